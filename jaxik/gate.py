@@ -1,0 +1,87 @@
+"""Every decision of the pipeline is made by a gate.
+
+`Hard` decides as a game does. `Smooth` blurs, for users who want slopes through decisions. Both
+answer with a weight 0..1, so that `a * b` is "and" and `1 - a` is "not" for either. A call names its
+`band`: the width over which a decision turns, in the unit of what is compared.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class AbstractGate(eqx.Module):
+    """How a comparison becomes a weight, and a weight a choice."""
+
+    @abstractmethod
+    def below(self, x: Array, threshold: Array, *, band: float) -> Array:
+        """1 where `x` is at or below `threshold`, else 0."""
+
+    def above(self, x: Array, threshold: Array, *, band: float) -> Array:
+        """1 where `x` is at or above `threshold`, else 0."""
+        return self.below(-x, -threshold, band=band)
+
+    @abstractmethod
+    def choose(self, weight: Array, yes: Array, no: Array) -> Array:
+        """`yes` where `weight` is 1, `no` where it is 0."""
+
+    @abstractmethod
+    def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
+        """`x` kept between `low` and `high`."""
+
+    @abstractmethod
+    def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+        """The smallest along the last axis."""
+
+    def largest(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+        """The largest along the last axis."""
+        return -self.least(-x, band=band)
+
+
+class Hard(AbstractGate):
+    """Decides as a game does: the slope through a decision is zero."""
+
+    def below(self, x: Array, threshold: Array, *, band: float) -> Array:
+        del band
+        return (x <= threshold).astype(x.dtype)
+
+    def choose(self, weight: Array, yes: Array, no: Array) -> Array:
+        return jnp.where(weight > 0.5, yes, no)
+
+    def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
+        # Not jnp.minimum: its slope is split where the operands are equal.
+        del band
+        capped = jnp.where(x > high, high, x)
+        return jnp.where(capped < low, low, capped)
+
+    def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+        # Not jnp.min: its slope picks the branch by bitwise equality after fusion.
+        del band
+        return jnp.take_along_axis(x, jnp.argmin(x, axis=-1, keepdims=True), axis=-1)[..., 0]
+
+
+class Smooth(AbstractGate):
+    """Blurs each decision over `softness` bands; tends to `Hard` as softness falls to zero."""
+
+    softness: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    def below(self, x: Array, threshold: Array, *, band: float) -> Array:
+        return jax.nn.sigmoid((threshold - x) / (band * self.softness))
+
+    def choose(self, weight: Array, yes: Array, no: Array) -> Array:
+        return no + weight * (yes - no)
+
+    def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
+        width = band * self.softness
+        over_low = jax.nn.softplus((x - low) / width) - jax.nn.softplus((x - high) / width)
+        return low + width * over_low
+
+    def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+        width = band * self.softness
+        return jnp.sum(x * jax.nn.softmax(-x / width, axis=-1), axis=-1)
+
+
+HARD = Hard()

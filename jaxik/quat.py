@@ -1,0 +1,149 @@
+"""Unit quaternions, wxyz, Hamilton, active; every function broadcasts over the leading axes.
+
+`q` and `-q` are the same rotation. Corrections of a local rotation are multiplied on its right.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import vec
+
+
+def components(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array, Array]:
+    """The w, x, y and z of `q`, each of shape `*b`."""
+    return q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+
+
+def stack(w: Array, x: Array, y: Array, z: Array) -> Float[Array, "*b 4"]:
+    """The quaternion with these components, which are broadcast against each other."""
+    return jnp.stack(jnp.broadcast_arrays(w, x, y, z), axis=-1)
+
+
+def identity(dtype=None) -> Float[Array, "4"]:
+    """The rotation that turns nothing."""
+    return jnp.array([1.0, 0.0, 0.0, 0.0], dtype)
+
+
+def multiply(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*c 4"]:
+    """`a` after `b`."""
+    aw, ax, ay, az = components(a)
+    bw, bx, by, bz = components(b)
+    return stack(
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+    """The inverse rotation."""
+    w, x, y, z = components(q)
+    return stack(w, -x, -y, -z)
+
+
+def rotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
+    """`v` turned by `q`."""
+    w, x, y, z = components(q)
+    vx, vy, vz = vec.components(v)
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return vec.stack(
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+def unrotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
+    """`v` turned by the inverse of `q`."""
+    return rotate(conjugate(q), v)
+
+
+def dot(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Array:
+    """Scalar product of the four components."""
+    aw, ax, ay, az = components(a)
+    bw, bx, by, bz = components(b)
+    return aw * bw + ax * bx + ay * by + az * bz
+
+
+def unit(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+    """`q` at length one; the identity, with zero slope, where `q` has no direction."""
+    square = dot(q, q)
+    known = square > jnp.finfo(q.dtype).eps ** 2
+    inverse = 1.0 / jnp.sqrt(jnp.where(known, square, 1.0))
+    return jnp.where(known[..., None], q * inverse[..., None], identity(q.dtype))
+
+
+def from_cos_sin(
+    axis: Float[Array, "*a 3"], cos: Float[Array, "*b"], sin: Float[Array, "*b"]
+) -> Float[Array, "*c 4"]:
+    """Turn about the unit `axis` by the angle with this cosine and sine, without trigonometry.
+
+    Half-angle formulas, on the better conditioned side of a right angle; half a turn is a turn
+    about `+axis`.
+    """
+    acute = cos >= 0
+    larger = jnp.sqrt(jnp.where(acute, 1.0 + cos, 1.0 - cos) * 0.5)
+    smaller = jnp.abs(sin) / (2.0 * larger)
+    half_cos = jnp.where(acute, larger, smaller)
+    half_sin = jnp.where(acute, smaller, larger) * jnp.where(sin < 0, -1.0, 1.0)
+    x, y, z = vec.components(axis)
+    return stack(half_cos, x * half_sin, y * half_sin, z * half_sin)
+
+
+def from_axis_angle(axis: Float[Array, "*a 3"], angle: Float[Array, "*b"]) -> Float[Array, "*c 4"]:
+    """Turn about the unit `axis` by `angle`, rad, right-handed."""
+    x, y, z = vec.components(axis)
+    sin = jnp.sin(0.5 * angle)
+    return stack(jnp.cos(0.5 * angle), x * sin, y * sin, z * sin)
+
+
+def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
+    """Turn about `v` by its length, rad; smooth through zero (Taylor series there)."""
+    square = vec.dot(v, v)
+    large = square > jnp.finfo(v.dtype).eps ** 0.5
+    angle = jnp.sqrt(jnp.where(large, square, 1.0))
+    half_sinc = jnp.where(large, jnp.sin(0.5 * angle) / angle, 0.5 - square / 48.0)
+    cos = jnp.where(large, jnp.cos(0.5 * angle), 1.0 - square / 8.0)
+    x, y, z = vec.components(v)
+    return stack(cos, x * half_sinc, y * half_sinc, z * half_sinc)
+
+
+def arc(
+    a: Float[Array, "*a 3"], b: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]
+) -> Float[Array, "*c 4"]:
+    """Shortest rotation from the unit vector `a` to the unit vector `b`.
+
+    Where they are opposed every axis is as short: half a turn about the unit vector `fallback`,
+    which should be at right angles to `a`; the slope is zero there.
+    """
+    w = 1.0 + vec.dot(a, b)
+    known = w > 4.0 * jnp.finfo(w.dtype).eps
+    x, y, z = vec.components(vec.cross(a, b))
+    fx, fy, fz = vec.components(fallback)
+    safe = jnp.where(known, w, 1.0)
+    # |(w, a x b)|² = 2 w for unit vectors, but a float32 "unit" vector is not quite one.
+    inverse = 1.0 / jnp.sqrt(safe * safe + jnp.where(known, x * x + y * y + z * z, 0.0))
+    return stack(
+        jnp.where(known, safe * inverse, 0.0),
+        jnp.where(known, x * inverse, fx),
+        jnp.where(known, y * inverse, fy),
+        jnp.where(known, z * inverse, fz),
+    )
+
+
+def nlerp(
+    a: Float[Array, "*a 4"], b: Float[Array, "*b 4"], weight: Float[Array, "*w"]
+) -> Float[Array, "*c 4"]:
+    """`a` at weight 0, `b` at weight 1, between them the normalised line along the shorter way."""
+    near = jnp.where((dot(a, b) < 0)[..., None], -b, b)
+    return unit(a + (near - a) * jnp.asarray(weight)[..., None])
+
+
+def angle(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Array:
+    """Angle of the rotation between `a` and `b`, 0..pi rad; zero slope where they are equal."""
+    w, x, y, z = components(multiply(conjugate(a), b))
+    sin = vec.safe_sqrt(x * x + y * y + z * z)
+    cos = jnp.abs(w)
+    same = (sin == 0) & (cos == 0)
+    return 2.0 * jnp.arctan2(sin, jnp.where(same, 1.0, cos))

@@ -1,0 +1,99 @@
+"""What a rule is made of: parameters that know their unit, range and kind, and switches.
+
+A stage's rule is an `eqx.Module` whose float fields are declared with `parameter`. The declaration is
+the only place where a number's default, unit and range stand: presets, the fit, the reports and the
+error messages read it from there.
+"""
+
+import dataclasses
+from typing import Any, Literal, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+Rule = TypeVar("Rule", bound=eqx.Module)
+Kind = Literal["smooth", "threshold"]
+Scale = Literal["linear", "log", "gain"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+    """What is known of a parameter before any data."""
+
+    unit: str
+    low: float  # a fit stays between low and high
+    high: float
+    kind: Kind  # a threshold moves a hard decision: its derivative there is zero
+    scale: Scale  # a gain is fitted as its half-life
+    above: str | None  # name of the field of the same rule that this one stays above
+
+
+def as_float_array(x: Any) -> Any:
+    """Python numbers and sequences become float arrays; arrays and tracers stay as they are."""
+    return x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.result_type(float))
+
+
+def as_switch(x: Any) -> Any:
+    """Python booleans become 0-d arrays, so that a switch is data and never a new program."""
+    return x if isinstance(x, jax.Array) else jnp.asarray(x, bool)
+
+
+def parameter(
+    default: float | tuple[float, ...],
+    *,
+    unit: str,
+    low: float,
+    high: float,
+    kind: Kind = "smooth",
+    scale: Scale = "linear",
+    above: str | None = None,
+) -> Any:
+    """A float leaf of a rule, `()` shared by the legs or `(legs,)` one each."""
+    declaration = Declaration(unit, low, high, kind, scale, above)
+    return eqx.field(
+        default_factory=lambda: as_float_array(default),
+        converter=as_float_array,
+        metadata={"declaration": declaration},
+    )
+
+
+def switch(default: bool) -> Any:
+    """A boolean leaf of a rule."""
+    return eqx.field(default_factory=lambda: as_switch(default), converter=as_switch)
+
+
+def declarations(module: eqx.Module, path: str = "") -> dict[str, Declaration]:
+    """Every declared parameter of a rule or of a tree of rules, by dotted name."""
+    found: dict[str, Declaration] = {}
+    for field in dataclasses.fields(module):
+        name = f"{path}{field.name}"
+        if "declaration" in field.metadata:
+            found[name] = field.metadata["declaration"]
+        elif isinstance(child := getattr(module, field.name), eqx.Module):
+            found |= declarations(child, f"{name}.")
+    return found
+
+
+def get(module: eqx.Module, name: str) -> jax.Array:
+    """The leaf with this dotted name."""
+    for part in name.split("."):
+        module = getattr(module, part)
+    return module  # type: ignore[return-value]
+
+
+def replace(module: Rule, values: dict[str, Any]) -> Rule:
+    """The tree with the leaves of these dotted names exchanged.
+
+    Raises:
+        ValueError: for a name that the tree does not have.
+    """
+    names = list(values)
+    leaves = []
+    for name in names:
+        try:
+            old = get(module, name)
+        except AttributeError:
+            raise ValueError(f"no parameter named {name!r}; there are {list(declarations(module))}")
+        leaves.append(jnp.asarray(values[name], old.dtype))
+    return eqx.tree_at(lambda tree: [get(tree, name) for name in names], module, leaves)
