@@ -42,12 +42,16 @@ def share_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
 
 
 def spring(
-    value: Float[Array, "*b"], velocity: Float[Array, "*b"], goal: Array, half_life: Array, dt: Array
+    value: Float[Array, "*b"],
+    velocity: Float[Array, "*b"],
+    goal: Array,
+    half_life: Array,
+    dt: Array,
 ) -> tuple[Array, Array]:
     """Value and velocity after `dt` s of a critically damped spring towards a still `goal`.
 
-    `x'' = -w² (x - goal) - 2 w x'` solved exactly, with `w = 2 ln 2 / half_life`; a half-life of 0 or
-    less jumps and stops.
+    `x'' = -w² (x - goal) - 2 w x'` solved exactly, with `w = 2 ln 2 / half_life`; a half-life of
+    0 or less jumps and stops.
     """
     damped = half_life > 0
     rate = 2.0 * LN2 / jnp.where(damped, half_life, 1.0)
@@ -60,8 +64,10 @@ def spring(
 
 
 def half_life_of_gain(gain: Array, tick_hz: Array) -> Array:
-    """Half-life, s, of a gain per tick; 0 for gain 1, infinite for gain 0."""
-    return -LN2 / (tick_hz * jnp.log1p(-gain))
+    """Half-life, s, of a gain per tick; 0, with zero slope, for gain 1; infinite for gain 0."""
+    damped = gain < 1
+    safe = -LN2 / (tick_hz * jnp.log1p(-jnp.where(damped, gain, 0.5)))
+    return jnp.where(damped, safe, 0.0)
 
 
 def gain_of_half_life(half_life: Array, tick_hz: Array) -> Array:
@@ -75,4 +81,3 @@ def half_life_of_speed(speed: Array, dt: Array) -> Array:
     damped = (share > 0) & (share < 1)
     safe = -LN2 * dt / jnp.log1p(-jnp.where(damped, share, 0.5))
     return jnp.where(damped, safe, 0.0)
-

@@ -1,8 +1,8 @@
 """Every decision of the pipeline is made by a gate.
 
 `Hard` decides as a game does. `Smooth` blurs, for users who want slopes through decisions. Both
-answer with a weight 0..1, so that `a * b` is "and" and `1 - a` is "not" for either. A call names its
-`band`: the width over which a decision turns, in the unit of what is compared.
+answer with a weight 0..1, so that `a * b` is "and" and `1 - a` is "not" for either. A call names
+its `band`: the width over which a decision turns, in the unit of what is compared.
 """
 
 from abc import abstractmethod
@@ -80,8 +80,12 @@ class Smooth(AbstractGate):
         return low + width * over_low
 
     def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        width = band * self.softness
-        return jnp.sum(x * jax.nn.softmax(-x / width, axis=-1), axis=-1)
+        # Counted from the smallest: at a small width `x / width` is too large for its rounding not
+        # to matter, and a compiled softmax of it is NaN. The answer does not depend on the shift.
+        smallest = jax.lax.stop_gradient(jnp.min(x, axis=-1, keepdims=True))
+        above = x - smallest
+        share = jax.nn.softmax(-above / (band * self.softness), axis=-1)
+        return smallest[..., 0] + jnp.sum(above * share, axis=-1)
 
 
 HARD = Hard()

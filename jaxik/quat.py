@@ -28,12 +28,13 @@ def multiply(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Float[Array, "
     """`a` after `b`."""
     aw, ax, ay, az = components(a)
     bw, bx, by, bz = components(b)
-    return stack(
+    product = stack(
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
     )
+    return vec.fence(product)
 
 
 def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -47,11 +48,12 @@ def rotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c
     w, x, y, z = components(q)
     vx, vy, vz = vec.components(v)
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return vec.stack(
+    turned = vec.stack(
         vx + w * tx + y * tz - z * ty,
         vy + w * ty + z * tx - x * tz,
         vz + w * tz + x * ty - y * tx,
     )
+    return vec.fence(turned)
 
 
 def unrotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
@@ -74,28 +76,37 @@ def unit(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     return jnp.where(known[..., None], q * inverse[..., None], identity(q.dtype))
 
 
-def from_cos_sin(
-    axis: Float[Array, "*a 3"], cos: Float[Array, "*b"], sin: Float[Array, "*b"]
-) -> Float[Array, "*c 4"]:
-    """Turn about the unit `axis` by the angle with this cosine and sine, without trigonometry.
+def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array, Array]:
+    """Cosine (>= 0) and sine of half the angle, -pi..pi, with this cosine and sine.
 
-    Half-angle formulas, on the better conditioned side of a right angle; half a turn is a turn
-    about `+axis`.
+    Half-angle formulas on the better conditioned side of a right angle: exact, and with finite
+    slopes everywhere; half a turn has the half-angle +pi/2.
     """
     acute = cos >= 0
     larger = jnp.sqrt(jnp.where(acute, 1.0 + cos, 1.0 - cos) * 0.5)
-    smaller = jnp.abs(sin) / (2.0 * larger)
-    half_cos = jnp.where(acute, larger, smaller)
-    half_sin = jnp.where(acute, smaller, larger) * jnp.where(sin < 0, -1.0, 1.0)
+    smaller = sin / (2.0 * larger)
+    sign = jnp.where(sin < 0, -1.0, 1.0)
+    return jnp.where(acute, larger, sign * smaller), jnp.where(acute, smaller, sign * larger)
+
+
+def from_half(
+    axis: Float[Array, "*a 3"], half_cos: Float[Array, "*b"], half_sin: Float[Array, "*b"]
+) -> Float[Array, "*c 4"]:
+    """Turn about the unit `axis`, given the cosine and sine of half its angle."""
     x, y, z = vec.components(axis)
     return stack(half_cos, x * half_sin, y * half_sin, z * half_sin)
 
 
+def from_cos_sin(
+    axis: Float[Array, "*a 3"], cos: Float[Array, "*b"], sin: Float[Array, "*b"]
+) -> Float[Array, "*c 4"]:
+    """Turn about the unit `axis` by the angle with this cosine and sine, without trigonometry."""
+    return from_half(axis, *half_angle(cos, sin))
+
+
 def from_axis_angle(axis: Float[Array, "*a 3"], angle: Float[Array, "*b"]) -> Float[Array, "*c 4"]:
     """Turn about the unit `axis` by `angle`, rad, right-handed."""
-    x, y, z = vec.components(axis)
-    sin = jnp.sin(0.5 * angle)
-    return stack(jnp.cos(0.5 * angle), x * sin, y * sin, z * sin)
+    return from_half(axis, jnp.cos(0.5 * angle), jnp.sin(0.5 * angle))
 
 
 def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:

@@ -1,11 +1,12 @@
 """What a rule is made of: parameters that know their unit, range and kind, and switches.
 
-A stage's rule is an `eqx.Module` whose float fields are declared with `parameter`. The declaration is
-the only place where a number's default, unit and range stand: presets, the fit, the reports and the
-error messages read it from there.
+A stage's rule is an `eqx.Module` whose float fields are declared with `parameter`. The declaration
+is the only place where a number's default, unit and range stand: presets, the fit, the reports and
+the error messages read it from there.
 """
 
 import dataclasses
+import operator
 from typing import Any, Literal, TypeVar
 
 import equinox as eqx
@@ -58,6 +59,11 @@ def parameter(
     )
 
 
+def constant(default: float) -> Any:
+    """A float leaf of a rule that is a convention, such as a tick rate: never fitted."""
+    return eqx.field(default_factory=lambda: as_float_array(default), converter=as_float_array)
+
+
 def switch(default: bool) -> Any:
     """A boolean leaf of a rule."""
     return eqx.field(default_factory=lambda: as_switch(default), converter=as_switch)
@@ -77,9 +83,7 @@ def declarations(module: eqx.Module, path: str = "") -> dict[str, Declaration]:
 
 def get(module: eqx.Module, name: str) -> jax.Array:
     """The leaf with this dotted name."""
-    for part in name.split("."):
-        module = getattr(module, part)
-    return module  # type: ignore[return-value]
+    return operator.attrgetter(name)(module)
 
 
 def replace(module: Rule, values: dict[str, Any]) -> Rule:
@@ -88,12 +92,12 @@ def replace(module: Rule, values: dict[str, Any]) -> Rule:
     Raises:
         ValueError: for a name that the tree does not have.
     """
-    names = list(values)
+    getters = [operator.attrgetter(name) for name in values]
     leaves = []
-    for name in names:
+    for getter, (name, value) in zip(getters, values.items(), strict=True):
         try:
-            old = get(module, name)
+            leaves.append(jnp.asarray(value, getter(module).dtype))
         except AttributeError:
-            raise ValueError(f"no parameter named {name!r}; there are {list(declarations(module))}")
-        leaves.append(jnp.asarray(values[name], old.dtype))
-    return eqx.tree_at(lambda tree: [get(tree, name) for name in names], module, leaves)
+            there_are = list(declarations(module))
+            raise ValueError(f"no parameter named {name!r}; there are {there_are}") from None
+    return eqx.tree_at(lambda tree: [getter(tree) for getter in getters], module, leaves)

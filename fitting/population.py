@@ -1,0 +1,98 @@
+"""Many candidates at once: what they cost, and where they would go."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .space import EDGE, Problem, Space
+
+POPULATION = 64  # candidates in one vmapped call
+
+
+class Population(eqx.Module):
+    """Many `u` evaluated at once."""
+
+    cost: Float[np.ndarray, " population"]  # hard; infinite where a row is not finite
+    moved: Float[np.ndarray, "population free"]  # after one Gauss-Newton step of smooth columns
+    promised: Float[np.ndarray, " population"]  # cost there if the given slopes held
+
+
+def count_rows(problem: Problem) -> int:
+    """How many rows a problem has; nothing is computed."""
+    return len(jax.eval_shape(problem.rows, problem.space.u0))
+
+
+@eqx.filter_jit
+def from_values(
+    space: Space, values: Float[Array, "candidates free"]
+) -> Float[Array, "candidates free"]:
+    """`u` of many rows of values."""
+    return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(values)
+
+
+@eqx.filter_jit
+def _values_of(space: Space, candidates: Array) -> Array:
+    return jax.vmap(space.values)(candidates)
+
+
+@eqx.filter_jit
+def _evaluate(problem: Problem, candidates: Array, slopes: Array) -> tuple[Array, Array, Array]:
+    rows = jax.vmap(problem.rows)(candidates)
+    gram = slopes.T @ slopes
+    empty = jnp.diag(gram) == 0  # such a column does not move
+    pulls = rows @ slopes
+    steps = -jnp.linalg.solve(gram + jnp.diag(empty.astype(gram.dtype)), pulls.T).T
+    costs = 0.5 * jnp.sum(rows**2, axis=1)
+    return costs, candidates + steps, costs + 0.5 * jnp.sum(pulls * steps, axis=1)
+
+
+def evaluate(
+    problem: Problem,
+    candidates: Float[np.ndarray, "candidates free"],
+    slopes: Float[np.ndarray, "rows free"] | None = None,
+) -> Population:
+    """Costs of any number of `u`, and where one Gauss-Newton step of these slopes takes them.
+
+    Evaluated POPULATION at a time, the last call filled up, so that there is one program. Without
+    slopes nothing moves.
+    """
+    dtype = problem.space.u0.dtype
+    if slopes is None:
+        slopes = np.zeros((count_rows(problem), problem.space.size))
+    parts = []
+    for first in range(0, len(candidates), POPULATION):
+        some = candidates[first : first + POPULATION]
+        filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), dtype)
+        part = _evaluate(problem, filled, jnp.asarray(slopes, dtype))
+        parts.append([np.asarray(one)[: len(some)] for one in part])
+    cost, moved, promised = (np.concatenate(one) for one in zip(*parts, strict=True))
+    finite = np.isfinite(cost)
+    return Population(
+        np.where(finite, cost, np.inf),
+        np.where(np.isfinite(moved), moved, candidates),
+        np.where(finite, promised, np.inf),
+    )
+
+
+def vary(
+    space: Space,
+    parents: Float[np.ndarray, "candidates free"],
+    shifts: Float[np.ndarray, "candidates free"],
+    renewed: Bool[np.ndarray, "candidates free"],
+    random: np.random.Generator,
+) -> Float[np.ndarray, "candidates free"]:
+    """`u` with some values shifted and some drawn anew from their range, the others being kept.
+
+    Values and not `u` are kept: a threshold above another one would move with it, off the plateau
+    that it had found. Shifts are in the log-odds of the share of the range; 0 keeps a value.
+    """
+    low, high = np.asarray(space.low), np.asarray(space.high)
+    before = np.asarray(_values_of(space, jnp.asarray(parents, space.u0.dtype)))
+    share = np.clip((before - low) / (high - low), EDGE, 1 - EDGE)
+    odds = np.log(share / (1 - share)) + shifts
+    odds[renewed] = random.logistic(size=int(renewed.sum()))
+    varied = low + (high - low) / (1 + np.exp(-odds))
+    values = np.where((shifts != 0) | renewed, varied, before)
+    return np.asarray(from_values(space, jnp.asarray(values, space.u0.dtype)))

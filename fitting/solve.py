@@ -1,0 +1,355 @@
+"""The fit: Levenberg–Marquardt for what has slopes, sampling for what decides.
+
+The pipeline stays hard. A threshold has no slope through a hard decision, so thresholds are moved
+by two ways, and the lower cost is kept (each wins where the other fails):
+
+- `blocks`: a population is evaluated in one vmapped call, the elite breeds the next one, and
+  Levenberg–Marquardt follows on the smooth columns; a few rounds of it.
+- `ensemble`: Levenberg–Marquardt on the mean residual over random shifts of the thresholds, whose
+  columns come from a regression on the shifts; the shifts shrink; then blocks.
+
+Where the two end apart, a third go starts from the better one.
+
+A fit compiles three programs, whatever the number of starts and stages: a march of
+Levenberg–Marquardt on the hard rows, one on the ensemble's, and the population.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from .population import POPULATION, count_rows, evaluate, vary
+from .slopes import Model, ensemble, hard, with_slopes
+from .space import Problem
+
+MARCH = 8  # steps of Levenberg–Marquardt in one call, between two reports
+ROUNDING = 1e-9  # relative: two programs do not sum a cost alike
+TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
+CALM = 2  # such steps in a row that end a march
+STALLS = 12  # rejected steps in a row that end it: each shrinks the step to a quarter
+AGREED = 1e-3  # relative: two ways that end further apart call for a third go
+ROUNDS = 5  # of blocks
+GENERATIONS = 5  # of a population per round
+ELITE = 8
+REPEATED = 16  # children that come again after a Gauss-Newton step
+SPREADS = (0.8, 0.4, 0.2, 0.1)  # of the ensemble's shifts, in u
+PAIRS = 16  # antithetic shifts of the ensemble
+START_SPREAD = 0.5  # of a further start, in prior standard deviations
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """One report of a running fit."""
+
+    stage: str
+    start: int  # which start, from 0
+    step: int  # steps of Levenberg–Marquardt so far, in this start
+    cost: float  # where the stage stands
+    best: float  # lowest cost on the hard rows so far, over all starts
+    seconds: float  # since the beginning
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """Where a fit ended, and how."""
+
+    names: tuple[str, ...]
+    u: Float[np.ndarray, " free"]
+    values: Float[np.ndarray, " free"]  # in their own units
+    cost_before: float  # of the base's values
+    cost: float
+    converged: bool
+    message: str  # one sentence
+    jacobian: Float[np.ndarray, "rows free"]  # of `Problem.rows` at `u`; zero at thresholds
+    history: tuple[Progress, ...]
+    steps: int  # of Levenberg–Marquardt, all starts together
+    seconds: float
+
+
+class _Position(eqx.Module):
+    """Where a march of Levenberg–Marquardt stands; all of it data."""
+
+    u: Array
+    cost: Array
+    step_size: Array
+    calm: Array  # accepted steps in a row that gained next to nothing
+    stalls: Array  # rejected steps in a row
+    steps: Array
+
+    @property
+    def done(self) -> Array:
+        return (self.calm >= CALM) | (self.stalls >= STALLS)
+
+
+@eqx.filter_jit
+def _march(
+    model: Model, position: _Position, limit: Array, args: tuple[Problem, Array]
+) -> tuple[_Position, Array]:
+    """At most `limit` steps of Levenberg–Marquardt; where it came to, and the slopes there.
+
+    optimistix keeps the linearised program in its state, which no call can hand to the next without
+    compiling again; so a march begins by evaluating where the last one stopped, with its step size,
+    and goes on exactly as if it had not stopped.
+    """
+    rows = with_slopes(model)
+    solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
+    common = {"args": args, "options": {"jac": "fwd"}, "tags": frozenset()}
+    shape = jax.eval_shape(rows, position.u, args)[0]
+    state = solver.init(rows, position.u, f_struct=shape, aux_struct=None, **common)
+    state = eqx.tree_at(lambda s: s.search_state.step_size, state, position.step_size)
+    arrays, static = eqx.partition(state, eqx.is_array)
+
+    def advance(carry: tuple[_Position, Any]) -> tuple[_Position, Any]:
+        at, arrays = carry
+        before = eqx.combine(arrays, static)
+        u, state, _ = solver.step(rows, at.u, state=before, **common)
+        first = before.first_step  # evaluates where it stands
+        accepted = state.num_accepted_steps > before.num_accepted_steps
+        cost = state.f_info.as_min()
+        little = accepted & (at.cost - cost <= TOLERANCE * at.cost)
+        calm = jnp.where(little, at.calm + 1, jnp.where(accepted, 0, at.calm))
+        moved = _Position(
+            u=u,
+            cost=cost,
+            step_size=state.search_state.step_size,
+            calm=jnp.where(first, at.calm, calm),
+            stalls=jnp.where(first, at.stalls, jnp.where(accepted, 0, at.stalls + 1)),
+            steps=at.steps + jnp.where(first, 0, 1),
+        )
+        return moved, eqx.filter(state, eqx.is_array)
+
+    def going(carry: tuple[_Position, Any]) -> Array:
+        taken = carry[0].steps - position.steps
+        return eqx.combine(carry[1], static).first_step | (~carry[0].done & (taken < limit))
+
+    position, arrays = jax.lax.while_loop(going, advance, (position, arrays))
+    return position, eqx.combine(arrays, static).f_info.jac.as_matrix()
+
+
+class _Spent(Exception):
+    """The steps allowed for a start are used up."""
+
+
+class _Fit:
+    """A running fit: what it costs, the best point, and who is told."""
+
+    def __init__(self, problem: Problem, seed: int, max_steps: int, progress: Any) -> None:
+        self.problem = problem
+        self.random = np.random.default_rng(seed)
+        self.max_steps = max_steps
+        self.progress = progress
+        self.began = time.perf_counter()
+        self.thresholds = np.asarray(problem.space.thresholds)
+        self.rows = count_rows(problem)
+        self.still = np.zeros((self.rows, problem.space.size))  # slopes that move nothing
+        self.start = 0
+        self.steps = 0  # of this start
+        self.total = 0
+        self.best = np.asarray(problem.space.u0)
+        self.best_cost = np.inf
+        self.settled = False  # the best point is the end of a finished march
+        self.history: list[Progress] = []
+
+    def keep(self, stage: str, u: np.ndarray, cost: float, settled: bool = False) -> None:
+        """Remembers a point of the hard program if it is the best, and reports."""
+        if cost < self.best_cost or (settled and cost <= self.best_cost * (1 + ROUNDING)):
+            self.best, self.best_cost, self.settled = u, cost, settled
+        self.report(stage, cost)
+
+    def report(self, stage: str, cost: float) -> None:
+        elapsed = time.perf_counter() - self.began
+        report = Progress(stage, self.start, self.steps, cost, self.best_cost, elapsed)
+        self.history.append(report)
+        if self.progress is not None:
+            self.progress(report)
+
+    def position(self, u: np.ndarray) -> _Position:
+        dtype = self.problem.space.u0.dtype
+        one, zero = jnp.ones((), dtype), jnp.zeros((), int)
+        return _Position(jnp.asarray(u, dtype), one, one, zero, zero, zero)
+
+    def descend(self, stage: str, u: np.ndarray, limit: int, shifts: Array | None = None) -> Any:
+        """Levenberg–Marquardt from `u`: the point it came to, the cost and the slopes there.
+
+        Without shifts the thresholds are frozen and the rows are the hard ones.
+        """
+        position, slopes = self.position(u), jnp.asarray(self.still)
+        model, second = (hard, position.u) if shifts is None else (ensemble, shifts)
+        while not position.done and int(position.steps) < limit:
+            left = min(MARCH, limit - int(position.steps), self.max_steps - self.steps)
+            if left <= 0:
+                raise _Spent
+            before = int(position.steps)
+            position, slopes = _march(model, position, jnp.asarray(left), (self.problem, second))
+            self.steps += int(position.steps) - before
+            self.total += int(position.steps) - before
+            if shifts is None:
+                settled = stage == "polish" and bool(position.done)
+                self.keep(stage, np.asarray(position.u), float(position.cost), settled)
+            else:
+                self.report(stage, float(position.cost))
+        cost = float(position.cost) if jnp.isfinite(position.cost) else float("inf")
+        return np.asarray(position.u), cost, slopes[: self.rows]
+
+    def breed(self, u: np.ndarray, cost: float, slopes: Any, spread: float) -> Any:
+        """The best of some generations bred from `u`.
+
+        A child is a parent with some thresholds shifted; a third of them also have one parameter,
+        of either kind, drawn anew from its range, which frees a clamp that had no slope because it
+        was never reached. Other thresholds want other smooth columns, so the most promising
+        children come again after a Gauss-Newton step.
+        """
+        elite, costs = u[None], np.asarray([cost])
+        moved = elite[:0]
+        rate = max(0.3, 1 / max(1, self.thresholds.sum()))
+        for generation in range(GENERATIONS):
+            count = POPULATION - len(moved)
+            parents = elite[self.random.integers(len(elite), size=count)]
+            changed = (self.random.random(parents.shape) < rate) & self.thresholds
+            shifts = self.random.normal(0, spread * 0.6**generation, parents.shape) * changed
+            renewed = np.zeros(parents.shape, bool)
+            some = np.arange(count // 3)
+            renewed[some, self.random.integers(u.size, size=some.size)] = True
+            children = vary(self.problem.space, parents, shifts, renewed, self.random)
+            children = np.concatenate([moved, children])
+            born = evaluate(self.problem, children, slopes)
+            every = np.concatenate([elite, children])
+            costs = np.concatenate([costs, born.cost])
+            order = np.argsort(costs, kind="stable")[:ELITE]
+            elite, costs = every[order], costs[order]
+            moved = born.moved[np.argsort(born.promised, kind="stable")[:REPEATED]]
+            self.keep("blocks", elite[0], float(costs[0]))
+        return elite[0], float(costs[0])
+
+    def blocks(self, u: np.ndarray, spread: float) -> Any:
+        """Turns of thresholds by population and smooth columns by Levenberg–Marquardt."""
+        u, cost, slopes = self.descend("blocks", u, MARCH)
+        for number in range(ROUNDS):
+            before = cost
+            u, cost = self.breed(u, cost, slopes, spread * 0.7**number)
+            u, cost, slopes = self.descend("blocks", u, MARCH)
+            if number > 1 and before - cost < 1e-4 * before:
+                break
+        return u, cost
+
+    def slopes(self, u: np.ndarray) -> np.ndarray:
+        """Slopes of the problem's rows at `u`."""
+        position = self.position(u)
+        args = (self.problem, position.u)
+        return np.asarray(_march(hard, position, jnp.zeros((), int), args)[1])[: self.rows]
+
+    def blur(self, u: np.ndarray) -> Any:
+        """Levenberg–Marquardt on the mean residual over shifts that shrink."""
+        draws = np.zeros((PAIRS, u.size))
+        draws[:, self.thresholds] = self.random.normal(size=(PAIRS, int(self.thresholds.sum())))
+        both = np.stack([draws, -draws], axis=1).reshape(2 * PAIRS, u.size)
+        for spread in SPREADS:
+            shifts = jnp.asarray(spread * both, self.problem.space.u0.dtype)
+            u, _, _ = self.descend("ensemble", u, MARCH, shifts)
+        return u
+
+    def run_start(self, number: int, u: np.ndarray, cost: float) -> None:
+        """Both ways from one start, then the smooth columns to their end."""
+        self.start, self.steps = number, 0
+        self.keep("start", u, cost)
+        ends = [self.blocks(u, 1.2)]
+        if self.thresholds.any():
+            ends.append(self.blocks(self.blur(u), 0.4))
+        ends.sort(key=lambda end: end[1])
+        if ends[-1][1] - ends[0][1] > AGREED * ends[0][1]:
+            ends.insert(0, self.blocks(ends[0][0], 1.2))
+        u, _ = ends[0]
+        self.descend("polish", u, self.max_steps)
+
+    def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:
+        """Points of finite cost: the prior's centre, then the lowest of a population of draws."""
+        space = self.problem.space
+        if isinstance(given, int):
+            draws = self.random.normal(size=(POPULATION - 1, space.size))
+            u0 = np.asarray(space.u0)
+            candidates = u0 + START_SPREAD * np.asarray(space.prior_sd) * draws
+            candidates = np.concatenate([u0[None], candidates])
+            count = given
+        else:
+            candidates, count = given, len(given)
+        costs = evaluate(self.problem, candidates, self.still).cost
+        order = [0, *(1 + np.argsort(costs[1:], kind="stable"))]
+        finite = [(candidates[i], float(costs[i])) for i in order if np.isfinite(costs[i])]
+        return finite[:count]
+
+
+def solve(
+    problem: Problem,
+    *,
+    starts: int | Float[np.ndarray, "starts free"] = 1,
+    seed: int = 0,
+    max_steps: int = 1000,
+    progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """The free parameters of least cost.
+
+    An interrupt (Ctrl-C) ends the search and keeps the best point so far.
+
+    Args:
+        problem: what to fit.
+        starts: how many, the first at the prior's centre and the others the lowest of some draws
+            from the prior; or the `u` to start from.
+        seed: of the draws; the same seed gives the same solution.
+        max_steps: of Levenberg–Marquardt, for each start.
+        progress: called with every report.
+
+    Returns:
+        The solution; `converged` and `message` say how far to trust it.
+
+    Raises:
+        ValueError: for no start or no step.
+    """
+    if max_steps < 1 or (starts if isinstance(starts, int) else len(starts)) < 1:
+        raise ValueError(f"starts is {starts} and max_steps {max_steps}, wanted at least 1 of each")
+    fit = _Fit(problem, seed, max_steps, progress)
+    base = np.asarray(problem.space.pack({}))
+    cost_before = float(evaluate(problem, base[None], fit.still).cost[0])
+    spent = interrupted = False
+    try:
+        for number, (u, cost) in enumerate(fit.starting_points(starts)):
+            try:
+                fit.run_start(number, u, cost)
+            except _Spent:
+                spent = True
+    except KeyboardInterrupt:
+        interrupted = True
+    converged = fit.settled and not interrupted
+    return Solution(
+        names=problem.space.names,
+        u=fit.best,
+        values=np.asarray(problem.space.values(jnp.asarray(fit.best, problem.space.u0.dtype))),
+        cost_before=cost_before,
+        cost=fit.best_cost,
+        converged=converged,
+        message=_sentence(fit, converged, interrupted, spent),
+        jacobian=fit.slopes(fit.best),
+        history=tuple(fit.history),
+        steps=fit.total,
+        seconds=time.perf_counter() - fit.began,
+    )
+
+
+def _sentence(fit: _Fit, converged: bool, interrupted: bool, spent: bool) -> str:
+    """How the fit ended."""
+    if interrupted:
+        return f"Interrupted after {fit.total} steps; this is the best point so far."
+    if not np.isfinite(fit.best_cost):
+        return f"Not converged: no residuals are finite at any of {POPULATION} starting points."
+    if converged:
+        return f"Converged: no further step lowers the cost by more than {TOLERANCE:g} of itself."
+    if spent:
+        return f"Not converged: the {fit.max_steps} steps allowed for a start were used up."
+    return "Not converged: the steps ended in a region where slopes or residuals are not finite."

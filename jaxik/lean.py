@@ -1,0 +1,124 @@
+"""Stage 4: the body's lean against the slope under the feet (the record's "undulation")."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from . import ease, quat, vec
+from .frame import Contact, Frame, Ground, Slope, heading
+from .gate import AbstractGate
+from .rule import constant, parameter
+
+
+class Lean(eqx.Module):
+    """What the slope does to the body."""
+
+    turn_ws: Float[Array, "4"]  # rotation of the body about its pivot, world axes
+    normal_ws: Float[Array, "3"]  # unit, the smoothed ground normal
+
+
+class AbstractLean(eqx.Module):
+    """Leans the body."""
+
+    @abstractmethod
+    def init(self, dtype: Any) -> Any:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def sense(
+        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+    ) -> Slope:
+        """The slope that this frame alone shows."""
+
+    @abstractmethod
+    def advance(
+        self,
+        slope: Slope,
+        up_ws: Array,
+        slide: Array,
+        dt: Array,
+        state: Any,
+        started: Array,
+        gate: AbstractGate,
+    ) -> tuple[Any, Lean]:
+        """The lean after memory."""
+
+
+class LeanState(eqx.Module):
+    """Smoothed slope and slide weight."""
+
+    forward: Float[Array, ""]  # rad
+    side: Float[Array, ""]  # rad
+    slide: Float[Array, ""]  # 0..1
+
+
+class SlopeLean(AbstractLean):
+    """Leans by a rate times the smoothed slope, with other rates and gains while sliding.
+
+    The slope comes from the normals under the feet that stand. Rate +1 lays the body's up on the
+    normal, a negative rate leans into the hill. The slope is smoothed before the rates are applied,
+    so that the smoothed normal exists by itself.
+    """
+
+    forward_rate: Array = parameter(-0.30, unit="1", low=-1.0, high=1.0)
+    side_rate: Array = parameter(-0.10, unit="1", low=-1.0, high=1.0)
+    forward_rate_slide: Array = parameter(0.80, unit="1", low=-1.0, high=1.0)
+    side_rate_slide: Array = parameter(0.60, unit="1", low=-1.0, high=1.0)
+    gain: Array = parameter(0.19, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    gain_slide: Array = parameter(0.294, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    slide_on_gain: Array = parameter(0.226, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    slide_off_gain: Array = parameter(0.135, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    tick_hz: Array = constant(30.0)
+
+    def init(self, dtype: Any) -> LeanState:
+        zero = jnp.zeros((), dtype)
+        return LeanState(zero, zero, zero)
+
+    def sense(
+        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+    ) -> Slope:
+        forward_ws, right_ws = heading(frame.world_from_model, up_ws)
+        share = contact.weight * ground.ankle.found * weight
+        normal = jnp.sum(vec.scale(ground.ankle.normal, share), axis=-2)
+        normal = jnp.where(jnp.sum(share) > 0, normal, up_ws)
+        up = vec.dot(normal, up_ws)
+        return Slope(
+            vec.safe_arctan2(-vec.dot(normal, forward_ws), up),
+            vec.safe_arctan2(-vec.dot(normal, right_ws), up),
+            forward_ws,
+            right_ws,
+        )
+
+    def advance(
+        self,
+        slope: Slope,
+        up_ws: Array,
+        slide: Array,
+        dt: Array,
+        state: LeanState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[LeanState, Lean]:
+        entering = gate.above(slide - state.slide, jnp.zeros_like(slide), band=0.1)
+        slide_gain = gate.choose(entering, self.slide_on_gain, self.slide_off_gain)
+        slide_share = ease.share_of_gain(slide_gain, dt, self.tick_hz)
+        sliding = ease.approach(state.slide, slide, jnp.where(started, slide_share, 1.0))
+
+        gain = ease.approach(self.gain, self.gain_slide, sliding)
+        share = jnp.where(started, ease.share_of_gain(gain, dt, self.tick_hz), 1.0)
+        forward = ease.approach(state.forward, slope.forward, share)
+        side = ease.approach(state.side, slope.side, share)
+
+        lean_forward = forward * ease.approach(self.forward_rate, self.forward_rate_slide, sliding)
+        lean_side = side * ease.approach(self.side_rate, self.side_rate_slide, sliding)
+        turn = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
+        normal = (
+            up_ws
+            - vec.scale(slope.forward_ws, jnp.tan(forward))
+            - vec.scale(slope.right_ws, jnp.tan(side))
+        )
+        lean = Lean(quat.from_rotvec(turn), vec.unit(normal, up_ws))
+        return LeanState(forward, side, sliding), lean

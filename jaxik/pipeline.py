@@ -1,0 +1,223 @@
+"""Foot IK as sense, advance, pose: one frame with `step`, a clip with `run`.
+
+What has no memory is computed for all frames at once (`sense`, `pose`); only a few numbers per leg go
+through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from . import quat, vec
+from .contact import AbstractContact
+from .foot import AbstractFoot
+from .frame import Frame, Sensed
+from .gate import HARD, AbstractGate
+from .lean import AbstractLean, Lean
+from .leg import AbstractLeg
+from .lock import AbstractLock
+from .pelvis import AbstractPelvis
+from .probe import AbstractProbe
+from .skeleton import LegPose, Rig, Transform, bone_lengths
+from .target import AbstractTarget
+from .terrain import Terrain
+
+
+class FootIK(eqx.Module):
+    """A foot-IK system: one rule a stage, in the order in which they run."""
+
+    probe: AbstractProbe
+    contact: AbstractContact
+    target: AbstractTarget
+    lean: AbstractLean
+    lock: AbstractLock
+    pelvis: AbstractPelvis
+    leg: AbstractLeg
+    foot: AbstractFoot
+
+
+class State(eqx.Module):
+    """All that the pipeline remembers between frames."""
+
+    started: Bool[Array, "*b"]  # False before the first frame, on which memory jumps to its goals
+    target: Any
+    lean: Any
+    lock: Any
+    pelvis: Any
+
+
+class Advanced(eqx.Module):
+    """What memory makes of a frame."""
+
+    foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, before the lock
+    target_ws: Float[Array, "legs 3"]  # m, of the ankles
+    lean: Lean
+    state: State  # after the frame
+
+
+class Corrections(eqx.Module):
+    """Local rotations that turn the animated pose into the solved one, right-multiplied."""
+
+    hip: Float[Array, "*b legs 4"]
+    knee: Float[Array, "*b legs 4"]
+    ankle: Float[Array, "*b legs 4"]
+
+
+class Trace(eqx.Module):
+    """Every stage's output."""
+
+    sensed: Sensed
+    advanced: Advanced
+
+
+class Result(eqx.Module):
+    """The frame after foot IK."""
+
+    pose: LegPose  # legs, model space
+    body: Transform  # carries the animated body to where it belongs, model space
+    corrections: Corrections
+    reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
+    trace: Trace
+
+
+def init(ik: FootIK, rig: Rig) -> State:
+    """The memory of a character that has not been seen yet: its first frame starts settled."""
+    dtype = rig.side.dtype
+    return State(
+        jnp.zeros((), bool),
+        ik.target.init(rig, dtype),
+        ik.lean.init(dtype),
+        ik.lock.init(rig, dtype),
+        ik.pelvis.init(dtype),
+    )
+
+
+def sense(ik: FootIK, rig: Rig, terrain: Terrain, frame: Frame, gate: AbstractGate) -> Sensed:
+    """All that the frame shows by itself."""
+    up = terrain.up_ws
+    weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
+    with jax.named_scope("probe"):
+        ground = ik.probe.sense(rig, terrain, frame)
+    with jax.named_scope("contact"):
+        contact = ik.contact.sense(frame, gate)
+    with jax.named_scope("target"):
+        foothold = ik.target.sense(frame, up, ground, contact, gate)
+    with jax.named_scope("lean"):
+        slope = ik.lean.sense(frame, up, ground, contact, weight)
+    thigh, shin = bone_lengths(frame.pose)
+    return Sensed(
+        up_ws=up,
+        dt=frame.dt,
+        slide=frame.slide,
+        platform=frame.platform,
+        present=rig.present,
+        weight=weight,
+        hip_ws=frame.world_from_model.apply(frame.pose.hip.pos),
+        ankle_ws=frame.world_from_model.apply(frame.pose.ankle.pos),
+        thigh=thigh,
+        shin=shin,
+        ground=ground,
+        contact=contact,
+        foothold=foothold,
+        slope=slope,
+    )
+
+
+def advance(ik: FootIK, sensed: Sensed, state: State, gate: AbstractGate) -> Advanced:
+    """Memory: the footholds, their locks, the lean and the pelvis after this frame."""
+    up, started = sensed.up_ws, state.started
+    with jax.named_scope("target"):
+        target, rise = ik.target.advance(sensed.foothold, sensed.dt, state.target, started, gate)
+        foothold_ws = sensed.foothold.point_ws + vec.scale(up, rise)
+    with jax.named_scope("lean"):
+        leaning, lean = ik.lean.advance(
+            sensed.slope, up, sensed.slide, sensed.dt, state.lean, started, gate
+        )
+    with jax.named_scope("lock"):
+        # The hip as the frame before left it: this frame's offset follows from the locks.
+        hip_ws = sensed.hip_ws + state.pelvis.offset_ws
+        lock, offset_ws = ik.lock.advance(sensed, foothold_ws, hip_ws, state.lock, started, gate)
+        target_ws = foothold_ws + offset_ws + vec.scale(up, sensed.contact.lift)
+    with jax.named_scope("pelvis"):
+        pelvis = ik.pelvis.advance(sensed, target_ws, lean, state.pelvis, started, gate)
+    after = State(jnp.ones_like(started), target, leaning, lock, pelvis)
+    return Advanced(foothold_ws, target_ws, lean, after)
+
+
+def pose(
+    ik: FootIK, rig: Rig, frame: Frame, sensed: Sensed, advanced: Advanced, gate: AbstractGate
+) -> Result:
+    """The solved legs."""
+    body = carry(rig, frame, advanced.lean.turn_ws, advanced.state.pelvis.offset_ws)
+    target_ms = frame.world_from_model.inverse().apply(advanced.target_ws)
+    with jax.named_scope("leg"):
+        bend = ik.leg.pose(rig, frame.pose.moved(body), target_ms, sensed.weight, gate)
+    with jax.named_scope("foot"):
+        planted = ik.foot.pose(rig, frame, sensed, bend, gate)
+    corrections = Corrections(bend.hip, bend.knee, planted.ankle)
+    return Result(planted.pose, body, corrections, bend.reached, Trace(sensed, advanced))
+
+
+def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform:
+    """The body's move in model space: a turn about the middle of the hips, then an offset."""
+    into_model = quat.conjugate(frame.world_from_model.rot)
+    present = jnp.where(rig.present, 1.0, 0.0)
+    count = jnp.where(jnp.any(rig.present), jnp.sum(present), 1.0)
+    pivot = jnp.sum(vec.scale(frame.pose.hip.pos, present), axis=-2) / count
+    turn = quat.multiply(into_model, quat.multiply(turn_ws, quat.conjugate(into_model)))
+    offset = quat.rotate(into_model, offset_ws)
+    return Transform(pivot + offset - quat.rotate(turn, pivot), turn)
+
+
+@eqx.filter_jit
+def step(
+    ik: FootIK, rig: Rig, terrain: Terrain, state: State, frame: Frame, gate: AbstractGate = HARD
+) -> tuple[State, Result]:
+    """One frame of one character, live.
+
+    Args:
+        ik: the system; its float leaves are its parameters.
+        rig: the legs.
+        terrain: the ground, world space.
+        state: memory, from `init` or from the step before.
+        frame: the animation.
+        gate: `Hard` decides as a game does; `Smooth` has slopes through decisions.
+    """
+    sensed = sense(ik, rig, terrain, frame, gate)
+    advanced = advance(ik, sensed, state, gate)
+    return advanced.state, pose(ik, rig, frame, sensed, advanced, gate)
+
+
+@eqx.filter_jit
+def resume(
+    ik: FootIK, rig: Rig, terrain: Terrain, state: State, frames: Frame, gate: AbstractGate = HARD
+) -> tuple[State, Result]:
+    """A clip from a given memory; the leaves of `frames` have a leading axis of frames.
+
+    Equal to `step` for each frame in turn. Returns the memory after the last frame, so that a clip
+    may be cut anywhere.
+    """
+    sensed = jax.vmap(lambda frame: sense(ik, rig, terrain, frame, gate))(frames)
+
+    def scanned(state: State, sensed: Sensed) -> tuple[State, Advanced]:
+        advanced = advance(ik, sensed, state, gate)
+        return advanced.state, advanced
+
+    after, advanced = jax.lax.scan(scanned, state, sensed)
+    result = jax.vmap(lambda frame, s, a: pose(ik, rig, frame, s, a, gate))(
+        frames, sensed, advanced
+    )
+    return after, result
+
+
+def run(
+    ik: FootIK, rig: Rig, terrain: Terrain, frames: Frame, gate: AbstractGate = HARD
+) -> Result:
+    """A clip of one character; the leaves of `frames` and of the result lead with frames.
+
+    Jit, vmap and differentiate over any argument.
+    """
+    return resume(ik, rig, terrain, init(ik, rig), frames, gate)[1]

@@ -1,0 +1,391 @@
+"""Ground: planes and triangle meshes, met by rays along -up.
+
+All rays of a terrain are parallel, so a mesh needs no tree: seen along up it is a drawing in the
+plane, and a grid over that drawing (`grid`) says which triangles a ray can meet. Which triangle is
+met is a discrete answer without a slope; where and at what angle follows from the plane of that
+triangle and differentiates with respect to the ray, up and the vertices.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
+
+from . import grid, vec
+
+ALL_LAYERS = 0xFFFFFFFF  # a mask that sees every layer
+LAYERS = 32
+HORIZON = 1e4  # m; a longer ray, an endless one too, ends here
+
+
+class Hit(eqx.Module):
+    """What a ray met; a miss has `found` 0, the ray's end as its point and up as its normal."""
+
+    point: Float[Array, "*b 3"]  # m, world
+    normal: Float[Array, "*b 3"]  # unit, on the side of the ray's origin: never below the horizon
+    distance: Float[Array, "*b"]  # m from the origin; a miss has the ray's whole length
+    found: Float[Array, "*b"]  # 1 or 0
+
+
+class AbstractSurface(eqx.Module):
+    """Something that rays along -up can meet."""
+
+    @abstractmethod
+    def meet(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        """Distance to the nearest meeting at or below each origin, m, the unit normal there, facing
+        the origin, and whether there is one; finite numbers where there is none."""
+
+
+class Plane(AbstractSurface):
+    """An endless plane, seen from both sides. One that contains up is never met."""
+
+    point_ws: Float[Array, "*t 3"]  # m
+    normal_ws: Float[Array, "*t 3"]  # unit
+    layers: UInt[Array, "*t"]  # one bit
+
+    def meet(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        distance = _drop(origins_ws, up_ws, self.point_ws, self.normal_ws)
+        rise = vec.dot(self.normal_ws, up_ws)
+        # A ray that starts on the plane meets it, whatever rounding makes of the difference.
+        size = jnp.abs(origins_ws).sum(axis=-1) + jnp.abs(self.point_ws).sum()
+        allowance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(size)
+        seen = (rise != 0) & (distance * jnp.abs(rise) >= -allowance) & (self.layers & mask != 0)
+        normal = jnp.where(rise < 0, -self.normal_ws, self.normal_ws)
+        return distance, jnp.broadcast_to(normal, (*distance.shape, 3)), seen
+
+
+class Mesh(AbstractSurface):
+    """Triangles, seen from both sides, with a grid that finds them.
+
+    No ray falls through an edge or a corner that triangles share. A triangle that contains up (a
+    wall) or has no area is never met: a ray along it has no single answer.
+    """
+
+    vertices_ws: Float[Array, "*t vertices 3"]  # m
+    triangles: Int[Array, "*t triangles 3"]
+    layers: UInt[Array, "*t triangles"]  # one bit each
+    grid: grid.Grid
+    centre_ws: Float[Array, "*t 3"]  # m, origin of the grid's frame, which keeps rounding small
+    axes_ws: Float[Array, "*t 3 3"]  # rows: the frame's x, y and z; y is up
+    corners: Float[Array, "*t triangles 9"]  # x z y of each corner in that frame, for the search
+    visible: UInt[Array, "*t triangles"]  # `layers`, without walls and triangles of no area
+
+    def with_vertices(self, vertices_ws: Float[Array, "vertices 3"]) -> "Mesh":
+        """The same triangles over moved vertices, m; slopes pass through.
+
+        The grid stays. It finds every triangle while no vertex has moved further sideways (at right
+        angles to up) than the `slack` that the mesh was made with; moves along up are free.
+        Beyond that a ray may miss what moved.
+        """
+        corners, wall = _corners(vertices_ws, self.triangles, self.centre_ws, self.axes_ws)
+        visible = jnp.where(wall, jnp.zeros_like(self.layers), self.layers)
+        return eqx.tree_at(
+            lambda mesh: (mesh.vertices_ws, mesh.corners, mesh.visible),
+            self,
+            (vertices_ws, corners, visible),
+        )
+
+    def meet(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        triangle = self._search(origins_ws, mask)
+        seen = triangle >= 0
+        ends = self.triangles.at[jnp.where(seen, triangle, 0)].get(mode="promise_in_bounds")
+        a, b, c = (
+            self.vertices_ws.at[ends[..., corner]].get(mode="promise_in_bounds")
+            for corner in range(3)
+        )
+        # Sides in units of the longest, so that a tiny triangle has a normal too.
+        square = jnp.maximum(vec.dot(b - a, b - a), vec.dot(c - a, c - a))
+        inverse = jax.lax.stop_gradient(vec.safe_divide(1.0, vec.safe_sqrt(square)))
+        normal = vec.unit(vec.cross(vec.scale(b - a, inverse), vec.scale(c - a, inverse)), up_ws)
+        normal = vec.scale(normal, jnp.where(vec.dot(normal, up_ws) < 0, -1.0, 1.0))
+        distance = _drop(origins_ws, up_ws, a, normal)
+        # A ray let in by rounding lies outside its triangle by a hair, which a steep plane makes
+        # long: the value stays between the corners, the slope is that of the plane.
+        drops = [vec.dot(origins_ws - corner, up_ws) for corner in (a, b, c)]
+        low = jnp.minimum(jnp.minimum(drops[0], drops[1]), drops[2])
+        high = jnp.maximum(jnp.maximum(drops[0], drops[1]), drops[2])
+        distance += jax.lax.stop_gradient(jnp.clip(distance, low, high) - distance)
+        return distance, normal, seen
+
+    def _search(
+        self, origins_ws: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]
+    ) -> Int[Array, "*b"]:
+        """The triangle met first by each ray, -1 where there is none.
+
+        Watertight, after Woop, Benthin and Wald (Watertight Ray/Triangle Intersection, JCGT 2013):
+        corners are taken relative to the ray, which rounds a shared corner alike for all its
+        triangles; in that slightly moved mesh, which has no gaps either, the signs of the edge
+        functions are taken with an allowance above their rounding.
+        """
+        origins, corners, frame, centre, axes = jax.lax.stop_gradient(
+            (origins_ws, self.corners, self.grid, self.centre_ws, self.axes_ws)
+        )
+        x, y, z = (vec.dot(origins - centre, axes[axis]) for axis in range(3))
+        start, count = frame.look_up(x, z)
+        slack = 4 * jnp.finfo(x.dtype).eps
+
+        def edge(px: Array, pz: Array, qx: Array, qz: Array) -> tuple[Array, Array]:
+            left, right = px * qz, pz * qx
+            return left - right, slack * (jnp.abs(left) + jnp.abs(right))
+
+        def body(step: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+            height, winner = best
+            triangle = frame.members.at[start + step].get(mode="clip")
+            row = corners.at[triangle].get(mode="promise_in_bounds")
+            ax, bx, cx = row[..., 0] - x, row[..., 3] - x, row[..., 6] - x
+            az, bz, cz = row[..., 1] - z, row[..., 4] - z, row[..., 7] - z
+            (a, near_a), (b, near_b), (c, near_c) = (
+                edge(bx, bz, cx, cz),
+                edge(cx, cz, ax, az),
+                edge(ax, az, bx, bz),
+            )
+            inside = ((a >= -near_a) & (b >= -near_b) & (c >= -near_c)) | (
+                (a <= near_a) & (b <= near_b) & (c <= near_c)
+            )
+            # The allowance would lengthen a needle; its box, which needs none, cuts it off.
+            inside &= (jnp.minimum(jnp.minimum(ax, bx), cx) <= 0) & (
+                jnp.maximum(jnp.maximum(ax, bx), cx) >= 0
+            )
+            inside &= (jnp.minimum(jnp.minimum(az, bz), cz) <= 0) & (
+                jnp.maximum(jnp.maximum(az, bz), cz) >= 0
+            )
+            a, b, c = jnp.abs(a), jnp.abs(b), jnp.abs(c)
+            here = vec.safe_divide(a * row[..., 2] + b * row[..., 5] + c * row[..., 8], a + b + c)
+            inside &= here <= y + slack * (jnp.abs(here) + jnp.abs(y))  # starts on it: meets it
+            inside &= self.visible.at[triangle].get(mode="promise_in_bounds") & mask != 0
+            better = inside & (step < count) & (here > height)
+            return jnp.where(better, here, height), jnp.where(better, triangle, winner)
+
+        nothing = jnp.full(x.shape, -jnp.inf, jnp.result_type(x, corners))
+        none = jnp.full(x.shape, -1, jnp.int32)
+        longest = jnp.max(count, initial=0)
+        return jax.lax.fori_loop(jnp.zeros_like(longest), longest, body, (nothing, none))[1]
+
+
+class Terrain(eqx.Module):
+    """Surfaces under one up direction."""
+
+    up_ws: Float[Array, "*t 3"]  # unit; rays run along its opposite
+    surfaces: tuple[AbstractSurface, ...]
+
+    def with_vertices(self, vertices_ws: Float[Array, "vertices 3"], surface: int = 0) -> "Terrain":
+        """This terrain with one of its meshes over moved vertices; see `Mesh.with_vertices`."""
+        moved = self.surfaces[surface]
+        if not isinstance(moved, Mesh):
+            raise ValueError(f"surface {surface} is a {type(moved).__name__}; vertices need a Mesh")
+        return eqx.tree_at(
+            lambda terrain: terrain.surfaces[surface], self, moved.with_vertices(vertices_ws)
+        )
+
+
+def cast(
+    terrain: Terrain,
+    origins_ws: Float[Array, "*b 3"],
+    reach: Float[Array, "*#b"] | float,
+    mask: UInt[Array, "*#b"] | int = ALL_LAYERS,
+) -> Hit:
+    """What rays along -up meet first.
+
+    A ray that starts on a surface meets it; there the distance can be below zero by a rounding
+    error. On an edge that triangles share either normal may come back.
+
+    Args:
+        terrain: what there is to meet.
+        origins_ws: where the rays start, m.
+        reach: their lengths, m; above `HORIZON`, infinite too, it counts as `HORIZON`.
+        mask: the layers that each ray sees, one bit a layer (`layer_mask`).
+    """
+    limit = jnp.minimum(jnp.asarray(reach, origins_ws.dtype), HORIZON)
+    distance = jnp.broadcast_to(limit, origins_ws.shape[:-1])
+    normal = jnp.broadcast_to(terrain.up_ws, origins_ws.shape)
+    found = jnp.zeros(distance.shape, bool)
+    for surface in terrain.surfaces:
+        drop, facing, seen = surface.meet(origins_ws, terrain.up_ws, jnp.asarray(mask, jnp.uint32))
+        nearer = seen & (drop <= distance)
+        distance = jnp.where(nearer, drop, distance)
+        normal = jnp.where(nearer[..., None], facing, normal)
+        found |= nearer
+    point = origins_ws - vec.scale(terrain.up_ws, distance)
+    return Hit(point, normal, distance, found.astype(distance.dtype))
+
+
+def layer_mask(*layers: int) -> int:
+    """The mask that sees these layers and no others."""
+    return sum(int(_bits(layer)) for layer in set(layers))
+
+
+def plane(
+    point: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+    normal: ArrayLike | tuple[float, ...] = (0.0, 1.0, 0.0),
+    up: ArrayLike | tuple[float, ...] = (0.0, 1.0, 0.0),
+    layer: int = 0,
+    dtype=None,
+) -> Terrain:
+    """An endless plane through `point`, m, on one layer (0 to 31).
+
+    `normal` and `up` need not be unit. The dtype is that of the arrays given, else JAX's default.
+
+    Raises:
+        ValueError: a direction of no length, a layer that does not exist.
+    """
+    dtype = dtype or _dtype(point, normal, up)
+    surface = Plane(
+        jnp.asarray(point, dtype), _direction(normal, "normal", dtype), jnp.asarray(_bits(layer))
+    )
+    return Terrain(_direction(up, "up", dtype), (surface,))
+
+
+def mesh(
+    vertices: ArrayLike,
+    triangles: ArrayLike,
+    up: ArrayLike | tuple[float, ...] = (0.0, 1.0, 0.0),
+    layer: int | ArrayLike = 0,
+    slack: float = 0.0,
+    dtype=None,
+) -> Terrain:
+    """Triangles over `vertices`, m, world; made on the host, so outside jit.
+
+    Args:
+        vertices: (vertices, 3), m.
+        triangles: (triangles, 3), rows of `vertices`; either winding.
+        up: need not be unit.
+        layer: 0 to 31, one for all or one a triangle.
+        slack: m, how far `with_vertices` may later move a vertex sideways. It lengthens the grid's
+            lists: keep it below the size of a triangle.
+        dtype: of the floats; None takes that of `vertices`, as far as JAX has it switched on.
+
+    Raises:
+        ValueError: wrong shapes, no triangle, vertices that are not finite or not there, an `up`
+            of no length, a layer that does not exist.
+    """
+    dtype = dtype or _dtype(vertices)
+    places, corners = np.asarray(vertices), np.asarray(triangles)
+    _check(places, corners)
+    up_ws = _direction(up, "up", dtype)
+    bits = np.broadcast_to(_bits(layer), len(corners))
+    vertices_ws, triangles_i = jnp.asarray(places, dtype), jnp.asarray(corners, jnp.int32)
+    used = places[corners.reshape(-1)]
+    centre_ws = jnp.asarray((used.min(axis=0) + used.max(axis=0)) / 2, dtype)
+    axes_ws = _axes(np.asarray(up_ws), dtype)
+    rows, wall = _corners(vertices_ws, triangles_i, centre_ws, axes_ws)
+    plan = np.asarray(rows).reshape(-1, 3, 3)[..., :2]
+    # Rays and corners are rounded where they enter the frame: by the size of either.
+    size = float(np.abs(used).max()) + float(np.abs(plan).max())
+    pad = slack + 16 * float(np.finfo(plan.dtype).eps) * size
+    listed = np.ones(len(wall), bool) if slack > 0 else ~np.asarray(wall)
+    surface = Mesh(
+        vertices_ws=vertices_ws,
+        triangles=triangles_i,
+        layers=jnp.asarray(bits),
+        grid=grid.build(plan, listed, pad),
+        centre_ws=centre_ws,
+        axes_ws=axes_ws,
+        corners=rows,
+        visible=jnp.asarray(np.where(wall, np.uint32(0), bits)),
+    )
+    return Terrain(up_ws, (surface,))
+
+
+def combine(*terrains: Terrain) -> Terrain:
+    """One terrain with the surfaces of all; a ray meets the nearest.
+
+    Raises:
+        ValueError: nothing given, or up directions that differ.
+    """
+    if not terrains:
+        raise ValueError("combine needs at least one terrain")
+    ups = [terrain.up_ws for terrain in terrains]
+    if not any(isinstance(up, jax.core.Tracer) for up in ups):
+        if not all(np.allclose(up, ups[0], rtol=0, atol=1e-6) for up in ups):
+            listed = ", ".join(str(np.asarray(up).tolist()) for up in ups)
+            raise ValueError(f"terrains to combine share one up direction; got {listed}")
+    surfaces = (surface for terrain in terrains for surface in terrain.surfaces)
+    return Terrain(ups[0], tuple(surfaces))
+
+
+def _drop(
+    origins: Float[Array, "*b 3"],
+    up: Float[Array, "3"],
+    point: Float[Array, "*#b 3"],
+    normal: Float[Array, "*#b 3"],
+) -> Float[Array, "*b"]:
+    """Distance along -up to the plane; 0 where the plane contains up."""
+    return vec.safe_divide(vec.dot(origins - point, normal), vec.dot(up, normal))
+
+
+def _corners(
+    vertices: Float[Array, "vertices 3"],
+    triangles: Int[Array, "triangles 3"],
+    centre: Float[Array, "3"],
+    axes: Float[Array, "3 3"],
+) -> tuple[Float[Array, "triangles 9"], Bool[Array, " triangles"]]:
+    """Rows x z y x z y x z y of the corners in the grid's frame, and which triangles are walls.
+
+    Each vertex is turned once, by components: the same number for all its triangles.
+    """
+    x, y, z = (vec.dot(vertices - centre, axes[axis]) for axis in range(3))
+    turned = vec.stack(x, z, y)[triangles]
+    sides = turned[:, 1:, :2] - turned[:, :1, :2]
+    left, right = sides[:, 0, 0] * sides[:, 1, 1], sides[:, 0, 1] * sides[:, 1, 0]
+    noise = 4 * jnp.finfo(turned.dtype).eps * (jnp.abs(left) + jnp.abs(right))
+    return turned.reshape(-1, 9), jnp.abs(left - right) <= noise
+
+
+def _axes(up: Float[np.ndarray, "3"], dtype) -> Float[Array, "3 3"]:
+    """Right-handed axes whose second is up; those of the world where up is its y."""
+    forward = np.eye(3)[2] if abs(up[2]) < 0.9 else np.eye(3)[0]
+    side = np.cross(np.float64(up), forward)
+    side /= np.linalg.norm(side)
+    return jnp.asarray(np.stack([side, up, np.cross(side, up)]), dtype)
+
+
+def _dtype(*given: ArrayLike | tuple[float, ...]) -> jnp.dtype:
+    """The float dtype of the arrays among `given`, JAX's default where there are none."""
+    arrays = [array for array in given if isinstance(array, jax.Array | np.ndarray)]
+    return jnp.result_type(float, *arrays)
+
+
+def _direction(given: ArrayLike | tuple[float, ...], name: str, dtype) -> Float[Array, "3"]:
+    direction = jnp.asarray(given, dtype)
+    if not isinstance(direction, jax.core.Tracer):
+        if direction.shape != (3,) or not 0 < float(vec.dot(direction, direction)) < np.inf:
+            raise ValueError(f"{name} is a direction, three numbers with a length; got {given}")
+    return vec.scale(direction, 1.0 / vec.length(direction))
+
+
+def _bits(layer: int | ArrayLike) -> np.ndarray:
+    """The bit of each layer."""
+    numbers = np.asarray(layer)
+    if not np.issubdtype(numbers.dtype, np.integer) or ((numbers < 0) | (numbers >= LAYERS)).any():
+        raise ValueError(f"layers are whole numbers from 0 to {LAYERS - 1}; got {layer}")
+    return np.asarray(np.uint32(1) << numbers.astype(np.uint32))
+
+
+def _check(vertices: np.ndarray, triangles: np.ndarray) -> None:
+    """Refuses what is not a mesh."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices have the shape (vertices, 3); got {vertices.shape}")
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
+        raise ValueError(f"triangles have the shape (1 or more, 3); got {triangles.shape}")
+    if not np.issubdtype(triangles.dtype, np.integer):
+        raise ValueError(f"triangles are rows of vertices, whole numbers; got {triangles.dtype}")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError(
+            f"triangles name vertices 0 to {len(vertices) - 1}; got {triangles.min()} to "
+            f"{triangles.max()}"
+        )
+    wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(wrong):
+        raise ValueError(
+            f"{len(wrong)} of {len(vertices)} vertices are not finite, the first is vertex "
+            f"{wrong[0]}: {vertices[wrong[0]].tolist()}"
+        )

@@ -1,0 +1,217 @@
+"""Contact, probe, lean, target, lock and pelvis of the `record` reference: senses and memory.
+
+`up` is the terrain's, unit, world; everything is in world space unless it says _ms.
+"""
+
+import math
+
+import numpy as np
+
+from . import maths
+from .maths import Array, across, apply, clip, cross, length, lerp, rotate, unit
+from .terrain import Hit
+from .things import Foot, Frame, Ground, Parameters, Rig, State, world_from_foot
+
+
+def forward(turned: Array, up: Array) -> Array:
+    """The model's forward in the plane at right angles to up; of its up where it looks along up."""
+    return unit(across(rotate(turned, maths.Z), up), unit(across(rotate(turned, maths.Y), up), up))
+
+
+def sense(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int) -> Foot:
+    """Contact, rays and foothold of one leg (steps 1 to 3)."""
+    up = terrain.up
+    ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
+    lift = frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg)
+    planted_height = parameters.of_leg("contact.planted_height", leg)
+    raised_height = parameters.of_leg("contact.raised_height", leg)
+    if raised_height > planted_height:
+        contact = clip((raised_height - lift) / (raised_height - planted_height), 0.0, 1.0)
+    else:
+        contact = 1.0 if lift <= planted_height else 0.0
+
+    ray_up = parameters.of_leg("probe.ray_up", leg)
+    reach = ray_up + parameters.of_leg("probe.ray_down", leg)
+    hit = terrain.cast(ankle_ws + up * ray_up, reach)
+    if parameters.of_leg("probe.use_toe", leg):
+        toe_ls = np.array(parameters.of_leg("probe.toe_ls", leg))
+        toe_ls[0] *= rig.side[leg]
+        toe_ws = ankle_ws + rotate(world_from_foot(rig, frame, leg), toe_ls)
+        toe_hit = terrain.cast(toe_ws + up * ray_up, reach)
+    else:
+        toe_hit = Hit(False, ankle_ws, up)
+
+    if hit.found:
+        steepest = math.cos(parameters.of_leg("target.max_slope", leg))
+        cosine = max(float(hit.normal @ up), steepest)
+        sole = parameters.of_leg("target.foot_height", leg)
+        foothold = hit.point + up * (sole * (1.0 / cosine - 1.0))
+    else:
+        foothold = ankle_ws - up * lift
+    return Foot(
+        hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
+        ankle_ws=ankle_ws,
+        lift=float(lift),
+        contact=float(contact),
+        planted=bool(lift <= planted_height),
+        lifted=bool(lift >= raised_height),
+        hit=hit,
+        toe_hit=toe_hit,
+        foothold_ws=foothold,
+    )
+
+
+def lean(
+    parameters: Parameters,
+    feet: list[Foot],
+    forward: Array,
+    up: Array,
+    state: State | None,
+    frame: Frame,
+) -> tuple[float, Array, Array, Array]:
+    """Slide weight, smoothed slope (2), the body's turn (4) and the smoothed normal (3), world."""
+    right = cross(forward, up)
+    shares = taking_part(parameters, frame)
+    weights = [foot.seen * share for foot, share in zip(feet, shares, strict=True)]
+    normal = np.zeros(3)
+    for foot, weight in zip(feet, weights, strict=True):
+        normal = normal + weight * foot.hit.normal
+    if sum(weights) == 0.0:
+        normal = up
+    goal = np.array(
+        [
+            math.atan2(-float(normal @ forward), float(normal @ up)),
+            math.atan2(-float(normal @ right), float(normal @ up)),
+        ]
+    )
+
+    hz = parameters["lean.tick_hz"]
+    if state is None:
+        slide, slope = float(frame.slide), goal
+    else:
+        rising = frame.slide > state.slide_weight
+        slide_gain = parameters["lean.slide_on_gain" if rising else "lean.slide_off_gain"]
+        share = maths.share_of_gain(slide_gain, hz, frame.dt)
+        slide = lerp(state.slide_weight, float(frame.slide), share)
+        gain = lerp(parameters["lean.gain"], parameters["lean.gain_slide"], slide)
+        slope = state.slope + maths.share_of_gain(gain, hz, frame.dt) * (goal - state.slope)
+
+    lean_forward, lean_side = (
+        lerp(parameters[f"lean.{name}_rate"], parameters[f"lean.{name}_rate_slide"], slide) * angle
+        for name, angle in zip(("forward", "side"), slope, strict=True)
+    )
+    body_turn = maths.turn_by_vector(right * lean_forward - forward * lean_side)
+    smooth_normal = unit(up - math.tan(slope[0]) * forward - math.tan(slope[1]) * right, up)
+    return slide, slope, body_turn, smooth_normal
+
+
+def smooth_height(
+    parameters: Parameters, leg: int, foot: Foot, up: Array, before: float | None, dt: float
+) -> float:
+    """Smoothed height of the foothold along up, m."""
+    goal = float(up @ foot.foothold_ws)
+    if before is None:
+        return goal
+    name = "target.rise_half_life" if goal > before else "target.fall_half_life"
+    return lerp(before, goal, maths.share_of_half_life(parameters.of_leg(name, leg), dt))
+
+
+def clamped_target(
+    parameters: Parameters, leg: int, foot: Foot, up: Array, height: float, frame: Frame
+) -> tuple[Array, Array]:
+    """Foothold at the smoothed height and ankle target above it, both moved into the limits."""
+    foothold = foot.foothold_ws + up * (height - up @ foot.foothold_ws)
+    target = foothold + up * foot.lift
+    lowest = parameters.of_leg("target.min_ankle_height", leg)
+    highest = parameters.of_leg("target.max_ankle_height", leg)
+    height_ms = maths.unapply(frame.world_from_model, target)[1]
+    shift = up * (clip(height_ms, lowest, highest) - height_ms)
+    return foothold + shift, target + shift
+
+
+def lock(
+    parameters: Parameters,
+    leg: int,
+    foot: Foot,
+    foothold: Array,
+    up: Array,
+    state: State | None,
+    frame: Frame,
+) -> tuple[bool, float, Array]:
+    """Whether the foot is locked, its lock factor, and the target's offset in world space (3)."""
+    if state is None:
+        was_locked, factor, offset = False, 0.0, np.zeros(3)
+        moved, pelvis_offset = np.zeros(3), np.zeros(3)
+    else:
+        was_locked, factor = bool(state.locked[leg]), float(state.factor[leg])
+        offset = rotate(frame.platform.rot, state.offset_in_platform[leg])
+        pelvis_offset = state.pelvis_offset_ws
+        moved = foothold - apply(frame.platform, state.foothold_in_platform[leg])
+
+    # Where the ankle would be if the foot stayed, seen from where the hip probably is.
+    hip = foot.hip_ws + pelvis_offset
+    kept = foothold - moved + offset + up * foot.lift
+    thigh = length(frame.hip.pos[leg] - frame.knee.pos[leg])
+    shin = length(frame.knee.pos[leg] - frame.ankle.pos[leg])
+    knee_angle = maths.interior_angle(thigh, shin, float((kept - hip) @ (kept - hip)))
+    deviation = maths.angle_between(kept - hip, foot.ankle_ws - foot.hip_ws)
+    takes_part = taking_part(parameters, frame)[leg] > 0.0
+    must_release = (
+        foot.lifted
+        or knee_angle < parameters.of_leg("lock.release_min_angle", leg)
+        or knee_angle > parameters.of_leg("lock.release_max_angle", leg)
+        or deviation > parameters.of_leg("lock.release_cone", leg)
+        or length(offset - moved) > parameters.of_leg("lock.release_distance", leg)
+        or not parameters.of_leg("lock.enabled", leg)
+        or not takes_part
+    )
+    if was_locked:
+        locked = not must_release
+    else:
+        max_speed = parameters.of_leg("lock.max_speed", leg)
+        slow = math.isinf(max_speed) or length(moved) <= max_speed * frame.dt
+        relockable = factor <= parameters.of_leg("lock.relock_threshold", leg)
+        locked = foot.planted and relockable and slow and foot.hit.found and not must_release
+
+    if locked:
+        half_life = parameters.of_leg("lock.lock_half_life", leg)
+        factor += maths.share_of_half_life(half_life, frame.dt) * (1.0 - factor)
+        return True, factor, offset - factor * moved
+    kept_share = 1.0 - maths.share_of_half_life(
+        parameters.of_leg("lock.unlock_half_life", leg), frame.dt
+    )
+    return False, factor * kept_share, offset * kept_share
+
+
+def taking_part(parameters: Parameters, frame: Frame) -> list[float]:
+    """Each leg's share of foot IK, 0..1."""
+    return [
+        float(weight * parameters.of_leg("leg.weight", leg))
+        for leg, weight in enumerate(frame.weight)
+    ]
+
+
+def pelvis_height(
+    parameters: Parameters,
+    feet: list[Foot],
+    targets: list[Array],
+    up: Array,
+    state: State | None,
+    frame: Frame,
+) -> float:
+    """Smoothed height of the body over its animated place, m along up or the normal."""
+    shares = taking_part(parameters, frame)
+    weights = [foot.seen * share for foot, share in zip(feet, shares, strict=True)]
+    gaps = [float(up @ (t - foot.ankle_ws)) for t, foot in zip(targets, feet, strict=True)]
+    asking = [(w, g) for w, g, share in zip(weights, gaps, shares, strict=True) if share > 0.0]
+    top = max((gap for _, gap in asking), default=0.0)
+    low = min((top + weight * (gap - top) for weight, gap in asking), default=0.0)
+    contact = max(weights)
+    limit = parameters["pelvis.limit"]
+    goal = contact * clip(low, -limit, limit)
+    if state is None:
+        return goal
+    hz = parameters["pelvis.tick_hz"]
+    on = maths.share_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
+    off = maths.share_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
+    return lerp(state.pelvis_height, goal, lerp(off, on, contact))

@@ -1,0 +1,179 @@
+"""Body, leg and foot of the `record` reference: what moves the joints, without memory."""
+
+import math
+
+import numpy as np
+
+from . import maths
+from .maths import Array, Transform, across, apply, clip, cross, length, rotate, turn, unit
+from .things import Foot, Frame, Parameters, Rig, world_from_foot
+
+# Forward distance in m from ankle hit to toe hit below which their heights say no pitch.
+SHORT_FOOT = 0.01
+
+
+def body(frame: Frame, offset_ws: Array, turn_ws: Array) -> Transform:
+    """Model space before to model space after: a turn about the middle of the hips, and a shift."""
+    model_from_world = maths.inverse(frame.world_from_model.rot)
+    rot = maths.conjugate(turn_ws, model_from_world)
+    pivot = np.mean(frame.hip.pos, axis=0)
+    return Transform(pivot + rotate(model_from_world, offset_ws) - rotate(rot, pivot), rot)
+
+
+def _carry(transform: Transform, joint: Transform, leg: int) -> Transform:
+    """One leg's joint, carried rigidly."""
+    return Transform(
+        apply(transform, joint.pos[leg]), maths.multiply(transform.rot, joint.rot[leg])
+    )
+
+
+def solve_leg(
+    parameters: Parameters, rig: Rig, leg: int, frame: Frame, body: Transform, target: Array
+) -> tuple[Transform, Transform, Transform, bool]:
+    """Hip, knee and ankle that bring the ankle to `target`, and whether they do; model space."""
+    hip, knee, ankle = (_carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle))
+    weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
+    axis = rotate(knee.rot, rig.knee_axis_ls[leg])
+    distance = length(target - hip.pos)
+
+    nearest, soft_from, wanted = _wanted_distance(
+        length(hip.pos - knee.pos),
+        length(ankle.pos - knee.pos),
+        distance,
+        parameters.of_leg("leg.min_knee_angle", leg),
+        parameters.of_leg("leg.max_knee_angle", leg),
+        parameters.of_leg("leg.soften", leg),
+    )
+    reached = nearest <= distance <= soft_from and weight >= 1.0
+
+    knee_turn = turn(axis, _knee_angle(hip.pos - knee.pos, ankle.pos - knee.pos, axis, wanted))
+    bent = knee.pos + rotate(knee_turn, ankle.pos - knee.pos)
+    hip_turn = _hip_turn(
+        bent - hip.pos, target - hip.pos, axis, parameters.of_leg("leg.twist", leg)
+    )
+
+    knee_turn = maths.nlerp(maths.IDENTITY, knee_turn, weight)
+    hip_turn = maths.nlerp(maths.IDENTITY, hip_turn, weight)
+    bent = knee.pos + rotate(knee_turn, ankle.pos - knee.pos)
+    shin_turn = maths.multiply(hip_turn, knee_turn)
+    return (
+        Transform(hip.pos, maths.multiply(hip_turn, hip.rot)),
+        Transform(
+            hip.pos + rotate(hip_turn, knee.pos - hip.pos), maths.multiply(shin_turn, knee.rot)
+        ),
+        Transform(hip.pos + rotate(hip_turn, bent - hip.pos), maths.multiply(shin_turn, ankle.rot)),
+        reached,
+    )
+
+
+def _wanted_distance(
+    a: float, b: float, distance: float, min_angle: float, max_angle: float, soften: float
+) -> tuple[float, float, float]:
+    """Nearest hip-ankle distance, where softening starts, and the softened distance, all m."""
+    nearest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(min_angle), 0.0))
+    farthest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(max_angle), 0.0))
+    soft_from = soften * farthest
+    room = farthest - soft_from
+    wanted = distance
+    if distance > soft_from:
+        wanted = soft_from
+        if room > 0.0:
+            wanted += room * (1.0 - math.exp(-(distance - soft_from) / room))
+    return nearest, soft_from, max(wanted, nearest)
+
+
+def _knee_angle(to_hip: Array, to_ankle: Array, axis: Array, wanted: float) -> float:
+    """Turn about the hinge `axis` after which hip and ankle are `wanted` m apart."""
+    a, b = length(across(to_hip, axis)), length(across(to_ankle, axis))
+    if min(a, b) < maths.DIRECTIONLESS:
+        return 0.0
+    along = float(axis @ to_hip) - float(axis @ to_ankle)
+    in_plane = clip(wanted**2 - along**2, (a - b) ** 2, (a + b) ** 2)
+    present = maths.signed_angle(to_hip, to_ankle, axis)
+    if present < 0.0:
+        present += 2.0 * math.pi
+    return maths.interior_angle(a, b, in_plane) - present
+
+
+def _hip_turn(bent: Array, target: Array, axis: Array, twist: float) -> Array:
+    """Turn about the hip that points `bent` at `target`, keeps the bend plane, and twists."""
+    along_leg = unit(bent, unit(target, -maths.Y))
+    direction = unit(target, along_leg)
+    arc = maths.shortest_arc(along_leg, direction, axis)
+    level = turn(direction, maths.signed_angle(rotate(arc, axis), axis, direction))
+    return maths.multiply(turn(direction, twist), maths.multiply(level, arc))
+
+
+def foot(
+    parameters: Parameters,
+    rig: Rig,
+    leg: int,
+    foot: Foot,
+    frame: Frame,
+    knee: Transform,
+    ankle: Transform,
+    forward: Array,
+    up: Array,
+) -> Array:
+    """Model-space rotation of the ankle: the animated one, tilted onto the ground within limits."""
+    world_from_model = frame.world_from_model.rot
+    foot_rot = world_from_foot(rig, frame, leg)
+    foot_forward = rotate(foot_rot, maths.Z)
+    heading = unit(across(foot_forward, up), forward)
+    right = cross(heading, up)
+    side = float(rig.side[leg])
+    lateral = -side * right
+
+    pitch, roll = _ground_angles(foot, heading, right, lateral, up)
+    pitch, roll = pitch * foot.seen, roll * foot.seen
+
+    shin = unit(rotate(world_from_model, ankle.pos - knee.pos), -up)
+    joint_pitch = _joint_angle(foot_forward, shin)
+    pitch = clip(
+        joint_pitch + pitch,
+        min(joint_pitch, parameters.of_leg("foot.min_pitch", leg)),
+        max(joint_pitch, parameters.of_leg("foot.max_pitch", leg)),
+    )
+    tilt = turn(right, pitch - joint_pitch)
+    if side != 0.0:
+        joint_roll = _joint_angle(side * rotate(foot_rot, maths.X), shin)
+        roll = clip(
+            joint_roll + roll,
+            min(joint_roll, parameters.of_leg("foot.min_roll", leg)),
+            max(joint_roll, parameters.of_leg("foot.max_roll", leg)),
+        )
+        roll_axis = rotate(tilt, unit(cross(lateral, up), heading))
+        tilt = maths.multiply(turn(roll_axis, roll - joint_roll), tilt)
+
+    tilt_ms = maths.conjugate(tilt, maths.inverse(world_from_model))
+    wanted = maths.multiply(tilt_ms, frame.ankle.rot[leg])
+    weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
+    return maths.nlerp(ankle.rot, wanted, weight)
+
+
+def _ground_angles(
+    foot: Foot, heading: Array, right: Array, lateral: Array, up: Array
+) -> tuple[float, float]:
+    """Pitch (+ toes up) and then roll (+ outer edge up) of the ground under the foot."""
+    if not foot.hit.found:
+        return 0.0, 0.0
+    normal = foot.hit.normal
+    pitch = math.atan2(-float(normal @ heading), float(normal @ up))
+    if foot.toe_hit.found:
+        sole = foot.toe_hit.point - foot.hit.point
+        if sole @ heading > SHORT_FOOT:
+            pitch = math.atan2(float(sole @ up), float(sole @ heading))
+    pitched_up = rotate(turn(right, pitch), up)
+    return pitch, math.atan2(-float(normal @ lateral), float(normal @ pitched_up))
+
+
+def _joint_angle(foot_axis: Array, shin: Array) -> float:
+    """Angle by which a foot's axis rises from the plane at right angles to the shin."""
+    return math.atan2(-float(foot_axis @ shin), length(across(foot_axis, shin)))
+
+
+def toe(frame: Frame, leg: int, ankle: Transform) -> Transform:
+    """The toe, carried rigidly with the solved ankle."""
+    change = maths.multiply(ankle.rot, maths.inverse(frame.ankle.rot[leg]))
+    reach = frame.toe.pos[leg] - frame.ankle.pos[leg]
+    return Transform(ankle.pos + rotate(change, reach), maths.multiply(change, frame.toe.rot[leg]))

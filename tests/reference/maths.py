@@ -1,0 +1,173 @@
+"""Vectors and wxyz quaternions in float64, with ordinary trigonometry and if/else.
+
+Vectors are arrays of shape (3,), quaternions (4,) in the order w x y z, unit, active. Angles in
+radians. Nothing here is batched.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# A vector shorter than this (in its own unit) has no direction.
+DIRECTIONLESS = 1e-9
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+X, Y, Z = np.eye(3)
+
+
+class Transform(NamedTuple):
+    """A rigid placement, pos (3) in m and rot (4); or one a leg, (legs, 3) and (legs, 4)."""
+
+    pos: Array
+    rot: Array
+
+
+def length(v: Array) -> float:
+    """Euclidean length."""
+    return math.sqrt(float(v @ v))
+
+
+def unit(v: Array, fallback: Array) -> Array:
+    """`v` scaled to length one; `fallback` where `v` has no direction."""
+    size = length(v)
+    if size < DIRECTIONLESS:
+        return fallback
+    return v / size
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Right-handed vector product."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def across(v: Array, direction: Array) -> Array:
+    """The part of `v` at right angles to the unit `direction`."""
+    return v - direction * (v @ direction)
+
+
+def angle_between(a: Array, b: Array) -> float:
+    """Unsigned angle in 0..pi; 0 where either has no direction."""
+    if length(a) < DIRECTIONLESS or length(b) < DIRECTIONLESS:
+        return 0.0
+    return math.atan2(length(cross(a, b)), float(a @ b))
+
+
+def signed_angle(a: Array, b: Array, axis: Array) -> float:
+    """Angle in -pi..pi of the turn about the unit `axis` that brings `a` to `b` in projection."""
+    a, b = across(a, axis), across(b, axis)
+    if length(a) < DIRECTIONLESS or length(b) < DIRECTIONLESS:
+        return 0.0
+    return math.atan2(float(axis @ cross(a, b)), float(a @ b))
+
+
+def interior_angle(a: float, b: float, distance_squared: float) -> float:
+    """Angle between sides `a` and `b` over the third side; pi where a side is missing."""
+    if 2.0 * a * b < DIRECTIONLESS**2:
+        return math.pi
+    return math.acos(clip((a * a + b * b - distance_squared) / (2.0 * a * b), -1.0, 1.0))
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Hamilton product: the rotation `b` first, then `a`."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.tolist(), b.tolist()
+    return np.array(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def inverse(q: Array) -> Array:
+    """The opposite rotation of a unit quaternion."""
+    return np.array([q[0], -q[1], -q[2], -q[3]])
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """`v` turned by `q`."""
+    w, xyz = q[0], q[1:]
+    twice = 2.0 * cross(xyz, v)
+    return v + w * twice + cross(xyz, twice)
+
+
+def conjugate(q: Array, by: Array) -> Array:
+    """`by` q `by`^-1: the turn `q`, stated in the space that `by` leads to."""
+    return multiply(multiply(by, q), inverse(by))
+
+
+def turn(axis: Array, angle: float) -> Array:
+    """Rotation by `angle` about the unit `axis`."""
+    return np.concatenate([[math.cos(angle / 2)], math.sin(angle / 2) * axis])
+
+
+def turn_by_vector(vector: Array) -> Array:
+    """Rotation about `vector` by its length in radians."""
+    angle = length(vector)
+    if angle == 0.0:
+        return IDENTITY
+    return turn(vector / angle, angle)
+
+
+def shortest_arc(a: Array, b: Array, spare_axis: Array) -> Array:
+    """Smallest turn from unit `a` to unit `b`; opposite ones turn about `spare_axis` made square.
+
+    Where `spare_axis` lies along `a` too, any axis at right angles does.
+    """
+    axis = cross(a, b)
+    if length(axis) >= DIRECTIONLESS:
+        return turn(axis / length(axis), angle_between(a, b))
+    if a @ b > 0.0:
+        return IDENTITY
+    square = across(spare_axis, a)
+    if length(square) < DIRECTIONLESS:
+        square = across(np.eye(3)[np.argmin(np.abs(a))], a)
+    return turn(square / length(square), math.pi)
+
+
+def nlerp(a: Array, b: Array, weight: float) -> Array:
+    """Normalised straight blend from `a` to `b`, along the shorter way."""
+    if a @ b < 0.0:
+        b = -b
+    blend = a + weight * (b - a)
+    return blend / math.sqrt(float(blend @ blend))
+
+
+def lerp(a: float, b: float, weight: float) -> float:
+    """`a` at weight 0, `b` at weight 1."""
+    return a + weight * (b - a)
+
+
+def clip(value: float, low: float, high: float) -> float:
+    """`value` kept within [low, high]; where the limits cross, the upper one wins."""
+    return min(max(value, low), high)
+
+
+def share_of_gain(gain: float, tick_hz: float, dt: float) -> float:
+    """Part of the way covered in `dt` s by a gain per tick; a gain of 1 or more jumps."""
+    if gain >= 1.0:
+        return 1.0
+    return 1.0 - (1.0 - gain) ** (dt * tick_hz)
+
+
+def share_of_half_life(half_life: float, dt: float) -> float:
+    """Part of the way covered in `dt` s; a half-life <= 0 s jumps, an infinite one stays."""
+    if half_life <= 0.0:
+        return 1.0
+    return 1.0 - 2.0 ** (-dt / half_life)
+
+
+def apply(transform: Transform, point: Array) -> Array:
+    """`point` taken from the inner to the outer space of `transform`."""
+    return transform.pos + rotate(transform.rot, point)
+
+
+def unapply(transform: Transform, point: Array) -> Array:
+    """`point` taken from the outer to the inner space of `transform`."""
+    return rotate(inverse(transform.rot), point - transform.pos)

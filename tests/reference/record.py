@@ -1,0 +1,104 @@
+"""The `record` pipeline in plain NumPy float64: one character, one leg, one frame at a time.
+
+An oracle for the JAX stages, written from the rules alone (if/else, loops, acos and atan2), so that
+an error would have to be made twice to stay unseen. Metres, radians, seconds, wxyz; suffixes _ws
+world, _ms model, _ls local. Model up is +Y, forward +Z, left +X; `up` is the terrain's.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from . import ground, limb, maths
+from .maths import Transform
+from .things import DEFAULTS, Frame, Ground, Parameters, Rig, State
+
+__all__ = ["DEFAULTS", "Frame", "Ground", "Parameters", "Rig", "State", "Transform", "run", "step"]
+
+
+def step(
+    parameters: Parameters, rig: Rig, terrain: Ground, state: State | None, frame: Frame
+) -> tuple[State, dict[str, np.ndarray]]:
+    """One frame. Without a state it is the first: smoothed values start on their goals."""
+    up = terrain.up
+    turned = frame.world_from_model.rot
+    forward = ground.forward(turned, up)
+    legs = range(len(frame.weight))
+    feet = [ground.sense(parameters, rig, terrain, frame, leg) for leg in legs]
+
+    slide, slope, body_turn_ws, smooth_normal = ground.lean(
+        parameters, feet, forward, up, state, frame
+    )
+
+    heights, footholds, targets = [], [], []
+    for leg in legs:
+        before = None if state is None else state.ground_height[leg]
+        height = ground.smooth_height(parameters, leg, feet[leg], up, before, frame.dt)
+        foothold, target = ground.clamped_target(parameters, leg, feet[leg], up, height, frame)
+        heights.append(height)
+        footholds.append(foothold)
+        targets.append(target)
+
+    locks = [
+        ground.lock(parameters, leg, feet[leg], footholds[leg], up, state, frame) for leg in legs
+    ]
+    targets = [target + offset for target, (_, _, offset) in zip(targets, locks, strict=True)]
+
+    pelvis = ground.pelvis_height(parameters, feet, targets, up, state, frame)
+    pelvis_offset_ws = pelvis * (up if parameters["pelvis.vertical_only"] else smooth_normal)
+    body = limb.body(frame, pelvis_offset_ws, body_turn_ws)
+
+    solved = []
+    for leg in legs:
+        target_ms = maths.unapply(frame.world_from_model, targets[leg])
+        hip, knee, ankle, reached = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
+        rot = limb.foot(parameters, rig, leg, feet[leg], frame, knee, ankle, forward, up)
+        ankle = Transform(ankle.pos, rot)
+        solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle), reached))
+
+    state = State(
+        ground_height=np.array(heights),
+        slope=slope,
+        slide_weight=slide,
+        pelvis_height=pelvis,
+        pelvis_offset_ws=pelvis_offset_ws,
+        offset_ws=np.array([offset for _, _, offset in locks]),
+        offset_in_platform=np.array(
+            [maths.rotate(maths.inverse(frame.platform.rot), offset) for _, _, offset in locks]
+        ),
+        locked=np.array([locked for locked, _, _ in locks]),
+        factor=np.array([factor for _, factor, _ in locks]),
+        foothold_in_platform=np.array(
+            [maths.unapply(frame.platform, foothold) for foothold in footholds]
+        ),
+    )
+    output = {
+        "body_pos": body.pos,
+        "body_rot": body.rot,
+        "reached": np.array([reached for *_, reached in solved]),
+        "contact": np.array([foot.contact for foot in feet]),
+        "locked": state.locked,
+        "factor": state.factor,
+        "offset_ws": state.offset_ws,
+        "target_ws": np.array(targets),
+        "slope": slope,
+        "slide_weight": np.array(slide),
+        "ground_height": state.ground_height,
+        "pelvis_height": np.array(pelvis),
+        "pelvis_offset_ws": pelvis_offset_ws,
+    }
+    for index, joint in enumerate(("hip", "knee", "ankle", "toe")):
+        output[f"{joint}_pos"] = np.array([row[index].pos for row in solved])
+        output[f"{joint}_rot"] = np.array([row[index].rot for row in solved])
+    return state, output
+
+
+def run(
+    parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
+) -> dict[str, np.ndarray]:
+    """A clip from its first frame: every output of `step`, stacked over the frames."""
+    state, outputs = None, []
+    for frame in frames:
+        state, output = step(parameters, rig, terrain, state, frame)
+        outputs.append(output)
+    return {name: np.stack([output[name] for output in outputs]) for name in outputs[0]}

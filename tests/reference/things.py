@@ -1,0 +1,153 @@
+"""What the `record` reference is given and what it remembers: parameters, rig, frames, state."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from . import maths
+from .maths import Array, Transform
+from .terrain import Hit
+
+# The record's defaults of a 1.8 m adult; gains per tick of 30 Hz; then the group it lacks.
+DEFAULTS: dict[str, Any] = {
+    "contact.ground_height": 0.0,
+    "contact.planted_height": 0.10,
+    "contact.raised_height": 0.16,
+    "probe.ray_up": 0.50,
+    "probe.ray_down": 0.80,
+    "probe.toe_ls": np.array([0.0, -0.07, 0.20]),
+    "probe.use_toe": True,
+    "target.min_ankle_height": -0.30,
+    "target.max_ankle_height": 0.55,
+    "target.foot_height": 0.08,
+    "target.max_slope": math.radians(60.0),
+    "target.rise_half_life": 0.0,
+    "target.fall_half_life": 0.0,
+    "lean.forward_rate": -0.30,
+    "lean.side_rate": -0.10,
+    "lean.forward_rate_slide": 0.80,
+    "lean.side_rate_slide": 0.60,
+    "lean.gain": 0.19,
+    "lean.gain_slide": 0.294,
+    "lean.slide_on_gain": 0.226,
+    "lean.slide_off_gain": 0.135,
+    "lean.tick_hz": 30.0,
+    "lock.enabled": True,
+    "lock.release_min_angle": math.radians(50.0),
+    "lock.release_max_angle": math.radians(172.0),
+    "lock.release_cone": math.radians(25.0),
+    "lock.relock_threshold": 0.20,
+    "lock.lock_half_life": 0.05,
+    "lock.unlock_half_life": 0.10,
+    "lock.release_distance": 0.20,
+    "lock.max_speed": math.inf,
+    "pelvis.limit": 0.30,
+    "pelvis.on_gain": 0.225,
+    "pelvis.off_gain": 0.116,
+    "pelvis.vertical_only": True,
+    "pelvis.tick_hz": 30.0,
+    "leg.max_knee_angle": math.acos(-0.990),
+    "leg.min_knee_angle": math.acos(0.766),
+    "leg.soften": 0.98,
+    "leg.twist": 0.0,
+    "leg.weight": 1.0,
+    "foot.max_pitch": 0.52,
+    "foot.min_pitch": -0.79,
+    "foot.max_roll": 0.26,
+    "foot.min_roll": -0.52,
+}
+
+
+class Ground(Protocol):
+    """What a ray can be cast onto."""
+
+    up: Array
+
+    def cast(self, origin: Array, reach: float) -> Hit: ...
+
+
+class Parameters:
+    """Values by dotted name; a value is shared, or has one row a leg."""
+
+    def __init__(self, changes: Mapping[str, Any] | None = None) -> None:
+        unknown = set(changes or {}) - set(DEFAULTS)
+        if unknown:
+            raise ValueError(f"no parameters {sorted(unknown)}; there are {sorted(DEFAULTS)}")
+        self.values = {**DEFAULTS, **(changes or {})}
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
+
+    def of_leg(self, name: str, leg: int) -> Any:
+        """The value that `leg` sees."""
+        value = np.asarray(self.values[name])
+        return value[leg] if value.ndim > np.ndim(DEFAULTS[name]) else self.values[name]
+
+
+@dataclass
+class Rig:
+    """What stays the same: knee_axis_ls (legs 3), ankle_from_foot (legs 4), side (legs)."""
+
+    knee_axis_ls: Array
+    ankle_from_foot: Array
+    side: Array
+
+
+@dataclass
+class Frame:
+    """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space."""
+
+    world_from_model: Transform
+    hip: Transform
+    knee: Transform
+    ankle: Transform
+    toe: Transform
+    weight: Array
+    slide: float
+    dt: float
+    platform: Transform
+
+
+@dataclass
+class State:
+    """What the next frame needs; rows are legs."""
+
+    ground_height: Array
+    slope: Array
+    slide_weight: float
+    pelvis_height: float
+    pelvis_offset_ws: Array
+    offset_ws: Array
+    offset_in_platform: Array
+    locked: Array
+    factor: Array
+    foothold_in_platform: Array
+
+
+@dataclass
+class Foot:
+    """One leg's readings of this frame: animated joints, contact, hits and foothold, world."""
+
+    hip_ws: Array
+    ankle_ws: Array
+    lift: float
+    contact: float
+    planted: bool
+    lifted: bool
+    hit: Hit
+    toe_hit: Hit
+    foothold_ws: Array
+
+    @property
+    def seen(self) -> float:
+        """Contact weight of a foot that sees ground."""
+        return self.contact if self.hit.found else 0.0
+
+
+def world_from_foot(rig: Rig, frame: Frame, leg: int) -> Array:
+    """Rotation from the animated foot's axes (x left, y up, z forward) to the world's."""
+    world_from_ankle = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
+    return maths.multiply(world_from_ankle, rig.ankle_from_foot[leg])

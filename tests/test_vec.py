@@ -1,0 +1,171 @@
+"""Vectors: their axioms, their limits and their slopes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from slopes import assert_slopes_agree, directions, finite_slopes, numbers, vectors
+
+from jaxik import vec
+
+few = settings(max_examples=15, derandomize=True, deadline=None)
+ANY_SIZE = (1.0, 1e-5, 1e-12, 0.0)
+
+RNG = np.random.default_rng(0)
+A, B = RNG.normal(size=(2, 4, 3))
+X, Y = RNG.normal(size=(2, 4))
+FUNCTIONS = {
+    "components": (vec.components, (A,)),
+    "stack": (vec.stack, (X, Y, X)),
+    "dot": (vec.dot, (A, B)),
+    "cross": (vec.cross, (A, B)),
+    "scale": (vec.scale, (A, X)),
+    "safe_sqrt": (vec.safe_sqrt, (X**2,)),
+    "safe_divide": (vec.safe_divide, (X, Y)),
+    "safe_arctan2": (vec.safe_arctan2, (X, Y)),
+    "length": (vec.length, (A,)),
+    "unit": (vec.unit, (A, B)),
+    "reject": (vec.reject, (A, B)),
+    "lerp": (vec.lerp, (A, B, X)),
+}
+
+
+def everything(args):
+    return {name: function(*args[name]) for name, (function, _) in FUNCTIONS.items()}
+
+
+def test_precision_follows_the_inputs():
+    for dtype in (jnp.float32, jnp.float64):
+        args = {
+            name: [jnp.asarray(x, dtype) for x in args] for name, (_, args) in FUNCTIONS.items()
+        }
+        for name, answer in jax.eval_shape(everything, args).items():
+            assert {leaf.dtype for leaf in jax.tree.leaves(answer)} == {jnp.dtype(dtype)}, name
+
+
+def test_a_compiled_batch_is_many_singles():
+    args = {name: [jnp.asarray(x) for x in args] for name, (_, args) in FUNCTIONS.items()}
+    batch, singles = jax.jit(everything)(args), jax.jit(jax.vmap(everything))(args)
+    for name in FUNCTIONS:
+        for one, other in zip(*map(jax.tree.leaves, (batch[name], singles[name])), strict=True):
+            assert_allclose(one, other, 1e-14, 1e-14, err_msg=name)
+
+
+def test_one_vector_broadcasts_against_many():
+    one = jnp.asarray(B[0])
+    assert_allclose(vec.cross(jnp.asarray(A), one), np.cross(A, B[0]), atol=1e-15)
+    assert vec.dot(one, jnp.zeros((2, 5, 3))).shape == (2, 5)
+    assert vec.lerp(one, jnp.asarray(A), jnp.asarray(0.5)).shape == (4, 3)
+    assert vec.scale(one, jnp.asarray(X)).shape == (4, 3)
+    assert vec.unit(jnp.zeros((2, 4, 3)), jnp.asarray(A)).shape == (2, 4, 3)
+
+
+def test_a_constant_takes_the_precision_of_its_companion():
+    for dtype in (jnp.float32, jnp.float64):
+        up = vec.constant((0.0, 1.0, 0.0), jnp.zeros(2, dtype))
+        assert up.dtype == dtype and up.tolist() == [0.0, 1.0, 0.0]
+
+
+@few
+@given(vectors(ANY_SIZE), vectors(ANY_SIZE))
+def test_products_are_those_of_numpy(a, b):
+    ja, jb = jnp.asarray(a), jnp.asarray(b)
+    assert_allclose(vec.dot(ja, jb), np.dot(a, b), rtol=1e-12, atol=1e-15)
+    assert_allclose(vec.cross(ja, jb), np.cross(a, b), rtol=1e-12, atol=1e-15)
+    assert_allclose(vec.length(ja), np.linalg.norm(a), rtol=1e-12)
+    assert_allclose(vec.stack(*vec.components(ja)), a, atol=0)
+
+
+def test_the_vector_product_is_right_handed():
+    x, y, z = jnp.eye(3)
+    assert_allclose(vec.cross(x, y), z, atol=0)
+    assert_allclose(vec.cross(y, x), -z, atol=0)
+
+
+@few
+@given(vectors(ANY_SIZE), directions())
+def test_a_unit_has_length_one_and_the_same_direction_or_is_the_fallback(v, pair):
+    fallback = jnp.asarray(pair[0])
+    answer = vec.unit(jnp.asarray(v), fallback)
+    assert_allclose(vec.length(answer), 1.0, atol=1e-14)
+    if v.any():
+        assert_allclose(np.cross(answer, v), 0, atol=1e-14)
+        assert vec.dot(answer, jnp.asarray(v)) > 0
+    else:
+        assert_allclose(answer, fallback, atol=0)
+
+
+@few
+@given(vectors(ANY_SIZE), directions())
+def test_what_is_rejected_is_at_right_angles_and_the_rest_along(v, pair):
+    direction = jnp.asarray(pair[0])
+    across = vec.reject(jnp.asarray(v), direction)
+    assert_allclose(vec.dot(across, direction), 0, atol=1e-14)
+    assert_allclose(np.cross(v - across, direction), 0, atol=1e-14)
+
+
+@few
+@given(vectors(), vectors(), numbers(0, 1))
+def test_a_line_starts_at_one_end_and_stops_at_the_other(a, b, weight):
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    assert_allclose(vec.lerp(a, b, jnp.asarray(0.0)), a, atol=0)
+    assert_allclose(vec.lerp(a, b, jnp.asarray(1.0)), b, atol=1e-15)
+    assert_allclose(vec.lerp(a, b, jnp.asarray(weight)), (1 - weight) * a + weight * b, atol=1e-14)
+
+
+@few
+@given(numbers(), numbers())
+def test_safe_functions_are_the_plain_ones_away_from_their_limits(x, y):
+    jx, jy = jnp.asarray(x), jnp.asarray(y)
+    assert_allclose(vec.safe_sqrt(jx), np.sqrt(max(x, 0.0)))
+    assert_allclose(vec.safe_divide(jx, jy, otherwise=7.0), x / y if y else 7.0)
+    if (x, y) != (0, 0):
+        assert_allclose(vec.safe_arctan2(jy, jx), np.arctan2(y, x))
+
+
+def test_safe_functions_are_flat_at_their_limits():
+    assert vec.safe_sqrt(jnp.asarray(0.0)) == vec.safe_sqrt(jnp.asarray(-1.0)) == 0
+    assert vec.safe_arctan2(jnp.asarray(0.0), jnp.asarray(0.0)) == 0
+    for x in (0.0, -1.0):
+        assert_allclose(finite_slopes(vec.safe_sqrt, x), 0, atol=0)
+    assert_allclose(finite_slopes(vec.safe_divide, 1.0, 0.0), 0, atol=0)
+    assert_allclose(finite_slopes(vec.safe_arctan2, 0.0, 0.0), 0, atol=0)
+    assert_allclose(finite_slopes(vec.length, np.zeros(3)), 0, atol=0)
+    assert_allclose(finite_slopes(vec.unit, np.zeros(3), np.eye(3)[0])[:, :3], 0, atol=0)
+
+
+@few
+@given(vectors((1.0, 1e-5, 0.0)), vectors(), numbers())
+def test_slopes_of_products_and_lengths_are_those_of_differences(a, b, weight):
+    assert_slopes_agree(vec.dot, a, b)
+    assert_slopes_agree(vec.cross, a, b)
+    assert_slopes_agree(vec.reject, a, b)
+    assert_slopes_agree(vec.length, a)
+    assert_slopes_agree(vec.lerp, a, b, weight)
+    assert_slopes_agree(vec.scale, a, weight)
+
+
+@few
+@given(vectors(), vectors())
+def test_slopes_of_directions_are_those_of_differences(v, fallback):
+    assert_slopes_agree(vec.unit, v, fallback)
+
+
+@few
+@given(numbers(0.1, 2), numbers(0.1, 2), st.sampled_from([1.0, 1e-3]), st.sampled_from([1, -1]))
+def test_slopes_of_safe_functions_are_those_of_differences(x, y, size, sign):
+    assert_slopes_agree(vec.safe_sqrt, size * x)
+    assert_slopes_agree(vec.safe_divide, x, sign * size * y)
+    assert_slopes_agree(vec.safe_arctan2, size * x, sign * y)
+
+
+def test_slopes_stay_finite_in_single_precision_however_short_the_vector():
+    sizes = 10.0 ** -jnp.asarray([3, 6, 9, 15, 30], jnp.float32)
+    v = sizes[:, None] * jnp.asarray([1.0, 0.0, 0.0], jnp.float32)
+    fallback = jnp.asarray([0.0, 1.0, 0.0], jnp.float32)
+    of_unit = jax.jit(jax.vmap(jax.jacrev(vec.unit), (0, None)))(v, fallback)
+    of_length = jax.jit(jax.vmap(jax.jacfwd(vec.length)))(v)
+    for slope in (of_unit, of_length):
+        assert slope.dtype == jnp.float32 and jnp.isfinite(slope).all()
