@@ -8,16 +8,19 @@ law in the plane in which the captured leg bends.
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from .clips import contacts
+from .clips import contacts, load_clip
 from .clips.clip import Clip
+from .clips.npz import is_blocks
 from .clips.recording import localise, place
 from .clips.rigs import hinges, unit
 
+STRETCH = 1e-4  # m, change of a bone's length that counts as stretching
 LONGEST = 0.9995  # share of a leg's length that it may be stretched to
 
 
@@ -42,9 +45,7 @@ def flat_base(
     Errors: ValueError when a foot never stands or the ground is not finite under a stance.
     """
     rig = clip.rig
-    stance = clip.stance
-    if stance is None:
-        stance = contacts.standing(clip.joints_ws(3), clip.fps)
+    stance = clip.standing()
     ground = ground_under(clip, stance, height_under)
     pelvis = clip.positions_ws[:, rig.pelvis]
     if pelvis_height is None:
@@ -58,6 +59,32 @@ def flat_base(
         _rebuild(clip, joints, lengths, ground[:, leg], positions_ws, rotations_ws)
     positions_ws, rotations_ws = _hang_children(clip, positions_ws, rotations_ws)
     return replace(clip.with_motion(positions_ws, rotations_ws), stance=stance)
+
+
+def rigid_legs(clip: Clip) -> Clip:
+    """The clip with thighs and shins of the rig's lengths in every frame.
+
+    Where an animation stretches a leg its foot is drawn along the line to its hip until the leg
+    reaches; a clip whose bones already keep their lengths is returned as it is.
+    """
+    rig = clip.rig
+    hip, knee, ankle = (clip.joints_ws(role) for role in range(3))
+    errors = [
+        np.abs(np.linalg.norm(a - b, axis=-1) - np.asarray(length)).max()
+        for a, b, length in ((hip, knee, rig.thigh), (knee, ankle, rig.shin))
+    ]
+    if max(errors) < STRETCH:
+        return clip
+    positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
+    for leg, joints in enumerate(rig.joints):
+        lengths = float(rig.thigh[leg]), float(rig.shin[leg])
+        _rebuild(clip, joints, lengths, np.zeros(clip.frames), positions_ws, rotations_ws)
+    return clip.with_motion(*_hang_children(clip, positions_ws, rotations_ws))
+
+
+def load_base(path: Path) -> Clip:
+    """The animation in a file as foot IK takes it: a blocks file's base, with rigid legs."""
+    return rigid_legs(load_clip(path, variant="base" if is_blocks(path) else "captured"))
 
 
 def ground_under(

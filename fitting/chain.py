@@ -2,8 +2,9 @@
 
 emcee's HDF5 backend (3.1.6, `HDFBackend.save_step`) opens the file at every step, which costs 5 ms,
 and changes it in place: of 24 kills between two of its writes to the disk 4 left a file from which
-nothing could be read. Here a finished step is one record appended to a journal beside the HDF5 file,
-in one write and with a checksum, so that a kill can only tear the last one, which is then dropped.
+nothing could be read. Here a finished step is one record appended to a journal beside the HDF5
+file, in one write and with a checksum, so that a kill can only tear the last one, which is then
+dropped.
 From time to time `save` writes the whole chain to a new HDF5 file, exchanges it for the old one
 (an exchange that either happens or does not) and empties the journal. Steps that stand in both are
 recognised by their number. The HDF5 file has the layout of emcee's backend, which can read it.
@@ -81,11 +82,13 @@ class Chain:
 
     @property
     def u(self) -> Float[np.ndarray, "steps walkers free"]:
+        """Where the walkers were, without bounds."""
         shape = (0, self.identity.walkers, len(self.identity.parameters))
         return np.stack(self._u) if self._u else np.empty(shape)
 
     @property
     def log_probability(self) -> Float[np.ndarray, "steps walkers"]:
+        """Of the posterior, up to a constant."""
         empty = np.empty((0, self.identity.walkers))
         return np.stack(self._log_probability) if self._u else empty
 

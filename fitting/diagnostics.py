@@ -127,6 +127,7 @@ class Check:
 
     @property
     def slowest(self) -> float:
+        """Longest autocorrelation time, in steps."""
         return float(self.times.max())
 
     @property

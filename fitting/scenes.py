@@ -1,7 +1,9 @@
 """Terrain files: anything trimesh reads becomes a `jaxik.terrain.Terrain`."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import ArrayLike, Float, Int
@@ -63,6 +65,25 @@ def load_terrain(
         raise ValueError(f"{path}: {error}") from error
 
 
+def save_mesh(
+    path: str | Path,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> None:
+    """Writes triangles, m, y up, as text PLY, which `load_terrain` reads; the same bytes always.
+
+    Vertices are kept to a tenth of a millimetre.
+    """
+    lines = [
+        "ply", "format ascii 1.0", f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
+        *(" ".join(f"{value:.4f}" for value in vertex) for vertex in np.round(vertices, 4) + 0.0),
+        *(f"3 {a} {b} {c}" for a, b, c in faces),
+    ]  # fmt: skip
+    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+
+
 def _read(
     path: Path,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
@@ -82,3 +103,19 @@ def _read(
         held = ", ".join(type(held).__name__ for held in scene.geometry.values()) or "nothing"
         raise ValueError(f"{path}: terrain needs triangles; the file holds {held}")
     return np.array(whole.vertices, np.float64), np.array(whole.faces, np.int64)
+
+
+def heights(ground: terrain.Terrain, above: float = 100.0) -> Callable[[np.ndarray], np.ndarray]:
+    """Height of the highest ground under points (points, 3), m; NaN where there is none.
+
+    Args:
+        ground: with y up.
+        above: m, where the rays start over the points.
+    """
+
+    def under(points_ws: np.ndarray) -> np.ndarray:
+        origins = jnp.asarray(points_ws) * jnp.array([1.0, 0.0, 1.0]) + jnp.array([0, above, 0])
+        hit = terrain.cast(ground, origins, jnp.asarray(2 * above))
+        return np.where(hit.found > 0, np.asarray(hit.point)[..., 1], np.nan)
+
+    return under

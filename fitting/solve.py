@@ -8,10 +8,9 @@ by two ways, and the lower cost is kept (each wins where the other fails):
 - `ensemble`: Levenberg–Marquardt on the mean residual over random shifts of the thresholds, whose
   columns come from a regression on the shifts; the shifts shrink; then blocks.
 
-Where the two end apart, a third go starts from the better one.
-
-A fit compiles three programs, whatever the number of starts and stages: a march of
-Levenberg–Marquardt on the hard rows, one on the ensemble's, and the population.
+Where the two end apart, a third go starts from the better one. A fit compiles three programs,
+whatever the number of starts and stages: a march of Levenberg–Marquardt on the hard rows, one on
+the ensemble's, and the population.
 """
 
 import dataclasses
@@ -181,7 +180,7 @@ class _Fit:
 
         Without shifts the thresholds are frozen and the rows are the hard ones.
         """
-        position, slopes = self.position(u), jnp.asarray(self.still)
+        position, slopes = self.position(u), self.still
         model, second = (hard, position.u) if shifts is None else (ensemble, shifts)
         while not position.done and int(position.steps) < limit:
             left = min(MARCH, limit - int(position.steps), self.max_steps - self.steps)
@@ -197,7 +196,7 @@ class _Fit:
             else:
                 self.report(stage, float(position.cost))
         cost = float(position.cost) if jnp.isfinite(position.cost) else float("inf")
-        return np.asarray(position.u), cost, slopes[: self.rows]
+        return np.asarray(position.u), cost, np.asarray(slopes)[: self.rows]
 
     def breed(self, u: np.ndarray, cost: float, slopes: Any, spread: float) -> Any:
         """The best of some generations bred from `u`.
@@ -207,8 +206,7 @@ class _Fit:
         was never reached. Other thresholds want other smooth columns, so the most promising
         children come again after a Gauss-Newton step.
         """
-        elite, costs = u[None], np.asarray([cost])
-        moved = elite[:0]
+        elite, moved, costs = u[None], u[None][:0], np.asarray([cost])
         rate = max(0.3, 1 / max(1, self.thresholds.sum()))
         for generation in range(GENERATIONS):
             count = POPULATION - len(moved)
@@ -242,9 +240,9 @@ class _Fit:
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """Slopes of the problem's rows at `u`."""
-        position = self.position(u)
-        args = (self.problem, position.u)
-        return np.asarray(_march(hard, position, jnp.zeros((), int), args)[1])[: self.rows]
+        here = self.position(u)
+        slopes = _march(hard, here, jnp.zeros((), int), (self.problem, here.u))[1]
+        return np.asarray(slopes)[: self.rows]
 
     def blur(self, u: np.ndarray) -> Any:
         """Levenberg–Marquardt on the mean residual over shifts that shrink."""
@@ -266,8 +264,7 @@ class _Fit:
         ends.sort(key=lambda end: end[1])
         if ends[-1][1] - ends[0][1] > AGREED * ends[0][1]:
             ends.insert(0, self.blocks(ends[0][0], 1.2))
-        u, _ = ends[0]
-        self.descend("polish", u, self.max_steps)
+        self.descend("polish", ends[0][0], self.max_steps)
 
     def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:
         """Points of finite cost: the prior's centre, then the lowest of a population of draws."""
@@ -276,7 +273,7 @@ class _Fit:
             draws = self.random.normal(size=(POPULATION - 1, space.size))
             u0 = np.asarray(space.u0)
             candidates = u0 + START_SPREAD * np.asarray(space.prior_sd) * draws
-            candidates = np.concatenate([u0[None], candidates])
+            candidates = np.concatenate([u0[None], candidates]).astype(u0.dtype)
             count = given
         else:
             candidates, count = given, len(given)
@@ -296,7 +293,8 @@ def solve(
 ) -> Solution:
     """The free parameters of least cost.
 
-    An interrupt (Ctrl-C) ends the search and keeps the best point so far.
+    An interrupt (Ctrl-C) ends the search and keeps the best point so far. The solution's
+    `converged` and `message` say how far to trust it.
 
     Args:
         problem: what to fit.
@@ -305,9 +303,6 @@ def solve(
         seed: of the draws; the same seed gives the same solution.
         max_steps: of Levenberg–Marquardt, for each start.
         progress: called with every report.
-
-    Returns:
-        The solution; `converged` and `message` say how far to trust it.
 
     Raises:
         ValueError: for no start or no step.
@@ -347,7 +342,7 @@ def _sentence(fit: _Fit, converged: bool, interrupted: bool, spent: bool) -> str
     if interrupted:
         return f"Interrupted after {fit.total} steps; this is the best point so far."
     if not np.isfinite(fit.best_cost):
-        return f"Not converged: no residuals are finite at any of {POPULATION} starting points."
+        return "Not converged: no residuals are finite at any starting point."
     if converged:
         return f"Converged: no further step lowers the cost by more than {TOLERANCE:g} of itself."
     if spent:

@@ -49,10 +49,12 @@ class Free:
 
     @property
     def leaf(self) -> str:
+        """Dotted name without the leg."""
         return self.name.partition("[")[0]
 
     @property
     def leg(self) -> int | None:
+        """Which leg's element, or None for the whole leaf."""
         index = self.name.partition("[")[2]
         return int(index[:-1]) if index else None
 
@@ -100,21 +102,23 @@ def free(ik: eqx.Module, name: str, **overrides: Any) -> Free:
         high=high,
         prior_mean=float(overrides.get("prior_mean", min(max(float(value.mean()), low), high))),
         prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
-        kind=overrides.get("kind", declaration.kind),
-        scale=overrides.get("scale", declaration.scale),
+        kind=_one_of(name, "kind", overrides.get("kind", declaration.kind), rule.Kind),
+        scale=_one_of(name, "scale", overrides.get("scale", declaration.scale), rule.Scale),
         above=above,
     )
     _check(made)
     return made
 
 
+def _one_of(name: str, what: str, given: Any, words: Any) -> Any:
+    if given not in get_args(words):
+        raise ValueError(f"{name}: {what} is {given!r}, wanted one of {get_args(words)}")
+    return given
+
+
 def _check(one: Free) -> None:
-    """Raises ValueError where bounds, prior or words make no sense."""
+    """Raises ValueError where bounds or prior make no sense."""
     allowed = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (0.0, 1.0)}
-    if one.scale not in allowed:
-        raise ValueError(f"{one.name}: scale is {one.scale!r}, wanted one of {list(allowed)}")
-    if one.kind not in get_args(rule.Kind):
-        raise ValueError(f"{one.name}: kind is {one.kind!r}, wanted one of {get_args(rule.Kind)}")
     least, most = allowed[one.scale]
     if not least < one.low < one.high < most:
         raise ValueError(
@@ -164,10 +168,12 @@ class Space(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Of the free parameters, in the order of `u`."""
         return tuple(one.name for one in self.frees)
 
     @property
     def size(self) -> int:
+        """How many are free."""
         return len(self.frees)
 
     @property
@@ -206,12 +212,11 @@ class Space(eqx.Module):
         for i in self.order:
             one = self.frees[i]
             leaf = leaves[one.leaf]
-            value = jnp.mean(leaf if one.leg is None else leaf[one.leg])
-            value = jnp.asarray(named.get(one.name, value), leaf.dtype)
-            start = _straighten(self._floor(i, leaves), one.scale)
-            end = _straighten(self.high[i], one.scale)
-            inside = jnp.clip(value, self._floor(i, leaves), self.high[i])
-            share = (_straighten(inside, one.scale) - start) / (end - start)
+            present = jnp.mean(leaf if one.leg is None else leaf[one.leg])
+            value = jnp.asarray(named.get(one.name, present), leaf.dtype)
+            ends = jnp.stack([self._floor(i, leaves), self.high[i]])
+            start, end = _straighten(ends, one.scale)
+            share = (_straighten(jnp.clip(value, *ends), one.scale) - start) / (end - start)
             share = jnp.clip(share, EDGE, 1 - EDGE)
             u[i] = jnp.log(share) - jnp.log1p(-share)
             leaves[one.leaf] = _put(leaf, one.leg, value)

@@ -38,11 +38,11 @@ class AbstractFoot(eqx.Module):
 class PitchRollFoot(AbstractFoot):
     """Pitches and rolls the animated foot onto the ground, its heading kept.
 
-    The pitch comes from the two hits where there is a toe ray, else, like the roll, from the normal;
-    both count by the foot's contact. Pitch, then roll, lays the sole on the normal exactly. Limits are
-    joint angles against the shin: 0 is a foot at right angles to it, a positive pitch lifts the toes,
-    a positive roll lifts the outer edge (so one pair of roll limits serves both sides, A16). They limit
-    what the ground adds: an animation beyond its limits stays as it is.
+    The pitch comes from the two hits where there is a toe ray, else, like the roll, from the
+    normal; both count by the foot's contact. Pitch, then roll, lays the sole on the normal exactly.
+    Limits are joint angles against the shin: 0 is a foot at right angles to it, a positive pitch
+    lifts the toes, a positive roll lifts the outer edge (so one pair of roll limits serves both
+    sides, A16). They limit what the ground adds: an animation beyond its limits stays as it is.
     """
 
     max_pitch: Array = parameter(0.52, unit="rad", low=0.0, high=1.4)
@@ -62,7 +62,9 @@ class PitchRollFoot(AbstractFoot):
         right = vec.cross(ahead, up)
 
         pitch, roll = ground_angles(sensed, ahead, right, rig.side)
-        shin = vec.unit(bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up))
+        shin = vec.unit(
+            bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
+        )
         shin = quat.rotate(world.rot, shin)
         pitch = limited(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
         roll = limited(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
@@ -103,7 +105,7 @@ def joint_angle(axis: Array, shin: Array) -> Array:
 
 
 def limited(tilt: Array, joint: Array, low: Array, high: Array, gate: AbstractGate) -> Array:
-    """`tilt` shortened so that it takes the joint angle, which it adds to, no further than a limit."""
+    """`tilt` shortened so that it takes the joint angle it adds to no further than a limit."""
     least = jnp.where(joint < low, joint, low)
     most = jnp.where(joint > high, joint, high)
     return gate.clip(joint + tilt, least, most, band=ANGLE_BAND) - joint

@@ -1,4 +1,4 @@
-"""A plan-view grid over triangles: which of them a ray along -up can meet.
+"""A plan-view grid over triangles: which of them a ray along -up meets first.
 
 Built once with NumPy, asked in JAX. The plane of the grid is at right angles to up; where a ray
 pierces it decides the cell, and the cell lists its triangles. Cells are as many as twice the
@@ -6,10 +6,15 @@ triangles; those still crowded are split four by four, again and again while tha
 that an uneven mesh costs neither long lists nor a fine grid everywhere.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from . import vec
 
 CELLS = 2.0  # cells per triangle, at most; fewer lengthen the lists, more only fill memory
 ENTRIES = 12  # list entries per triangle on average, at most, before cells grow
@@ -20,8 +25,12 @@ CHUNK = 1 << 20  # candidates tested at once; bounds the memory of a build
 
 
 class Grid(eqx.Module):
-    """Lists of triangles by cell. Index data: no slope passes through it."""
+    """Lists of triangles by cell, in a frame whose y is up. No slope passes through it."""
 
+    centre_ws: Float[Array, "*t 3"]  # m, the frame's origin, amid the mesh to keep rounding small
+    axes_ws: Float[Array, "*t 3 3"]  # rows: the frame's x, y (up) and z
+    corners: Float[Array, "*t triangles 9"]  # m; x z y of each corner in the frame
+    visible: UInt[Array, "*t triangles"]  # one bit a layer; none for walls and lines
     corner: Float[Array, "*t 2"]  # m, where the first cell begins
     pitch: Float[Array, "*t"]  # m, side of an unsplit cell
     first: Int[Array, "*t cells_and_end"]  # where the list of each cell begins in `members`
@@ -30,15 +39,26 @@ class Grid(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)  # unsplit cells along x and z
     depth: int = eqx.field(static=True)  # how often the most crowded cell was split
 
-    def look_up(
+    def moved(
+        self,
+        vertices_ws: Float[Array, "vertices 3"],
+        triangles: Int[Array, "triangles 3"],
+        layers: UInt[Array, " triangles"],
+    ) -> "Grid":
+        """The same lists over moved vertices."""
+        corners, wall = _corners(vertices_ws, triangles, self.centre_ws, self.axes_ws)
+        visible = jnp.where(wall, jnp.zeros_like(layers), layers)
+        return eqx.tree_at(lambda grid: (grid.corners, grid.visible), self, (corners, visible))
+
+    def _look_up(
         self, x: Float[Array, "*b"], z: Float[Array, "*b"]
     ) -> tuple[Int[Array, "*b"], Int[Array, "*b"]]:
         """Where the list for a place in the plane, m, begins in `members`, and its length.
 
         Outside the grid, and for coordinates that are not numbers, the length is 0.
         """
-        across = (x - self.corner[0]) / self.pitch
-        along = (z - self.corner[1]) / self.pitch
+        corner, pitch = jax.lax.stop_gradient((self.corner, self.pitch))
+        across, along = (x - corner[0]) / pitch, (z - corner[1]) / pitch
         inside = (across >= 0) & (across < self.shape[0]) & (along >= 0) & (along < self.shape[1])
         across, along = jnp.where(inside, across, 0.0), jnp.where(inside, along, 0.0)
         row, column = jnp.floor(across), jnp.floor(along)
@@ -53,22 +73,149 @@ class Grid(eqx.Module):
         end = self.first.at[cell + 1].get(mode="promise_in_bounds")
         return start, jnp.where(inside, end - start, 0)
 
+    @jax.jit  # so that a call outside jit compiles once a shape
+    def search(
+        self, origins_ws: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]
+    ) -> Int[Array, "*b"]:
+        """The triangle met first by each ray, -1 where there is none.
+
+        Watertight, after Woop, Benthin and Wald (Watertight Ray/Triangle Intersection, JCGT 2013):
+        corners are taken relative to the ray, which rounds a shared corner alike for all its
+        triangles; in that slightly moved mesh, which has no gaps either, the signs of the edge
+        functions are taken with an allowance above their rounding.
+        """
+        origins, corners, centre, axes = jax.lax.stop_gradient(
+            (origins_ws, self.corners, self.centre_ws, self.axes_ws)
+        )
+        x, y, z = (vec.dot(origins - centre, axes[axis]) for axis in range(3))
+        start, count = self._look_up(x, z)
+        slack = 4 * jnp.finfo(x.dtype).eps
+
+        def edge(px: Array, pz: Array, qx: Array, qz: Array) -> tuple[Array, Array]:
+            left, right = px * qz, pz * qx
+            return left - right, slack * (jnp.abs(left) + jnp.abs(right))
+
+        def body(step: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+            height, winner = best
+            triangle = self.members.at[start + step].get(mode="clip")
+            row = corners.at[triangle].get(mode="promise_in_bounds")
+            ax, bx, cx = row[..., 0] - x, row[..., 3] - x, row[..., 6] - x
+            az, bz, cz = row[..., 1] - z, row[..., 4] - z, row[..., 7] - z
+            (a, near_a), (b, near_b), (c, near_c) = (
+                edge(bx, bz, cx, cz),
+                edge(cx, cz, ax, az),
+                edge(ax, az, bx, bz),
+            )
+            inside = ((a >= -near_a) & (b >= -near_b) & (c >= -near_c)) | (
+                (a <= near_a) & (b <= near_b) & (c <= near_c)
+            )
+            # The allowance would lengthen a needle; its box, which needs none, cuts it off.
+            inside &= (jnp.minimum(jnp.minimum(ax, bx), cx) <= 0) & (
+                jnp.maximum(jnp.maximum(ax, bx), cx) >= 0
+            )
+            inside &= (jnp.minimum(jnp.minimum(az, bz), cz) <= 0) & (
+                jnp.maximum(jnp.maximum(az, bz), cz) >= 0
+            )
+            a, b, c = jnp.abs(a), jnp.abs(b), jnp.abs(c)
+            here = vec.safe_divide(a * row[..., 2] + b * row[..., 5] + c * row[..., 8], a + b + c)
+            inside &= here <= y + slack * (jnp.abs(here) + jnp.abs(y))  # starts on it: meets it
+            inside &= self.visible.at[triangle].get(mode="promise_in_bounds") & mask != 0
+            better = inside & (step < count) & (here > height)
+            return jnp.where(better, here, height), jnp.where(better, triangle, winner)
+
+        nothing = jnp.full(x.shape, -jnp.inf, jnp.result_type(x, corners))
+        none = jnp.full(x.shape, -1, jnp.int32)
+        longest = jnp.max(count, initial=0)
+        return jax.lax.fori_loop(jnp.zeros_like(longest), longest, body, (nothing, none))[1]
+
 
 def build(
-    plan: Float[np.ndarray, "triangles 3 2"], listed: Bool[np.ndarray, " triangles"], pad: float
+    vertices_ws: Float[Array, "vertices 3"],
+    triangles: Int[Array, "triangles 3"],
+    layers: UInt[Array, " triangles"],
+    up_ws: Float[Array, "3"],
+    slack: float,
 ) -> Grid:
-    """The grid over these triangles, on the host.
+    """The grid over these triangles; on the host, so outside jit.
 
     Args:
-        plan: corners in the plane of the grid, m; the grid's floats take this dtype.
-        listed: False leaves a triangle out.
-        pad: m, how far a corner may lie from where `plan` has it and still be found; covers the
-            rounding of rays and any later move of the vertices.
+        vertices_ws: m.
+        triangles: rows of vertices; either winding.
+        layers: one bit each.
+        up_ws: unit.
+        slack: m, how far a vertex may later move sideways and its triangles still be found.
     """
+    used = np.asarray(vertices_ws)[np.asarray(triangles).reshape(-1)]
+    centre_ws = jnp.asarray((used.min(axis=0) + used.max(axis=0)) / 2)
+    axes_ws = _axes(up_ws)
+    corners, wall = _corners(vertices_ws, triangles, centre_ws, axes_ws)
+    plan = np.asarray(corners).reshape(-1, 3, 3)[..., :2]
+    # Rays and corners are rounded where they enter the frame: by the size of either.
+    size = float(np.abs(used).max()) + float(np.abs(plan).max())
+    pad = slack + 16 * float(np.finfo(plan.dtype).eps) * size
+    # A wall can only be met once its corners moved sideways.
+    listed = np.ones(len(plan), bool) if slack > 0 else ~np.asarray(wall)
+    lists = _lists(plan.astype(np.float64), listed, pad)
+    return Grid(
+        centre_ws=centre_ws,
+        axes_ws=axes_ws,
+        corners=corners,
+        visible=jnp.where(wall, jnp.zeros_like(layers), layers),
+        corner=jnp.asarray(lists.corner, plan.dtype),
+        pitch=jnp.asarray(lists.pitch, plan.dtype),
+        first=jnp.asarray(lists.first, jnp.int32),
+        children=jnp.asarray(lists.children, jnp.int32),
+        members=jnp.asarray(lists.members, jnp.int32),
+        shape=lists.shape,
+        depth=lists.depth,
+    )
+
+
+def _corners(
+    vertices: Float[Array, "vertices 3"],
+    triangles: Int[Array, "triangles 3"],
+    centre: Float[Array, "3"],
+    axes: Float[Array, "3 3"],
+) -> tuple[Float[Array, "triangles 9"], Bool[Array, " triangles"]]:
+    """Rows x z y x z y x z y of the corners in the grid's frame, and which triangles are walls.
+
+    Each vertex is turned once, by components: the same number for all its triangles.
+    """
+    x, y, z = (vec.dot(vertices - centre, axes[axis]) for axis in range(3))
+    turned = vec.stack(x, z, y)[triangles]
+    sides = turned[:, 1:, :2] - turned[:, :1, :2]
+    left, right = sides[:, 0, 0] * sides[:, 1, 1], sides[:, 0, 1] * sides[:, 1, 0]
+    noise = 4 * jnp.finfo(turned.dtype).eps * (jnp.abs(left) + jnp.abs(right))
+    return turned.reshape(-1, 9), jnp.abs(left - right) <= noise
+
+
+def _axes(up: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Right-handed axes whose second is up; those of the world where up is its y."""
+    second = np.asarray(up, np.float64)
+    forward = np.eye(3)[2] if abs(second[2]) < 0.9 else np.eye(3)[0]
+    side = np.cross(second, forward)
+    side /= np.linalg.norm(side)
+    return jnp.asarray(np.stack([side, second, np.cross(side, second)]), up.dtype)
+
+
+class _Lists(NamedTuple):
+    """The discrete part of a `Grid`, by the same names."""
+
+    corner: np.ndarray
+    pitch: float
+    first: np.ndarray
+    children: np.ndarray
+    members: np.ndarray
+    shape: tuple[int, int]
+    depth: int
+
+
+def _lists(
+    plan: Float[np.ndarray, "triangles 3 2"], listed: Bool[np.ndarray, " triangles"], pad: float
+) -> _Lists:
+    """Which cells there are and what is in them, for the triangles that are to be `listed`."""
     numbers = np.flatnonzero(listed)
-    corners = plan[numbers].astype(np.float64)
-    if not len(numbers):  # nothing to meet: one empty cell
-        corners, numbers = np.zeros((0, 3, 2)), np.zeros(0, np.int64)
+    corners = plan[numbers]
     shape, corner, pitch = _frame(corners, pad)
     owner, member = _enumerate(corners, shape, corner, pitch, pad)
     mids = corner + pitch * (np.indices(shape).reshape(2, -1).T + 0.5)
@@ -98,19 +245,19 @@ def build(
     members = np.concatenate([members for _, members in settled])
     order = np.argsort(cell, kind="stable")
     counts = np.bincount(cell, minlength=base + cells)
-    found = numbers[members[order]] if len(members) else np.zeros(1, np.int64)
-    return Grid(
-        corner=jnp.asarray(corner, plan.dtype),
-        pitch=jnp.asarray(pitch, plan.dtype),
-        first=jnp.asarray(np.concatenate([[0], np.cumsum(counts)]), jnp.int32),
-        children=jnp.asarray(np.concatenate(children), jnp.int32),
-        members=jnp.asarray(found, jnp.int32),
+    return _Lists(
+        corner=corner,
+        pitch=pitch,
+        first=np.concatenate([[0], np.cumsum(counts)]),
+        children=np.concatenate(children),
+        # One entry at least, for the reads of rays that have nothing to meet.
+        members=numbers[members[order]] if len(members) else np.zeros(1, np.int64),
         shape=shape,
         depth=depth,
     )
 
 
-# Middles of a cell's parts, in half sides from its own middle, in the order of `look_up`.
+# Middles of a cell's parts, in half sides from its own middle, in the order of `_look_up`.
 _OFFSETS = (2 * np.indices((SPLIT, SPLIT)).reshape(2, -1).T + 1) / SPLIT - 1.0
 
 

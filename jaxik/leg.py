@@ -30,7 +30,9 @@ class AbstractLeg(eqx.Module):
     weight: eqx.AbstractVar[Array]  # 0..1, share of foot IK
 
     @abstractmethod
-    def pose(self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate) -> Bend:
+    def pose(
+        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
+    ) -> Bend:
         """The leg with its ankle at `target_ms`, m."""
 
 
@@ -39,20 +41,22 @@ class TwoBone(AbstractLeg):
 
     Exact for a hinge that is not square to the leg: distances are split along and across the hinge
     axis, and the triangle is closed across it. Half-angle algebra throughout (systems.md, 0, after
-    ozz's two-bone job). Knee limits and softening act on the distance from hip to ankle, never on the
-    angle: from `soften` times the longest reach the leg approaches that reach exponentially.
+    ozz's two-bone job). Knee limits and softening act on the distance from hip to ankle, never on
+    the angle: from `soften` times the longest reach the leg approaches that reach exponentially.
 
     Beyond reach the leg points at the target; with the target on the hip it keeps its direction; a
     leg with a zero bone, or lying along its hinge, does not bend.
     """
 
-    max_knee_angle: Array = parameter(3.0000531, unit="rad", low=2.0, high=3.1415926536)
-    min_knee_angle: Array = parameter(0.6983874, unit="rad", low=0.0, high=1.8)
+    max_knee_angle: Array = parameter(3.0000531803, unit="rad", low=2.0, high=3.1415926536)
+    min_knee_angle: Array = parameter(0.6982008392, unit="rad", low=0.0, high=1.8)
     soften: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
     twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
     weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
 
-    def pose(self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate) -> Bend:
+    def pose(
+        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
+    ) -> Bend:
         to_hip = pose.hip.pos - pose.knee.pos
         to_ankle = pose.ankle.pos - pose.knee.pos
         to_target = target_ms - pose.hip.pos
@@ -75,8 +79,10 @@ class TwoBone(AbstractLeg):
             Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
             Transform(knee_pos, quat.multiply(whole, pose.knee.rot)),
             ankle,
-            Transform(ankle_pos + quat.rotate(whole, pose.toe.pos - pose.ankle.pos),
-                quat.multiply(whole, pose.toe.rot)),
+            Transform(
+                ankle_pos + quat.rotate(whole, pose.toe.pos - pose.ankle.pos),
+                quat.multiply(whole, pose.toe.rot),
+            ),
         )
         return Bend(
             solved,
@@ -94,7 +100,9 @@ class TwoBone(AbstractLeg):
         shortest = opposite_side(thigh, shin, jnp.cos(self.min_knee_angle))
         free = self.soften * longest
         distance = vec.length(to_target)
-        allowed = gate.clip(soft_limit(distance, free, longest), shortest, longest, band=LENGTH_BAND)
+        allowed = gate.clip(
+            soft_limit(distance, free, longest), shortest, longest, band=LENGTH_BAND
+        )
         inside = gate.above(distance, shortest, band=LENGTH_BAND)
         return allowed, inside * gate.below(distance, free, band=LENGTH_BAND)
 
@@ -120,7 +128,7 @@ def soft_limit(x: Array, free: Array, limit: Array) -> Array:
 
 
 def hinge_turn(to_hip: Array, to_ankle: Array, hinge: Array, reach: Array) -> tuple[Array, Array]:
-    """Cosine and sine of half the knee's turn about `hinge` that brings hip and ankle `reach` apart.
+    """Cosine and sine of half the knee's turn about `hinge` that takes hip and ankle `reach` apart.
 
     The interior angle is 0..pi after the turn, whatever side the leg was bent to before. Clamped to
     straight or folded where the triangle does not close; no turn where a side lies along the hinge.

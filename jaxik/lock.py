@@ -57,7 +57,7 @@ class OffsetLock(AbstractLock):
     contact says planted and it is slower than `max_speed`; it is released when the contact says
     lifted, or early: when staying would bend or straighten the knee too far, when hip to place
     leaves hip to animated ankle by more than `release_cone`, or when the offset grows beyond
-    `release_distance`. A released foot locks again once its factor is at or below `relock_threshold`.
+    `release_distance`. A released foot locks again once its factor is at most `relock_threshold`.
     """
 
     enabled: Array = switch(True)

@@ -1,7 +1,7 @@
 """Foot IK as sense, advance, pose: one frame with `step`, a clip with `run`.
 
-What has no memory is computed for all frames at once (`sense`, `pose`); only a few numbers per leg go
-through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
+What has no memory is computed for all frames at once (`sense`, `pose`); only a few numbers per leg
+go through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
 """
 
 from typing import Any
@@ -164,7 +164,7 @@ def pose(
 def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform:
     """The body's move in model space: a turn about the middle of the hips, then an offset."""
     into_model = quat.conjugate(frame.world_from_model.rot)
-    present = jnp.where(rig.present, 1.0, 0.0)
+    present = rig.present.astype(offset_ws.dtype)
     count = jnp.where(jnp.any(rig.present), jnp.sum(present), 1.0)
     pivot = jnp.sum(vec.scale(frame.pose.hip.pos, present), axis=-2) / count
     turn = quat.multiply(into_model, quat.multiply(turn_ws, quat.conjugate(into_model)))
@@ -213,9 +213,7 @@ def resume(
     return after, result
 
 
-def run(
-    ik: FootIK, rig: Rig, terrain: Terrain, frames: Frame, gate: AbstractGate = HARD
-) -> Result:
+def run(ik: FootIK, rig: Rig, terrain: Terrain, frames: Frame, gate: AbstractGate = HARD) -> Result:
     """A clip of one character; the leaves of `frames` and of the result lead with frames.
 
     Jit, vmap and differentiate over any argument.

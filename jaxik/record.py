@@ -1,19 +1,20 @@
 """The game's foot-IK parameter record: bytes, CSV text, and the parameters it means.
 
 Little-endian: u8 knee axis at 0x0, flags in bits 0-2 at 0x1 (3-7 padding), two bytes of padding, 31
-consecutive f32 from 0x04 to 0x7c, and from 0x80 a tail of unknown length. Everything that is read is
-kept, so that writing gives the same bytes again. The record's spelling and units live in this file only.
+consecutive f32 from 0x04 to 0x7c, and from 0x80 a tail of unknown length. Everything that is read
+is kept, so that writing gives the same bytes again. The record's spelling and units live here only.
 Numbers like A1 name the settled questions of systems.md, section 4.
 """
 
 import csv
 import dataclasses
 import io
+import re
 import struct
 import warnings
-from typing import Literal
+from collections.abc import Callable
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -63,16 +64,17 @@ FLOATS = (  # name in the record, in the order of the offsets; our name; unit at
 FLOAT_NAMES = tuple(name for name, _, _ in FLOATS)
 FLAG_NAMES = tuple(name for _, name, _ in FLAGS)
 COLUMNS = ("kneeAxisType", *FLAG_NAMES, "padflag", "pad1", *FLOAT_NAMES, "pad3")
-KNEE_AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
+KNEE_AXES = np.concatenate([np.eye(3), -np.eye(3)])  # by kneeAxisType
+QUIET_NAN = b"\0\0\xc0\x7f"  # what "nan" reads as
 
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
     """How the record's doubtful fields are read."""
 
-    length_unit: Literal["auto", "m", "cm"] = "auto"  # A1
-    knee_convention: Literal["interior", "flexion"] = "interior"  # A3
-    lean_sign: Literal[1, -1] = 1  # A6
+    length_unit: str = "auto"  # A1: auto, m or cm
+    knee_convention: str = "interior"  # A3: interior or flexion
+    lean_sign: int = 1  # A6: 1 or -1
     tick_hz: float = 30.0  # A5
 
     def __post_init__(self) -> None:
@@ -96,6 +98,14 @@ class Record:
     padding: bytes = b"\0\0"
     floats: tuple[bytes, ...] = (b"\0\0\0\0",) * len(FLOATS)  # as stored: NaN payloads survive
     tail: bytes = b""
+
+    def __post_init__(self) -> None:
+        for name in ("knee_axis_type", "flags"):
+            if not 0 <= (came := getattr(self, name)) <= 0xFF:
+                raise ValueError(f"{name} is {came}; it is one byte, 0 to 255")
+        came, wanted = list(map(len, (self.padding, *self.floats))), [2] + [4] * len(FLOATS)
+        if came != wanted:
+            raise ValueError(f"padding and floats have {wanted} bytes; these have {came}")
 
     def value(self, name: str) -> float:
         """A float by its name in the record."""
@@ -137,7 +147,7 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
     reading = reading or Reading()
     knee_axis(record)
     values: dict[str, float] = {}
-    for name, ours, unit in FLOATS:
+    for name, ours, unit in _fields(reading):
         if not np.isfinite(stored := record.value(name)):
             raise ValueError(f"{name} is {stored}; the record's floats are finite numbers")
         values[ours] = _inside(name, stored, unit, record, reading)
@@ -151,20 +161,25 @@ def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = No
     """The record that holds the pipeline's parameters.
 
     `base` gives the knee axis, the padding and the tail; a float that means in `base` what it means
-    in `ik` keeps its bytes.
+    in `ik` keeps its bytes. With `length_unit` "auto" the unit is that of `base`, else metres.
+
+    Raises:
+        ValueError: for a parameter that differs between legs, is beyond a 32-bit float, or would be
+            read back in another unit.
     """
     reading = reading or Reading()
     kept = base or Record()
     flags = kept.flags & ~0b111
     for bit, _, ours in FLAGS:
-        flags |= int(bool(rule.get(ik, ours))) << bit
-    if base is not None and reading.length_unit == "auto":
-        unit = "cm" if _in_centimetres(base) else "m"
-        reading = dataclasses.replace(reading, length_unit=unit)
+        flags |= int(_leaf(ik, ours)) << bit
+    guessed = reading.length_unit == "auto"
+    if guessed:
+        length_unit = "cm" if base is not None and _in_centimetres(base) else "m"
+        reading = dataclasses.replace(reading, length_unit=length_unit)
     floats = []
-    for index, (name, ours, unit) in enumerate(FLOATS):
+    for index, (name, ours, unit) in enumerate(_fields(reading)):
         value = _leaf(ik, ours)
-        stored = struct.pack("<f", _outside(value, unit, reading))
+        stored = _packed(_outside(value, unit, reading))
         if base is not None and np.isfinite(base.value(name)):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -172,14 +187,19 @@ def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = No
             if np.isclose(before, value, rtol=1e-6, atol=1e-7):
                 stored = base.floats[index]
         floats.append(stored)
-    return dataclasses.replace(kept, flags=flags, floats=tuple(floats))
+    made = dataclasses.replace(kept, flags=flags, floats=tuple(floats))
+    if guessed and _in_centimetres(made) != (reading.length_unit == "cm"):
+        raise ValueError(
+            f"lengths written in {reading.length_unit} would be read in the other unit: a planted "
+            'height over 1 or a ray over 5 counts as cm; give length_unit "m" or "cm"'
+        )
+    return made
 
 
 def knee_axis(record: Record) -> np.ndarray:
     """The knee's hinge in its joint's space, unit (3,)."""
     if record.knee_axis_type >= len(KNEE_AXES):
-        names = "0 +X, 1 +Y, 2 +Z, 3 -X, 4 -Y, 5 -Z"
-        raise ValueError(f"kneeAxisType is {record.knee_axis_type}; it is one of {names}")
+        raise ValueError(f"kneeAxisType is {record.knee_axis_type}; 0 to 5 are +X +Y +Z -X -Y -Z")
     return KNEE_AXES[record.knee_axis_type]
 
 
@@ -189,9 +209,7 @@ def with_knee_axis(rig: Rig, record: Record) -> Rig:
     A rig measured from a captured clip has its own axes and does not need this.
     """
     axis = jnp.asarray(knee_axis(record), rig.knee_axis_ls.dtype)
-    return eqx.tree_at(
-        lambda r: r.knee_axis_ls, rig, jnp.broadcast_to(axis, rig.knee_axis_ls.shape)
-    )
+    return dataclasses.replace(rig, knee_axis_ls=jnp.broadcast_to(axis, rig.knee_axis_ls.shape))
 
 
 def to_csv(records: list[Record]) -> str:
@@ -201,11 +219,8 @@ def to_csv(records: list[Record]) -> str:
     rows.writerow(COLUMNS)
     for record in records:
         flags = [int(record.flag(name)) for name in FLAG_NAMES]
-        floats = [_shortest(stored) for stored in record.floats]
-        rows.writerow(
-            [record.knee_axis_type, *flags, record.flags >> 3, record.padding.hex()]
-            + [*floats, record.tail.hex()]
-        )
+        head = [record.knee_axis_type, *flags, record.flags >> 3, record.padding.hex()]
+        rows.writerow([*head, *map(_shortest, record.floats), record.tail.hex()])
     return out.getvalue()
 
 
@@ -216,43 +231,81 @@ def from_csv(text: str) -> list[Record]:
         ValueError: naming row and column.
     """
     rows = csv.DictReader(io.StringIO(text))
-    columns = rows.fieldnames or []
+    columns = list(rows.fieldnames or [])
     needed = [name for name in COLUMNS if not name.startswith("pad")]
     if missing := [name for name in needed if name not in columns]:
-        raise ValueError(f"the CSV has no column {missing}; it has {list(columns)}")
+        raise ValueError(f"the CSV has no column {missing}; it has {columns}")
     if unknown := [name for name in columns if name not in COLUMNS]:
         raise ValueError(f"the CSV has unknown columns {unknown}; a record has {list(COLUMNS)}")
+    if twice := [name for name in COLUMNS if columns.count(name) > 1]:
+        raise ValueError(f"the CSV has column {twice} more than once")
     records = []
-    for number, row in enumerate(rows, start=2):
-        floats = tuple(struct.pack("<f", _number(row, name, number)) for name in FLOAT_NAMES)
-        flags = int(_number(row, "padflag", number)) << 3 if row.get("padflag") else 0
+    for cells in rows:
+        line = f"row {rows.line_num}"
+        if None in cells or None in cells.values():
+            raise ValueError(f"{line} has not the {len(columns)} cells of the header")
+        flags = _read(line, cells, "padflag", _whole(0x1F), "a whole number from 0 to 31", "0") << 3
         for bit, name, _ in FLAGS:
-            flags |= int(bool(_number(row, name, number))) << bit
-        padding = bytes.fromhex(row.get("pad1") or "0000")
-        tail = bytes.fromhex(row.get("pad3") or "")
-        records.append(
-            Record(int(_number(row, "kneeAxisType", number)), flags, padding, floats, tail)
-        )
+            flags |= _read(line, cells, name, _whole(1), "0 or 1") << bit
+        axis = _read(line, cells, "kneeAxisType", _whole(0xFF), "a whole number from 0 to 255")
+        floats = tuple(_read(line, cells, name, _packed, "a 32-bit number") for name in FLOAT_NAMES)
+        padding = _read(line, cells, "pad1", bytes.fromhex, "bytes in hexadecimal", "0000")
+        tail = _read(line, cells, "pad3", bytes.fromhex, "bytes in hexadecimal")
+        if len(padding) != 2:
+            raise ValueError(f"{line}, column pad1: {padding.hex()!r} is not two bytes")
+        records.append(Record(axis, flags, padding, floats, tail))
     return records
 
 
-def _number(row: dict, name: str, number: int) -> float:
+def _read(
+    line: str, cells: dict, name: str, convert: Callable, wanted: str, missing: str = ""
+) -> Any:
+    cell = (cells.get(name) or missing).strip()
     try:
-        return float(row[name])
-    except (TypeError, ValueError):
-        raise ValueError(f"row {number}, column {name}: {row[name]!r} is not a number") from None
+        return convert(cell)
+    except ValueError:
+        raise ValueError(f"{line}, column {name}: {cell!r} is not {wanted}") from None
+
+
+def _whole(most: int) -> Callable[[str], int]:
+    return lambda cell: range(most + 1).index(int(cell))
 
 
 def _shortest(stored: bytes) -> str:
-    """The shortest decimal that reads back as the same f32."""
-    return str(np.frombuffer(stored, "<f4")[0])
+    """The shortest decimal that reads back as the same f32; all bits of a NaN that is not plain."""
+    value = np.frombuffer(stored, "<f4")[0]
+    if np.isnan(value) and stored != QUIET_NAN:
+        return f"nan(0x{stored[::-1].hex()})"
+    return str(value)
+
+
+def _packed(value: float | str) -> bytes:
+    """The f32 nearest to a number or its text; a ValueError where there is none."""
+    if isinstance(value, str) and (bits := re.fullmatch(r"nan\(0x([0-9a-fA-F]{8})\)", value)):
+        return bytes.fromhex(bits[1])[::-1]
+    number = float(value)
+    try:
+        return QUIET_NAN if np.isnan(number) else struct.pack("<f", number)
+    except OverflowError:
+        raise ValueError(f"{value} is beyond a 32-bit float") from None
+
+
+def _fields(reading: Reading) -> list[tuple[str, str, str]]:
+    """`FLOATS`, for a reading: a knee's largest flexion is its smallest interior angle (A3)."""
+    if reading.knee_convention == "interior":
+        return list(FLOATS)
+    other = {"leg.max_knee_angle": "leg.min_knee_angle", "leg.min_knee_angle": "leg.max_knee_angle"}
+    return [(name, other.get(ours, ours), unit) for name, ours, unit in FLOATS]
 
 
 def _leaf(ik: FootIK, name: str) -> float:
-    if name.endswith("]"):
-        name, index = name[:-1].split("[")
-        return float(rule.get(ik, name)[int(index)])
-    return float(jnp.mean(rule.get(ik, name)))
+    """A number that all legs share."""
+    leaf, _, index = name.rstrip("]").partition("[")
+    values = np.asarray(rule.get(ik, leaf))
+    values = np.unique(values[..., int(index)] if index else values)
+    if len(values) > 1:
+        raise ValueError(f"{name} is {values.tolist()}; the record has one value for all legs")
+    return float(values[0])
 
 
 def _in_centimetres(record: Record) -> bool:

@@ -45,10 +45,10 @@ class TargetState(eqx.Module):
 class SlopeTarget(AbstractTarget):
     """Keeps the animated lift over the ground and the sole exact on a slope.
 
-    The ankle goes to `I + u (l + h (1/(n·u) - 1))` (ozz's construction with the animated lift `l` added):
-    on a slope the ankle of a sole that lies flat is `h / (n·u)` above the hit. The height follows the
-    ground with one half-life up and one down; the ankle stays between two heights in model space.
-    Where no ground was found the foothold is the animation's own.
+    The ankle goes to `I + u (l + h (1/(n·u) - 1))` (ozz's construction with the animated lift `l`
+    added): on a slope the ankle of a sole that lies flat is `h / (n·u)` above the hit. The height
+    follows the ground with one half-life up and one down; the ankle stays between two heights in
+    model space. Where no ground was found the foothold is the animation's own.
     """
 
     min_ankle_height: Array = parameter(-0.30, unit="m", low=-1.0, high=0.5)

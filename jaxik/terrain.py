@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from . import grid, vec
@@ -72,10 +73,6 @@ class Mesh(AbstractSurface):
     triangles: Int[Array, "*t triangles 3"]
     layers: UInt[Array, "*t triangles"]  # one bit each
     grid: grid.Grid
-    centre_ws: Float[Array, "*t 3"]  # m, origin of the grid's frame, which keeps rounding small
-    axes_ws: Float[Array, "*t 3 3"]  # rows: the frame's x, y and z; y is up
-    corners: Float[Array, "*t triangles 9"]  # x z y of each corner in that frame, for the search
-    visible: UInt[Array, "*t triangles"]  # `layers`, without walls and triangles of no area
 
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"]) -> "Mesh":
         """The same triangles over moved vertices, m; slopes pass through.
@@ -84,18 +81,13 @@ class Mesh(AbstractSurface):
         angles to up) than the `slack` that the mesh was made with; moves along up are free.
         Beyond that a ray may miss what moved.
         """
-        corners, wall = _corners(vertices_ws, self.triangles, self.centre_ws, self.axes_ws)
-        visible = jnp.where(wall, jnp.zeros_like(self.layers), self.layers)
-        return eqx.tree_at(
-            lambda mesh: (mesh.vertices_ws, mesh.corners, mesh.visible),
-            self,
-            (vertices_ws, corners, visible),
-        )
+        found_by = self.grid.moved(vertices_ws, self.triangles, self.layers)
+        return Mesh(vertices_ws, self.triangles, self.layers, found_by)
 
     def meet(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
     ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
-        triangle = self._search(origins_ws, mask)
+        triangle = self.grid.search(origins_ws, mask)
         seen = triangle >= 0
         ends = self.triangles.at[jnp.where(seen, triangle, 0)].get(mode="promise_in_bounds")
         a, b, c = (
@@ -104,7 +96,9 @@ class Mesh(AbstractSurface):
         )
         # Sides in units of the longest, so that a tiny triangle has a normal too.
         square = jnp.maximum(vec.dot(b - a, b - a), vec.dot(c - a, c - a))
-        inverse = jax.lax.stop_gradient(vec.safe_divide(1.0, vec.safe_sqrt(square)))
+        inverse = jax.lax.stop_gradient(
+            vec.safe_divide(jnp.ones_like(square), vec.safe_sqrt(square))
+        )
         normal = vec.unit(vec.cross(vec.scale(b - a, inverse), vec.scale(c - a, inverse)), up_ws)
         normal = vec.scale(normal, jnp.where(vec.dot(normal, up_ws) < 0, -1.0, 1.0))
         distance = _drop(origins_ws, up_ws, a, normal)
@@ -115,60 +109,6 @@ class Mesh(AbstractSurface):
         high = jnp.maximum(jnp.maximum(drops[0], drops[1]), drops[2])
         distance += jax.lax.stop_gradient(jnp.clip(distance, low, high) - distance)
         return distance, normal, seen
-
-    def _search(
-        self, origins_ws: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]
-    ) -> Int[Array, "*b"]:
-        """The triangle met first by each ray, -1 where there is none.
-
-        Watertight, after Woop, Benthin and Wald (Watertight Ray/Triangle Intersection, JCGT 2013):
-        corners are taken relative to the ray, which rounds a shared corner alike for all its
-        triangles; in that slightly moved mesh, which has no gaps either, the signs of the edge
-        functions are taken with an allowance above their rounding.
-        """
-        origins, corners, frame, centre, axes = jax.lax.stop_gradient(
-            (origins_ws, self.corners, self.grid, self.centre_ws, self.axes_ws)
-        )
-        x, y, z = (vec.dot(origins - centre, axes[axis]) for axis in range(3))
-        start, count = frame.look_up(x, z)
-        slack = 4 * jnp.finfo(x.dtype).eps
-
-        def edge(px: Array, pz: Array, qx: Array, qz: Array) -> tuple[Array, Array]:
-            left, right = px * qz, pz * qx
-            return left - right, slack * (jnp.abs(left) + jnp.abs(right))
-
-        def body(step: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-            height, winner = best
-            triangle = frame.members.at[start + step].get(mode="clip")
-            row = corners.at[triangle].get(mode="promise_in_bounds")
-            ax, bx, cx = row[..., 0] - x, row[..., 3] - x, row[..., 6] - x
-            az, bz, cz = row[..., 1] - z, row[..., 4] - z, row[..., 7] - z
-            (a, near_a), (b, near_b), (c, near_c) = (
-                edge(bx, bz, cx, cz),
-                edge(cx, cz, ax, az),
-                edge(ax, az, bx, bz),
-            )
-            inside = ((a >= -near_a) & (b >= -near_b) & (c >= -near_c)) | (
-                (a <= near_a) & (b <= near_b) & (c <= near_c)
-            )
-            # The allowance would lengthen a needle; its box, which needs none, cuts it off.
-            inside &= (jnp.minimum(jnp.minimum(ax, bx), cx) <= 0) & (
-                jnp.maximum(jnp.maximum(ax, bx), cx) >= 0
-            )
-            inside &= (jnp.minimum(jnp.minimum(az, bz), cz) <= 0) & (
-                jnp.maximum(jnp.maximum(az, bz), cz) >= 0
-            )
-            a, b, c = jnp.abs(a), jnp.abs(b), jnp.abs(c)
-            here = vec.safe_divide(a * row[..., 2] + b * row[..., 5] + c * row[..., 8], a + b + c)
-            inside &= here <= y + slack * (jnp.abs(here) + jnp.abs(y))  # starts on it: meets it
-            inside &= self.visible.at[triangle].get(mode="promise_in_bounds") & mask != 0
-            better = inside & (step < count) & (here > height)
-            return jnp.where(better, here, height), jnp.where(better, triangle, winner)
-
-        nothing = jnp.full(x.shape, -jnp.inf, jnp.result_type(x, corners))
-        none = jnp.full(x.shape, -1, jnp.int32)
-        longest = jnp.max(count, initial=0)
-        return jax.lax.fori_loop(jnp.zeros_like(longest), longest, body, (nothing, none))[1]
 
 
 class Terrain(eqx.Module):
@@ -271,28 +211,12 @@ def mesh(
     places, corners = np.asarray(vertices), np.asarray(triangles)
     _check(places, corners)
     up_ws = _direction(up, "up", dtype)
-    bits = np.broadcast_to(_bits(layer), len(corners))
-    vertices_ws, triangles_i = jnp.asarray(places, dtype), jnp.asarray(corners, jnp.int32)
-    used = places[corners.reshape(-1)]
-    centre_ws = jnp.asarray((used.min(axis=0) + used.max(axis=0)) / 2, dtype)
-    axes_ws = _axes(np.asarray(up_ws), dtype)
-    rows, wall = _corners(vertices_ws, triangles_i, centre_ws, axes_ws)
-    plan = np.asarray(rows).reshape(-1, 3, 3)[..., :2]
-    # Rays and corners are rounded where they enter the frame: by the size of either.
-    size = float(np.abs(used).max()) + float(np.abs(plan).max())
-    pad = slack + 16 * float(np.finfo(plan.dtype).eps) * size
-    listed = np.ones(len(wall), bool) if slack > 0 else ~np.asarray(wall)
-    surface = Mesh(
-        vertices_ws=vertices_ws,
-        triangles=triangles_i,
-        layers=jnp.asarray(bits),
-        grid=grid.build(plan, listed, pad),
-        centre_ws=centre_ws,
-        axes_ws=axes_ws,
-        corners=rows,
-        visible=jnp.asarray(np.where(wall, np.uint32(0), bits)),
+    surface = (
+        jnp.asarray(places, dtype),
+        jnp.asarray(corners, jnp.int32),
+        jnp.asarray(np.broadcast_to(_bits(layer), len(corners))),
     )
-    return Terrain(up_ws, (surface,))
+    return Terrain(up_ws, (Mesh(*surface, grid.build(*surface, up_ws, slack)),))
 
 
 def combine(*terrains: Terrain) -> Terrain:
@@ -304,7 +228,7 @@ def combine(*terrains: Terrain) -> Terrain:
     if not terrains:
         raise ValueError("combine needs at least one terrain")
     ups = [terrain.up_ws for terrain in terrains]
-    if not any(isinstance(up, jax.core.Tracer) for up in ups):
+    if not any(isinstance(up, Tracer) for up in ups):
         if not all(np.allclose(up, ups[0], rtol=0, atol=1e-6) for up in ups):
             listed = ", ".join(str(np.asarray(up).tolist()) for up in ups)
             raise ValueError(f"terrains to combine share one up direction; got {listed}")
@@ -322,32 +246,6 @@ def _drop(
     return vec.safe_divide(vec.dot(origins - point, normal), vec.dot(up, normal))
 
 
-def _corners(
-    vertices: Float[Array, "vertices 3"],
-    triangles: Int[Array, "triangles 3"],
-    centre: Float[Array, "3"],
-    axes: Float[Array, "3 3"],
-) -> tuple[Float[Array, "triangles 9"], Bool[Array, " triangles"]]:
-    """Rows x z y x z y x z y of the corners in the grid's frame, and which triangles are walls.
-
-    Each vertex is turned once, by components: the same number for all its triangles.
-    """
-    x, y, z = (vec.dot(vertices - centre, axes[axis]) for axis in range(3))
-    turned = vec.stack(x, z, y)[triangles]
-    sides = turned[:, 1:, :2] - turned[:, :1, :2]
-    left, right = sides[:, 0, 0] * sides[:, 1, 1], sides[:, 0, 1] * sides[:, 1, 0]
-    noise = 4 * jnp.finfo(turned.dtype).eps * (jnp.abs(left) + jnp.abs(right))
-    return turned.reshape(-1, 9), jnp.abs(left - right) <= noise
-
-
-def _axes(up: Float[np.ndarray, "3"], dtype) -> Float[Array, "3 3"]:
-    """Right-handed axes whose second is up; those of the world where up is its y."""
-    forward = np.eye(3)[2] if abs(up[2]) < 0.9 else np.eye(3)[0]
-    side = np.cross(np.float64(up), forward)
-    side /= np.linalg.norm(side)
-    return jnp.asarray(np.stack([side, up, np.cross(side, up)]), dtype)
-
-
 def _dtype(*given: ArrayLike | tuple[float, ...]) -> jnp.dtype:
     """The float dtype of the arrays among `given`, JAX's default where there are none."""
     arrays = [array for array in given if isinstance(array, jax.Array | np.ndarray)]
@@ -356,7 +254,7 @@ def _dtype(*given: ArrayLike | tuple[float, ...]) -> jnp.dtype:
 
 def _direction(given: ArrayLike | tuple[float, ...], name: str, dtype) -> Float[Array, "3"]:
     direction = jnp.asarray(given, dtype)
-    if not isinstance(direction, jax.core.Tracer):
+    if not isinstance(direction, Tracer):
         if direction.shape != (3,) or not 0 < float(vec.dot(direction, direction)) < np.inf:
             raise ValueError(f"{name} is a direction, three numbers with a length; got {given}")
     return vec.scale(direction, 1.0 / vec.length(direction))

@@ -109,3 +109,15 @@ def test_the_base_of_the_blocks_is_the_one_that_comes_with_them(mocap):
     assert np.sqrt(np.mean(gaps[:, [3, 7]] ** 2)) < 0.002 and np.median(gaps[:, [2, 6]]) < 1e-6
     free = flat_base(captured, lambda points: points[:, 1] - 0.055)
     assert abs(free.positions_ws[0, 0, 1] - wanted.positions_ws[0, 0, 1]) < 0.003
+
+
+def test_what_hangs_on_a_foot_goes_with_it(mocap):
+    clip = load_clip(mocap / "clips/cmu_asfamc/02_01.amc")
+    base = flat_base(clip, lambda points: points[:, 1] - 0.05)
+    for toe, tip in (("ltoes", "ltoes_end"), ("rtoes", "rtoes_end")):
+        ends = [clip.joint_names.index(toe), clip.joint_names.index(tip)]
+        before, after = (np.diff(c.positions_ws[:, ends], axis=1) for c in (clip, base))
+        assert np.abs(after - before).max() < 1e-9
+    head = clip.joint_names.index("head")
+    lift = (base.positions_ws - clip.positions_ws)[:, [0, head]]
+    assert np.allclose(lift[:, 0], lift[:, 1])

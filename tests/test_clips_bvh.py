@@ -209,6 +209,17 @@ def test_a_file_that_is_no_motion_is_refused(written, tmp_path):
         load_clip(tmp_path / "clip.fbx")
 
 
+def test_bodies_without_size_or_stance_are_remarked(written):
+    head = "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n}\n"
+    clip = load_clip(written(head + "MOTION\nFrames: 1\nFrame Time: 0.01\n0 0 0\n"))
+    assert clip.scale == 1.0 and any("no bone has a length" in note for note in clip.remarks)
+    lying = BVH  # along x
+    for row, z in (("0 87 0 0 0 0", 0), ("0 87 1 0 0 5", 1), ("0 87 2 0 0 9", 2)):
+        lying = lying.replace(row, f"0 87 {z} 90 0 0")
+    clip = load_clip(written(lying))
+    assert any("not over the feet" in remark for remark in clip.remarks)
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [({"scale": -1.0}, "scale is -1"), ({"fps": 0.0}, "fps is 0"), ({"up": "x"}, "wanted 'y'"),

@@ -33,7 +33,7 @@ def test_half_the_rate_takes_every_second_frame(walk):
     half = edit.resample(walk, 30.0)
     assert half.fps == 30.0 and half.frames == (walk.frames + 1) // 2
     assert np.allclose(half.positions_ws, walk.positions_ws[::2], atol=1e-12)
-    assert np.array_equal(half.stance, walk.stance[::2])
+    assert np.array_equal(half.standing(), walk.standing()[::2])
 
 
 @pytest.mark.parametrize("fps", [120.0, 50.0, 24.0, 144.0])
@@ -51,7 +51,7 @@ def test_frames_made_from_a_masked_one_are_masked(walk):
     mask = np.ones(walk.frames, bool)
     mask[7] = False
     fine = edit.resample(replace(walk, mask=mask), 120.0)
-    assert np.flatnonzero(~fine.mask).tolist() == [13, 14, 15]
+    assert np.flatnonzero(fine.mask == 0).tolist() == [13, 14, 15]
 
 
 def test_rates_that_are_none_are_refused(walk):
@@ -63,7 +63,7 @@ def test_trim_keeps_both_ends(walk):
     cut = edit.trim(walk, 0.5, 1.0)
     assert cut.frames == 31
     assert np.array_equal(cut.positions_ws, walk.positions_ws[30:61])
-    assert np.array_equal(cut.stance, walk.stance[30:61])
+    assert np.array_equal(cut.standing(), walk.standing()[30:61])
     assert edit.trim(walk).frames == walk.frames
     for start, end in ((-0.1, 1.0), (1.0, 0.5), (0.0, 99.0)):
         with pytest.raises(ValueError, match="wanted 0 <= start <= end <="):
@@ -111,10 +111,10 @@ def test_a_popped_marker_is_masked(walk):
     positions[50, 7] += [0.0, 0.3, 0.0]
     popped = edit.mask_pops(walk.with_motion(positions, walk.rotations_ws))
     assert np.flatnonzero(edit.pops(popped)).tolist() == [49, 50, 51]
-    assert np.flatnonzero(~popped.mask).tolist() == [49, 50, 51]
+    assert np.flatnonzero(popped.mask == 0).tolist() == [49, 50, 51]
     assert not edit.pops(walk).any()
     again = edit.mask_pops(replace(walk, mask=popped.mask))
-    assert np.array_equal(again.mask, popped.mask)
+    assert again.mask is not None and (again.mask == popped.mask).all()
     assert any("markers pop in 3 frames" in told for told in describe(popped)["warnings"])
 
 
@@ -125,7 +125,7 @@ def test_a_clip_mirrored_twice_is_the_clip(walk):
     once = edit.mirror(uneven)
     assert np.allclose(once.joints_ws(2)[:, 0], uneven.joints_ws(2)[:, 1] * [-1, 1, 1])
     assert np.allclose(once.rig.thigh, uneven.rig.thigh[::-1])
-    assert np.array_equal(once.stance, uneven.stance[:, ::-1])
+    assert np.array_equal(once.standing(), uneven.standing()[:, ::-1])
     assert once.rig.side.tolist() == [1, -1]
     twice = edit.mirror(once)
     assert np.array_equal(twice.positions_ws, uneven.positions_ws)
@@ -154,7 +154,7 @@ def test_a_one_sided_body_has_no_mirror(walk):
 
 
 def test_marker_pops_and_t_poses_of_the_reference_files(mocap):
-    pops = edit.pops(load_clip(mocap / "clips/cmu_asfamc/03_03.amc"))
+    pops = edit.pops(load_clip(mocap / "blocks/03_03.npz"))
     assert pops.sum() == 52  # as facts.json counts them
     spans = {
         "cmu_bvh_mb/cmu_12_01_walk.bvh": (1, 523),

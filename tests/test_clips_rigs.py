@@ -1,5 +1,7 @@
 """Joints recognised, rigs measured, and clips as poses of legs."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -201,7 +203,19 @@ def test_contacts_agree_with_the_labels_of_the_blocks(mocap):
     labels = np.zeros((clip.frames, 2), bool)
     for row in rows:
         labels[row["first_frame"] : row["last_frame"] + 1, "lr".index(row["side"])] = True
-    assert np.array_equal(labels, clip.stance)
+    assert np.array_equal(labels, clip.standing())
     found = standing(clip.joints_ws(3), clip.fps)
     assert (found == labels).mean() > 0.99  # 0.9954 when written
     assert [len(runs(found[:, leg])) for leg in (0, 1)] == [28, 26]
+
+
+def test_a_character_that_always_lies_on_its_side_looks_along_z(walk):
+    positions = np.array(walk.positions_ws)
+    positions[:, [1, 5]] = positions[:, [0]] + [[0, 0.1, 0], [0, -0.1, 0]]
+    root = walk.with_motion(positions, walk.rotations_ws).world_from_model()
+    assert np.array_equal(root.rot, np.tile([1.0, 0.0, 0.0, 0.0], (walk.frames, 1)))
+
+
+def test_a_clip_made_without_legs_says_so(walk):
+    with pytest.raises(ValueError, match="walker was loaded without legs"):
+        _ = replace(walk, measured=None).rig

@@ -65,7 +65,9 @@ def test_up_layer_dtype_and_slack_reach_the_terrain(tmp_path):
 
 def test_the_real_blocks_are_read_in_metres_with_y_up(mocap):
     ground = scenes.load_terrain(mocap / "blocks" / "terrain.ply")
-    corners = np.asarray(ground.surfaces[0].vertices_ws)
+    (surface,) = ground.surfaces
+    assert isinstance(surface, terrain.Mesh)
+    corners = np.asarray(surface.vertices_ws)
     assert np.ptp(corners[:, 1]) < 1.0 < np.ptp(corners[:, 0])
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     assert corners[:, 1].min() <= height(ground, *middle[[0, 2]]) <= corners[:, 1].max()

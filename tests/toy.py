@@ -4,6 +4,7 @@ A foot is locked while it is near the ground and slow; its anchor follows it whi
 when locked; offsets, pelvis and pitch are smoothed and clamped. Metres, seconds, radians.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting import robust, space
+from fitting import robust, solve, space
 from jaxik import ease, rule
 from jaxik.gate import HARD
 
@@ -174,15 +175,26 @@ def make_data(truth: Toy, seed: int = 0, frames: int = 400, outliers: float = 0.
     return Data(inputs, tuple(seen))  # type: ignore[arg-type]
 
 
+NAMES = (*THRESHOLDS, *SMOOTH, "foot.idle")
+
+
+@functools.cache
+def solved(seed: int) -> tuple[space.Problem, solve.Solution]:
+    """A problem and its solution, made once for all tests."""
+    problem = make_problem(seed)
+    return problem, solve.solve(problem)
+
+
 def make_problem(
     seed: int = 0,
     frames: int = 400,
-    names: tuple[str, ...] = THRESHOLDS + SMOOTH,
+    names: tuple[str, ...] = NAMES,
+    truth: dict[str, float] = TRUTH,
     outliers: float = 0.0,
     loss: robust.Loss = "squares",
 ) -> space.Problem:
     """The defaults as a start, the truth in the data."""
     made = space.make_space(Toy(), [space.free(Toy(), name) for name in names])
     held = space.make_space(Toy(), [space.free(Toy(), name) for name in TRUTH])
-    truth = held.unpack(held.pack(TRUTH))
-    return space.Problem(made, make_data(truth, seed, frames, outliers), residuals, loss)
+    clean = held.unpack(held.pack(truth))
+    return space.Problem(made, make_data(clean, seed, frames, outliers), residuals, loss)

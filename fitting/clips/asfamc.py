@@ -236,7 +236,9 @@ def _assemble(skeleton: _Skeleton, values: dict[str, np.ndarray], degrees: bool)
         parent = skeleton.bones[bone.parent] if bone.parent else None
         parents.append(names.index(bone.parent) if bone.parent else -1)
         offsets.append(parent.direction * parent.length if parent else skeleton.position)
-        moved, turn = _bone_motion(bone, values.get(bone.name), frames, skeleton, degrees)
+        moved, turn = _bone_motion(
+            bone, values.get(bone.name, np.zeros((frames, 0))), frames, skeleton, degrees
+        )
         positions.append(offsets[-1] + moved)
         rotations.append(turn.as_quat(scalar_first=True))
     for bone in leaves:
@@ -253,7 +255,7 @@ def _assemble(skeleton: _Skeleton, values: dict[str, np.ndarray], degrees: bool)
 
 
 def _bone_motion(
-    bone: _Bone, rows: np.ndarray | None, frames: int, skeleton: _Skeleton, degrees: bool
+    bone: _Bone, rows: np.ndarray, frames: int, skeleton: _Skeleton, degrees: bool
 ) -> tuple[np.ndarray, Rotation]:
     """What a bone's channels add to its place, and its local rotation C M C⁻¹."""
     angles, order = bone.axis

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64
 
 from jaxik.skeleton import LegPose, Rig, Skeleton, Transform
 
+from . import contacts
 from .recording import continuous
 from .rigs import lateral
 from .roles import find_roles
@@ -33,10 +34,11 @@ class Clip:
     measured: Rig | None  # float64; None where no leg was found
     stance: Bool[np.ndarray, "frames legs"] | None = None  # contact labels that came with the clip
     mask: Bool[np.ndarray, " frames"] | None = None  # False: not to be trusted, as a marker popped
+    slide: Float64[np.ndarray, " frames"] | None = None  # 0..1, 1 while the character slides
     remarks: tuple[str, ...] = ()  # what was guessed or odd
 
     def __post_init__(self) -> None:
-        for name in ("offsets_ls", "positions_ws", "rotations_ws", "stance", "mask"):
+        for name in ("offsets_ls", "positions_ws", "rotations_ws", "stance", "mask", "slide"):
             if (array := getattr(self, name)) is not None:
                 view = array.view()
                 view.flags.writeable = False
@@ -73,6 +75,12 @@ class Clip:
     def joints_ws(self, role: int) -> Float64[np.ndarray, "frames legs 3"]:
         """Where a joint of each leg is: `role` 0 hip, 1 knee, 2 ankle, 3 toe."""
         return self.positions_ws[:, [joints[role] for joints in self.rig.joints]]
+
+    def standing(self) -> Bool[np.ndarray, "frames legs"]:
+        """The contact labels that came with the clip, or those found from its motion."""
+        return (
+            contacts.standing(self.joints_ws(3), self.fps) if self.stance is None else self.stance
+        )
 
     def leg_pose_ws(self) -> LegPose:
         """World transforms, (frames, legs), of the legs' joints, in JAX's default precision."""
@@ -131,4 +139,5 @@ class Clip:
             rotations_ws=self.rotations_ws[frames],
             stance=None if self.stance is None else self.stance[frames],
             mask=None if self.mask is None else self.mask[frames],
+            slide=None if self.slide is None else self.slide[frames],
         )

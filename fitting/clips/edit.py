@@ -31,8 +31,8 @@ def resample(clip: Clip, fps: float) -> Clip:
     """The clip at another rate; the same clip at the same rate.
 
     Between two frames local rotations go the shorter arc and local positions a straight line, so
-    bones keep their lengths. A stance label is that of the nearer frame; a frame between a good and
-    a masked one is masked. Ends with the last whole frame of the new rate.
+    bones keep their lengths. Stance labels and slide are those of the nearer frame; a frame between
+    a good and a masked one is masked. Ends with the last whole frame of the new rate.
     """
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps is {fps}; wanted a number above 0")
@@ -58,6 +58,7 @@ def resample(clip: Clip, fps: float) -> Clip:
         clip, fps=float(fps), positions_ws=positions_ws, rotations_ws=rotations_ws,
         stance=None if clip.stance is None else clip.stance[near],
         mask=None if clip.mask is None else clip.mask[before] & (whole | clip.mask[after]),
+        slide=None if clip.slide is None else clip.slide[near],
     )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ def describe(clip: Clip) -> dict:
 def _describe_legs(clip: Clip) -> dict:
     rig = clip.rig
     own = clip.stance is not None
-    stance = clip.stance if own else contacts.standing(clip.joints_ws(3), clip.fps)
+    stance = clip.standing()
     joint_map = {"pelvis": clip.joint_names[rig.pelvis]}
     legs = {}
     for index, name in enumerate(rig.names):

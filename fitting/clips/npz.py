@@ -1,7 +1,6 @@
 """Clips in NumPy archives: our own format, and the `blocks` benchmark of joint positions."""
 
-import os
-import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxik.skeleton import Rig
 
+from ..files import write
 from .clip import Clip
 from .recording import continuous, localise
 from .rigs import hinges, measure_rig, unit
@@ -18,7 +18,7 @@ from .roles import find_roles
 
 FORMAT = "jaxik clip 1"
 ARRAYS = ("offsets_ls", "positions_ws", "rotations_ws")
-OPTIONAL = ("stance", "mask")
+OPTIONAL = ("stance", "mask", "slide")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
 RIG_ARRAYS = ("knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "side", "present")
@@ -27,11 +27,15 @@ BLOCKS = ("fps", "pelvis", "pelvis_rot", "foot_rot", "stance")
 PARTS = ("hip", "knee", "ankle", "ball")
 
 
-def save_clip(path: str | Path, clip: Clip) -> None:
+def save_clip(
+    path: str | Path, clip: Clip, *, joints: Mapping[str, np.ndarray] | None = None
+) -> None:
     """Writes a clip as NPZ, which `load_clip` gives back exactly; never half a file.
 
-    Keys: `format`; the clip's fields under their own names (`stance`, `mask`, `dialect` where there
-    are any); the rig's as `rig_<field>`, `rig_joints` being (legs, 4) joint indices.
+    `joints` are further arrays for other programs, which `load_clip` passes over.
+
+    Keys: `format`; the clip's fields under their own names (`stance`, `mask`, `slide`, `dialect`
+    where there are any); the rig's as `rig_<field>`, `rig_joints` being (legs, 4) joint indices.
     """
     path = Path(path)
     content: dict[str, np.ndarray] = {
@@ -48,14 +52,13 @@ def save_clip(path: str | Path, clip: Clip) -> None:
         content["rig_names"] = np.array(clip.measured.names)
         content["rig_joints"] = np.array(clip.measured.joints)
         content["rig_pelvis"] = np.array(clip.measured.pelvis)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
+    content |= joints or {}
+
+    def fill(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # an open file, for NumPy adds a suffix to a name
             np.savez_compressed(file, **content)  # pyright: ignore[reportArgumentType]
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+
+    write(path, fill)
 
 
 def read_npz(path: Path, variant: str) -> Clip:
@@ -78,6 +81,17 @@ def read_npz(path: Path, variant: str) -> Clip:
     )
 
 
+def is_blocks(path: str | Path) -> bool:
+    """Whether a file is of the blocks benchmark, which holds a captured clip and its base."""
+    if Path(path).suffix.lower() != ".npz" or not Path(path).is_file():
+        return False
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return "base_pelvis" in archive.files
+    except Exception:  # whatever is wrong with it, reading it says so
+        return False
+
+
 def _own(path: Path, content: dict[str, np.ndarray]) -> Clip:
     if str(content["format"]) != FORMAT:
         raise ValueError(f"{path}: wanted the format {FORMAT!r}, got {str(content['format'])!r}")
@@ -91,19 +105,28 @@ def _own(path: Path, content: dict[str, np.ndarray]) -> Clip:
             rig = Rig(
                 **{name: jnp.asarray(content[f"rig_{name}"]) for name in RIG_ARRAYS},
                 names=tuple(map(str, content["rig_names"])),
-                joints=tuple(tuple(map(int, row)) for row in content["rig_joints"]),
+                joints=tuple(
+                    (int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"]
+                ),
                 pelvis=int(content["rig_pelvis"]),
             )
     return Clip(
         joint_names=tuple(map(str, content["joint_names"])),
         parents=tuple(map(int, content["parents"])),
+        offsets_ls=content["offsets_ls"],
+        positions_ws=content["positions_ws"],
+        rotations_ws=content["rotations_ws"],
+        fps=float(content["fps"]),
+        raw_frame_time=float(content["raw_frame_time"]),
+        source=str(content["source"]),
+        scale=float(content["scale"]),
+        up_axis=str(content["up_axis"]),
         dialect=str(content["dialect"]) if "dialect" in content else None,
         measured=rig,
+        stance=content.get("stance"),
+        mask=content.get("mask"),
+        slide=content.get("slide"),
         remarks=tuple(map(str, content["remarks"])),
-        **{name: content[name] for name in ARRAYS},
-        **{name: content.get(name) for name in OPTIONAL},
-        **{name: str(content[name]) for name in TEXTS},
-        **{name: float(content[name]) for name in NUMBERS},
     )
 
 
@@ -136,7 +159,7 @@ def _blocks(path: Path, content: dict[str, np.ndarray], variant: str) -> Clip:
         names += [f"{side}_{part}" for part in ("hip", "knee", "ankle", "toe")]
         parents += [0, len(names) - 4, len(names) - 3, len(names) - 2]
         positions += [part[:, leg] for part in (hip, knee, ankle, ball)]
-        rotations += leg_rotations(*positions[-4:-1], left_ws)
+        rotations += leg_rotations(hip[:, leg], knee[:, leg], ankle[:, leg], left_ws)
         rotations += [foot_rot[:, leg], foot_rot[:, leg]]
     return positions_clip(
         tuple(names), tuple(parents), np.stack(positions, axis=1), np.stack(rotations, axis=1),

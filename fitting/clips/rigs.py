@@ -76,16 +76,17 @@ def _measure_leg(
     stands: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     hip, knee, ankle, toe = (positions_ws[:, joint] for joint in leg.joints)
-    hip_rot, knee_rot, ankle_rot = (
-        Rotation.from_quat(rotations_ws[:, joint], scalar_first=True) for joint in leg.joints[:3]
+    hip_rot, knee_rot = (
+        Rotation.from_quat(rotations_ws[:, joint], scalar_first=True) for joint in leg.joints[:2]
     )
     lengths = [np.median(np.linalg.norm(b - a, axis=-1)) for a, b in
                ((hip, knee), (knee, ankle), (ankle, toe))]  # fmt: skip
     axis = knee_axis(hip, knee, ankle, hip_rot, knee_rot, left_ws)
     still = flat_frames(ankle, toe, stands)
+    ankle_rot = Rotation.from_quat(rotations_ws[still, leg.joints[2]], scalar_first=True)
     return (
         axis,
-        foot_axes(ankle[still], toe[still], ankle_rot[still], left_ws[still]),
+        foot_axes(ankle[still], toe[still], ankle_rot, left_ws[still]),
         np.array(lengths),
     )
 

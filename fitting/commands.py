@@ -1,0 +1,200 @@
+"""What each word of the command line does."""
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import jaxik
+from jaxik import record, rule
+
+from . import clips, experiment, files, frames, report, scenes, settings, store, study
+from .base import load_base
+from .clips import inspect as inspection
+from .posterior import SamplingProgress
+from .solve import Progress
+
+
+def fit(options: argparse.Namespace) -> int:
+    """Fits, and leaves a run folder with tables and plots."""
+    _prepare_jax()
+    asked = experiment.load_experiment(options.experiment)
+    store.prepare(options.output)
+    print(f"fitting {len(asked.free)} parameters of {asked.preset} to {len(asked.clips)} clip(s)")
+    fitted = study.fit(asked, progress=_Line(_fit_line))
+    store.save_fit(options.output, fitted)
+    report.write_fit(options.output, fitted)
+    print("\n" + report.fit_text(store.describe_fit(fitted), report.truth_of(asked)))
+    print(f"written to {options.output}; read {options.output / store.SUMMARY}")
+    return 0
+
+
+def sample(options: argparse.Namespace) -> int:
+    """Samples the posterior of a run, or goes on with it."""
+    _prepare_jax()
+    asked, told = store.load_fit(options.run)
+    if options.max_steps is not None:
+        asked = experiment.with_max_steps(asked, options.max_steps)
+    problem = experiment.make_problem(asked)
+    names = [row["name"] for row in told["parameters"]]
+    if names != list(problem.space.names):
+        raise ValueError(f"{options.run}: fit.json has {names}, the experiment {problem.space.names}")
+    start_u = np.array([row["u"] for row in told["parameters"]])
+    start_sd = np.array([row["start_sd"] for row in told["parameters"]])
+    chain = options.run / store.CHAIN
+    posterior = study.sample_start(problem, asked, start_u, start_sd, chain, _Line(_sample_line))
+    store.save_posterior(options.run, posterior)
+    report.write_posterior(options.run, asked, posterior)
+    print("\n" + report.posterior_text(posterior, report.truth_of(asked)))
+    print(f"written to {options.run}; read {options.run / store.SUMMARY}")
+    return 0
+
+
+def apply(options: argparse.Namespace) -> int:
+    """Runs a run's fitted parameters on a clip."""
+    _prepare_jax()
+    store.load_fit(options.run)
+    ik, _ = settings.from_toml(options.run / store.PARAMETERS)
+    return _solve_clip(ik, options)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs a preset or a parameter file on a clip."""
+    _prepare_jax()
+    if options.parameters is not None:
+        return _solve_clip(settings.from_toml(options.parameters)[0], options)
+    return _solve_clip(experiment.name_preset(options.preset), options)
+
+
+def inspect(options: argparse.Namespace) -> int:
+    """Prints what a loader understood of a clip."""
+    clip = clips.load_clip(options.clip, asf=options.asf, scale=options.scale)
+    told = inspection.describe(clip)
+    print(inspection.to_json(told) if options.json else inspection.render(told))
+    return 0
+
+
+def convert(options: argparse.Namespace) -> int:
+    """The word `record`: shows the game's record, or turns it into or out of our parameters."""
+    jax.config.update("jax_enable_x64", True)
+    reading = record.Reading(options.length_unit, options.knee, options.lean_sign, options.tick_hz)
+    if options.way == "show":
+        read = _read_records(options.file, reading)
+        print(record.to_csv(read) if options.csv else "\n\n".join(_shown(r, reading) for r in read))
+        return 0
+    (read, *more) = _read_records(options.file, reading, getattr(options, "base", None))
+    if more:
+        raise ValueError(f"{options.file} has {1 + len(more)} rows; give a file with one record")
+    if options.way == "to-toml":
+        files.write_text(options.output, settings.to_toml(record.to_ik(read, reading)))
+    else:
+        files.write(options.output, lambda path: path.write_bytes(record.to_bytes(read)))
+    print(f"written to {options.output}")
+    return 0
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "fit": fit,
+    "sample": sample,
+    "apply": apply,
+    "run": run,
+    "inspect": inspect,
+    "record": convert,
+}
+
+
+def _prepare_jax() -> None:
+    """Float64, and compiled programs kept between calls."""
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.jax_compilation_cache_dir is None:
+        cache = Path.home() / ".cache" / "jaxik"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    warnings.filterwarnings("ignore", message=".*persistent compilation cache.*")
+
+
+def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
+    base = load_base(options.clip)
+    ground = scenes.load_terrain(options.terrain, file_up=options.file_up)
+    began = time.perf_counter()
+    result = jaxik.run(ik, base.rig, ground, frames.frames_of(base, floor=options.floor))
+    solved = frames.solved_clip(base, result, floor=options.floor)
+    clips.save_clip(options.output, solved, joints=frames.named_joints(solved))
+    reached = float(np.mean(result.reached))
+    found = float(np.mean(result.trace.sensed.foothold.found))
+    print(
+        f"{base.frames} frames in {time.perf_counter() - began:.1f} s: ground under {found:.1%} of the "
+        f"feet, {reached:.1%} of the targets reached; written to {options.output}"
+    )
+    return 0
+
+
+def _read_records(
+    path: Path, reading: record.Reading, base: Path | None = None
+) -> list[record.Record]:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    kept = record.from_bytes(base.read_bytes()) if base is not None else None
+    if path.suffix.lower() == ".toml":
+        return [record.from_ik(settings.from_toml(path)[0], kept, reading)]
+    if path.suffix.lower() == ".csv":
+        read = record.from_csv(path.read_text())
+        if not read:
+            raise ValueError(f"{path}: the CSV has no row")
+        return read
+    return [record.from_bytes(path.read_bytes())]
+
+
+def _shown(one: record.Record, reading: record.Reading) -> str:
+    ik = record.to_ik(one, reading)
+    declared = rule.declarations(ik)
+    axis = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")[one.knee_axis_type]
+    lines = [f"{'kneeAxisType':30} {one.knee_axis_type} ({axis})"]
+    for _, name, ours in record.FLAGS:
+        lines.append(f"{name:30} {'on' if one.flag(name) else 'off':>12}   {ours}")
+    for name, ours, _ in record.FLOATS:
+        leaf, _, index = ours.partition("[")
+        value = rule.get(ik, leaf)
+        value = float(value[int(index[:-1])] if index else value)
+        meaning = f"{ours} = {value:.6g} {declared[leaf].unit}"
+        lines.append(f"{name:30} {one.value(name):12.6g}   {meaning}")
+    return "\n".join(lines)
+
+
+class _Line:
+    """Progress on one line of a terminal, on a line every ten seconds elsewhere."""
+
+    def __init__(self, show: Callable):
+        self.show = show
+        self.live = sys.stderr.isatty()
+        self.last = -1e9
+
+    def __call__(self, progress: Progress | SamplingProgress) -> None:
+        now = time.monotonic()
+        if now - self.last < (0.1 if self.live else 10.0):
+            return
+        self.last = now
+        text = self.show(progress)
+        print(f"\r{text:<100}" if self.live else text, end="" if self.live else "\n",
+              file=sys.stderr, flush=True)
+
+
+def _fit_line(progress: Progress) -> str:
+    return (
+        f"{progress.seconds:6.1f} s  start {progress.start + 1}  {progress.stage:<9} step "
+        f"{progress.step:<4} cost {progress.cost:.6g}  best {progress.best:.6g}"
+    )
+
+
+def _sample_line(progress: SamplingProgress) -> str:
+    time_now = progress.autocorrelation_time
+    slowest = "" if np.isnan(time_now) else f"  slowest autocorrelation {time_now:.0f} steps"
+    return (
+        f"{progress.elapsed:6.1f} s  step {progress.step} of at most {progress.max_steps}  "
+        f"acceptance {progress.acceptance:.2f}  log p {progress.log_probability:.1f}{slowest}"
+    )

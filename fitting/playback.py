@@ -1,0 +1,165 @@
+"""A clip played under given parameters, as the numbers that reports count and pictures draw."""
+
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+import jaxik
+from jaxik import frame, vec
+from jaxik.skeleton import Transform
+from jaxik.terrain import cast
+
+from .residuals import Scene, pelvis_ws, turn_between, whitened
+
+ABOVE, REACH = 1.0, 3.0  # m, where the rays that look for the ground start, and their length
+
+KINDS = ("ankle", "knee", "pelvis", "foot", "body", "contact", "smooth")  # in the rows' order
+
+Series = Array | np.ndarray  # NumPy once a playback is made
+
+
+class Motion(eqx.Module):
+    """Where legs and pelvis are; world space, m, frames first."""
+
+    pelvis: Float[Series, "frames 3"]
+    hip: Float[Series, "frames legs 3"]
+    knee: Float[Series, "frames legs 3"]
+    ankle: Float[Series, "frames legs 3"]
+    toe: Float[Series, "frames legs 3"]
+
+    @property
+    def knee_angle(self) -> Float[np.ndarray, "frames legs"]:
+        """Angle between thigh and shin, rad; pi for a straight leg."""
+        thigh, shin = np.asarray(self.hip - self.knee), np.asarray(self.ankle - self.knee)
+        across = np.linalg.norm(np.cross(thigh, shin), axis=-1)
+        return np.arctan2(across, np.sum(thigh * shin, axis=-1))
+
+
+class Playback(eqx.Module):
+    """One clip before and after foot IK, and as captured."""
+
+    before: Motion  # the animation on its flat floor
+    after: Motion
+    captured: Motion
+    up_ws: Float[Series, "3"]
+    forward_ws: Float[Series, "frames 3"]
+    ground_ws: Float[Series, "frames legs 3"]  # under the captured ankles
+    grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
+    dt: Float[Series, " frames"]
+    contact: Float[Series, "frames legs"]  # weight that the system gives each foot
+    locked: Float[Series, "frames legs"]
+    stance: Float[Series, "frames legs"]  # captured contact labels; all 0 where there are none
+    slide: Float[Series, " frames"]
+    seen: Bool[Series, " frames"]
+    errors: dict[str, Float[Series, "rows ..."]]  # of `after`, by kind of residual, in its unit
+    rows: dict[str, Float[Series, "rows ..."]]  # the same as the fit sees them, in sigmas
+    sigmas: dict[str, Float[Series, ""]]
+
+    @cached_property
+    def time(self) -> Float[np.ndarray, " frames"]:
+        """Seconds since the first frame."""
+        return np.cumsum(self.dt) - self.dt[0]
+
+    @cached_property
+    def travelled(self) -> Float[np.ndarray, " frames"]:
+        """Distance that the captured pelvis has come forward, m; less when it walks backwards."""
+        steps = np.diff(np.asarray(self.captured.pelvis), axis=0, prepend=self.captured.pelvis[:1])
+        return np.cumsum(np.sum(steps * self.forward_ws, axis=-1))
+
+    @property
+    def used(self) -> list[str]:
+        """Kinds of residuals that the fit looks at: those whose sigma is finite."""
+        return [kind for kind in KINDS if np.isfinite(self.sigmas[kind])]
+
+    def height(self, points_ws: Float[Series, "*b 3"]) -> Float[np.ndarray, "*b"]:
+        """Heights along up, m."""
+        return np.asarray(points_ws) @ np.asarray(self.up_ws)
+
+    def ground_height(self) -> Float[np.ndarray, "frames legs"]:
+        """Height of the ground under the captured ankles, m; NaN where there is none."""
+        return np.where(np.asarray(self.grounded) > 0, self.height(self.ground_ws), np.nan)
+
+    def along(self, points_ws: Float[Series, "frames ... 3"]) -> Float[np.ndarray, "frames ..."]:
+        """How far forward points are on the way that the character comes, m."""
+        wide = (slice(None),) + (None,) * (points_ws.ndim - 2)
+        off = np.asarray(points_ws) - self.captured.pelvis[wide]
+        return self.travelled[wide] + np.sum(off * self.forward_ws[wide], axis=-1)
+
+
+def play(ik: jaxik.FootIK, scene: Scene) -> Playback:
+    """The scene's clip under these parameters, as NumPy arrays."""
+    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    return jax.tree.map(np.asarray, _watch(scene, result))
+
+
+@eqx.filter_jit
+def _watch(scene: Scene, result: jaxik.Result) -> Playback:
+    world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
+    each = Transform(world.pos[:, None], world.rot[:, None])
+    animated, solved = (
+        jaxik.LegPose(*(each @ joint for joint in (pose.hip, pose.knee, pose.ankle, pose.toe)))
+        for pose in (scene.frames.pose, result.pose)
+    )
+    base, carried = world @ scene.pelvis, pelvis_ws(scene, result)
+    # The reference knows no hips and toes: they hang on the pelvis and the ankles as in the base.
+    hips = _per_leg(reference.pelvis).apply(_per_leg(base).inverse().apply(animated.hip.pos))
+    toes = reference.ankle.apply(animated.ankle.inverse().apply(animated.toe.pos))
+    hit = cast(scene.terrain, reference.ankle.pos + vec.scale(up, jnp.asarray(ABOVE)), REACH)
+    errors = _errors(scene, result, carried, solved)
+    sigmas = {kind: getattr(scene.sigmas, kind) for kind in errors}
+    calm = reference.seen[2:] & reference.seen[1:-1] & reference.seen[:-2]
+    rows = {
+        kind: whitened(error / sigmas[kind], reference.seen, scene.sigmas.correlation)
+        for kind, error in errors.items()
+        if kind != "smooth"
+    }
+    rows["smooth"] = jnp.where(calm[:, None, None], errors["smooth"] / sigmas["smooth"], 0.0)
+    return Playback(
+        before=Motion(base.pos, *_positions(animated)),
+        after=Motion(carried.pos, *_positions(solved)),
+        captured=Motion(reference.pelvis.pos, hips, reference.knee_ws, reference.ankle.pos, toes),
+        up_ws=up,
+        forward_ws=jax.vmap(lambda one: frame.heading(one, up)[0])(world),
+        ground_ws=hit.point,
+        grounded=hit.found,
+        dt=scene.frames.dt,
+        contact=result.trace.sensed.contact.weight,
+        locked=result.trace.advanced.state.lock.locked,
+        stance=reference.contact,
+        slide=scene.frames.slide,
+        seen=reference.seen,
+        errors=errors,
+        rows=rows,
+        sigmas=sigmas,
+    )
+
+
+def _errors(
+    scene: Scene, result: jaxik.Result, pelvis: Transform, legs: jaxik.LegPose
+) -> dict[str, Array]:
+    """What `residuals.rows_of_scene` divides by its sigmas, by kind and in its order."""
+    reference, present = scene.reference, scene.rig.present[:, None]
+    ankle = (legs.ankle.pos - reference.ankle.pos) * present
+    step = scene.frames.dt[1:-1, None, None]
+    standing = result.trace.sensed.contact.weight - reference.contact
+    return {
+        "ankle": ankle,
+        "knee": (legs.knee.pos - reference.knee_ws) * present,
+        "pelvis": pelvis.pos - reference.pelvis.pos,
+        "foot": turn_between(reference.ankle.rot, legs.ankle.rot) * present,
+        "body": turn_between(reference.pelvis.rot, pelvis.rot),
+        "contact": standing * scene.rig.present,
+        "smooth": (ankle[2:] - 2.0 * ankle[1:-1] + ankle[:-2]) / step**2,
+    }
+
+
+def _per_leg(each: Transform) -> Transform:
+    return Transform(each.pos[:, None], each.rot[:, None])
+
+
+def _positions(legs: jaxik.LegPose) -> tuple[Array, Array, Array, Array]:
+    return legs.hip.pos, legs.knee.pos, legs.ankle.pos, legs.toe.pos

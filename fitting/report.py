@@ -1,0 +1,217 @@
+"""What is read after a fit or a sampling: texts for the terminal, and the run's summary.md."""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from . import chain_plots, files, playback, plots, store, tables
+from .exercise import exercise, flipped_decisions
+from .experiment import Experiment, flat, leaf_names, name_preset
+from .posterior import Posterior
+from .study import Fit
+from .tables import Truth, markdown
+
+HEADING = "## Posterior"  # what follows it in summary.md is of `write_posterior`
+KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
+Pictures = dict[str, str]  # captions by file name
+
+
+def truth_of(experiment: Experiment) -> dict[str, float] | None:
+    """Known parameters by dotted name, from the first clip that has a file of them; None without.
+
+    Tables that are no stage's are left out, and so are switches. Of a leaf that holds several
+    values there is each with its `[index]`, and their mean by the leaf's own name.
+
+    Raises:
+        ValueError: for a file that is not TOML.
+    """
+    path = next((clip.truth for clip in experiment.clips if clip.truth is not None), None)
+    if path is None:
+        return None
+    try:
+        content = flat(tomllib.loads(path.read_text()), 2)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not TOML: {error}") from None
+    found: dict[str, float] = {}
+    for name in leaf_names(name_preset(experiment.preset)):
+        value = content.get(name, False)
+        if not isinstance(value, bool):
+            several = value if isinstance(value, list) else []
+            found |= {f"{name}[{i}]": float(one) for i, one in enumerate(several)}
+            found[name] = float(np.mean(value))
+    for name in experiment.free:  # one leg's element of a leaf that all legs share
+        leaf = name.partition("[")[0]
+        if leaf in found:
+            found.setdefault(name, found[leaf])
+    return found
+
+
+def fit_text(told: Mapping[str, Any], truth: Truth) -> str:
+    """What a fit found, for the terminal.
+
+    Args:
+        told: `store.describe_fit`.
+        truth: known parameters, where there are any.
+    """
+    rows = told["parameters"]
+    parts = [told["message"], _cost(told), "", tables.aligned(tables.fit_table(rows, truth))]
+    if any("half_life" in row for row in rows):
+        parts += ["", tables.aligned(tables.gain_table(rows, store.TICKS))]
+    if truth:
+        parts += ["", tables.recovered(rows, truth)]
+    return "\n".join(parts)
+
+
+def write_fit(run: Path, fitted: Fit) -> None:
+    """Writes the pictures of a fit and a new summary.md into the folder of its run."""
+    pictures: Pictures = {}
+    for index in range(len(fitted.problem.data)):
+        pictures |= _draw_clip(run, fitted, index)
+    title = f"{fitted.experiment.name}: cost of the fit over time"
+    figure = plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
+    pictures |= _keep(run, "cost.png", title, figure)
+    files.write_text(run / store.SUMMARY, _fit_summary(fitted, pictures))
+
+
+def posterior_text(posterior: Posterior, truth: Truth) -> str:
+    """What a sampling found, for the terminal."""
+    table = tables.aligned(tables.posterior_table(posterior, truth, {}))
+    parts = [*_health(posterior), "", table]
+    if truth:
+        covered = tables.covered(posterior, truth, posterior.names)
+        parts += ["", f"The truth lies in {covered} parameters."]
+    return "\n".join(parts)
+
+
+def write_posterior(run: Path, experiment: Experiment, posterior: Posterior) -> None:
+    """Writes the pictures of a posterior, and its section of summary.md over an older one."""
+    rows = {row["name"]: row for row in json.loads((run / store.FIT).read_text())["parameters"]}
+    truth = truth_of(experiment)
+    labels = [f"{name}, {rows[name]['unit']}" for name in posterior.names]
+    values = {name: row["value"] for name, row in rows.items()}
+    title = f"{experiment.name}: posterior of the parameters"
+    figure = chain_plots.corner(posterior, labels, values, truth, title)
+    pictures = _keep(run, "corner.png", title, figure)
+    title = f"{experiment.name}: walkers"
+    figure = chain_plots.chain(posterior, labels, truth, title)
+    pictures |= _keep(run, "chain.png", title, figure)
+
+    units = {name: row["unit"] for name, row in rows.items()}
+    parts = [HEADING, "\n".join(f"- {line}" for line in _health(posterior))]
+    parts.append(markdown(tables.posterior_table(posterior, truth, units)))
+    if truth:
+        determined = [name for name, row in rows.items() if row["determined"]]
+        covered = tables.covered(posterior, truth, posterior.names)
+        judged = tables.covered(posterior, truth, determined)
+        parts.append(
+            f"The truth lies in {covered} parameters; of those that the fit calls determined, in "
+            f"{judged}."
+        )
+    parts.append(_gallery(pictures))
+    summary = run / store.SUMMARY
+    before = summary.read_text() if summary.is_file() else f"# {experiment.name}\n"
+    kept = before.partition(f"\n{HEADING}\n")[0].rstrip()
+    files.write_text(summary, kept + "\n\n" + "\n\n".join(parts) + "\n")
+
+
+def _draw_clip(run: Path, fitted: Fit, index: int) -> Pictures:
+    """The pictures of one clip."""
+    scene, several = fitted.problem.data[index], len(fitted.problem.data) > 1
+    clip = fitted.experiment.name + (f", clip {index + 1}" if several else "")
+    end = f"_{index + 1}.png" if several else ".png"
+    first = playback.play(fitted.problem.space.base, scene)
+    last = playback.play(fitted.ik, scene)
+    legs, leg = scene.rig.names, fitted.ik.leg
+    limits = [float(np.mean(getattr(leg, name))) for name in KNEE_LIMITS if hasattr(leg, name)]
+    found: Pictures = {}
+    for name, words, draw in (
+        ("motion", "heights of feet and pelvis", lambda title: plots.motion(last, legs, title)),
+        ("side_view", "legs over the ground", lambda title: plots.side_view(last, legs, title)),
+        ("knees", "knee angles", lambda title: plots.knees(last, legs, limits, title)),
+        ("residuals", "residuals", lambda title: plots.residuals(first, last, title)),
+        ("locks", "contact and locks", lambda title: plots.locks(last, legs, title)),
+    ):
+        title = f"{clip}: {words}"
+        found |= _keep(run, f"{name}{end}", title, draw(title))
+    return found
+
+
+def _keep(run: Path, name: str, caption: str, figure: Figure) -> Pictures:
+    """Saves a figure and tells where."""
+    look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
+    files.write(run / name, lambda path: figure.savefig(path, **look))
+    return {name: caption}
+
+
+def _gallery(pictures: Pictures) -> str:
+    return "\n\n".join(f"![{caption}]({name})" for name, caption in pictures.items())
+
+
+def _cost(told: Mapping[str, Any]) -> str:
+    return (
+        f"Cost {told['cost_before']:.6g} before, {told['cost']:.6g} after: {told['steps']} steps "
+        f"in {told['seconds']:.1f} s."
+    )
+
+
+def _health(posterior: Posterior) -> list[str]:
+    """How the sampling went, a sentence each."""
+    steps, walkers = posterior.u.shape[0] * posterior.thin_by, posterior.u.shape[1]
+    stuck = ", ".join(map(str, posterior.stuck)) or "none"
+    return [
+        posterior.message,
+        f"{walkers} walkers, {steps} steps, the first {posterior.burn_in * posterior.thin_by} left "
+        f"out as burn-in; {posterior.seconds:.0f} s in the last call.",
+        f"Mean acceptance {tables.share(float(posterior.acceptance.mean()))}; slowest "
+        f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
+        f"Stuck walkers: {stuck}; left out of the summary: "
+        f"{', '.join(map(str, posterior.apart)) or 'none'}.",
+    ]
+
+
+def _fit_summary(fitted: Fit, pictures: Pictures) -> str:
+    experiment, found = fitted.experiment, fitted.identification
+    told, truth = store.describe_fit(fitted), truth_of(experiment)
+    rows = told["parameters"]
+    parts = [f"# {experiment.name}", f"{told['message']} {_cost(told)}"]
+    parts.append(f"Preset `{experiment.preset}`, loss `{experiment.loss}`, seed {experiment.seed}.")
+    parts += ["## Parameters", markdown(tables.fit_table(rows, truth))]
+    if truth:
+        parts.append(f"{tables.recovered(rows, truth)}.")
+    if any("half_life" in row for row in rows):
+        parts.append(markdown(tables.gain_table(rows, store.TICKS)))
+
+    parts.append("## What these clips do not determine")
+    names = ", ".join(f"`{name}`" for name in found.undetermined)
+    parts.append(f"Undetermined: {names}." if names else "All free parameters are determined.")
+    parts.append(
+        "Contraction is 1 where the clips alone decide and 0 where the prior is all that is known."
+    )
+    parts.append(markdown(tables.contraction_table(rows)))
+    if found.correlated:
+        pairs = (f"- `{a}` and `{b}`: {value:+.3f}" for a, b, value in found.correlated)
+        parts.append("Pairs of which these clips mostly determine one combination (correlation):")
+        parts.append("\n".join(pairs))
+    if found.weakest:
+        together = ", ".join(f"`{name}`" for name in found.weakest)
+        parts.append(f"The least determined direction moves {together}.")
+
+    clips = [exercise(fitted.ik, scene) for scene in fitted.problem.data]
+    parts += ["## What the clips ask of the fitted system", "Shares of all frames, a foot each:"]
+    parts.append(markdown(tables.exercise_table(clips)))
+    parts.append("Share of frames that would look different if the limit were out of the way:")
+    parts.append(markdown(tables.limits_table(clips)))
+    if found.profiles:
+        flips = flipped_decisions(fitted.problem, fitted.solution.u)
+        parts.append(
+            "Share of the feet's decisions (planted, lifted, locked, ground found) that flip when "
+            "a threshold moves by 10 % of its range, and by how much the cost rises:"
+        )
+        parts.append(markdown(tables.flips_table(flips, found.profiles)))
+    parts += ["## Pictures", _gallery(pictures)]
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,40 @@
+"""Parameters of a system as TOML: a preset's name and a table a stage, in our names and units."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+
+import jaxik
+from jaxik import rule
+
+from .experiment import check_keys, flat, leaf_names, name_preset, with_parameters
+
+
+def to_toml(ik: jaxik.FootIK, preset: str = "record") -> str:
+    """Every parameter, convention and switch of a system; units as the rules declare them."""
+    tables: dict = {"preset": preset}
+    for name in leaf_names(ik):
+        stage, leaf = name.split(".")
+        tables.setdefault(stage, {})[leaf] = np.asarray(rule.get(ik, name)).tolist()
+    return tomli_w.dumps(tables)
+
+
+def from_toml(path: str | Path) -> tuple[jaxik.FootIK, str]:
+    """The system in a TOML file, and its preset; what the file leaves out is the preset's.
+
+    Raises:
+        ValueError: a file that is not there or no TOML, a preset, name or value that is unknown.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such parameter file")
+    try:
+        content = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not TOML: {error}") from None
+    preset = content.pop("preset", "record")
+    ik = name_preset(preset)
+    check_keys(content, list(vars(ik)), str(path))
+    return with_parameters(ik, flat(content, 2), str(path)), preset

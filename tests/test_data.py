@@ -1,0 +1,159 @@
+"""The project's own data: it comes out of its seeds again, and holds what the experiments need."""
+
+import importlib.util
+import time
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxik
+from fitting import course, scenes
+from fitting.clips import load_clip, save_clip
+from jaxik import rule, terrain
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+SAME = 1e-6  # m, and of quaternions, on another machine
+LARGEST_CLIP, LARGEST_MESH = 400_000, 100_000  # bytes
+CLIPS = ("uneven_walk_base", "uneven_walk")
+
+
+@pytest.fixture(scope="module")
+def make():
+    """The script that makes the data."""
+    spec = importlib.util.spec_from_file_location("make", DATA / "make.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def made(make, tmp_path_factory):
+    """Everything, made again."""
+    folder = tmp_path_factory.mktemp("data")
+    make.make(folder)
+    return folder
+
+
+def under(ground, points):
+    """Hits of rays that start 2 m over points."""
+    return jax.jit(terrain.cast)(ground, points + np.array([0.0, 2.0, 0.0]), 4.0)
+
+
+def test_terrains_and_truth_come_out_again_to_the_byte(made):
+    names = {f"terrains/{path.name}" for path in (DATA / "terrains").iterdir()}
+    assert names == {f"terrains/{path.name}" for path in (made / "terrains").iterdir()}
+    for name in (*names, "clips/uneven_walk_truth.toml"):
+        assert (made / name).read_bytes() == (DATA / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_clips_come_out_again(made, name):
+    ours, theirs = (load_clip(folder / "clips" / f"{name}.npz") for folder in (made, DATA))
+    np.testing.assert_allclose(ours.positions_ws, theirs.positions_ws, rtol=0, atol=SAME)
+    np.testing.assert_allclose(ours.rotations_ws, theirs.rotations_ws, rtol=0, atol=SAME)
+    np.testing.assert_array_equal(ours.stance, theirs.stance)
+    np.testing.assert_array_equal(ours.slide, theirs.slide)
+    assert (ours.source, ours.fps) == (theirs.source, theirs.fps)
+
+
+def test_a_clip_saved_later_has_the_same_bytes(make, tmp_path):
+    clip = make.base()
+    save_clip(tmp_path / "now.npz", clip)
+    time.sleep(2.1)  # zip archives keep time in steps of 2 s
+    save_clip(tmp_path / "later.npz", make.base())
+    assert (tmp_path / "now.npz").read_bytes() == (tmp_path / "later.npz").read_bytes()
+
+
+def test_files_are_small():
+    for path in (DATA / "clips").glob("*.npz"):
+        assert path.stat().st_size < LARGEST_CLIP, path
+    for path in (DATA / "terrains").iterdir():
+        assert path.stat().st_size < LARGEST_MESH, path
+
+
+def test_the_reference_differs_from_the_truth_by_the_noise_that_the_file_tells(make):
+    truth = tomllib.loads((DATA / "clips" / "uneven_walk_truth.toml").read_text("utf-8"))
+    noise = truth.pop("noise")
+    values = {
+        f"{room}.{name}": value
+        for room, own in truth.items()
+        if isinstance(own, dict)
+        for name, value in own.items()
+    }
+    assert truth["preset"] == "record" and values == make.TRUTH
+    base = load_clip(DATA / "clips" / "uneven_walk_base.npz")
+    seen = load_clip(DATA / "clips" / "uneven_walk.npz")
+    clean = make.reference(base, scenes.load_terrain(DATA / "terrains" / "uneven_walk.ply"))
+    error = seen.positions_ws - clean.positions_ws
+    assert np.std(error) == pytest.approx(noise["position"], rel=0.02)
+    assert np.abs(np.corrcoef(error[1:].reshape(-1), error[:-1].reshape(-1))[0, 1]) < 0.03
+    turns = (
+        Rotation.from_quat(seen.rotations_ws.reshape(-1, 4), scalar_first=True)
+        * Rotation.from_quat(clean.rotations_ws.reshape(-1, 4), scalar_first=True).inv()
+    ).as_rotvec()
+    assert np.std(turns) == pytest.approx(noise["rotation"], rel=0.02)
+
+
+def test_the_truth_is_within_bounds_in_order_and_far_from_the_preset(make):
+    ik = jaxik.presets.record()
+    declared = rule.declarations(ik)
+    thresholds = [name for name in make.TRUTH if declared[name].kind == "threshold"]
+    assert len(make.TRUTH) >= 14 and len(thresholds) >= 3
+    for name, value in make.TRUTH.items():
+        low, high = declared[name].low, declared[name].high
+        assert low < value < high, name
+        assert abs(value - float(rule.get(ik, name))) >= 0.05 * (high - low) * (1 - 1e-6), name
+    assert make.TRUTH["contact.planted_height"] < make.TRUTH["contact.raised_height"]
+
+
+def test_the_base_is_ten_seconds_or_more_on_a_flat_floor_and_slides():
+    base = load_clip(DATA / "clips" / "uneven_walk_base.npz")
+    assert base.stance is not None and base.slide is not None
+    assert base.seconds > 10.0 and base.fps == 60.0
+    for leg, joints in enumerate(base.rig.joints):
+        ball = base.positions_ws[base.stance[:, leg], joints[3], 1]
+        np.testing.assert_allclose(ball, 0.045, rtol=0, atol=SAME)
+    assert 1.5 <= base.slide.sum() / base.fps <= 2.0
+
+
+def test_the_course_is_under_every_foot_within_reach_of_the_rays():
+    base = load_clip(DATA / "clips" / "uneven_walk_base.npz")
+    ground = scenes.load_terrain(DATA / "terrains" / "uneven_walk.ply")
+    for role in (2, 3):
+        hit = under(ground, base.joints_ws(role).reshape(-1, 3))
+        assert hit.found.min() == 1.0
+        assert np.abs(hit.point[:, 1]).max() < 0.36
+    slope = np.degrees(np.arccos(hit.normal[:, 1]))
+    assert slope.max() > 12.0 and np.mean(slope < 0.1) > 0.2
+
+
+@pytest.mark.parametrize("name", ["slope", "steps", "stones", "uneven"])
+def test_a_course_has_no_hole_and_faces_up(tmp_path, name):
+    mesh = getattr(course, name)()
+    scenes.save_mesh(tmp_path / "ground.ply", *mesh)
+    ground = scenes.load_terrain(tmp_path / "ground.ply")
+    rng = np.random.default_rng(0)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    points = rng.uniform(low, high, (2000, 3)) * [0.99, 0.0, 1.0]
+    assert under(ground, points).found.min() == 1.0
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    assert np.cross(b - a, c - a)[:, 1].min() > -1e-12
+
+
+def test_steps_are_as_high_as_they_say_and_the_slope_as_steep(tmp_path):
+    scenes.save_mesh(tmp_path / "steps.ply", *course.steps())
+    ground = scenes.load_terrain(tmp_path / "steps.ply")
+    middles = 1.0 + course.TREAD * (np.arange(-1, len(course.STEP_HEIGHTS)) + 0.5)
+    points = np.stack([0 * middles, 0 * middles, middles], axis=-1)
+    rises = np.diff(np.array(under(ground, points).point[:, 1], np.float64))
+    np.testing.assert_allclose(rises, course.STEP_HEIGHTS, rtol=0, atol=1e-4)
+    scenes.save_mesh(tmp_path / "slope.ply", *course.slope())
+    ground = scenes.load_terrain(tmp_path / "slope.ply")
+    normal = np.asarray(under(ground, np.array([[0.0, 0.0, 2.3]])).normal[0])
+    assert np.degrees(np.arctan2(-normal[2], normal[1])) == pytest.approx(12.0, abs=0.1)
+    assert -normal[0] / normal[1] == pytest.approx(0.1, abs=1e-3)

@@ -1,0 +1,106 @@
+"""Clips as frames of the pipeline, and its results as clips."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxik
+from fitting import frames, gait, walker
+from jaxik import rule, terrain
+
+FPS = 60.0
+SLOPE = 0.15  # rise per metre of z
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return walker.walk(2.0, FPS, slides=[walker.Slide(1.0, 1.5)])
+
+
+@pytest.fixture(scope="module")
+def result(clip):
+    ground = terrain.plane(normal=(0.0, 1.0, -SLOPE))
+    ik = rule.replace(jaxik.presets.record(), {"lean.forward_rate": 0.5})
+    return jaxik.run(ik, clip.rig, ground, frames.frames_of(clip))
+
+
+def test_frames_hold_the_clip_in_model_space_over_the_floor(clip):
+    made = frames.frames_of(clip, floor=-0.1)
+    pose = made.pose
+    for role, joint in enumerate((pose.hip, pose.knee, pose.ankle, pose.toe)):
+        back = made.world_from_model
+        for leg in range(2):
+            placed = Rotation.from_quat(np.array(back.rot), scalar_first=True).apply(
+                np.array(joint.pos[:, leg])
+            )
+            np.testing.assert_allclose(
+                placed + back.pos, clip.joints_ws(role)[:, leg], rtol=0, atol=1e-9
+            )
+    assert float(pose.ankle.pos[..., 1].min()) == pytest.approx(gait.ANKLE_HEIGHT + 0.1)
+    assert made.weight.shape == (clip.frames, 2)
+    np.testing.assert_allclose(made.dt, 1 / FPS)
+    np.testing.assert_array_equal(made.slide, clip.slide)
+    np.testing.assert_allclose(made.speed, gait.STRIDE / gait.PERIOD, rtol=0.02)
+
+
+def test_a_single_frame_stands_and_does_not_slide(clip):
+    made = frames.frames_of(dataclasses.replace(clip, slide=None).at(slice(0, 1)))
+    np.testing.assert_array_equal(made.speed, [0.0])
+    np.testing.assert_array_equal(made.slide, [0.0])
+
+
+def test_the_solved_clip_has_the_solved_legs_and_carries_the_rest_with_the_body(clip, result):
+    solved = frames.solved_clip(clip, result)
+    world = clip.world_from_model()
+    for leg, joints in enumerate(clip.rig.joints):
+        parts = (result.pose.hip, result.pose.knee, result.pose.ankle, result.pose.toe)
+        for joint, part in zip(joints, parts, strict=True):
+            for frame in (0, 40, 119):
+                turn = Rotation.from_quat(np.array(world.rot[frame]), scalar_first=True)
+                place = turn.apply(np.array(part.pos[frame, leg])) + world.pos[frame]
+                np.testing.assert_allclose(solved.positions_ws[frame, joint], place, atol=1e-9)
+    before = clip.positions_ws[:, 1] - clip.positions_ws[:, 0]
+    after = solved.positions_ws[:, 1] - solved.positions_ws[:, 0]
+    lengths = np.linalg.norm(before, axis=-1), np.linalg.norm(after, axis=-1)
+    np.testing.assert_allclose(*lengths, rtol=0, atol=1e-9)
+    tilt = Rotation.from_quat(solved.rotations_ws[100, 0], scalar_first=True).magnitude()
+    assert tilt > 0.03
+    assert solved.rig.joints == clip.rig.joints
+
+
+def test_joints_above_the_pelvis_and_below_a_foot_keep_their_places_on_their_parents(clip, result):
+    turned = Rotation.from_quat(clip.rotations_ws[:, 4], scalar_first=True)
+    tip = clip.positions_ws[:, 4] + turned.apply([0.01, -0.02, 0.05])
+    head = clip.positions_ws[:, 0] + [0.0, 0.6, 0.0]
+    longer = dataclasses.replace(
+        clip,
+        joint_names=(*clip.joint_names, "tip", "head"),
+        parents=(*clip.parents, 4, 0),
+        offsets_ls=np.concatenate([clip.offsets_ls, [[0.01, -0.02, 0.05], [0.0, 0.6, 0.0]]]),
+        positions_ws=np.concatenate(
+            [clip.positions_ws, np.stack([tip, head], axis=1)], axis=1
+        ),
+        rotations_ws=np.concatenate(
+            [clip.rotations_ws, clip.rotations_ws[:, [4, 0]]], axis=1
+        ),
+    )  # fmt: skip
+    solved = frames.solved_clip(longer, result)
+    for joint, parent, offset in ((9, 4, [0.01, -0.02, 0.05]), (10, 0, [0.0, 0.6, 0.0])):
+        holder = Rotation.from_quat(solved.rotations_ws[:, parent], scalar_first=True)
+        hung = solved.positions_ws[:, parent] + holder.apply(offset)
+        np.testing.assert_allclose(solved.positions_ws[:, joint], hung, rtol=0, atol=1e-9)
+        same = np.abs(np.sum(solved.rotations_ws[:, joint] * solved.rotations_ws[:, parent], -1))
+        np.testing.assert_allclose(same, 1.0, atol=1e-12)
+
+
+def test_on_flat_ground_the_solved_clip_is_the_clip_away_from_its_limits(clip):
+    quiet = {"lock.enabled": jnp.array(False), "leg.max_knee_angle": 3.1415, "leg.soften": 1.0}
+    ik = rule.replace(jaxik.presets.record(), quiet)
+    result = jaxik.run(ik, clip.rig, terrain.plane(), frames.frames_of(clip))
+    solved = frames.solved_clip(clip, result)
+    np.testing.assert_allclose(solved.positions_ws, clip.positions_ws, rtol=0, atol=1e-4)
+    same = np.abs(np.sum(solved.rotations_ws * clip.rotations_ws, axis=-1))
+    assert same.min() > np.cos(0.5e-3)

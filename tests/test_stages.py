@@ -1,0 +1,528 @@
+"""What every parameter and switch does, stage by stage, and the slopes through the stages."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from clips import FLAT, animate, at, make_rig, planes, to_frames, to_ik, to_rig
+from clips import to_terrain as to_ground
+from reference import poses
+
+import jaxik
+from jaxik import HARD, Smooth, presets, quat, rule, vec
+from jaxik import record as game
+
+RIG = make_rig()
+LOW, HIGH = 0, 1  # rows of a case's two values
+
+# What is read off a result: one number each, over all frames.
+
+FORWARD, UP, LEFT = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
+MEASURES = (
+    "target height",
+    "pelvis height",
+    "pelvis forward",
+    "knee angle",
+    "knee left",
+    "pitch",
+    "left pitch",
+    "left roll",
+    "lean forward",
+    "lean right",
+    "locked",
+    "offset",
+    "slip",
+    "miss",
+)
+
+
+def measure(result: jaxik.Result, frames: jaxik.Frame) -> jax.Array:
+    """The numbers of `MEASURES`, m and rad (a lean or a foot's turn as the sine of its angle)."""
+    after = result.trace.advanced.state
+    target = result.trace.advanced.target_ws
+    hip, knee, ankle = (getattr(result.pose, name).pos for name in ("hip", "knee", "ankle"))
+    up = frames.pose.hip.pos * 0 + jnp.asarray(UP)
+    turned = quat.multiply(result.pose.ankle.rot, quat.conjugate(frames.pose.ankle.rot))
+    toes = quat.rotate(turned, up * 0 + jnp.asarray(FORWARD))[..., 1]
+    edge = quat.rotate(turned, up * 0 + jnp.asarray(LEFT))[..., 1]
+    body = quat.rotate(result.body.rot, up[:, 0])
+    thigh, shin = hip - knee, ankle - knee
+    bend = jnp.arctan2(vec.length(vec.cross(thigh, shin)), vec.dot(thigh, shin))
+    place = jax.vmap(lambda w, a: w.apply(a))(frames.world_from_model, ankle)
+    offset = target - result.trace.advanced.foothold_ws
+    offset = offset - vec.scale(up, result.trace.sensed.contact.lift)
+    numbers = (
+        target[..., 1],
+        after.pelvis.height,
+        after.pelvis.offset_ws[..., 2],
+        bend,
+        knee[..., 0],
+        toes,
+        toes[:, 0],
+        edge[:, 0],
+        body[..., 2],
+        -body[..., 0],
+        after.lock.locked,
+        vec.length(offset),
+        vec.length(place[1:] - place[:-1]),
+        vec.length(place - target),
+    )
+    return jnp.stack([jnp.mean(number) for number in numbers])
+
+
+@jax.jit
+def measured(
+    inputs: tuple[jaxik.FootIK, jaxik.Frame, Any], tangents: Any, gate: Any
+) -> tuple[jax.Array, jax.Array]:
+    """The measures of a run, and their change along `tangents`, one for each float of `inputs`."""
+    floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
+
+    def read(floats: Any) -> jax.Array:
+        ik, frames, ground = eqx.combine(floats, rest)
+        return measure(jaxik.run(ik, to_rig(RIG), ground, frames, gate), frames)
+
+    return jax.jvp(read, (floats,), (tangents,))
+
+
+def still(inputs: Any) -> Any:
+    """The tangent along which nothing changes."""
+    return jax.tree.map(jnp.zeros_like, eqx.filter(inputs, eqx.is_inexact_array))
+
+
+# Situations. Four seconds each; a ground that rises forward, left, and its height.
+
+
+def drifting(speed: float) -> Callable[[float], list[float]]:
+    return lambda time: [speed * time, 0.0, 0.0]
+
+
+def hovering(time: float) -> np.ndarray:
+    return poses.standing((0.13, 0.13))
+
+
+def stepping_up(time: float) -> np.ndarray:
+    return poses.standing((0.08, 0.08) if time < 1.0 else (0.3, 0.3))
+
+
+def limping(time: float) -> np.ndarray:
+    """Feet of which one always asks for more than the other."""
+    lift = 0.02 * np.sin(2.9 * time)
+    return np.array([[0.11, 0.123 + lift, 0.071], [-0.1, 0.141 - lift, -0.03]])
+
+
+CLIPS: dict[str, dict[str, Any]] = {
+    "standing": {},
+    "sliding": {"slide": 1.0},
+    "begins to slide": {"slide": lambda time: float(time > 1.0)},
+    "ceases to slide": {"slide": lambda time: float(time < 1.0)},
+    "toes up": {"foot": 0.3},
+    "hovering": {"ankles": hovering},
+    "lifts its feet": {"ankles": stepping_up},
+    "goes forward": {"place": lambda time: [0.0, 0.0, 0.6 * time]},
+    "slides forward": {"place": lambda time: [0.0, 0.0, 0.6 * time], "slide": 1.0},
+    "limps": {"ankles": limping, "place": lambda time: [0.01, 0.0, 0.013 + 0.61 * time]},
+    "limps on its toes": {"ankles": limping, "foot": -0.2, "place": [0.013, 0.0, 0.37]},
+    "drifts": {"place": drifting(0.3)},
+    "sinks": {"place": drifting(0.02), "hip_height": lambda time: 0.9 - 0.1 * time},
+}
+NO_LOCK = {"lock.enabled": False}
+STIFF = {"pelvis.limit": 0.0}
+LOOSE = {  # nothing releases a lock but what a case sets
+    "lock.release_distance": 9.0,
+    "lock.release_cone": 1.5,
+    "lock.release_max_angle": 3.1415926536,
+    "lock.release_min_angle": 0.0,
+}
+ANKLE_DEEP = planes((0.2, 0.0, 0.3))
+RAMP_UP, RAMP_DOWN = planes((0, 0, 0), (0.2, 0, -0.1)), planes((0, 0, 0), (-0.2, 0, 0.2))
+KINK = planes((0, 0, 0), (0.5, 0, -0.125))  # begins to rise 0.2 m ahead of the ankles
+
+
+class Case(NamedTuple):
+    """From the first value to the second, the measure goes the way of `sign`."""
+
+    name: str
+    clip: str
+    ground: Any
+    values: tuple[Any, Any]
+    measure: str
+    sign: int
+    base: dict[str, Any] = {}
+    slope: bool = True  # False: a hit is there or not, and a miss has no slope
+
+
+def toe(**changes: float) -> list[float]:
+    return list(({"x": 0.0, "y": -0.07, "z": 0.20} | changes).values())
+
+
+RECORD = (
+    Case("contact.ground_height", "standing", FLAT, (0.0, 0.01), "target height", -1),
+    Case(
+        "target.min_ankle_height",
+        "standing",
+        planes((0, 0, -0.5)),
+        (-0.3, -0.2),
+        "target height",
+        1,
+    ),
+    Case(
+        "target.max_ankle_height",
+        "standing",
+        planes((0, 0, 0.45)),
+        (0.4, 0.45),
+        "target height",
+        1,
+        {"probe.ray_up": 0.6},
+    ),
+    Case(
+        "leg.max_knee_angle", "standing", planes((0, 0, -0.3)), (2.6, 2.8), "knee angle", 1, STIFF
+    ),
+    Case(
+        "leg.min_knee_angle",
+        "standing",
+        planes((0, 0, 0.5)),
+        (0.9, 1.2),
+        "knee angle",
+        1,
+        STIFF | {"probe.ray_up": 0.7, "target.max_ankle_height": 1.0},
+    ),
+    Case("contact.planted_height", "hovering", planes((0.2, 0, 0)), (0.10, 0.12), "pitch", 1),
+    Case("contact.raised_height", "hovering", planes((0.2, 0, 0)), (0.16, 0.20), "pitch", 1),
+    Case("probe.ray_up", "standing", ANKLE_DEEP, (0.1, 0.5), "pitch", 1, slope=False),
+    Case("probe.ray_down", "standing", planes((0.2, 0, -0.5)), (0.3, 0.8), "pitch", 1, slope=False),
+    Case(
+        "probe.toe_ls[0]",
+        "standing",
+        planes((0, 0.4, 0)),
+        (toe(x=-0.02), toe(x=0.02)),
+        "left pitch",
+        1,
+    ),
+    Case(
+        "probe.toe_ls[1]",
+        "toes up",
+        KINK,
+        (toe(y=-0.07, z=0.3), toe(y=0.03, z=0.3)),
+        "pitch",
+        -1,
+        {"foot.max_pitch": 1.0},
+    ),
+    Case("probe.toe_ls[2]", "standing", KINK, (toe(z=0.25), toe(z=0.30)), "pitch", 1),
+    Case("foot.max_pitch", "standing", planes((0.8, 0, 0)), (0.5, 0.7), "pitch", 1),
+    Case("foot.min_pitch", "standing", planes((-0.8, 0, 0)), (-0.4, -0.2), "pitch", 1),
+    Case("foot.max_roll", "standing", planes((0, 0.8, 0)), (0.2, 0.4), "left roll", 1),
+    Case("foot.min_roll", "standing", planes((0, -0.8, 0)), (-0.4, -0.2), "left roll", 1),
+    Case("pelvis.limit", "standing", planes((0, 0, -0.5)), (0.1, 0.2), "pelvis height", -1),
+    Case("pelvis.on_gain", "goes forward", RAMP_UP, (0.1, 0.3), "pelvis height", 1, NO_LOCK),
+    Case(
+        "pelvis.off_gain", "lifts its feet", planes((0, 0, -0.2)), (0.05, 0.2), "pelvis height", 1
+    ),
+    Case("lean.forward_rate", "standing", planes((0.3, 0, 0)), (-0.3, 0.3), "lean forward", -1),
+    Case("lean.side_rate", "standing", planes((0, -0.3, 0)), (-0.3, 0.3), "lean right", -1),
+    Case("lean.forward_rate_slide", "sliding", planes((0.3, 0, 0)), (0, 0.8), "lean forward", -1),
+    Case("lean.side_rate_slide", "sliding", planes((0, -0.3, 0)), (0, 0.8), "lean right", -1),
+    Case(
+        "lean.gain",
+        "goes forward",
+        RAMP_UP,
+        (0.05, 0.3),
+        "lean forward",
+        -1,
+        {"lean.forward_rate": 0.8},
+    ),
+    Case("lean.gain_slide", "slides forward", RAMP_UP, (0.05, 0.3), "lean forward", -1),
+    Case(
+        "lean.slide_on_gain",
+        "begins to slide",
+        planes((0.3, 0, 0)),
+        (0.05, 0.3),
+        "lean forward",
+        -1,
+    ),
+    Case(
+        "lean.slide_off_gain",
+        "ceases to slide",
+        planes((0.3, 0, 0)),
+        (0.05, 0.3),
+        "lean forward",
+        1,
+    ),
+    Case("lock.release_min_angle", "sinks", FLAT, (1.2, 1.6), "locked", -1, LOOSE),
+    Case("lock.release_max_angle", "drifts", FLAT, (2.5, 2.8), "locked", 1, LOOSE),
+    Case("lock.release_cone", "drifts", FLAT, (0.1, 0.3), "locked", 1, LOOSE),
+    Case(
+        "lock.relock_threshold",
+        "drifts",
+        FLAT,
+        (0.1, 0.5),
+        "locked",
+        1,
+        {"lock.release_distance": 0.05},
+    ),
+    Case("lock.enabled", "drifts", FLAT, (False, True), "slip", -1),
+    Case(
+        "probe.use_toe", "standing", KINK, (False, True), "pitch", 1, {"probe.toe_ls": toe(z=0.3)}
+    ),
+    Case(
+        "pelvis.vertical_only",
+        "standing",
+        planes((0.3, 0, -0.2)),
+        (False, True),
+        "pelvis forward",
+        -1,
+    ),
+)
+EXTRA = (
+    Case("target.foot_height", "standing", planes((0.5, 0, 0)), (0.05, 0.1), "target height", 1),
+    Case("target.max_slope", "standing", planes((1.0, 0, 0)), (0.3, 0.6), "target height", 1),
+    Case(
+        "target.rise_half_life", "goes forward", RAMP_UP, (0.05, 0.2), "target height", -1, NO_LOCK
+    ),
+    Case(
+        "target.fall_half_life", "goes forward", RAMP_DOWN, (0.05, 0.2), "target height", 1, NO_LOCK
+    ),
+    Case("lock.lock_half_life", "drifts", FLAT, (0.02, 0.1), "offset", -1, LOOSE),
+    Case(
+        "lock.unlock_half_life",
+        "drifts",
+        FLAT,
+        (0.05, 0.2),
+        "offset",
+        1,
+        {"lock.release_distance": 0.05, "lock.relock_threshold": 0.0},
+    ),
+    Case("lock.release_distance", "drifts", FLAT, (0.05, 0.15), "locked", 1),
+    Case("lock.max_speed", "drifts", FLAT, (0.2, 0.4), "locked", 1),
+    Case("leg.soften", "standing", planes((0, 0, -0.3)), (0.85, 0.95), "knee angle", 1, STIFF),
+    Case("leg.twist", "standing", FLAT, (0.0, 0.2), "knee left", -1),
+    Case("leg.weight", "standing", planes((0, 0, 0.1)), (0.3, 0.8), "miss", -1, STIFF),
+    Case("pelvis.tick_hz", "goes forward", RAMP_UP, (30.0, 60.0), "pelvis height", 1, NO_LOCK),
+    Case(
+        "lean.tick_hz",
+        "goes forward",
+        RAMP_UP,
+        (30.0, 60.0),
+        "lean forward",
+        -1,
+        {"lean.forward_rate": 0.8},
+    ),
+)
+CASES = (*RECORD, *EXTRA)
+SLOPED = [case for case in CASES if not isinstance(case.values[LOW], bool)]
+
+
+@functools.cache
+def clip(name: str) -> jaxik.Frame:
+    return to_frames(animate(RIG, **CLIPS[name]))
+
+
+def leaf(name: str) -> str:
+    return name.split("[")[0]
+
+
+def inputs_of(case: Case, value: Any) -> tuple[jaxik.FootIK, jaxik.Frame, Any]:
+    return to_ik(case.base | {leaf(case.name): value}), clip(case.clip), to_ground(case.ground)
+
+
+def run_case(case: Case, value: Any, gate: Any = HARD, tangent: Any = None) -> tuple[float, float]:
+    """The case's measure at a value, and its slope along a tangent of the leaf."""
+    inputs = inputs_of(case, value)
+    tangents = still(inputs)
+    if tangent is not None:
+        ik = rule.replace(tangents[0], {leaf(case.name): tangent})
+        tangents = (ik, *tangents[1:])
+    index = MEASURES.index(case.measure)
+    return tuple(float(x[index]) for x in measured(inputs, tangents, gate))  # type: ignore[return-value]
+
+
+def named(cases: Any) -> Any:
+    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
+
+
+def test_every_field_of_the_record_and_every_parameter_has_a_case():
+    assert [case.name for case in RECORD if case not in SLOPED] == [
+        "lock.enabled",
+        "probe.use_toe",
+        "pelvis.vertical_only",
+    ]
+    switches = {ours for _, _, ours in game.FLAGS}
+    assert {case.name for case in RECORD} == {ours for _, ours, _ in game.FLOATS} | switches
+    declared = set(rule.declarations(presets.record())) | {"lean.tick_hz", "pelvis.tick_hz"}
+    assert {leaf(case.name) for case in CASES} == declared | switches
+
+
+@named(CASES)
+def test_a_parameter_moves_the_result_the_way_it_should(case: Case):
+    low, high = (run_case(case, value)[0] for value in case.values)
+    assert case.sign * (high - low) > 1e-4
+
+
+@named(SLOPED)
+@pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
+def test_a_parameters_slope_is_its_difference_quotient(case: Case, gate: Any):
+    low, high = (np.asarray(value, float) for value in case.values)
+    middle, tangent = (low + high) / 2 + 1e-3 * (high - low), (high - low)
+    value, slope = run_case(case, middle, gate, tangent)
+    step = 1e-5
+    ahead, behind = (run_case(case, middle + s * step * tangent, gate)[0] for s in (1, -1))
+    quotient = (ahead - behind) / (2 * step)
+    assert np.isfinite([value, slope]).all()
+    threshold = rule.declarations(presets.record()).get(leaf(case.name))
+    decided = gate is HARD and threshold is not None and threshold.kind == "threshold"
+    if not decided:
+        np.testing.assert_allclose(slope, quotient, rtol=1e-4, atol=1e-8)
+    if gate is not HARD and case.slope:
+        assert case.sign * slope > 0
+    if not case.slope:
+        assert slope == 0
+
+
+@pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
+@pytest.mark.parametrize("name", ["limps", "limps on its toes"])
+def test_slopes_with_respect_to_the_animation_and_the_ground_are_difference_quotients(name, gate):
+    uneven = planes((0.05, 0.11, 0.0), (0.21, -0.1, -0.1))
+    inputs = (to_ik({"pelvis.vertical_only": False}), clip(name), to_ground(uneven))
+    rng = np.random.default_rng(0)
+    flat = still(inputs)
+    pose, root = inputs[1].pose, inputs[1].world_from_model
+    jitter = lambda x: jnp.asarray(0.1 * rng.normal(size=x.shape))  # noqa: E731
+    shifted = eqx.tree_at(
+        lambda f: (f.pose.hip.pos, f.pose.ankle.pos, f.pose.toe.pos, f.world_from_model.pos),
+        flat[1],
+        tuple(map(jitter, (pose.hip.pos, pose.ankle.pos, pose.toe.pos, root.pos))),
+    )
+    raised = eqx.tree_at(
+        lambda g: [plane.point_ws for plane in g.surfaces], flat[2], [jnp.full(3, 0.1)] * 3
+    )
+    tangents = (flat[0], shifted, raised)
+
+    def along(step: float) -> np.ndarray:
+        floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
+        floats = jax.tree.map(lambda x, t: x + step * t, floats, tangents)
+        return np.asarray(measured(eqx.combine(floats, rest), flat, gate)[0])
+
+    slopes = np.asarray(measured(inputs, tangents, gate)[1])
+    quotients = (along(1e-6) - along(-1e-6)) / 2e-6
+    assert np.abs(slopes).max() > 1e-2
+    np.testing.assert_allclose(slopes, quotients, rtol=1e-4, atol=1e-6)
+
+
+# Where slopes go wrong. One frame each, so that the whole is also a clip of one frame.
+
+
+def posed(hip: Any, knee: Any, ankle: Any, **changes: Any) -> jaxik.Frame:
+    """Both legs with their joints in these places, m, model space, their spaces unturned."""
+    frame = animate(RIG, count=1, **changes)[0]
+    both = lambda place: np.tile(np.asarray(place, float), (2, 1))  # noqa: E731
+    frame = dataclasses.replace(
+        frame,
+        hip=frame.hip._replace(pos=both(hip)),
+        knee=frame.knee._replace(pos=both(knee)),
+        ankle=frame.ankle._replace(pos=both(ankle)),
+        toe=frame.toe._replace(pos=both(ankle)),
+    )
+    return to_frames([frame])
+
+
+THIGH, SHIN = poses.THIGH, poses.SHIN
+ON_HIP = {"probe.ray_up": 2.0, "target.max_ankle_height": 2.0, "pelvis.limit": 0.0}
+SINGULAR: dict[str, tuple[dict[str, Any], jaxik.Frame, Any]] = {
+    "straight": ({}, posed([0, 0.9, 0], [0, 0.45, 0], [0, 0.02, 0]), FLAT),
+    "straight and too far": (
+        STIFF,
+        posed([0, 0.9, 0], [0, 0.45, 0], [0, 0.02, 0]),
+        planes((0, 0, -0.3)),
+    ),
+    "straight without softening": (
+        STIFF | {"leg.soften": 1.0, "leg.max_knee_angle": np.pi},
+        posed([0, 0.88, 0], [0, SHIN, 0], [0, 0, 0]),
+        FLAT,
+    ),
+    "folded": ({}, posed([0, 0.5, 0], [0, 0.05, 0], [0, 0.48, 0]), FLAT),
+    "folded without a limit": (
+        ON_HIP | {"leg.min_knee_angle": 0.0},
+        posed([0, 0.5, 0], [0, 0.05, 0], [0, 0.48, 0]),
+        planes((0, 0, 0.02)),
+    ),
+    "target on the hip": (
+        ON_HIP,
+        posed([0, 0.8, 0], [0, 0.4, 0.2], [0, 0, 0]),
+        planes((0, 0, 0.8)),
+    ),
+    "target above the hip": (
+        ON_HIP,
+        posed([0, 0.8, 0], [0, 0.4, 0.2], [0, 0, 0]),
+        planes((0, 0, 1.6)),
+    ),
+    "no bones": ({}, posed([0, 0.5, 0], [0, 0.5, 0], [0, 0.5, 0]), FLAT),
+    "no thigh": ({}, posed([0, 0.5, 0], [0, 0.5, 0], [0, 0.1, 0]), FLAT),
+    "no shin": ({}, posed([0, 0.5, 0], [0, 0.1, 0], [0, 0.1, 0]), FLAT),
+    "misses": ({}, to_frames(animate(RIG, count=1)), planes((0, 0, -5.0))),
+    "on the surface": ({}, posed([0, 0.8, 0], [0, 0.4, 0.2], [0, 0, 0]), FLAT),
+    "no time": ({}, dataclasses.replace(to_frames(animate(RIG, count=1)), dt=jnp.zeros(1)), FLAT),
+    "no weight": ({}, to_frames(animate(RIG, count=1, weight=0.0)), FLAT),
+    "no gap between planted and raised": (
+        {"contact.planted_height": 0.1, "contact.raised_height": 0.1},
+        to_frames(animate(RIG, count=1)),
+        FLAT,
+    ),
+    "looks straight up": (
+        {},
+        dataclasses.replace(
+            to_frames(animate(RIG, count=1)),
+            world_from_model=jaxik.Transform(
+                jnp.zeros((1, 3)), jnp.array([[0.5**0.5, -(0.5**0.5), 0, 0]])
+            ),
+        ),
+        planes((0.1, 0, 0)),
+    ),
+    "plane on edge": ({}, to_frames(animate(RIG, count=1)), planes((1e6, 0, 0))),
+}
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0, 0))
+def slopes_both_ways(floats: Any, rest: Any, tangents: Any) -> tuple[jax.Array, jax.Array, Any]:
+    """Of an uneven sum of places, turns and offsets: itself, its slope along `tangents`, all slopes."""
+
+    def total(floats: Any) -> jax.Array:
+        ik, frames, ground, gate = eqx.combine(floats, rest)
+        result = jaxik.run(ik, to_rig(RIG), ground, frames, gate)
+        state = result.trace.advanced.state
+        parts = jax.tree.leaves((result.pose, result.body, state.lock.offset, state.lean))
+        return sum(jnp.sum(jnp.cos(jnp.arange(x.size) + 1.0) * x.ravel()) for x in parts)
+
+    return *jax.jvp(total, (floats,), (tangents,)), jax.grad(total)(floats)
+
+
+@functools.cache
+def singular_slopes(smooth: bool) -> tuple[Any, Any, Any, Any]:
+    gate = Smooth(1.0) if smooth else HARD
+    each = [
+        (to_ik(values), frames, to_ground(ground), gate)
+        for values, frames, ground in SINGULAR.values()
+    ]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    floats, rest = eqx.partition(batch, eqx.is_inexact_array)
+    rng = np.random.default_rng(0)
+    tangents = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), floats)
+    return tangents, *slopes_both_ways(floats, rest, tangents)
+
+
+@pytest.mark.parametrize("smooth", [False, True], ids=["hard", "smooth"])
+@pytest.mark.parametrize("name", SINGULAR)
+def test_slopes_are_finite_and_the_same_both_ways(name, smooth):
+    row = list(SINGULAR).index(name)
+    tangents, value, forward, slopes = at(singular_slopes(smooth), row)
+    for path, slope in jax.tree_util.tree_leaves_with_path(slopes):
+        assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
+    assert np.isfinite(value) and np.isfinite(forward)
+    pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(tangents), strict=True)
+    reverse = [np.sum(np.asarray(slope) * np.asarray(tangent)) for slope, tangent in pairs]
+    np.testing.assert_allclose(sum(reverse), forward, rtol=1e-9, atol=1e-9 * np.abs(reverse).max())
