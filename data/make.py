@@ -33,7 +33,7 @@ TERRAINS = {
     "rubble": course.stones,
     "uneven_walk": course.uneven,
 }
-SECONDS, FPS, WALK_SEED, NOISE_SEED = 12.0, 60.0, 2, 11
+SECONDS, FPS, WALK_SEED, NOISE_SEED = 12.0, 30.0, 2, 11
 SLIPS = (walker.Slip(0.6, 4.4, 0.06), walker.Slip(5.6, 8.6, -0.06))
 SLIDES = (walker.Slide(8.8, 10.4),)
 POSITION_NOISE, ROTATION_NOISE = 0.002, float(np.radians(0.5))  # m a coordinate, rad an axis

@@ -72,6 +72,7 @@ def chain(
     posterior: Posterior, labels: Sequence[str], truth: Mapping[str, float] | None, title: str
 ) -> Figure:
     """Log-probability and parameters of the walkers over the sampler's steps."""
+    panels: list[tuple[str, np.ndarray, float | None]]
     panels = [("log-probability", posterior.log_probability, None)]
     for i, name in enumerate(posterior.names):
         panels.append((labels[i], posterior.values[..., i], (truth or {}).get(name)))

@@ -1,6 +1,8 @@
 """A clip played under given parameters, as the numbers that reports count and pictures draw."""
 
+from collections.abc import Mapping
 from functools import cached_property
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -19,7 +21,7 @@ ABOVE, REACH = 1.0, 3.0  # m, where the rays that look for the ground start, and
 
 KINDS = ("ankle", "knee", "pelvis", "foot", "body", "contact", "smooth")  # in the rows' order
 
-Series = Array | np.ndarray  # NumPy once a playback is made
+Series: TypeAlias = Array | np.ndarray  # NumPy once a playback is made
 
 
 class Motion(eqx.Module):
@@ -55,9 +57,9 @@ class Playback(eqx.Module):
     stance: Float[Series, "frames legs"]  # captured contact labels; all 0 where there are none
     slide: Float[Series, " frames"]
     seen: Bool[Series, " frames"]
-    errors: dict[str, Float[Series, "rows ..."]]  # of `after`, by kind of residual, in its unit
-    rows: dict[str, Float[Series, "rows ..."]]  # the same as the fit sees them, in sigmas
-    sigmas: dict[str, Float[Series, ""]]
+    errors: Mapping[str, Float[Series, "rows ..."]]  # of `after`, by kind of residual, in its unit
+    rows: Mapping[str, Float[Series, "rows ..."]]  # the same as the fit sees them, in sigmas
+    sigmas: Mapping[str, Float[Series, ""]]
 
     @cached_property
     def time(self) -> Float[np.ndarray, " frames"]:

@@ -32,7 +32,7 @@ WORDS = {
     "smooth": ("Ankle acceleration", "m/s²", 1.0),
 }
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
-STYLE = {
+STYLE: Any = {
     "font.size": 13,
     "axes.titlesize": 14,
     "axes.labelsize": 13,
@@ -79,7 +79,7 @@ def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
     way = play.travelled[inside]
     apart = max(STRIDE, (np.max(way) - np.min(way)) / 20)
     chosen = start + np.unique(np.floor((way - way[0]) / apart), return_index=True)[1]
-    tall = np.clip(16.0 * 1.5 / (np.ptp(way) + 1.1), 2.2, 6.5)
+    tall = np.clip(16.0 * 1.35 / (np.ptp(way) + 1.6), 2.2, 6.5)
     figure = Figure(figsize=(17, (tall + 0.7) * len(legs) + 1.4), layout="constrained")
     figure.suptitle(f"{title}, seen from the right, {_seconds(play, start, end)}")
     rows = figure.subplots(len(legs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -119,7 +119,7 @@ def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: s
     for axes in columns[0]:
         axes.set_ylabel("knee angle, degrees")
     if limits:
-        lines.append(Line2D([], [], **SIGMA, label="fitted limits"))
+        lines.append(Line2D([], [], **SIGMA, label="limits"))
     _legend(figure, *lines)
     return figure
 
@@ -142,10 +142,10 @@ def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
         axes.set_ylabel(unit)
         axes.set_xlim(fitted.time[0], fitted.time[-1])
         axes.set_ylim(bottom=0)
-        _spread(side, first.rows[kind], fitted.rows[kind])
+        _spread(side, np.asarray(first.rows[kind]), np.asarray(fitted.rows[kind]))
         side.set_title(f"{words}: spread of the residuals")
     grid[-1, 0].set_xlabel("time, s")
-    grid[-1, 1].set_xlabel("residual, in assumed sigmas")
+    grid[-1, 1].set_xlabel("residual as the fit sees it, in sigmas")
     _legend(
         figure,
         Line2D([], [], color=BEFORE, linewidth=3, label="with the preset's parameters"),
@@ -297,20 +297,11 @@ def _times(play: Playback, series: np.ndarray) -> np.ndarray:
 def _spread(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
     """Histograms of residuals in sigmas with the normal curve; what lies beyond 5 is put at 5."""
     edges = np.linspace(-5.0, 5.0, 41)
-    for rows, colour, kind in ((first, BEFORE, "stepfilled"), (fitted, AFTER, "step")):
+    for rows, colour, fill in ((first, BEFORE, True), (fitted, AFTER, False)):
         values = np.clip(rows[rows != 0], -5.0, 5.0)  # rows not seen are 0
         if values.size:
-            weights = np.full(values.size, 1.0 / (values.size * (edges[1] - edges[0])))
-            fill = 0.45 if kind == "stepfilled" else 1.0
-            axes.hist(
-                values,
-                edges,
-                weights=weights,
-                histtype=kind,
-                color=colour,
-                alpha=fill,
-                linewidth=2.0,
-            )
+            density = np.histogram(values, edges, density=True)[0]
+            axes.stairs(density, edges, fill=fill, color=colour, alpha=0.45 if fill else 1.0)
     curve = np.linspace(-5.0, 5.0, 201)
     axes.plot(
         curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black", linewidth=1.4

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from .space import EDGE, Problem, Space
 
 POPULATION = 64  # candidates in one vmapped call
+SWEEP = 14  # values of one parameter, spread over its range
 
 
 class Population(eqx.Module):
@@ -96,3 +97,16 @@ def vary(
     varied = low + (high - low) / (1 + np.exp(-odds))
     values = np.where((shifts != 0) | renewed, varied, before)
     return np.asarray(from_values(space, jnp.asarray(values, space.u0.dtype)))
+
+
+def sweep(space: Space, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, "candidates free"]:
+    """`u` with each parameter in turn carried through its range, the other values being kept."""
+    at = np.asarray(_values_of(space, jnp.asarray(u[None], space.u0.dtype)))[0]
+    shares = (np.arange(SWEEP) + 0.5) / SWEEP
+    odds = np.tile(np.log(shares / (1 - shares))[:, None], space.size)
+    grid = np.asarray(_values_of(space, jnp.asarray(odds, space.u0.dtype)))
+    values = np.tile(at, (space.size, SWEEP, 1))
+    for i in range(space.size):
+        values[i, :, i] = grid[:, i]
+    flat = values.reshape(-1, space.size)
+    return np.asarray(from_values(space, jnp.asarray(flat, space.u0.dtype)))

@@ -84,7 +84,7 @@ def posterior_text(posterior: Posterior, truth: Truth) -> str:
     parts = [*_health(posterior), "", table]
     if truth:
         covered = tables.covered(posterior, truth, posterior.names)
-        parts += ["", f"The truth lies in {covered} parameters."]
+        parts += ["", f"The 95 % intervals cover the truth of {covered} parameters."]
     return "\n".join(parts)
 
 
@@ -92,7 +92,8 @@ def write_posterior(run: Path, experiment: Experiment, posterior: Posterior) -> 
     """Writes the pictures of a posterior, and its section of summary.md over an older one."""
     rows = {row["name"]: row for row in json.loads((run / store.FIT).read_text())["parameters"]}
     truth = truth_of(experiment)
-    labels = [f"{name}, {rows[name]['unit']}" for name in posterior.names]
+    units = {name: row["unit"] for name, row in rows.items()}
+    labels = [f"{one}, {units[one]}" if units[one] != "1" else one for one in posterior.names]
     values = {name: row["value"] for name, row in rows.items()}
     title = f"{experiment.name}: posterior of the parameters"
     figure = chain_plots.corner(posterior, labels, values, truth, title)
@@ -101,7 +102,6 @@ def write_posterior(run: Path, experiment: Experiment, posterior: Posterior) -> 
     figure = chain_plots.chain(posterior, labels, truth, title)
     pictures |= _keep(run, "chain.png", title, figure)
 
-    units = {name: row["unit"] for name, row in rows.items()}
     parts = [HEADING, "\n".join(f"- {line}" for line in _health(posterior))]
     parts.append(markdown(tables.posterior_table(posterior, truth, units)))
     if truth:
@@ -109,8 +109,8 @@ def write_posterior(run: Path, experiment: Experiment, posterior: Posterior) -> 
         covered = tables.covered(posterior, truth, posterior.names)
         judged = tables.covered(posterior, truth, determined)
         parts.append(
-            f"The truth lies in {covered} parameters; of those that the fit calls determined, in "
-            f"{judged}."
+            f"The 95 % intervals cover the truth of {covered} parameters; of those that the fit "
+            f"calls determined, of {judged}."
         )
     parts.append(_gallery(pictures))
     summary = run / store.SUMMARY
@@ -124,7 +124,7 @@ def _draw_clip(run: Path, fitted: Fit, index: int) -> Pictures:
     scene, several = fitted.problem.data[index], len(fitted.problem.data) > 1
     clip = fitted.experiment.name + (f", clip {index + 1}" if several else "")
     end = f"_{index + 1}.png" if several else ".png"
-    first = playback.play(fitted.problem.space.base, scene)
+    first = playback.play(fitted.problem.space.unpack(fitted.problem.space.pack({})), scene)
     last = playback.play(fitted.ik, scene)
     legs, leg = scene.rig.names, fitted.ik.leg
     limits = [float(np.mean(getattr(leg, name))) for name in KNEE_LIMITS if hasattr(leg, name)]

@@ -10,8 +10,6 @@ from jaxtyping import Array
 
 from .space import Problem
 
-LEADERS = 4  # shifts of an ensemble, the first ones, that are also differentiated
-
 Model = Callable[[Array, Problem, Array], tuple[Array, Array]]
 
 
@@ -30,15 +28,14 @@ def ensemble(u: Array, problem: Problem, shifts: Array) -> tuple[Array, Array]:
     """Mean rows over shifted thresholds, with the slopes that a regression on the shifts gives.
 
     The mean over shifts has a slope where one hard program has none. The smooth columns are those
-    of the first LEADERS shifts only: a slope steers a step, and the cost judges it.
+    of the thresholds in the middle: a slope steers a step, and the cost judges it.
     """
-    led, slopes = jax.vmap(problem.rows_and_jacobian)(u + shifts[:LEADERS])
-    rest = jax.vmap(problem.rows)(u + shifts[LEADERS:])
-    every = jnp.concatenate([led, rest])
+    _, slopes = problem.rows_and_jacobian(u)
+    every = jax.vmap(problem.rows)(u + shifts)
     mean = jnp.mean(every, axis=0)
     regressed = (jnp.linalg.pinv(shifts) @ (every - mean)).T
     decides = jnp.asarray(problem.space.thresholds)
-    return mean, jnp.where(decides, regressed, jnp.mean(slopes, axis=0))
+    return mean, jnp.where(decides, regressed, slopes)
 
 
 def with_slopes(model: Model) -> Callable[[Array, Any], tuple[Array, None]]:

@@ -25,7 +25,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .population import POPULATION, count_rows, evaluate, vary
+from .population import POPULATION, count_rows, evaluate, sweep, vary
 from .slopes import Model, ensemble, hard, with_slopes
 from .space import Problem
 
@@ -36,6 +36,7 @@ CALM = 2  # such steps in a row that end a march
 STALLS = 12  # rejected steps in a row that end it: each shrinks the step to a quarter
 AGREED = 1e-3  # relative: two ways that end further apart call for a third go
 ROUNDS = 5  # of blocks
+SWEEPS = 8  # at most, one parameter carried away in each
 GENERATIONS = 5  # of a population per round
 ELITE = 8
 REPEATED = 16  # children that come again after a Gauss-Newton step
@@ -187,7 +188,8 @@ class _Fit:
             if left <= 0:
                 raise _Spent
             before = int(position.steps)
-            position, slopes = _march(model, position, jnp.asarray(left), (self.problem, second))
+            args = (self.problem, second)
+            position, slopes = _march(model, position, jnp.asarray(left, int), args)
             self.steps += int(position.steps) - before
             self.total += int(position.steps) - before
             if shifts is None:
@@ -264,7 +266,19 @@ class _Fit:
         ends.sort(key=lambda end: end[1])
         if ends[-1][1] - ends[0][1] > AGREED * ends[0][1]:
             ends.insert(0, self.blocks(ends[0][0], 1.2))
-        self.descend("polish", ends[0][0], self.max_steps)
+        self.descend("polish", self.sweep(*ends[0]), self.max_steps)
+
+    def sweep(self, u: np.ndarray, cost: float) -> np.ndarray:
+        """Out of the valleys of one parameter: a clamp never reached has no slope to be found by."""
+        for _ in range(SWEEPS):
+            candidates = sweep(self.problem.space, u)
+            born = evaluate(self.problem, candidates, self.still)
+            best = int(np.argmin(born.cost))
+            if born.cost[best] > cost * (1 - TOLERANCE):
+                break
+            self.keep("sweep", candidates[best], float(born.cost[best]))
+            u, cost, _ = self.descend("sweep", candidates[best], MARCH)
+        return u
 
     def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:
         """Points of finite cost: the prior's centre, then the lowest of a population of draws."""

@@ -124,7 +124,7 @@ def covered(posterior: Posterior, truth: Mapping[str, float], names: Sequence[st
     """How many of these parameters have the truth within their 95 % interval."""
     judged = [row for row in posterior.summary if row["name"] in names and row["name"] in truth]
     inside = sum(covers(row, truth[row["name"]]) for row in judged)
-    return f"the 95 % intervals of {inside} of {len(judged)}"
+    return f"{inside} of {len(judged)}"
 
 
 def covers(row: Mapping[str, Any], known: float) -> bool:

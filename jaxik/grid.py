@@ -73,7 +73,6 @@ class Grid(eqx.Module):
         end = self.first.at[cell + 1].get(mode="promise_in_bounds")
         return start, jnp.where(inside, end - start, 0)
 
-    @jax.jit  # so that a call outside jit compiles once a shape
     def search(
         self, origins_ws: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]
     ) -> Int[Array, "*b"]:

@@ -144,12 +144,23 @@ def cast(
         reach: their lengths, m; above `HORIZON`, infinite too, it counts as `HORIZON`.
         mask: the layers that each ray sees, one bit a layer (`layer_mask`).
     """
-    limit = jnp.minimum(jnp.asarray(reach, origins_ws.dtype), HORIZON)
-    distance = jnp.broadcast_to(limit, origins_ws.shape[:-1])
+    return _nearest(
+        terrain, origins_ws, jnp.asarray(reach, origins_ws.dtype), jnp.asarray(mask, jnp.uint32)
+    )
+
+
+@jax.jit  # a call outside jit compiles once a shape, not once an operation
+def _nearest(
+    terrain: Terrain,
+    origins_ws: Float[Array, "*b 3"],
+    reach: Float[Array, "*#b"],
+    mask: UInt[Array, "*#b"],
+) -> Hit:
+    distance = jnp.broadcast_to(jnp.minimum(reach, HORIZON), origins_ws.shape[:-1])
     normal = jnp.broadcast_to(terrain.up_ws, origins_ws.shape)
     found = jnp.zeros(distance.shape, bool)
     for surface in terrain.surfaces:
-        drop, facing, seen = surface.meet(origins_ws, terrain.up_ws, jnp.asarray(mask, jnp.uint32))
+        drop, facing, seen = surface.meet(origins_ws, terrain.up_ws, mask)
         nearer = seen & (drop <= distance)
         distance = jnp.where(nearer, drop, distance)
         normal = jnp.where(nearer[..., None], facing, normal)

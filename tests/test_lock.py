@@ -32,7 +32,7 @@ def slipping() -> jaxik.Result:
 
 
 def tracks(result: jaxik.Result) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Targets, footholds, targets without a lock (frames, legs, 3), m, and locked (frames, legs)."""
+    """Targets, footholds and unlocked targets (frames, legs, 3), m, and locked (frames, legs)."""
     advanced, sensed = result.trace.advanced, result.trace.sensed
     unlocked = advanced.foothold_ws + sensed.contact.lift[..., None] * sensed.up_ws[:, None]
     tracks = advanced.target_ws, advanced.foothold_ws, unlocked, advanced.state.lock.locked > 0
@@ -44,7 +44,7 @@ def test_nothing_pops_at_lock_or_release():
     offset = np.linalg.norm(targets - unlocked, axis=-1)
     assert (np.diff(locked.astype(int), axis=0) == 1).any(axis=0).all()
     assert (np.diff(locked.astype(int), axis=0) == -1).any(axis=0).all()
-    assert offset.max() > 0.05, "an anchor that is let go would pop by this"
+    assert offset.max() > 0.04, "an anchor that is let go would pop by this"
 
     # The lock adds to the second difference no more than the slip of a frame that it takes away or
     # gives back, twice, and the share of the offset that decays in a frame.
@@ -107,7 +107,7 @@ def test_a_locked_foot_stays_on_a_platform_that_moves_and_turns(root):
     if root == "rides":
         assert np.abs(targets - footholds).max() > 0.01, "a root that rides does not turn with it"
     reached = np.asarray(result.reached) > 0
-    assert reached.mean() > 0.9
+    assert reached.mean() > 0.5, "the platform carries the feet of a root that stands out of reach"
     ankles = (
         np.asarray(result.pose.ankle.pos) + np.array([place(i / 60) for i in range(240)])[:, None]
     )

@@ -165,7 +165,7 @@ def test_a_gain_is_told_as_half_life_and_at_30_and_60_hz(fitted):
     np.testing.assert_allclose(float(cells[1]), half_life, rtol=1e-3)
     np.testing.assert_allclose(float(cells[3]), 0.3, rtol=1e-3)
     np.testing.assert_allclose(float(cells[4]), 1 - np.sqrt(0.7), rtol=1e-3)
-    assert "truth" not in text and "5 %" not in text
+    assert "truth" not in text and "determined parameters within" not in text
 
 
 def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
@@ -189,14 +189,15 @@ def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {share} |"
 
 
-def test_two_clips_have_pictures_each(fitted, tmp_path):
-    problem = replace_data(fitted.problem, fitted.problem.data * 2)
-    pictures = report._draw_clip(tmp_path, replace(fitted, problem=problem), 1)
-    assert "locks_2.png" in pictures and pictures["locks_2.png"].startswith("hill, clip 2: ")
-
-
-def replace_data(problem: Problem, data: tuple) -> Problem:
-    return Problem(problem.space, data, problem.residuals, problem.loss)
+def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "_keep", lambda run, name, caption, figure: {name: caption})
+    problem = fitted.problem
+    twice = Problem(problem.space, problem.data * 2, problem.residuals, problem.loss)
+    pictures = report._draw_clip(tmp_path, replace(fitted, problem=twice), 1)
+    assert set(pictures) == {
+        "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png"
+    }  # fmt: skip
+    assert all(caption.startswith("hill, clip 2: ") for caption in pictures.values())
 
 
 def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
@@ -225,7 +226,7 @@ def test_limits_act_where_they_are_tight_and_never_at_the_end_of_their_range(fit
     ends = exercise.exercise(rule.replace(fitted.ik, values), scene).limits
     assert [ends[name] for name in values] == [0.0, 0.0, 0.0]
     tight = exercise.exercise(rule.replace(fitted.ik, {"pelvis.limit": 0.0}), scene).limits
-    assert tight["pelvis.limit"] > 0.9
+    assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
 
@@ -239,7 +240,10 @@ def test_counters_count_feet_that_lock_release_and_find_ground(fitted):
     assert asked.locks == tuple(int(n) for n in (np.diff(locked, axis=0) == 1).sum(axis=0))
     assert sum(asked.locks) > 0 and sum(asked.releases) > 0
     np.testing.assert_allclose(asked.locked, locked.mean(axis=0))
-    np.testing.assert_array_equal(asked.found, [1.0, 1.0])
+    ankle = np.asarray(walker.walk(seconds=2.0, fps=15.0).leg_pose_ws().ankle.pos)
+    below = ankle[..., 1] + 0.5 - (0.02 - 0.1 * ankle[..., 0] + 0.3 * ankle[..., 2])
+    np.testing.assert_allclose(asked.found, ((0 <= below) & (below <= 1.3)).mean(axis=0))
+    assert asked.found.max() < 1.0, "the hill rises out of reach of the rays"
 
 
 def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
@@ -247,7 +251,7 @@ def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
     base = rule.replace(space.base, {"lock.enabled": False})
     unlocked = make_space(base, space.frees)
     problem = Problem(unlocked, (scene,), residuals.rows_of_scenes)
-    (down, up) = exercise.flipped_decisions(problem, unlocked.pack(VALUES))[
+    (down, up) = exercise.flipped_decisions(problem, np.asarray(unlocked.pack(VALUES)))[
         "contact.planted_height"
     ]
     lift = np.asarray(scene.frames.pose.ankle.pos[..., 1])
@@ -269,7 +273,7 @@ def test_the_terminal_tells_a_posterior_with_its_health():
     assert "12 walkers, 240 steps, the first 40 left out" in text
     assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3;" in text
     assert "Converged: the chain is long enough." in text
-    assert "The truth lies in the 95 % intervals of 1 of 2 parameters." in text
+    assert "The 95 % intervals cover the truth of 1 of 2 parameters." in text
     assert "truth" not in report.posterior_text(posterior, None)
 
 
@@ -281,7 +285,9 @@ def test_a_posterior_is_written_after_the_fit_and_once_only(fitted, experiment, 
     report.write_posterior(tmp_path, experiment, made_posterior())
     assert (tmp_path / store.SUMMARY).read_text() == once
     assert once.startswith("# hill\n\n## Parameters\n\nof the fit\n\n## Posterior\n")
-    assert "the 95 % intervals of 1 of 2 parameters; of those that the fit calls" in once
+    assert (
+        "the truth of 1 of 2 parameters; of those that the fit calls determined, of 1 of 2." in once
+    )
     assert "| pelvis.on_gain | 1/tick |" in once
     for name in ("corner.png", "chain.png"):
         assert f"({name})" in once

@@ -107,12 +107,10 @@ def shoot(ground: terrain.Terrain, origins: jax.Array) -> terrain.Hit:
 @pytest.mark.parametrize(
     "name, up",
     [
-        ("rough", Y),
         ("rough", TILTED),
         ("stepped", Y),
         ("stepped", SIDEWAYS),
         ("overhanging", TILTED),
-        ("degenerate", Y),
         ("degenerate", HEAD_OVER),
     ],
 )
@@ -121,7 +119,7 @@ def test_random_rays_agree_with_embree(name, up):
     vertices, triangles = MESHES[name]()
     turn = turn_to(up)
     draw = np.random.default_rng(5)
-    local = draw.uniform((-4.5, -1.0, -4.5), (4.5, 4.0, 4.5), (15000, 3))
+    local = draw.uniform((-4.5, -1.0, -4.5), (4.5, 4.0, 4.5), (21000, 3))
     local[::2, 1] = 5.0
     vertices, origins, up = vertices @ turn.T, local @ turn.T, turn @ [0.0, 1.0, 0.0]
     ground = terrain.mesh(vertices, triangles, up=up)
@@ -145,10 +143,8 @@ def test_random_rays_agree_with_embree(name, up):
     [
         ("rough", Y, jnp.float32),
         ("rough", TILTED, jnp.float64),
-        ("stepped", Y, jnp.float64),
         ("stepped", TILTED, jnp.float32),
-        ("overhanging", SIDEWAYS, jnp.float32),
-        ("overhanging", HEAD_OVER, jnp.float64),
+        ("overhanging", SIDEWAYS, jnp.float64),
     ],
 )
 def test_no_ray_falls_through_an_edge_or_a_corner(name, up, dtype):
@@ -201,17 +197,12 @@ def test_a_ray_from_under_an_overhang_meets_what_is_below_it():
 
 def test_a_miss_ends_at_the_end_of_the_ray_with_up_as_its_normal():
     for ground in (terrain.mesh(*rough()), terrain.plane((0.0, -2.5, 0.0))):
-        origins = jnp.array([[0.0, 3.0, 0.0], [100.0, 3.0, 0.0], [0.0, -3.0, 0.0]])
-        hit = terrain.cast(ground, origins, jnp.array([0.5, 2.0, jnp.inf]))
+        origins = jnp.array([[0.0, 3.0, 0.0], [99.0, 3.0, 0.0], [0.0, -3.0, 0.0], [jnp.nan] * 3])
+        hit = terrain.cast(ground, origins, jnp.array([0.5, 2.0, jnp.inf, 1.0]))
         np.testing.assert_array_equal(hit.found, 0.0)
-        np.testing.assert_array_equal(hit.distance, [0.5, 2.0, terrain.HORIZON])
-        np.testing.assert_array_equal(hit.point[:, 1], [2.5, 1.0, -3.0 - terrain.HORIZON])
-        np.testing.assert_array_equal(hit.normal, np.eye(3)[[1, 1, 1]])
-
-
-def test_an_origin_that_is_not_a_number_finds_nothing():
-    hit = terrain.cast(terrain.mesh(*rough()), jnp.array([jnp.nan, 1.0, 0.0]), 5.0)
-    assert hit.found == 0.0
+        np.testing.assert_array_equal(hit.distance, [0.5, 2.0, terrain.HORIZON, 1.0])
+        np.testing.assert_array_equal(hit.point[:3, 1], [2.5, 1.0, -3.0 - terrain.HORIZON])
+        np.testing.assert_array_equal(hit.normal, np.eye(3)[[1, 1, 1, 1]])
 
 
 def test_reach_ends_a_ray_and_broadcasts():
@@ -261,18 +252,19 @@ def test_a_ray_sees_the_layers_of_its_mask_only():
 
 
 def test_the_nearest_of_several_surfaces_is_met():
-    ground = terrain.combine(terrain.plane((0.0, 0.3, 0.0)), terrain.mesh(*rough()))
+    ground = terrain.combine(terrain.plane((0.0, 0.3, 0.0), layer=1), terrain.mesh(*rough()))
     origins = jnp.asarray(np.random.default_rng(7).uniform(-3, 3, (500, 3))).at[:, 1].set(5.0)
-    both = shoot(ground, origins).point[:, 1]
-    alone = [shoot(terrain.Terrain(ground.up_ws, (s,)), origins) for s in ground.surfaces]
-    np.testing.assert_array_equal(both, np.maximum(alone[0].point[:, 1], alone[1].point[:, 1]))
-    assert 50 < np.sum(np.asarray(both) > 0.3) < 450
+    both, level, uneven = (
+        terrain.cast(ground, origins, jnp.inf, mask).point[:, 1] for mask in (3, 2, 1)
+    )
+    np.testing.assert_allclose(level, 0.3, atol=1e-12)
+    np.testing.assert_array_equal(both, np.maximum(level, uneven))
+    assert 50 < np.sum(np.asarray(uneven) > 0.3) < 450
 
 
-@pytest.mark.parametrize("up", [Y, TILTED])
-def test_slopes_by_the_origin_equal_finite_differences_both_ways(up):
+def test_slopes_by_the_origin_equal_finite_differences_both_ways():
     vertices, triangles = rough(10)
-    turn = turn_to(up)
+    turn = turn_to(TILTED)
     ground = terrain.combine(
         terrain.mesh(vertices @ turn.T, triangles, up=turn @ [0.0, 1.0, 0.0]),
         terrain.plane((0.0, 0.0, 0.0), turn @ [0.3, 0.9, 0.1], up=turn @ [0.0, 1.0, 0.0]),
@@ -303,14 +295,16 @@ def test_slopes_by_the_vertices_equal_finite_differences_both_ways():
     assert np.all(terrain.cast(ground, origins, jnp.inf).found == 1.0)
 
 
-@pytest.mark.parametrize("name", ["stepped", "degenerate"])
-def test_every_slope_is_finite_on_edges_corners_and_misses(name):
-    vertices, triangles = MESHES[name]()
+def test_every_slope_is_finite_on_edges_corners_walls_and_misses():
+    vertices, triangles = degenerate()
+    steps, _ = stepped()
     ground = terrain.combine(
         terrain.mesh(vertices, triangles, slack=0.01),
+        terrain.mesh(*stepped()),
         terrain.plane((0.0, -3.0, 0.0), (1.0, 0.0, 0.0)),
     )
-    origins = jnp.asarray(np.concatenate([vertices, vertices + [0, 1, 0], vertices + [99, 0, 0]]))
+    places = np.concatenate([vertices, steps])
+    origins = jnp.asarray(np.concatenate([places, places + [0, 1, 0], places + [99, 0, 0]]))
 
     def total(ground, origins, reach):
         hit = terrain.cast(ground, origins, reach)
@@ -354,7 +348,7 @@ def test_a_wall_that_leans_over_by_a_move_within_the_slack_is_met():
 
 def test_jit_vmap_scan_and_loop_answer_alike():
     ground = terrain.combine(terrain.mesh(*overhanging()), terrain.plane((0.0, -1.0, 0.0)))
-    origins = jnp.asarray(np.random.default_rng(11).uniform(-3, 3, (30, 2, 3)))
+    origins = jnp.asarray(np.random.default_rng(11).uniform(-3, 3, (40, 2, 3)))
     whole = shoot(ground, origins)
     mapped = jax.vmap(jax.vmap(lambda origin: terrain.cast(ground, origin, jnp.inf)))(origins)
     _, scanned = jax.lax.scan(lambda _, o: (None, terrain.cast(ground, o, jnp.inf)), None, origins)
@@ -382,15 +376,14 @@ def test_terrains_of_the_same_shapes_are_mapped_over():
     np.testing.assert_allclose(heights, np.broadcast_to(heights[0], (3, 2)), atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_dtype_follows_the_inputs_under_strict_promotion(dtype):
+def test_float32_stays_float32_under_strict_promotion():
     vertices, triangles = rough(6)
     with jax.numpy_dtype_promotion("strict"):
         ground = terrain.combine(
-            terrain.mesh(vertices.astype(dtype), triangles), terrain.plane(dtype=dtype)
+            terrain.mesh(vertices.astype(np.float32), triangles), terrain.plane(dtype=jnp.float32)
         )
-        hit = terrain.cast(ground, jnp.zeros((4, 3), dtype), jnp.asarray(3.0, dtype))
-    assert {leaf.dtype for leaf in jax.tree.leaves(hit)} == {jnp.dtype(dtype)}
+        hit = terrain.cast(ground, jnp.zeros((4, 3), jnp.float32), 3.0)
+    assert {leaf.dtype for leaf in jax.tree.leaves(hit)} == {jnp.dtype(jnp.float32)}
 
 
 def test_no_rays_give_no_hits():
