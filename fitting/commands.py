@@ -1,6 +1,7 @@
 """What each word of the command line does."""
 
 import argparse
+import csv
 import sys
 import time
 import warnings
@@ -15,7 +16,9 @@ from jaxik import record, rule
 
 from . import clips, experiment, files, frames, report, scenes, settings, store, study
 from .base import load_base
+from .cli import INTERRUPTED
 from .clips import inspect as inspection
+from .identify import identify
 from .posterior import SamplingProgress
 from .solve import Progress
 
@@ -24,14 +27,18 @@ def fit(options: argparse.Namespace) -> int:
     """Fits, and leaves a run folder with tables and plots."""
     _prepare_jax()
     asked = experiment.load_experiment(options.experiment)
-    store.prepare(options.output)
+    truth = report.truth_of(asked)
+    store.check_place(options.output)
+    problem = experiment.make_problem(asked)
     print(f"fitting {len(asked.free)} parameters of {asked.preset} to {len(asked.clips)} clip(s)")
-    fitted = study.fit(asked, progress=_Line(_fit_line))
+    solution = study.search(problem, asked, _Line(_fit_line))
+    store.save_solution(options.output, asked, problem, solution)
+    fitted = study.Fit(asked, problem, solution, identify(problem, solution))
     store.save_fit(options.output, fitted)
     report.write_fit(options.output, fitted)
-    print("\n" + report.fit_text(store.describe_fit(fitted), report.truth_of(asked)))
+    print("\n" + report.fit_text(store.describe_fit(fitted), truth))
     print(f"written to {options.output}; read {options.output / store.SUMMARY}")
-    return 0
+    return INTERRUPTED if solution.interrupted else 0
 
 
 def sample(options: argparse.Namespace) -> int:
@@ -40,19 +47,22 @@ def sample(options: argparse.Namespace) -> int:
     asked, told = store.load_fit(options.run)
     if options.max_steps is not None:
         asked = experiment.with_max_steps(asked, options.max_steps)
+    truth = report.truth_of(asked)
     problem = experiment.make_problem(asked)
     names = [row["name"] for row in told["parameters"]]
     if names != list(problem.space.names):
-        raise ValueError(f"{options.run}: fit.json has {names}, the experiment {problem.space.names}")
+        raise ValueError(
+            f"{options.run}: fit.json has {names}, the experiment {problem.space.names}"
+        )
     start_u = np.array([row["u"] for row in told["parameters"]])
     start_sd = np.array([row["start_sd"] for row in told["parameters"]])
     chain = options.run / store.CHAIN
     posterior = study.sample_start(problem, asked, start_u, start_sd, chain, _Line(_sample_line))
     store.save_posterior(options.run, posterior)
     report.write_posterior(options.run, asked, posterior)
-    print("\n" + report.posterior_text(posterior, report.truth_of(asked)))
+    print("\n" + report.posterior_text(posterior, truth))
     print(f"written to {options.run}; read {options.run / store.SUMMARY}")
-    return 0
+    return INTERRUPTED if posterior.interrupted else 0
 
 
 def apply(options: argparse.Namespace) -> int:
@@ -83,17 +93,23 @@ def convert(options: argparse.Namespace) -> int:
     """The word `record`: shows the game's record, or turns it into or out of our parameters."""
     jax.config.update("jax_enable_x64", True)
     reading = record.Reading(options.length_unit, options.knee, options.lean_sign, options.tick_hz)
+    base = _read_bytes(options.base) if getattr(options, "base", None) is not None else None
+    read = _read_records(options.file, reading, base)
     if options.way == "show":
-        read = _read_records(options.file, reading)
-        print(record.to_csv(read) if options.csv else "\n\n".join(_shown(r, reading) for r in read))
+        shown = (
+            record.to_csv(read).rstrip()
+            if options.csv
+            else "\n\n".join(_shown(one, reading) for one in read)
+        )
+        print(shown)
         return 0
-    (read, *more) = _read_records(options.file, reading, getattr(options, "base", None))
+    (only, *more) = read
     if more:
         raise ValueError(f"{options.file} has {1 + len(more)} rows; give a file with one record")
     if options.way == "to-toml":
-        files.write_text(options.output, settings.to_toml(record.to_ik(read, reading)))
+        files.write_text(options.output, settings.to_toml(record.to_ik(only, reading)))
     else:
-        files.write(options.output, lambda path: path.write_bytes(record.to_bytes(read)))
+        files.write(options.output, lambda path: path.write_bytes(record.to_bytes(only)))
     print(f"written to {options.output}")
     return 0
 
@@ -119,35 +135,55 @@ def _prepare_jax() -> None:
 
 
 def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
+    if options.output.suffix.lower() != ".npz":
+        raise ValueError(f"{options.output}: wanted a name that ends in .npz")
+    files.check_place(options.output)
     base = load_base(options.clip)
     ground = scenes.load_terrain(options.terrain, file_up=options.file_up)
+    motion = frames.frames_of(base, floor=options.floor)
+    experiment.check_shapes(ik, base.rig, ground, motion)
     began = time.perf_counter()
-    result = jaxik.run(ik, base.rig, ground, frames.frames_of(base, floor=options.floor))
+    result = jaxik.run(ik, base.rig, ground, motion)
     solved = frames.solved_clip(base, result, floor=options.floor)
+    if not np.isfinite(solved.positions_ws).all():
+        raise ValueError("these parameters give poses that are not finite; nothing was written")
     clips.save_clip(options.output, solved, joints=frames.named_joints(solved))
     reached = float(np.mean(result.reached))
     found = float(np.mean(result.trace.sensed.foothold.found))
     print(
-        f"{base.frames} frames in {time.perf_counter() - began:.1f} s: ground under {found:.1%} of the "
-        f"feet, {reached:.1%} of the targets reached; written to {options.output}"
+        f"{base.frames} frames in {time.perf_counter() - began:.1f} s: ground under {found:.1%} of "
+        f"the feet, {reached:.1%} of the targets reached; written to {options.output}"
     )
     return 0
 
 
-def _read_records(
-    path: Path, reading: record.Reading, base: Path | None = None
-) -> list[record.Record]:
+def _read_bytes(path: Path) -> record.Record:
     if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    kept = record.from_bytes(base.read_bytes()) if base is not None else None
-    if path.suffix.lower() == ".toml":
-        return [record.from_ik(settings.from_toml(path)[0], kept, reading)]
-    if path.suffix.lower() == ".csv":
-        read = record.from_csv(path.read_text())
-        if not read:
-            raise ValueError(f"{path}: the CSV has no row")
-        return read
-    return [record.from_bytes(path.read_bytes())]
+        raise ValueError(f"{path}: {'a folder, no file' if path.is_dir() else 'no such file'}")
+    try:
+        return record.from_bytes(path.read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _read_records(
+    path: Path, reading: record.Reading, base: record.Record | None
+) -> list[record.Record]:
+    """The records of a file; `base` completes one that is made from parameters."""
+    kind = path.suffix.lower()
+    if kind == ".toml":
+        return [record.from_ik(settings.from_toml(path)[0], base, reading)]
+    if base is not None:
+        raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
+    if kind != ".csv" or not path.is_file():
+        return [_read_bytes(path)]
+    try:
+        read = record.from_csv(path.read_text(encoding="utf-8"))
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not read:
+        raise ValueError(f"{path}: the CSV has no row")
+    return read
 
 
 def _shown(one: record.Record, reading: record.Reading) -> str:
@@ -180,8 +216,12 @@ class _Line:
             return
         self.last = now
         text = self.show(progress)
-        print(f"\r{text:<100}" if self.live else text, end="" if self.live else "\n",
-              file=sys.stderr, flush=True)
+        print(
+            f"\r{text:<100}" if self.live else text,
+            end="" if self.live else "\n",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def _fit_line(progress: Progress) -> str:

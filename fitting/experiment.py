@@ -1,35 +1,36 @@
 """Experiment files: what is fitted to what, read from TOML and turned into a `Problem`.
 
-    preset = "record"                    # a function of jaxik.presets
-    [[clips]]
-    reference = "walk.npz"               # the captured motion; paths are relative to the file
-    base = "walk_base.npz"               # the flat animation; without it `base.flat_base` makes one
-    terrain = "course.ply"
-    [parameters]                         # fixed values that differ from the preset's
-    lock.enabled = true
-    [free]                               # {} takes range, prior and scale from the rule
-    pelvis.on_gain = {}
-    contact.planted_height = { low = 0.05, high = 0.2 }
-    [sigmas]
-    ankle = 0.02
+preset = "record"                    # a function of jaxik.presets
+[[clips]]
+reference = "walk.npz"               # the captured motion; paths are relative to the file
+base = "walk_base.npz"               # the flat animation; without it `base.flat_base` makes one
+terrain = "course.ply"
+[parameters]                         # fixed values that differ from the preset's
+lock.enabled = true
+[free]                               # {} takes range, prior and scale from the rule
+pelvis.on_gain = {}
+contact.planted_height = { low = 0.05, high = 0.2 }
+[sigmas]
+ankle = 0.02
 """
 
-import difflib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxik
 from jaxik import presets, rule
 from jaxik.skeleton import Transform
+from jaxik.terrain import Terrain
 
-from . import clips, frames, scenes
+from . import checks, clips, frames, posterior, scenes
 from .base import flat_base, load_base
+from .checks import check_keys, check_table, flat
 from .clips import edit
 from .residuals import Reference, Scene, Sigmas, rows_of_scenes
 from .space import Free, Loss, Problem, free, make_space
@@ -64,7 +65,7 @@ class FitOptions:
     """How long the solver may go on."""
 
     starts: int = 1
-    max_steps: int = 200
+    max_steps: int = 1000  # of Levenberg–Marquardt, from each start
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,21 @@ class Experiment:
     sample: SampleOptions = SampleOptions()
 
 
+# What the tables of the file hold.
+CLIP = dict.fromkeys(("reference", "terrain", "base", "truth", "file_up"), checks.TEXT)
+CLIP |= {"start": checks.TIME, "end": checks.TIME}
+FREE = dict.fromkeys(("low", "high", "prior_mean"), checks.NUMBER)
+FREE |= {"prior_sd": checks.POSITIVE, "kind": checks.TEXT, "scale": checks.TEXT}
+SIGMA = dict.fromkeys(SIGMAS, checks.POSITIVE) | {"correlation": checks.SHARE}
+FIT = {"starts": checks.COUNT, "max_steps": checks.COUNT}
+SAMPLE = dict.fromkeys(("walkers", "max_steps", "thin_by"), checks.COUNT)
+SAMPLE |= {"stop_at": checks.POSITIVE}
+TOP = {"name": checks.TEXT, "preset": checks.TEXT, "loss": checks.TEXT}
+TOP |= {"fps": checks.RATE, "seed": checks.SEED}
+TOP |= dict.fromkeys(("free", "parameters", "sigmas", "fit", "sample"), checks.TABLE)
+TOP |= {"clips": checks.Kind("[[clips]], one for each clip", lambda made: isinstance(made, list))}
+
+
 def load_experiment(path: str | Path) -> Experiment:
     """Reads an experiment file.
 
@@ -103,61 +119,30 @@ def load_experiment(path: str | Path) -> Experiment:
             a value of the wrong kind; a clip or terrain that is not there.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such experiment file")
-    try:
-        content = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not TOML: {error}") from None
-    return parse_experiment(content, path)
+    return parse_experiment(checks.read_toml(path, "experiment"), path)
 
 
 def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     """The experiment in a TOML table; relative paths are meant from beside `path`."""
-    known = [one.name for one in fields(Experiment) if one.name != "path"]
-    check_keys(content, known, f"{path}")
+    check_table(content, TOP, f"{path}")
     for key in ("clips", "free"):
         if not content.get(key):
             raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
-    if not isinstance(content["clips"], list):
-        raise ValueError(f"{path}: clips is a table; write [[clips]], one for each clip")
     name_preset(content.get("preset", "record"))
     if (loss := content.get("loss", "squares")) not in get_args(Loss):
         raise ValueError(f"{path}: loss is {loss!r}; it is one of {get_args(Loss)}")
-    sigmas = content.get("sigmas", {})
-    check_keys(sigmas, list(SIGMAS), f"{path} [sigmas]")
-    for key, value in sigmas.items():
-        least = -1e-12 if key == "correlation" else 0.0
-        if not isinstance(value, int | float) or not value > least:
-            raise ValueError(f"{path} [sigmas]: {key} is {value!r}; wanted a number above 0")
+    check_table(content.get("sigmas", {}), SIGMA, f"{path} [sigmas]")
     made = dict(content)
     made["clips"] = tuple(_entry(entry, path) for entry in content["clips"])
-    made["free"] = {name: _table(v, path, name) for name, v in flat(content["free"], 2).items()}
+    made["free"] = _free(content["free"], f"{path} [free]")
     made["parameters"] = flat(content.get("parameters", {}), 2)
-    made["fit"] = _options(FitOptions, content.get("fit", {}), f"{path} [fit]")
-    made["sample"] = _options(SampleOptions, content.get("sample", {}), f"{path} [sample]")
+    made["fit"] = FitOptions(**check_table(content.get("fit", {}), FIT, f"{path} [fit]"))
+    sample = check_table(content.get("sample", {}), SAMPLE, f"{path} [sample]")
+    made["sample"] = SampleOptions(**sample)
+    if "walkers" in sample:
+        posterior.check_walkers(len(made["free"]), sample["walkers"])
     made.setdefault("name", path.stem)
     return Experiment(path=path, **made)
-
-
-def flat(tables: Mapping[str, Any], depth: int, prefix: str = "") -> dict[str, Any]:
-    """Nested TOML tables as dotted names, `depth` parts each: `lock.enabled`."""
-    found: dict[str, Any] = {}
-    for key, value in tables.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping) and name.count(".") + 1 < depth:
-            found |= flat(value, depth, f"{name}.")
-        else:
-            found[name] = value
-    return found
-
-
-def check_keys(given: Mapping[str, Any], known: list[str], where: str) -> None:
-    """ValueError for a key that is not known, with the nearest one that is."""
-    for key in given:
-        if key not in known:
-            nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
-            raise ValueError(f"{where}: unknown key {key!r}; nearest is {nearest!r} of {known}")
 
 
 def name_preset(name: str) -> jaxik.FootIK:
@@ -186,16 +171,19 @@ def system(experiment: Experiment) -> jaxik.FootIK:
 
 
 def with_parameters(ik: jaxik.FootIK, values: Mapping[str, Any], where: str) -> jaxik.FootIK:
-    """The system with these values by dotted name, switches included; ValueError for a wrong one."""
+    """The system with these values by dotted name, switches too; ValueError for a wrong one."""
     leaves = leaf_names(ik)
     check_keys(values, leaves, where)
     for name, value in values.items():
         old = rule.get(ik, name)
-        new = np.asarray(value)
+        try:
+            new = np.asarray(value)
+        except ValueError:  # lists of unlike lengths
+            new = np.asarray(None)
         if new.dtype.kind not in ("b" if old.dtype == bool else "if") or np.isnan(new).any():
             kind = "true or false" if old.dtype == bool else "a number"
             raise ValueError(f"{where}: {name} is {value!r}; wanted {kind}")
-        if new.shape != old.shape and new.ndim != 1:
+        if new.shape != old.shape and (old.ndim, new.ndim) != (0, 1):
             raise ValueError(f"{where}: {name} has shape {new.shape}; wanted {old.shape}")
     return rule.replace(ik, dict(values))
 
@@ -213,28 +201,33 @@ def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[Free]:
         raise ValueError(f"{experiment.path} [free]: {error}") from None
 
 
-def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Clip, Any]:
+def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Clip, Terrain]:
     """The reference clip, its flat base and the terrain, over the same frames."""
     ground = scenes.load_terrain(entry.terrain, file_up=entry.file_up)
-    reference = edit.mask_pops(_cut(clips.load_clip(entry.reference), entry, fps))
+    reference = _cut(clips.load_clip(entry.reference), entry.reference, entry, fps)
+    reference = edit.mask_pops(reference)
     if entry.base is None:
         return reference, flat_base(reference, scenes.heights(ground)), ground
-    base = _cut(load_base(entry.base), entry, fps)
-    if base.frames != reference.frames or len(base.rig.side) != len(reference.rig.side):
-        raise ValueError(
-            f"{entry.base}: the base has {base.frames} frames and {len(base.rig.side)} legs, "
-            f"the reference {reference.frames} and {len(reference.rig.side)}"
-        )
+    base = _cut(load_base(entry.base), entry.base, entry, fps)
+    ours, theirs = (
+        f"{one.frames} frames at {one.fps:g} Hz of the legs {list(one.rig.names)}"
+        for one in (base, reference)
+    )
+    if ours != theirs:
+        raise ValueError(f"{entry.base}: the base has {ours}; the reference has {theirs}")
     return reference, base, ground
 
 
-def _cut(clip: clips.Clip, entry: ClipEntry, fps: float | None) -> clips.Clip:
-    clip = edit.trim(clip, entry.start, entry.end)
+def _cut(clip: clips.Clip, path: Path, entry: ClipEntry, fps: float | None) -> clips.Clip:
+    try:
+        clip = edit.trim(clip, entry.start, entry.end)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     return clip if fps is None else edit.resample(clip, fps)
 
 
 def make_scene(
-    reference: clips.Clip, base: clips.Clip, ground: Any, sigmas: Mapping[str, float]
+    reference: clips.Clip, base: clips.Clip, ground: Terrain, sigmas: Mapping[str, float]
 ) -> Scene:
     """The data of one clip."""
     animation = frames.frames_of(base)
@@ -278,37 +271,49 @@ def make_problem(experiment: Experiment) -> Problem:
     space = make_space(ik, free_parameters(experiment, ik))
     made = []
     for entry in experiment.clips:
-        made.append(make_scene(*load_pair(entry, experiment.fps), experiment.sigmas))
+        scene = make_scene(*load_pair(entry, experiment.fps), experiment.sigmas)
+        check_shapes(ik, scene.rig, scene.terrain, scene.frames)
+        made.append(scene)
     return Problem(space, tuple(made), rows_of_scenes, experiment.loss)
 
 
+def check_shapes(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Terrain, motion: jaxik.Frame) -> None:
+    """ValueError where a parameter has another number of values than the rig has legs."""
+    several = {
+        f"{stage}.{one.name}": getattr(part, one.name).shape
+        for stage, part in vars(ik).items()
+        for one in fields(part)
+        if getattr(part, one.name).shape != getattr(type(part)(), one.name).shape
+    }
+    if not several:
+        return  # the usual case, which need not wait for a trace
+    try:
+        jax.eval_shape(jaxik.run, ik, rig, ground, motion)
+    except (TypeError, ValueError):
+        told = ", ".join(f"{name} has {shape[0]} values" for name, shape in several.items())
+        raise ValueError(
+            f"{told}; wanted one for all legs or, where legs may differ, {len(rig.side)} for the "
+            f"legs {list(rig.names)}"
+        ) from None
+
+
 def _entry(given: Any, path: Path) -> ClipEntry:
-    table = _table(given, path, "[[clips]]")
-    known = [one.name for one in fields(ClipEntry)]
-    check_keys(table, known, f"{path} [[clips]]")
+    table = check_table(given, CLIP, f"{path} [[clips]]")
     made: dict[str, Any] = dict(table)
     for key in ("reference", "terrain"):
         if key not in table:
             raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
     for key in ("reference", "terrain", "base", "truth"):
         if key in table:
-            made[key] = (path.parent / str(table[key])).resolve()
+            made[key] = (path.parent / table[key]).resolve()
             if not made[key].is_file():
                 raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: no such file")
     return ClipEntry(**made)
 
 
-def _options(kind: type, given: Any, where: str) -> Any:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{where}: is {given!r}; wanted a table")
-    check_keys(given, [one.name for one in fields(kind)], where)
-    for key, value in given.items():
-        if not isinstance(value, int | float) or not value > 0:
-            raise ValueError(f"{where}: {key} is {value!r}; wanted a number above 0")
-    return kind(**given)
-
-
-def _table(given: Any, path: Path, name: str) -> Mapping[str, Any]:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{path}: {name} is {given!r}; wanted a table, such as {{}}")
-    return given
+def _free(tables: Mapping[str, Any], where: str) -> dict[str, Mapping[str, Any]]:
+    for stage, table in tables.items():
+        if table == {} and "." not in stage:
+            raise ValueError(f"{where}: {stage} has no parameter; write {stage}.<name> = {{}}")
+    named = flat(tables, 2)
+    return {name: check_table(table, FREE, f"{where} {name}") for name, table in named.items()}

@@ -7,12 +7,21 @@ from pathlib import Path
 from typing import Any
 
 
+def check_place(path: Path) -> None:
+    """ValueError where no file can be written, before anything is computed for it."""
+    if path.is_dir():
+        raise ValueError(f"{path}: cannot be written: it is a folder")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: cannot be written: there is no folder {path.parent}")
+
+
 def write(path: Path, fill: Callable[[Path], Any]) -> None:
     """`fill` writes a temporary file beside `path`, which then takes its place.
 
     Raises:
         ValueError: where the folder is not there or may not be written.
     """
+    check_place(path)
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}", suffix=path.suffix)
     except OSError as error:
@@ -31,4 +40,4 @@ def write(path: Path, fill: Callable[[Path], Any]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Writes a text file."""
-    write(path, lambda temporary: temporary.write_text(text))
+    write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

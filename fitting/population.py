@@ -99,14 +99,29 @@ def vary(
     return np.asarray(from_values(space, jnp.asarray(values, space.u0.dtype)))
 
 
-def sweep(space: Space, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, "candidates free"]:
-    """`u` with each parameter in turn carried through its range, the other values being kept."""
-    at = np.asarray(_values_of(space, jnp.asarray(u[None], space.u0.dtype)))[0]
+def sweep(problem: Problem, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, float]:
+    """The best `u`, and its cost, with some parameters carried elsewhere in their range.
+
+    Each parameter in turn takes SWEEP values, the others keeping theirs; then the best of each are
+    taken over together, as many of them, the best first, as make the lowest cost.
+    """
+    space = problem.space
+    size, dtype = space.size, space.u0.dtype
+    at = np.asarray(_values_of(space, jnp.asarray(u[None], dtype)))[0]
     shares = (np.arange(SWEEP) + 0.5) / SWEEP
-    odds = np.tile(np.log(shares / (1 - shares))[:, None], space.size)
-    grid = np.asarray(_values_of(space, jnp.asarray(odds, space.u0.dtype)))
-    values = np.tile(at, (space.size, SWEEP, 1))
-    for i in range(space.size):
-        values[i, :, i] = grid[:, i]
-    flat = values.reshape(-1, space.size)
-    return np.asarray(from_values(space, jnp.asarray(flat, space.u0.dtype)))
+    odds = np.tile(np.log(shares / (1 - shares))[:, None], size)
+    grid = np.asarray(_values_of(space, jnp.asarray(odds, dtype)))
+    alone = np.tile(at, (size, SWEEP, 1))
+    for i in range(size):
+        alone[i, :, i] = grid[:, i]
+    candidates = np.asarray(from_values(space, jnp.asarray(alone.reshape(-1, size), dtype)))
+    costs = evaluate(problem, candidates).cost.reshape(size, SWEEP)
+
+    together = np.tile(at, (size, 1))
+    for rank, i in enumerate(np.argsort(costs.min(axis=1), kind="stable")):
+        together[rank:, i] = grid[np.argmin(costs[i]), i]
+    joined = np.asarray(from_values(space, jnp.asarray(together, dtype)))
+    every = np.concatenate([candidates, joined])
+    costs = np.concatenate([costs.ravel(), evaluate(problem, joined).cost])
+    best = int(np.argmin(costs))
+    return every[best], float(costs[best])

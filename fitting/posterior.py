@@ -56,6 +56,7 @@ class Posterior:
     converged: bool
     message: str
     seconds: float  # of this call
+    interrupted: bool = False
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
@@ -118,7 +119,8 @@ def sample_problem(
     start_u, start_sd = np.asarray(start_u, float), np.asarray(start_sd, float)
     walkers = max(4 * size, 4) if walkers is None else walkers
     _check_start(size, start_u, start_sd)
-    _check_counts(size, walkers, max_steps, thin_by, check_every)
+    check_walkers(size, walkers)
+    _check_counts(max_steps, thin_by, check_every)
     identity = Identity(problem.space.names, walkers, seed, thin_by, digest(problem))
     names = problem.space.names
 
@@ -152,7 +154,8 @@ def sample_problem(
     converged, message = diagnostics.verdict(before, latest, names, thin_by, stop_at)
     if interrupted:
         converged, message = False, f"Interrupted, the chain is kept. {message}"
-    return _conclude(problem, chain, latest, converged, message, time.monotonic() - began)
+    made = _conclude(problem, chain, latest, converged, message, time.monotonic() - began)
+    return dataclasses.replace(made, interrupted=interrupted)
 
 
 def digest(problem: Problem) -> str:
@@ -262,12 +265,16 @@ def _check_start(size: int, start_u: np.ndarray, start_sd: np.ndarray) -> None:
         raise ValueError(f"start_sd is {start_sd}, wanted more than 0 everywhere")
 
 
-def _check_counts(size: int, walkers: int, max_steps: int, thin_by: int, check_every: int) -> None:
+def check_walkers(size: int, walkers: int) -> None:
+    """ValueError for a number of walkers that the moves cannot use in `size` dimensions."""
     least = max(4, 2 * size)
     if walkers % 2 or walkers < least:
         raise ValueError(
             f"walkers is {walkers}, wanted an even number from {least} on, two per free parameter"
         )
+
+
+def _check_counts(max_steps: int, thin_by: int, check_every: int) -> None:
     if thin_by < 1 or check_every < 1:
         raise ValueError(f"thin_by is {thin_by}, check_every {check_every}, wanted 1 or more")
     if max_steps < thin_by:

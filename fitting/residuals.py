@@ -50,7 +50,7 @@ def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:
 
 
 def turn_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
-    """Rotation vector from `a` to `b`, rad, exact to third order: twice the sine of half its angle."""
+    """Turn from `a` to `b`, rad, exact to third order: twice the sine of half its angle."""
     w, x, y, z = quat.components(quat.multiply(quat.conjugate(a), b))
     return 2.0 * vec.scale(vec.stack(x, y, z), jnp.where(w < 0, -1.0, 1.0))
 
@@ -88,12 +88,12 @@ def rows_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " rows"]:
 
 
 def whitened(
-    rows: Float[Array, "frames *r"], seen: Bool[Array, " frames"], correlation: Array
-) -> Float[Array, "frames *r"]:
+    rows: Float[Array, " frames *r"], seen: Bool[Array, " frames"], correlation: Array
+) -> Float[Array, " frames *r"]:
     """Rows of which each is what the frame before did not foretell, in its own deviations.
 
-    `(r_t - rho r_{t-1}) / sqrt(1 - rho²)` where both frames were seen, `r_t` where only this one was,
-    0 where it was not: independent rows if the errors are a first-order autoregression.
+    `(r_t - rho r_{t-1}) / sqrt(1 - rho²)` where both frames were seen, `r_t` where only this one
+    was, 0 where it was not: independent rows if the errors are a first-order autoregression.
     """
     wide = (slice(None),) + (None,) * (rows.ndim - 1)
     rows = jnp.where(seen[wide], rows, 0.0)

@@ -1,6 +1,5 @@
 """Parameters of a system as TOML: a preset's name and a table a stage, in our names and units."""
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +8,14 @@ import tomli_w
 import jaxik
 from jaxik import rule
 
-from .experiment import check_keys, flat, leaf_names, name_preset, with_parameters
+from .checks import check_keys, flat, nested, read_toml
+from .experiment import leaf_names, name_preset, with_parameters
 
 
 def to_toml(ik: jaxik.FootIK, preset: str = "record") -> str:
     """Every parameter, convention and switch of a system; units as the rules declare them."""
-    tables: dict = {"preset": preset}
-    for name in leaf_names(ik):
-        stage, leaf = name.split(".")
-        tables.setdefault(stage, {})[leaf] = np.asarray(rule.get(ik, name)).tolist()
-    return tomli_w.dumps(tables)
+    values = {name: np.asarray(rule.get(ik, name)).tolist() for name in leaf_names(ik)}
+    return tomli_w.dumps({"preset": preset} | nested(values))
 
 
 def from_toml(path: str | Path) -> tuple[jaxik.FootIK, str]:
@@ -28,12 +25,7 @@ def from_toml(path: str | Path) -> tuple[jaxik.FootIK, str]:
         ValueError: a file that is not there or no TOML, a preset, name or value that is unknown.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such parameter file")
-    try:
-        content = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not TOML: {error}") from None
+    content = read_toml(path, "parameter")
     preset = content.pop("preset", "record")
     ik = name_preset(preset)
     check_keys(content, list(vars(ik)), str(path))

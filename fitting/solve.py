@@ -36,7 +36,8 @@ CALM = 2  # such steps in a row that end a march
 STALLS = 12  # rejected steps in a row that end it: each shrinks the step to a quarter
 AGREED = 1e-3  # relative: two ways that end further apart call for a third go
 ROUNDS = 5  # of blocks
-SWEEPS = 8  # at most, one parameter carried away in each
+SWEEPS = 8  # of all parameters before the last march, at most
+WORTH = 1e-5  # relative fall of the cost for which a sweep's find is taken
 GENERATIONS = 5  # of a population per round
 ELITE = 8
 REPEATED = 16  # children that come again after a Gauss-Newton step
@@ -72,6 +73,7 @@ class Solution:
     history: tuple[Progress, ...]
     steps: int  # of Levenberg–Marquardt, all starts together
     seconds: float
+    interrupted: bool = False
 
 
 class _Position(eqx.Module):
@@ -231,6 +233,8 @@ class _Fit:
 
     def blocks(self, u: np.ndarray, spread: float) -> Any:
         """Turns of thresholds by population and smooth columns by Levenberg–Marquardt."""
+        u, cost, _ = self.descend("blocks", u, MARCH)
+        u, cost = self.sweep(u, cost, 2)
         u, cost, slopes = self.descend("blocks", u, MARCH)
         for number in range(ROUNDS):
             before = cost
@@ -266,19 +270,18 @@ class _Fit:
         ends.sort(key=lambda end: end[1])
         if ends[-1][1] - ends[0][1] > AGREED * ends[0][1]:
             ends.insert(0, self.blocks(ends[0][0], 1.2))
-        self.descend("polish", self.sweep(*ends[0]), self.max_steps)
+        u, _ = self.sweep(*ends[0], SWEEPS)
+        self.descend("polish", u, self.max_steps)
 
-    def sweep(self, u: np.ndarray, cost: float) -> np.ndarray:
-        """Out of the valleys of one parameter: a clamp never reached has no slope to be found by."""
-        for _ in range(SWEEPS):
-            candidates = sweep(self.problem.space, u)
-            born = evaluate(self.problem, candidates, self.still)
-            best = int(np.argmin(born.cost))
-            if born.cost[best] > cost * (1 - TOLERANCE):
+    def sweep(self, u: np.ndarray, cost: float, rounds: int) -> Any:
+        """Out of the valleys of single parameters: a clamp never reached has no slope to follow."""
+        for _ in range(rounds):
+            carried, lower = sweep(self.problem, u)
+            if lower > cost * (1 - WORTH):
                 break
-            self.keep("sweep", candidates[best], float(born.cost[best]))
-            u, cost, _ = self.descend("sweep", candidates[best], MARCH)
-        return u
+            self.keep("sweep", carried, lower)
+            u, cost, _ = self.descend("sweep", carried, MARCH)
+        return u, cost
 
     def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:
         """Points of finite cost: the prior's centre, then the lowest of a population of draws."""
@@ -307,8 +310,8 @@ def solve(
 ) -> Solution:
     """The free parameters of least cost.
 
-    An interrupt (Ctrl-C) ends the search and keeps the best point so far. The solution's
-    `converged` and `message` say how far to trust it.
+    An interrupt (Ctrl-C) ends the search and keeps the best point so far, if there is one. The
+    solution's `converged` and `message` say how far to trust it.
 
     Args:
         problem: what to fit.
@@ -334,6 +337,8 @@ def solve(
             except _Spent:
                 spent = True
     except KeyboardInterrupt:
+        if not np.isfinite(fit.best_cost):
+            raise
         interrupted = True
     converged = fit.settled and not interrupted
     return Solution(
@@ -348,6 +353,7 @@ def solve(
         history=tuple(fit.history),
         steps=fit.total,
         seconds=time.perf_counter() - fit.began,
+        interrupted=interrupted,
     )
 
 

@@ -10,53 +10,73 @@ summary.md, *.png to read
 import dataclasses
 import json
 import math
-import tomllib
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
 from jaxik import rule
 
 from . import settings
+from .checks import nested
 from .experiment import Experiment, load_experiment
 from .files import write_text
 from .posterior import Posterior
+from .solve import Solution
+from .space import Problem
 from .study import Fit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
+READ = ("name", "unit", "u", "start_sd", "value", "determined")  # of fit.json when sampling
+HINT = "`jaxik fit` makes a run"
 TICKS = (30.0, 60.0)  # Hz, at which a gain is also reported
 
 
-def prepare(run: Path) -> None:
-    """The folder of a run, made where it is not there.
+def check_place(run: Path) -> None:
+    """ValueError where no folder for a run can be; makes nothing yet."""
+    there = next(one for one in (run, *run.absolute().parents) if one.exists())
+    if not there.is_dir():
+        raise ValueError(f"{run}: no folder for the run can be made, as {there} is a file")
+    if not os.access(there, os.W_OK):
+        raise ValueError(f"{run}: no folder for the run can be made, as {there} is read-only")
 
-    Raises:
-        ValueError: where a file is in its way.
-    """
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"{run}: cannot make the run's folder: {error.strerror}") from None
+
+def save_solution(run: Path, experiment: Experiment, problem: Problem, solution: Solution) -> None:
+    """Begins the folder of a run with the fitted system, before anything else may go wrong."""
+    run.mkdir(parents=True, exist_ok=True)
+    (run / FIT).unlink(missing_ok=True)  # of an earlier fit: the run is finished when it is there
+    ik = problem.space.unpack(jnp.asarray(solution.u))
+    write_text(run / EXPERIMENT, resolved(experiment))
+    write_text(run / PARAMETERS, settings.to_toml(ik, experiment.preset))
 
 
 def save_fit(run: Path, fitted: Fit) -> None:
     """Keeps a fit in the folder of its run."""
-    write_text(run / EXPERIMENT, resolved(fitted.experiment))
-    write_text(run / PARAMETERS, settings.to_toml(fitted.ik, fitted.experiment.preset))
+    save_solution(run, fitted.experiment, fitted.problem, fitted.solution)
     write_text(run / FIT, json.dumps(describe_fit(fitted), indent=2))
 
 
 def resolved(experiment: Experiment) -> str:
-    """The experiment's file with absolute paths, so that the run may lie anywhere."""
-    content = tomllib.loads(experiment.path.read_text())
-    for table, entry in zip(content["clips"], experiment.clips, strict=True):
-        for key in ("reference", "terrain", "base", "truth"):
-            if key in table:
-                table[key] = str(getattr(entry, key))
+    """The experiment as TOML with absolute paths, so that the run may lie anywhere."""
+    content = _plain(dataclasses.asdict(experiment))
+    del content["path"]
+    for name in ("free", "parameters"):
+        content[name] = nested(content[name])
     return tomli_w.dumps(content)
+
+
+def _plain(value: Any) -> Any:
+    """What TOML can hold: no paths, and nothing where there is None."""
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items() if one is not None}
+    if isinstance(value, tuple | list):
+        return [_plain(one) for one in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def describe_fit(fitted: Fit) -> dict[str, Any]:
@@ -113,16 +133,19 @@ def load_fit(run: Path) -> tuple[Experiment, dict[str, Any]]:
     Raises:
         ValueError: for a folder that holds no finished fit.
     """
-    for name in (EXPERIMENT, FIT):
+    if not run.is_dir():
+        raise ValueError(f"{run}: {'a file' if run.exists() else 'no such folder'}; {HINT}")
+    for name in (EXPERIMENT, FIT, PARAMETERS):
         if not (run / name).is_file():
-            there = sorted(one.name for one in run.iterdir()) if run.is_dir() else "nothing"
-            raise ValueError(f"{run}: no {name}; there is {there}. `jaxik fit` makes a run")
+            there = sorted(one.name for one in run.iterdir()) or "nothing"
+            raise ValueError(f"{run}: no {name}; there is {there}; {HINT}")
     try:
-        told = json.loads((run / FIT).read_text())
-        if not told["parameters"]:
-            raise KeyError("parameters")
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{run / FIT}: not the numbers of a fit: {error}") from None
+        told = json.loads((run / FIT).read_text(encoding="utf-8"))
+        missing = {key for row in told["parameters"] for key in READ if key not in row}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{run / FIT}: not the numbers of a fit: {error!r}; {HINT}") from None
+    if missing:
+        raise ValueError(f"{run / FIT}: parameters without {sorted(missing)}; {HINT}")
     return load_experiment(run / EXPERIMENT), told
 
 

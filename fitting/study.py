@@ -56,14 +56,21 @@ def fit(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     problem = make_problem(experiment)
-    solution = solve(
+    solution = search(problem, experiment, progress)
+    return Fit(experiment, problem, solution, identify(problem, solution))
+
+
+def search(
+    problem: Problem, experiment: Experiment, progress: Callable[[Progress], None] | None
+) -> Solution:
+    """The first half of `fit`: the parameters, before anything is said of how sure they are."""
+    return solve(
         problem,
         starts=experiment.fit.starts,
         max_steps=experiment.fit.max_steps,
         seed=experiment.seed,
         progress=progress,
     )
-    return Fit(experiment, problem, solution, identify(problem, solution))
 
 
 def sample(
@@ -72,7 +79,7 @@ def sample(
     path: Path | None = None,
     progress: Callable[[SamplingProgress], None] | None = None,
 ) -> Posterior:
-    """Samples the posterior around a fit; `path` keeps the chain, and goes on with one kept there."""
+    """Samples the posterior around a fit; `path` keeps the chain and goes on with one there."""
     return sample_start(
         fitted.problem, fitted.experiment, fitted.solution.u, fitted.start_sd, path, progress
     )

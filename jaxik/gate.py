@@ -69,7 +69,11 @@ class Smooth(AbstractGate):
     softness: Float[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def below(self, x: Array, threshold: Array, *, band: float) -> Array:
-        return jax.nn.sigmoid((threshold - x) / (band * self.softness))
+        # An endless threshold decides; divided by the width it would have no slope in softness.
+        gap = threshold - x
+        endless = jnp.isinf(gap)
+        share = jax.nn.sigmoid(jnp.where(endless, 0.0, gap) / (band * self.softness))
+        return jnp.where(endless, jnp.where(gap > 0, 1.0, 0.0), share)
 
     def choose(self, weight: Array, yes: Array, no: Array) -> Array:
         return no + weight * (yes - no)

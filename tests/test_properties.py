@@ -304,13 +304,13 @@ def walk_at(hz: float) -> jaxik.Frame:
     return to_frames(padded(stepping(make_rig(), drift=0.05, hz=hz, count=int(2 * hz))))
 
 
-def test_rates_of_30_60_and_120_hz_agree_within_two_centimetres_and_three_millimetres_on_average():
+def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz():
     ground = to_terrain(planes((0.1, 0.05, 0.0), (-0.1, 0.0, 0.1)))
     runs = {
         hz: jaxik.run(to_ik({}), to_rig(make_rig()), ground, walk_at(hz)) for hz in (30, 60, 120)
     }
     fine = at(runs[120], slice(0, FRAMES, 4))
-    for hz in (30, 60):
+    for hz, most, mean in ((30, 3e-3, 1e-3), (60, 1.2e-3, 5e-4)):  # m; 2.3 and 0.8 mm measured
         coarse = at(runs[hz], slice(0, 2 * hz, hz // 30))
         apart = np.stack(
             [
@@ -318,8 +318,7 @@ def test_rates_of_30_60_and_120_hz_agree_within_two_centimetres_and_three_millim
                 for j in JOINTS
             ]
         )
-        print(hz, apart.max(), apart.mean())
-        assert apart.max() < 0.02 and apart.mean() < 0.003
+        assert apart.max() < most and apart.mean() < mean
 
 
 # Batches.
@@ -444,7 +443,7 @@ def doubles(program):
                 yield from doubles(getattr(inner, "jaxpr", inner))
 
 
-def test_single_precision_stays_within_a_tenth_of_a_millimetre_of_double():
+def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
     result = jaxik.run(*single_inputs(to_ik(ODD)))
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
         floating = jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -455,9 +454,8 @@ def test_single_precision_stays_within_a_tenth_of_a_millimetre_of_double():
     )
     for joint in JOINTS:
         came, wanted = getattr(result.pose, joint), getattr(double.pose, joint)
-        print(joint, np.abs(came.pos - wanted.pos).max())
-        np.testing.assert_allclose(came.pos, wanted.pos, atol=1e-4)
-        assert_same_rot(came.rot, wanted.rot, 1e-3)
+        np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-5)
+        assert_same_rot(came.rot, wanted.rot, 1e-4)
     thigh = np.linalg.norm(result.pose.knee.pos - result.pose.hip.pos, axis=-1)
     np.testing.assert_allclose(thigh, poses.THIGH, atol=1e-6)
 
@@ -542,6 +540,5 @@ def test_smooth_tends_to_hard_as_softness_falls():
             for j in JOINTS
         ]
         apart.append(max(gaps))
-    print(apart)
     assert apart == sorted(apart, reverse=True)
     assert apart[0] > 1e-3 and apart[-1] < 1e-7
