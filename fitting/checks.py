@@ -3,7 +3,8 @@
 import difflib
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +33,9 @@ RATE = Kind("a finite number above 0", lambda value: _is_number(value) and 0 < v
 TIME = Kind("a number of seconds, 0 or more", lambda value: _is_number(value) and value >= 0)
 SHARE = Kind("a number from 0 to below 1", lambda value: _is_number(value) and 0 <= value < 1)
 COUNT = Kind("a whole number above 0", lambda value: _is_whole(value) and value > 0)
-SEED = Kind("a whole number from 0 to 4294967295", lambda value: value in range(2**32))
+SEED = Kind(
+    "a whole number from 0 to 4294967295", lambda value: _is_whole(value) and 0 <= value < 2**32
+)
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -40,17 +43,31 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
     Args:
         path: the file.
-        what: it is, for the error.
+        what: it should be, for the error: "an experiment".
 
     Raises:
         ValueError: a file that is not there or no TOML.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: {'a folder, not a' if path.is_dir() else 'no such'} {what} file")
+        raise ValueError(f"{path}: {missing(path)}, wanted {what} file")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not TOML: {error}") from None
+
+
+def missing(path: Path) -> str:
+    """Why there is nothing to read, in words."""
+    return "a folder" if path.is_dir() else "no such file"
+
+
+@contextmanager
+def located(where: Path | str) -> Iterator[None]:
+    """Says in front of a ValueError from within where it is."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def check_keys(given: Mapping[str, Any], known: Sequence[str], where: str) -> None:
@@ -75,11 +92,14 @@ def check_table(given: Any, kinds: Mapping[str, Kind], where: str) -> Mapping[st
 
 
 def flat(tables: Mapping[str, Any], depth: int, prefix: str = "") -> dict[str, Any]:
-    """Nested TOML tables as dotted names, `depth` parts each: `lock.enabled`."""
+    """Nested TOML tables as dotted names, `depth` parts each: `lock.enabled`.
+
+    An empty table keeps its place, so that no name goes unread.
+    """
     found: dict[str, Any] = {}
     for key, value in tables.items():
         name = f"{prefix}{key}"
-        if isinstance(value, Mapping) and name.count(".") + 1 < depth:
+        if isinstance(value, Mapping) and value and name.count(".") + 1 < depth:
             found |= flat(value, depth, f"{name}.")
         else:
             found[name] = value

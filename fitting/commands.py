@@ -20,7 +20,7 @@ from .cli import INTERRUPTED
 from .clips import inspect as inspection
 from .identify import identify
 from .posterior import SamplingProgress
-from .solve import Progress
+from .solution import Progress
 
 
 def fit(options: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import population
-from .solve import Solution
+from .solution import Solution
 from .space import Problem
 
 CONTRACTED = 0.5  # below it a parameter counts as undetermined

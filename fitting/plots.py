@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatter
 
 from .playback import Motion, Playback
-from .solve import Progress
+from .solution import Progress
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 BEFORE, AFTER, CAPTURED = "#8c8c8c", "#0072B2", "#D55E00"

@@ -1,7 +1,6 @@
 """What is read after a fit or a sampling: texts for the terminal, and the run's summary.md."""
 
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from . import chain_plots, files, playback, plots, store, tables
+from .checks import flat, read_toml
 from .exercise import exercise, flipped_decisions
-from .experiment import Experiment, flat, leaf_names, name_preset
+from .experiment import Experiment, name_preset, with_parameters
 from .posterior import Posterior
 from .study import Fit
 from .tables import Truth, markdown
@@ -28,18 +28,17 @@ def truth_of(experiment: Experiment) -> dict[str, float] | None:
     values there is each with its `[index]`, and their mean by the leaf's own name.
 
     Raises:
-        ValueError: for a file that is not TOML.
+        ValueError: for a file that is not TOML, a name that is unknown, a value that is no number.
     """
     path = next((clip.truth for clip in experiment.clips if clip.truth is not None), None)
     if path is None:
         return None
-    try:
-        content = flat(tomllib.loads(path.read_text()), 2)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not TOML: {error}") from None
+    ik = name_preset(experiment.preset)
+    content = read_toml(path, "a truth")
+    values = flat({stage: table for stage, table in content.items() if stage in vars(ik)}, 2)
+    with_parameters(ik, values, str(path))
     found: dict[str, float] = {}
-    for name in leaf_names(name_preset(experiment.preset)):
-        value = content.get(name, False)
+    for name, value in values.items():
         if not isinstance(value, bool):
             several = value if isinstance(value, list) else []
             found |= {f"{name}[{i}]": float(one) for i, one in enumerate(several)}

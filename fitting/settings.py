@@ -25,7 +25,7 @@ def from_toml(path: str | Path) -> tuple[jaxik.FootIK, str]:
         ValueError: a file that is not there or no TOML, a preset, name or value that is unknown.
     """
     path = Path(path)
-    content = read_toml(path, "parameter")
+    content = read_toml(path, "a parameter")
     preset = content.pop("preset", "record")
     ik = name_preset(preset)
     check_keys(content, list(vars(ik)), str(path))

@@ -13,7 +13,6 @@ whatever the number of starts and stages: a march of Levenberg–Marquardt on th
 the ensemble's, and the population.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +26,7 @@ from jaxtyping import Array, Float
 
 from .population import POPULATION, count_rows, evaluate, sweep, vary
 from .slopes import Model, ensemble, hard, with_slopes
+from .solution import Progress, Solution
 from .space import Problem
 
 MARCH = 8  # steps of Levenberg–Marquardt in one call, between two reports
@@ -44,36 +44,6 @@ REPEATED = 16  # children that come again after a Gauss-Newton step
 SPREADS = (0.8, 0.4, 0.2, 0.1)  # of the ensemble's shifts, in u
 PAIRS = 16  # antithetic shifts of the ensemble
 START_SPREAD = 0.5  # of a further start, in prior standard deviations
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """One report of a running fit."""
-
-    stage: str
-    start: int  # which start, from 0
-    step: int  # steps of Levenberg–Marquardt so far, in this start
-    cost: float  # where the stage stands
-    best: float  # lowest cost on the hard rows so far, over all starts
-    seconds: float  # since the beginning
-
-
-@dataclasses.dataclass(frozen=True)
-class Solution:
-    """Where a fit ended, and how."""
-
-    names: tuple[str, ...]
-    u: Float[np.ndarray, " free"]
-    values: Float[np.ndarray, " free"]  # in their own units
-    cost_before: float  # of the base's values
-    cost: float
-    converged: bool
-    message: str  # one sentence
-    jacobian: Float[np.ndarray, "rows free"]  # of `Problem.rows` at `u`; zero at thresholds
-    history: tuple[Progress, ...]
-    steps: int  # of Levenberg–Marquardt, all starts together
-    seconds: float
-    interrupted: bool = False
 
 
 class _Position(eqx.Module):

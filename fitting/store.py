@@ -26,7 +26,7 @@ from .checks import nested
 from .experiment import Experiment, load_experiment
 from .files import write_text
 from .posterior import Posterior
-from .solve import Solution
+from .solution import Solution
 from .space import Problem
 from .study import Fit
 

@@ -13,7 +13,8 @@ import jaxik
 from .experiment import Experiment, load_experiment, make_problem
 from .identify import Identification, identify
 from .posterior import Posterior, SamplingProgress, sample_problem
-from .solve import Progress, Solution, solve
+from .solution import Progress, Solution
+from .solve import solve
 from .space import Problem
 
 THRESHOLD_SD = 0.05  # of u, around the fit: a Laplace ball at a threshold has the prior's width
