@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from .checks import located
 from .clips import contacts, load_clip
 from .clips.clip import Clip
 from .clips.npz import is_blocks
@@ -84,7 +85,9 @@ def rigid_legs(clip: Clip) -> Clip:
 
 def load_base(path: Path) -> Clip:
     """The animation in a file as foot IK takes it: a blocks file's base, with rigid legs."""
-    return rigid_legs(load_clip(path, variant="base" if is_blocks(path) else "captured"))
+    clip = load_clip(path, variant="base" if is_blocks(path) else "captured")
+    with located(path):
+        return rigid_legs(clip)
 
 
 def ground_under(

@@ -38,6 +38,11 @@ SEED = Kind(
 )
 
 
+def one_of(words: Sequence[str]) -> Kind:
+    """Any of these texts."""
+    return Kind(f"one of {list(words)}", lambda value: value in words)
+
+
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """The tables of a TOML file.
 

@@ -14,7 +14,7 @@ import numpy as np
 import jaxik
 from jaxik import record, rule
 
-from . import clips, experiment, files, frames, report, scenes, settings, store, study
+from . import checks, clips, experiment, files, frames, report, scenes, settings, store, study
 from .base import load_base
 from .cli import INTERRUPTED
 from .clips import inspect as inspection
@@ -96,18 +96,19 @@ def convert(options: argparse.Namespace) -> int:
     base = _read_bytes(options.base) if getattr(options, "base", None) is not None else None
     read = _read_records(options.file, reading, base)
     if options.way == "show":
-        shown = (
-            record.to_csv(read).rstrip()
-            if options.csv
-            else "\n\n".join(_shown(one, reading) for one in read)
-        )
-        print(shown)
+        if options.csv:
+            print(record.to_csv(read).rstrip())
+        else:
+            with checks.located(options.file):
+                print("\n\n".join(_shown(one, reading) for one in read))
         return 0
     (only, *more) = read
     if more:
         raise ValueError(f"{options.file} has {1 + len(more)} rows; give a file with one record")
     if options.way == "to-toml":
-        files.write_text(options.output, settings.to_toml(record.to_ik(only, reading)))
+        with checks.located(options.file):
+            text = settings.to_toml(record.to_ik(only, reading))
+        files.write_text(options.output, text)
     else:
         files.write(options.output, lambda path: path.write_bytes(record.to_bytes(only)))
     print(f"written to {options.output}")
@@ -127,7 +128,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 def _prepare_jax() -> None:
     """Float64, and compiled programs kept between calls."""
     jax.config.update("jax_enable_x64", True)
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         cache = Path.home() / ".cache" / "jaxik"
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
@@ -159,11 +160,9 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
 
 def _read_bytes(path: Path) -> record.Record:
     if not path.is_file():
-        raise ValueError(f"{path}: {'a folder, no file' if path.is_dir() else 'no such file'}")
-    try:
+        raise ValueError(f"{path}: {checks.missing(path)}, wanted a record")
+    with checks.located(path):
         return record.from_bytes(path.read_bytes())
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _read_records(

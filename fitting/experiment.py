@@ -97,15 +97,19 @@ class Experiment:
 
 
 # What the tables of the file hold.
-CLIP = dict.fromkeys(("reference", "terrain", "base", "truth", "file_up"), checks.TEXT)
-CLIP |= {"start": checks.TIME, "end": checks.TIME}
-FREE = dict.fromkeys(("low", "high", "prior_mean"), checks.NUMBER)
+CLIP: dict[str, checks.Kind] = dict.fromkeys(("reference", "terrain", "base", "truth"), checks.TEXT)
+CLIP |= {"start": checks.TIME, "end": checks.TIME, "file_up": checks.one_of(("y", "z"))}
+FREE: dict[str, checks.Kind] = dict.fromkeys(("low", "high", "prior_mean"), checks.NUMBER)
 FREE |= {"prior_sd": checks.POSITIVE, "kind": checks.TEXT, "scale": checks.TEXT}
 SIGMA = dict.fromkeys(SIGMAS, checks.POSITIVE) | {"correlation": checks.SHARE}
 FIT = {"starts": checks.COUNT, "max_steps": checks.COUNT}
-SAMPLE = dict.fromkeys(("walkers", "max_steps", "thin_by"), checks.COUNT)
+SAMPLE: dict[str, checks.Kind] = dict.fromkeys(("walkers", "max_steps", "thin_by"), checks.COUNT)
 SAMPLE |= {"stop_at": checks.POSITIVE}
-TOP = {"name": checks.TEXT, "preset": checks.TEXT, "loss": checks.TEXT}
+TOP: dict[str, checks.Kind] = {
+    "name": checks.TEXT,
+    "preset": checks.TEXT,
+    "loss": checks.one_of(get_args(Loss)),
+}
 TOP |= {"fps": checks.RATE, "seed": checks.SEED}
 TOP |= dict.fromkeys(("free", "parameters", "sigmas", "fit", "sample"), checks.TABLE)
 TOP |= {"clips": checks.Kind("[[clips]], one for each clip", lambda made: isinstance(made, list))}
@@ -119,7 +123,7 @@ def load_experiment(path: str | Path) -> Experiment:
             a value of the wrong kind; a clip or terrain that is not there.
     """
     path = Path(path)
-    return parse_experiment(checks.read_toml(path, "experiment"), path)
+    return parse_experiment(checks.read_toml(path, "an experiment"), path)
 
 
 def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
@@ -128,29 +132,32 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     for key in ("clips", "free"):
         if not content.get(key):
             raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
-    name_preset(content.get("preset", "record"))
-    if (loss := content.get("loss", "squares")) not in get_args(Loss):
-        raise ValueError(f"{path}: loss is {loss!r}; it is one of {get_args(Loss)}")
+    with checks.located(path):
+        name_preset(content.get("preset", "record"))
     check_table(content.get("sigmas", {}), SIGMA, f"{path} [sigmas]")
     made = dict(content)
     made["clips"] = tuple(_entry(entry, path) for entry in content["clips"])
-    made["free"] = _free(content["free"], f"{path} [free]")
+    made["free"] = {
+        name: check_table(given, FREE, f"{path} [free] {name}")
+        for name, given in flat(content["free"], 2).items()
+    }
     made["parameters"] = flat(content.get("parameters", {}), 2)
     made["fit"] = FitOptions(**check_table(content.get("fit", {}), FIT, f"{path} [fit]"))
     sample = check_table(content.get("sample", {}), SAMPLE, f"{path} [sample]")
     made["sample"] = SampleOptions(**sample)
     if "walkers" in sample:
-        posterior.check_walkers(len(made["free"]), sample["walkers"])
+        with checks.located(f"{path} [sample]"):
+            posterior.check_walkers(len(made["free"]), sample["walkers"])
     made.setdefault("name", path.stem)
     return Experiment(path=path, **made)
 
 
-def name_preset(name: str) -> jaxik.FootIK:
+def name_preset(name: object) -> jaxik.FootIK:
     """The preset of this name; ValueError with the list of names."""
     known = sorted(n for n, made in vars(presets).items() if _makes_ik(made))
     if name not in known:
         raise ValueError(f"no preset named {name!r}; there are {known}")
-    return getattr(presets, name)()
+    return getattr(presets, str(name))()
 
 
 def _makes_ik(made: Any) -> bool:
@@ -183,7 +190,7 @@ def with_parameters(ik: jaxik.FootIK, values: Mapping[str, Any], where: str) -> 
         if new.dtype.kind not in ("b" if old.dtype == bool else "if") or np.isnan(new).any():
             kind = "true or false" if old.dtype == bool else "a number"
             raise ValueError(f"{where}: {name} is {value!r}; wanted {kind}")
-        if new.shape != old.shape and (old.ndim, new.ndim) != (0, 1):
+        if new.shape != old.shape and (old.ndim, new.ndim, new.size > 0) != (0, 1, True):
             raise ValueError(f"{where}: {name} has shape {new.shape}; wanted {old.shape}")
     return rule.replace(ik, dict(values))
 
@@ -195,17 +202,17 @@ def leaf_names(ik: jaxik.FootIK) -> list[str]:
 
 def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[Free]:
     """The free parameters as the experiment and the rules declare them."""
-    try:
+    with checks.located(f"{experiment.path} [free]"):
         return [free(ik, name, **options) for name, options in experiment.free.items()]
-    except ValueError as error:
-        raise ValueError(f"{experiment.path} [free]: {error}") from None
 
 
 def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Clip, Terrain]:
     """The reference clip, its flat base and the terrain, over the same frames."""
     ground = scenes.load_terrain(entry.terrain, file_up=entry.file_up)
-    reference = _cut(clips.load_clip(entry.reference), entry.reference, entry, fps)
-    reference = edit.mask_pops(reference)
+    captured = clips.load_clip(entry.reference)
+    with checks.located(entry.reference):
+        captured = edit.mask_pops(captured)  # at its own rate: a pop is shorter than other frames
+    reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
         return reference, flat_base(reference, scenes.heights(ground)), ground
     base = _cut(load_base(entry.base), entry.base, entry, fps)
@@ -219,10 +226,8 @@ def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Cl
 
 
 def _cut(clip: clips.Clip, path: Path, entry: ClipEntry, fps: float | None) -> clips.Clip:
-    try:
+    with checks.located(path):
         clip = edit.trim(clip, entry.start, entry.end)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
     return clip if fps is None else edit.resample(clip, fps)
 
 
@@ -268,11 +273,14 @@ def make_problem(experiment: Experiment) -> Problem:
         ValueError: for anything in the experiment that does not fit its clips or its preset.
     """
     ik = system(experiment)
-    space = make_space(ik, free_parameters(experiment, ik))
+    frees = free_parameters(experiment, ik)
+    with checks.located(f"{experiment.path} [free]"):
+        space = make_space(ik, frees)
     made = []
     for entry in experiment.clips:
         scene = make_scene(*load_pair(entry, experiment.fps), experiment.sigmas)
-        check_shapes(ik, scene.rig, scene.terrain, scene.frames)
+        with checks.located(f"{experiment.path} [parameters]"):
+            check_shapes(ik, scene.rig, scene.terrain, scene.frames)
         made.append(scene)
     return Problem(space, tuple(made), rows_of_scenes, experiment.loss)
 
@@ -307,13 +315,6 @@ def _entry(given: Any, path: Path) -> ClipEntry:
         if key in table:
             made[key] = (path.parent / table[key]).resolve()
             if not made[key].is_file():
-                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: no such file")
+                why = checks.missing(made[key])
+                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {why}")
     return ClipEntry(**made)
-
-
-def _free(tables: Mapping[str, Any], where: str) -> dict[str, Mapping[str, Any]]:
-    for stage, table in tables.items():
-        if table == {} and "." not in stage:
-            raise ValueError(f"{where}: {stage} has no parameter; write {stage}.<name> = {{}}")
-    named = flat(tables, 2)
-    return {name: check_table(table, FREE, f"{where} {name}") for name, table in named.items()}

@@ -211,7 +211,8 @@ def stepping(rig: reference.Rig, drift: float = 0.0, **changes: Any) -> list[ref
     def place(time: float) -> list[float]:
         return [drift * time, 0.0, 0.6 * time]
 
-    return animate(rig, ankles, **({"place": place} | changes))
+    changes.setdefault("place", place)
+    return animate(rig, ankles, **changes)
 
 
 def _step(cycles: float, leg: int) -> list[float]:

@@ -94,7 +94,9 @@ def limits_kept(ik: jaxik.FootIK, frames: jaxik.Frame, result: jaxik.Result) -> 
     """Frames in which no lock holds a foot back and no leg is beyond `soften` times its reach."""
     held = np.linalg.norm(offset_of(result), axis=-1).max(axis=-1) > 1e-6
     a, b = (np.asarray(bone) for bone in bone_lengths(frames.pose))
-    free = ik.leg.soften * np.sqrt(a * a + b * b - 2 * a * b * np.cos(ik.leg.max_knee_angle))
+    free = rule.get(ik, "leg.soften") * np.sqrt(
+        a * a + b * b - 2 * a * b * np.cos(rule.get(ik, "leg.max_knee_angle"))
+    )
     reach = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
     return ~held & (reach <= np.asarray(free)).all(axis=-1)
 
@@ -122,8 +124,8 @@ def along_heading(frames: jaxik.Frame) -> Transform:
 
 def test_flat_ground_changes_feet_that_slip_only_by_their_locks():
     rig = make_rig()
-    slipping = {"place": lambda time: [0.1 * max(time - 2.0, 0.0), 0.0, 0.6 * time]}
-    ik, frames = to_ik({}), to_frames(stepping(rig, **slipping))
+    slipping = lambda time: [0.1 * max(time - 2.0, 0.0), 0.0, 0.6 * time]  # noqa: E731
+    ik, frames = to_ik({}), to_frames(stepping(rig, place=slipping))
     result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
     kept = limits_kept(ik, frames, result)
     assert 0.4 < kept.mean() < 0.6, "locks are at work, and only in the second half"
@@ -238,7 +240,7 @@ def test_mirroring_the_world_mirrors_the_answer(name):
     )
     flip = np.array([-1.0, 1.0, 1.0])
     ground = PlainTerrain(BROKEN.up, planes=[(p * flip, n * flip) for p, n in BROKEN.planes])
-    ik = rule.replace(ik, {"leg.twist": -ik.leg.twist})
+    ik = rule.replace(ik, {"leg.twist": -rule.get(ik, "leg.twist")})
     after = jaxik.run(ik, other, to_terrain(ground), mirrored(wander()))
     before = wandered(name)
     assert_same_pose(after.pose, mirrored(before.pose))
@@ -497,8 +499,8 @@ def compilations():
     """A list that grows by one with every program that XLA compiles."""
     events: list[str] = []
 
-    def listen(event: str, duration: float, **_: object) -> None:
-        del duration
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del duration_secs, kwargs
         if event.endswith("backend_compile_duration"):
             events.append(event)
 
