@@ -15,7 +15,7 @@ from jaxik import frame, vec
 from jaxik.skeleton import Transform
 from jaxik.terrain import cast
 
-from .residuals import Scene, pelvis_ws, turn_between, whitened
+from .residuals import Scene, errors_of, legs_ws, pelvis_ws, rows_by_kind
 
 ABOVE, REACH = 1.0, 3.0  # m, where the rays that look for the ground start, and their length
 
@@ -101,25 +101,13 @@ def play(ik: jaxik.FootIK, scene: Scene) -> Playback:
 @eqx.filter_jit
 def _watch(scene: Scene, result: jaxik.Result) -> Playback:
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
-    each = Transform(world.pos[:, None], world.rot[:, None])
-    animated, solved = (
-        jaxik.LegPose(*(each @ joint for joint in (pose.hip, pose.knee, pose.ankle, pose.toe)))
-        for pose in (scene.frames.pose, result.pose)
-    )
+    animated, solved = scene.frames.pose.moved(_per_leg(world)), legs_ws(scene, result)
     base, carried = world @ scene.pelvis, pelvis_ws(scene, result)
     # The reference knows no hips and toes: they hang on the pelvis and the ankles as in the base.
     hips = _per_leg(reference.pelvis).apply(_per_leg(base).inverse().apply(animated.hip.pos))
     toes = reference.ankle.apply(animated.ankle.inverse().apply(animated.toe.pos))
     hit = cast(scene.terrain, reference.ankle.pos + vec.scale(up, jnp.asarray(ABOVE)), REACH)
-    errors = _errors(scene, result, carried, solved)
-    sigmas = {kind: getattr(scene.sigmas, kind) for kind in errors}
-    calm = reference.seen[2:] & reference.seen[1:-1] & reference.seen[:-2]
-    rows = {
-        kind: whitened(error / sigmas[kind], reference.seen, scene.sigmas.correlation)
-        for kind, error in errors.items()
-        if kind != "smooth"
-    }
-    rows["smooth"] = jnp.where(calm[:, None, None], errors["smooth"] / sigmas["smooth"], 0.0)
+    errors = errors_of(scene, result)
     return Playback(
         before=Motion(base.pos, *_positions(animated)),
         after=Motion(carried.pos, *_positions(solved)),
@@ -135,28 +123,9 @@ def _watch(scene: Scene, result: jaxik.Result) -> Playback:
         slide=scene.frames.slide,
         seen=reference.seen,
         errors=errors,
-        rows=rows,
-        sigmas=sigmas,
+        rows=rows_by_kind(scene, errors),
+        sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},
     )
-
-
-def _errors(
-    scene: Scene, result: jaxik.Result, pelvis: Transform, legs: jaxik.LegPose
-) -> dict[str, Array]:
-    """What `residuals.rows_of_scene` divides by its sigmas, by kind and in its order."""
-    reference, present = scene.reference, scene.rig.present[:, None]
-    ankle = (legs.ankle.pos - reference.ankle.pos) * present
-    step = scene.frames.dt[1:-1, None, None]
-    standing = result.trace.sensed.contact.weight - reference.contact
-    return {
-        "ankle": ankle,
-        "knee": (legs.knee.pos - reference.knee_ws) * present,
-        "pelvis": pelvis.pos - reference.pelvis.pos,
-        "foot": turn_between(reference.ankle.rot, legs.ankle.rot) * present,
-        "body": turn_between(reference.pelvis.rot, pelvis.rot),
-        "contact": standing * scene.rig.present,
-        "smooth": (ankle[2:] - 2.0 * ankle[1:-1] + ankle[:-2]) / step**2,
-    }
 
 
 def _per_leg(each: Transform) -> Transform:

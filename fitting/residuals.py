@@ -55,36 +55,49 @@ def turn_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Arra
     return 2.0 * vec.scale(vec.stack(x, y, z), jnp.where(w < 0, -1.0, 1.0))
 
 
-def rows_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " rows"]:
-    """Residuals of one clip in standard deviations; 0 where the reference was not seen."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
-    reference, sigmas = scene.reference, scene.sigmas
+def legs_ws(scene: Scene, result: jaxik.Result) -> jaxik.LegPose:
+    """The solved legs, (frames legs), world space."""
     world = scene.frames.world_from_model
-    each = Transform(world.pos[:, None], world.rot[:, None])
-    pelvis = pelvis_ws(scene, result)
-    ankle_ws = each.apply(result.pose.ankle.pos)
-    ankle_error = ankle_ws - reference.ankle.pos
-    present = scene.rig.present[:, None]
-    kinds = (
-        (ankle_error * present, sigmas.ankle),
-        ((each.apply(result.pose.knee.pos) - reference.knee_ws) * present, sigmas.knee),
-        (pelvis.pos - reference.pelvis.pos, sigmas.pelvis),
-        (
-            turn_between(reference.ankle.rot, each.turn(result.pose.ankle.rot)) * present,
-            sigmas.foot,
-        ),
-        (turn_between(reference.pelvis.rot, pelvis.rot), sigmas.body),
-        (
-            (result.trace.sensed.contact.weight - reference.contact) * scene.rig.present,
-            sigmas.contact,
-        ),
-    )
-    rows = [whitened(error / sigma, reference.seen, sigmas.correlation) for error, sigma in kinds]
+    return result.pose.moved(Transform(world.pos[:, None], world.rot[:, None]))
+
+
+def errors_of(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
+    """How far a result is from the reference, by kind of residual, in the unit of its sigma."""
+    reference, present = scene.reference, scene.rig.present[:, None]
+    legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
+    ankle = (legs.ankle.pos - reference.ankle.pos) * present
     step = scene.frames.dt[1:-1, None, None]
-    bend = (ankle_error[2:] - 2.0 * ankle_error[1:-1] + ankle_error[:-2]) * present / step**2
-    calm = reference.seen[2:] & reference.seen[1:-1] & reference.seen[:-2]
-    rows.append(jnp.where(calm[:, None, None], bend / sigmas.smooth, 0.0))
-    return jnp.concatenate([row.ravel() for row in rows])
+    standing = result.trace.sensed.contact.weight - reference.contact
+    return {
+        "ankle": ankle,
+        "knee": (legs.knee.pos - reference.knee_ws) * present,
+        "pelvis": pelvis.pos - reference.pelvis.pos,
+        "foot": turn_between(reference.ankle.rot, legs.ankle.rot) * present,
+        "body": turn_between(reference.pelvis.rot, pelvis.rot),
+        "contact": standing * scene.rig.present,
+        "smooth": (ankle[2:] - 2.0 * ankle[1:-1] + ankle[:-2]) / step**2,
+    }
+
+
+def rows_by_kind(scene: Scene, errors: dict[str, Array]) -> dict[str, Array]:
+    """Errors in standard deviations, whitened; 0 where the reference was not seen."""
+    seen, sigmas = scene.reference.seen, scene.sigmas
+    calm = seen[2:] & seen[1:-1] & seen[:-2]
+    rows = {}
+    for kind, error in errors.items():
+        scaled = error / getattr(sigmas, kind)
+        if kind == "smooth":  # an acceleration takes three frames
+            rows[kind] = jnp.where(calm[:, None, None], scaled, 0.0)
+        else:
+            rows[kind] = whitened(scaled, seen, sigmas.correlation)
+    return rows
+
+
+def rows_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " rows"]:
+    """Residuals of one clip in standard deviations, one kind after another."""
+    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    rows = rows_by_kind(scene, errors_of(scene, result))
+    return jnp.concatenate([row.ravel() for row in rows.values()])
 
 
 def whitened(

@@ -240,7 +240,8 @@ class _Fit:
         ends.sort(key=lambda end: end[1])
         if ends[-1][1] - ends[0][1] > AGREED * ends[0][1]:
             ends.insert(0, self.blocks(ends[0][0], 1.2))
-        u, _ = self.sweep(*ends[0], SWEEPS)
+        u, cost = ends[0]
+        u, _ = self.sweep(u, cost, SWEEPS)
         self.descend("polish", u, self.max_steps)
 
     def sweep(self, u: np.ndarray, cost: float, rounds: int) -> Any:

@@ -22,9 +22,9 @@ def stack(x: Array, y: Array, z: Array) -> Float[Array, "*b 3"]:
 def fence(x: Array) -> Array:
     """`x`, computed once.
 
-    XLA's fusion on a CPU computes a cheap value again in each consumer; through a chain of quaternion
-    products, where every component depends on every component before, that grows exponentially. A
-    fence after each product halved the compile time of a frame and made it run five times faster.
+    XLA's fusion on a CPU computes a cheap value again in each consumer; through a chain of
+    quaternion products, where every component depends on every component before, that grows
+    exponentially. Fences after the products halved the compile time of the pipeline.
     """
     return jax.lax.optimization_barrier(x)
 

@@ -159,7 +159,7 @@ def test_a_marker_pop_is_not_seen(tmp_path):
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk.npz", "popped.npz") + SECOND
     read = experiment.load_experiment(write(tmp_path, clips=clips))
     (scene,) = experiment.make_problem(read).data
-    assert not scene.reference.seen[15] and scene.reference.seen[[0, 12, 18, 30]].all()
+    assert not scene.reference.seen[15] and np.asarray(scene.reference.seen)[[0, 12, 18, 30]].all()
     resampled = dataclasses.replace(read, fps=15.0)
     assert not experiment.make_problem(resampled).data[0].reference.seen[7]
 
