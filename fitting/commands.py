@@ -16,7 +16,6 @@ from jaxik import record, rule
 
 from . import checks, clips, experiment, files, frames, report, scenes, settings, store, study
 from .base import load_base
-from .cli import INTERRUPTED
 from .clips import inspect as inspection
 from .identify import identify
 from .posterior import SamplingProgress
@@ -38,7 +37,9 @@ def fit(options: argparse.Namespace) -> int:
     report.write_fit(options.output, fitted)
     print("\n" + report.fit_text(store.describe_fit(fitted), truth))
     print(f"written to {options.output}; read {options.output / store.SUMMARY}")
-    return INTERRUPTED if solution.interrupted else 0
+    if solution.interrupted:
+        raise KeyboardInterrupt  # all is written: it may go on
+    return 0
 
 
 def sample(options: argparse.Namespace) -> int:
@@ -62,7 +63,9 @@ def sample(options: argparse.Namespace) -> int:
     report.write_posterior(options.run, asked, posterior)
     print("\n" + report.posterior_text(posterior, truth))
     print(f"written to {options.run}; read {options.run / store.SUMMARY}")
-    return INTERRUPTED if posterior.interrupted else 0
+    if posterior.interrupted:
+        raise KeyboardInterrupt
+    return 0
 
 
 def apply(options: argparse.Namespace) -> int:

@@ -7,8 +7,8 @@ import pytest
 from clips_made import stairs, walker
 from scipy.spatial.transform import Rotation
 
-from fitting.base import flat_base, ground_under
-from fitting.clips import load_clip
+from fitting.base import LONGEST, flat_base, ground_under, load_base, rigid_legs
+from fitting.clips import load_clip, save_clip
 from fitting.clips.contacts import runs
 
 
@@ -121,3 +121,47 @@ def test_what_hangs_on_a_foot_goes_with_it(mocap):
     head = clip.joint_names.index("head")
     lift = (base.positions_ws - clip.positions_ws)[:, [0, head]]
     assert np.allclose(lift[:, 0], lift[:, 1])
+
+
+def stretched(walk):
+    """The walk with its left ankle and what hangs on it pulled a little off the shin."""
+    positions = walk.positions_ws.copy()
+    positions[10:40, 3:5, 1] -= 0.03
+    return replace(walk, positions_ws=positions)
+
+
+def test_legs_that_stretch_are_made_rigid_and_the_rest_is_left_alone(walk):
+    rigid = rigid_legs(stretched(walk))
+    hip, knee, ankle = (rigid.joints_ws(role) for role in range(3))
+    thigh, shin = (np.asarray(length) for length in (walk.rig.thigh, walk.rig.shin))
+    assert np.allclose(np.linalg.norm(knee - hip, axis=-1), thigh, atol=1e-9)
+    assert np.allclose(np.linalg.norm(ankle - knee, axis=-1), shin, atol=1e-9)
+    reach = np.linalg.norm((stretched(walk).joints_ws(2) - hip), axis=-1)
+    near = reach < LONGEST * (thigh + shin) - 1e-9
+    assert near.any() and np.allclose(ankle[near], stretched(walk).joints_ws(2)[near], atol=1e-9)
+    assert np.allclose(rigid.positions_ws[:, [0, 1, 5]], walk.positions_ws[:, [0, 1, 5]])
+    toe = rigid.positions_ws[:, 4] - rigid.positions_ws[:, 3]
+    assert np.allclose(toe, walk.positions_ws[:, 4] - walk.positions_ws[:, 3], atol=1e-9)
+
+
+def test_a_clip_whose_bones_keep_their_lengths_is_returned_as_it_is(walk, base):
+    assert rigid_legs(walk) is walk and rigid_legs(base) is base
+
+
+def test_a_base_is_loaded_from_any_clip_and_of_the_blocks_the_flat_one(walk, tmp_path, mocap):
+    save_clip(tmp_path / "walk.npz", walk)
+    assert np.array_equal(load_base(tmp_path / "walk.npz").positions_ws, walk.positions_ws)
+    blocks = mocap / "blocks" / "03_03.npz"
+    wanted, loaded = load_clip(blocks, variant="base"), load_base(blocks)
+    hips = [0, 1, 5]
+    assert np.allclose(loaded.positions_ws[:, hips], wanted.positions_ws[:, hips], atol=1e-12)
+    hip, knee, ankle = (loaded.joints_ws(role) for role in range(3))
+    for bone, length in ((knee - hip, loaded.rig.thigh), (ankle - knee, loaded.rig.shin)):
+        assert np.abs(np.linalg.norm(bone, axis=-1) - np.asarray(length)).max() < 1e-6
+
+
+def test_a_base_without_legs_is_refused_with_its_file(walk, tmp_path):
+    names = tuple(f"joint {i}" for i in range(len(walk.joint_names)))
+    save_clip(tmp_path / "odd.npz", replace(walk, joint_names=names, measured=None))
+    with pytest.raises(ValueError, match=r"odd\.npz: no pair of legs recognised"):
+        load_base(tmp_path / "odd.npz")
