@@ -2,11 +2,14 @@
 
 import argparse
 import csv
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,7 +33,8 @@ def fit(options: argparse.Namespace) -> int:
     store.check_place(options.output)
     problem = experiment.make_problem(asked)
     print(f"fitting {len(asked.free)} parameters of {asked.preset} to {len(asked.clips)} clip(s)")
-    solution = study.search(problem, asked, _Line(_fit_line))
+    with _Line(_fit_line) as line:
+        solution = study.search(problem, asked, line)
     store.save_solution(options.output, asked, problem, solution)
     fitted = study.Fit(asked, problem, solution, identify(problem, solution))
     store.save_fit(options.output, fitted)
@@ -58,7 +62,8 @@ def sample(options: argparse.Namespace) -> int:
     start_u = np.array([row["u"] for row in told["parameters"]])
     start_sd = np.array([row["start_sd"] for row in told["parameters"]])
     chain = options.run / store.CHAIN
-    posterior = study.sample_start(problem, asked, start_u, start_sd, chain, _Line(_sample_line))
+    with _Line(_sample_line) as line:
+        posterior = study.sample_start(problem, asked, start_u, start_sd, chain, line)
     store.save_posterior(options.run, posterior)
     report.write_posterior(options.run, asked, posterior)
     print("\n" + report.posterior_text(posterior, truth))
@@ -205,14 +210,36 @@ def _shown(one: record.Record, reading: record.Reading) -> str:
 
 
 class _Line:
-    """Progress on one line of a terminal, on a line every ten seconds elsewhere."""
+    """Progress on one line of a terminal, on a line every ten seconds elsewhere.
+
+    Within it no Ctrl-C is lost: one that comes while Python collects garbage ends in a hook of JAX,
+    which goes on; it is raised again at the next report.
+    """
 
     def __init__(self, show: Callable):
         self.show = show
         self.live = sys.stderr.isatty()
         self.last = -1e9
+        self.handler: Any = None
+        self.interrupted = False
+
+    def __enter__(self) -> "_Line":
+        own = threading.current_thread() is threading.main_thread()
+        if own and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            self.handler = signal.signal(signal.SIGINT, self._interrupt)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.handler is not None:
+            signal.signal(signal.SIGINT, self.handler)
+
+    def _interrupt(self, *_: object) -> None:
+        self.interrupted = True
+        raise KeyboardInterrupt
 
     def __call__(self, progress: Progress | SamplingProgress) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
         now = time.monotonic()
         if now - self.last < (0.1 if self.live else 10.0):
             return

@@ -202,6 +202,23 @@ def test_an_interrupted_fit_is_written_with_its_best_point(
     assert store.SUMMARY in tree(tmp_path / "run")
 
 
+def test_an_interrupt_that_another_hook_swallows_is_raised_at_the_next_report(capsys):
+    def show(_) -> str:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            pass
+        return "going on"
+
+    progress = solve.Progress("start", 0, 0, 1.0, 1.0, 0.0)
+    with commands._Line(show) as line:
+        line(progress)
+        assert capsys.readouterr().err == "going on\n"
+        with pytest.raises(KeyboardInterrupt):
+            line(progress)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_an_interrupted_sampling_keeps_its_chain(quickly, run, tmp_path, monkeypatch, capsys):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
 

@@ -46,7 +46,11 @@ def truth(embedded) -> jax.Array:
     return embedded.space.pack({name: known[name] for name in names if name in known})
 
 
-@eqx.filter_jit
+# Compiled in a hurry: what is only looked at, and not the slopes that a fit uses.
+hurried = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@hurried
 def rows_and_result(ik, scene):
     return residuals.rows_of_scene(ik, scene), jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
 
@@ -212,12 +216,12 @@ def rows_and_jacobian(problem, u):
     return problem.rows_and_jacobian(u)
 
 
-@jax.jit
+@hurried
 def rows_at(problem, points):
     return jax.vmap(problem.rows)(points)
 
 
-@functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+@hurried
 def reverse_mode(problem, u, weights):
     return jax.vjp(problem.rows, u)[1](weights)[0]
 
