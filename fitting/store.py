@@ -9,7 +9,6 @@ summary.md, *.png to read
 
 import dataclasses
 import json
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import tomli_w
 
-from jaxik import rule
+from jaxik import ease, rule
 
 from . import settings
 from .checks import nested
@@ -120,10 +119,11 @@ def describe_fit(fitted: Fit) -> dict[str, Any]:
 
 def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
     """The half-life of a gain per tick, s, and the gains that it means at other rates."""
-    half_life = -math.log(2.0) / (tick_hz * math.log1p(-gain))
-    readings = {"half_life": half_life}
+    given, rate = jnp.asarray(gain), jnp.asarray(tick_hz)
+    readings = {"half_life": float(ease.half_life_of_gain(given, rate))}
     for hz in TICKS:
-        readings[f"gain_at_{hz:.0f}_hz"] = -math.expm1(tick_hz / hz * math.log1p(-gain))
+        share = ease.share_of_gain(given, jnp.asarray(1.0 / hz), rate)
+        readings[f"gain_at_{hz:.0f}_hz"] = float(share)
     return readings
 
 
