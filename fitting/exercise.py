@@ -38,7 +38,7 @@ def exercise(ik: jaxik.FootIK, scene: Scene) -> Exercise:
     """What the scene's clip asks of this system."""
     result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
     present = np.asarray(scene.rig.present)
-    locked = np.asarray(result.trace.advanced.state.lock.locked)[:, present] > 0.5
+    locked = np.asarray(result.trace.advanced.held.locked)[:, present] > 0.5
     turns = np.diff(locked.astype(int), axis=0)
 
     def share(flags: Array) -> np.ndarray:
@@ -51,7 +51,7 @@ def exercise(ik: jaxik.FootIK, scene: Scene) -> Exercise:
         found=share(result.trace.sensed.foothold.found),
         standing=share(result.trace.sensed.contact.weight),
         reached=share(result.reached),
-        locked=share(result.trace.advanced.state.lock.locked),
+        locked=share(result.trace.advanced.held.locked),
         locks=tuple(int(n) for n in (turns > 0).sum(axis=0)),
         releases=tuple(int(n) for n in (turns < 0).sum(axis=0)),
         limits=active_limits(ik, scene, result),
@@ -74,9 +74,9 @@ def active_limits(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> dict[
         leaf = name.rpartition(".")[2]
         if declared.kind == "threshold" or not (leaf == "limit" or leaf[:4] in ("max_", "min_")):
             continue
-        free = jnp.full_like(
-            rule.get(ik, name), declared.low if leaf[:4] == "min_" else declared.high
-        )
+        value = rule.get(ik, name)
+        lowest, highest = jnp.minimum(value, declared.low), jnp.maximum(value, declared.high)
+        free = lowest if leaf[:4] == "min_" else highest
         without = _step_each(rule.replace(ik, {name: free}), scene, before)
         found[name] = float(np.mean(_differ(as_is, without)))
     return found
@@ -115,11 +115,11 @@ def flipped_decisions(
 
 
 def _decisions(result: jaxik.Result) -> np.ndarray:
-    sensed, state = result.trace.sensed, result.trace.advanced.state
+    sensed, held = result.trace.sensed, result.trace.advanced.held
     every = (
         sensed.contact.planted,
         sensed.contact.lifted,
-        state.lock.locked,
+        held.locked,
         sensed.foothold.found,
     )
     return np.stack([np.asarray(one) > 0.5 for one in every], axis=-1).ravel()

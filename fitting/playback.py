@@ -118,7 +118,7 @@ def _watch(scene: Scene, result: jaxik.Result) -> Playback:
         grounded=hit.found,
         dt=scene.frames.dt,
         contact=result.trace.sensed.contact.weight,
-        locked=result.trace.advanced.state.lock.locked,
+        locked=result.trace.advanced.held.locked,
         stance=reference.contact,
         slide=scene.frames.slide,
         seen=reference.seen,

@@ -1,4 +1,4 @@
-"""Stage 2: how far each foot of the animation stands."""
+"""Stage 3: how far each foot of the animation stands."""
 
 from abc import abstractmethod
 
@@ -12,6 +12,7 @@ from .gate import AbstractGate
 from .rule import parameter
 
 HEIGHT_BAND = 0.01  # m over which a softened height decision turns
+SPEED_BAND = 0.05  # m/s, likewise
 
 
 class AbstractContact(eqx.Module):
@@ -40,3 +41,24 @@ class HeightContact(AbstractContact):
         zero, one = jnp.zeros_like(lift), jnp.ones_like(lift)
         ramp = gate.clip(share, zero, one, band=0.1)
         return Contact(lift, jnp.where(span > 0, ramp, planted), planted, lifted)
+
+
+class StandingContact(AbstractContact):
+    """Every foot always stands: where there is ground, foot IK works (ozz and Mec)."""
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        lift = frame.pose.ankle.pos[..., 1]
+        one, zero = jnp.ones_like(lift), jnp.zeros_like(lift)
+        return Contact(lift, one, one, zero)
+
+
+class IdleContact(AbstractContact):
+    """All feet stand while the character does, none while it moves (Unreal, seed 001)."""
+
+    idle_speed: Array = parameter(0.0, unit="m/s", low=0.0, high=3.0, kind="threshold")
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        lift = frame.pose.ankle.pos[..., 1]
+        idle = gate.below(frame.speed, self.idle_speed, band=SPEED_BAND)
+        idle = jnp.broadcast_to(idle, lift.shape)
+        return Contact(lift, idle, idle, 1.0 - idle)

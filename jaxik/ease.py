@@ -2,7 +2,8 @@
 
 A law gives a `share` 0..1 of the gap, and `approach` goes that share of the way. Gain and half-life
 are the same exponential in two notations and exact at any `dt`; the clamped speed is not, and is
-kept as its engine has it; the critically damped spring is exact and also carries a velocity.
+kept as its engine has it; the critically damped spring is exact and also carries a velocity. A
+weight that moves at one pace (`towards`) closes its gap in steps.
 """
 
 import jax.numpy as jnp
@@ -39,6 +40,24 @@ def share_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
     """
     share = jnp.clip(dt * speed, 0.0, 1.0)
     return jnp.where((speed > 0) & (jnp.abs(gap) > JUMP_GAP), share, 1.0)
+
+
+def towards(value: Array, goal: Array, step: Array) -> Array:
+    """`value` moved towards `goal` by `step` (0 or more), or as far as the goal."""
+    gap = goal - value
+    return value + jnp.where(gap > step, step, jnp.where(gap < -step, -step, gap))
+
+
+def step_of_time(time: Array, dt: Array) -> Array:
+    """Step in `dt` s of a weight that goes from 0 to 1 in `time` s; all of it at 0 or less."""
+    lasting = time > 0
+    return jnp.where(lasting, dt / jnp.where(lasting, time, 1.0), 1.0)
+
+
+def step_of_speed(speed: Array, dt: Array) -> Array:
+    """Step in `dt` s of a weight that moves by `speed` a second; all of it at an endless speed."""
+    endless = jnp.isinf(speed)
+    return jnp.where(endless, 1.0, jnp.where(endless, 0.0, speed) * dt)
 
 
 def spring(

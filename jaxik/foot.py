@@ -1,4 +1,4 @@
-"""Stage 8: ankles that lay the soles on the ground."""
+"""Stage 10: ankles that lay the soles on the ground."""
 
 from abc import abstractmethod
 
@@ -7,13 +7,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import quat, vec
-from .frame import FORWARD, Frame, Sensed
+from .aim import aim_turn
+from .effector import Effector
+from .frame import FORWARD, UP, Frame, Ground, Sensed, animated
 from .gate import AbstractGate
-from .leg import Bend, local
-from .rule import parameter
+from .leg import Bend
+from .limb import turn_about
+from .probe import foot_heading
+from .rule import parameter, switch
 from .skeleton import LegPose, Rig, Transform
+from .terrain import Hit
 
 ANGLE_BAND = 0.035  # rad, 2 degrees
+SHARE_BAND = 0.05  # of a turn's angle
+LEAST_SHARE = 0.01  # a turn below this share of its limit counts as that
+SAME_ANGLE = 1e-6  # rad, within which a limit did nothing
 SHORTEST_SOLE = 0.01  # m, horizontal distance under which two hits give no pitch
 LEFT = (1.0, 0.0, 0.0)  # foot axes
 
@@ -23,19 +31,41 @@ class Planted(eqx.Module):
 
     pose: LegPose  # legs, model space
     ankle: Float[Array, "legs 4"]  # correction, on the right of the ankle's rotation
+    reached: Float[Array, " legs"]  # 1 where the foot is turned as the ground asks, else 0
 
 
 class AbstractFoot(eqx.Module):
     """Turns feet."""
 
     @abstractmethod
+    def sense(
+        self, rig: Rig, frame: Frame, up_ws: Array, ground: Ground, gate: AbstractGate
+    ) -> Float[Array, "legs 4"]:
+        """The ankles' rotation in the world that memory may keep, before the legs are solved."""
+
+    @abstractmethod
     def pose(
-        self, rig: Rig, frame: Frame, sensed: Sensed, bend: Bend, gate: AbstractGate
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        effector: Effector,
+        bend: Bend,
+        gate: AbstractGate,
     ) -> Planted:
         """The solved legs with their feet turned."""
 
 
-class PitchRollFoot(AbstractFoot):
+class AbstractAnimatedFoot(AbstractFoot):
+    """Turns feet from where the animation has them."""
+
+    def sense(
+        self, rig: Rig, frame: Frame, up_ws: Array, ground: Ground, gate: AbstractGate
+    ) -> Float[Array, "legs 4"]:
+        return animated(frame).rot
+
+
+class PitchRollFoot(AbstractAnimatedFoot):
     """Pitches and rolls the animated foot onto the ground, its heading kept.
 
     The pitch comes from the two hits where there is a toe ray, else, like the roll, from the
@@ -51,11 +81,17 @@ class PitchRollFoot(AbstractFoot):
     min_roll: Array = parameter(-0.52, unit="rad", low=-1.0, high=0.0)
 
     def pose(
-        self, rig: Rig, frame: Frame, sensed: Sensed, bend: Bend, gate: AbstractGate
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        effector: Effector,
+        bend: Bend,
+        gate: AbstractGate,
     ) -> Planted:
         world = frame.world_from_model
-        up = sensed.up_ws
-        foot = world.turn(quat.multiply(frame.pose.ankle.rot, rig.ankle_from_foot))
+        up = sensed.leg_up_ws
+        foot = quat.multiply(effector.rot_ws, rig.ankle_from_foot)
         sole = quat.rotate(foot, vec.constant(FORWARD, up))
         outer = vec.scale(quat.rotate(foot, vec.constant(LEFT, up)), rig.side)
         ahead = vec.unit(vec.reject(sole, up), sensed.slope.forward_ws)
@@ -66,6 +102,7 @@ class PitchRollFoot(AbstractFoot):
             bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
         shin = quat.rotate(world.rot, shin)
+        free_pitch, free_roll = pitch, roll
         pitch = limited(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
         roll = limited(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
 
@@ -73,18 +110,141 @@ class PitchRollFoot(AbstractFoot):
         tilt = quat.multiply(
             quat.from_axis_angle(pitched, roll * rig.side), quat.from_axis_angle(right, pitch)
         )
-        tilt_ms = local(world.rot, tilt)
+        cut = jnp.abs(pitch - free_pitch) + jnp.abs(roll - free_roll)
+        kept = gate.below(cut, jnp.full_like(cut, SAME_ANGLE), band=ANGLE_BAND)
+        return turned(frame, effector, bend, quat.multiply(tilt, effector.rot_ws), kept)
+
+
+class AimFoot(AbstractAnimatedFoot):
+    """ozz's aim job: the ankle's up looks at a point one metre off the ground, along its normal.
+
+    From the pose after the leg's turn: the axis out of the sole, from `offset` (m, foot axes), aims
+    at the ankle's target plus the normal; the foot's forward axis is pulled to where it was, then
+    turned by `twist`. A leg without ground, or with `enabled` off, keeps its foot as carried.
+    """
+
+    enabled: Array = switch(True)
+    offset: Array = parameter((0.0, 0.0, 0.0), unit="m", low=-0.2, high=0.2)
+    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        effector: Effector,
+        bend: Bend,
+        gate: AbstractGate,
+    ) -> Planted:
         carried = bend.pose.ankle
-        wanted = quat.multiply(tilt_ms, frame.pose.ankle.rot)
-        ankle = Transform(carried.pos, quat.nlerp(carried.rot, wanted, sensed.weight))
-        toe = ankle @ (frame.pose.ankle.inverse() @ frame.pose.toe)
-        pose = LegPose(bend.pose.hip, bend.pose.knee, ankle, toe)
-        return Planted(pose, quat.multiply(quat.conjugate(carried.rot), ankle.rot))
+        into_model = frame.world_from_model.inverse()
+        foot = quat.multiply(carried.rot, rig.ankle_from_foot)
+        aim = into_model.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
+        upward, ahead = (quat.rotate(foot, vec.constant(axis, aim)) for axis in (UP, FORWARD))
+        start = quat.rotate(foot, self.offset)
+        turn, reached = aim_turn(aim, upward, start, ahead, ahead, self.twist, gate)
+        weight = jnp.where(self.enabled, effector.weight * sensed.foothold.found, 0.0)
+        turn = quat.nlerp(quat.identity(turn.dtype), turn, weight * self.weight)
+        full = jnp.where(weight * self.weight >= 1, 1.0, 0.0)
+        return with_ankle(frame, bend, quat.multiply(turn, carried.rot), reached * full)
+
+
+class FlatFoot(AbstractFoot):
+    """Lays the foot flat on three hits, its heading the animation's (Mec).
+
+    The pitch is that from foot to toe, the roll that from foot to corner; where a ray missed it is
+    zero. Both tilt a foot that stands upright along its up, by `max_tilt` at most.
+    """
+
+    max_tilt: Array = parameter(0.7853981634, unit="rad", low=0.0, high=1.5)
+
+    def sense(
+        self, rig: Rig, frame: Frame, up_ws: Array, ground: Ground, gate: AbstractGate
+    ) -> Float[Array, "legs 4"]:
+        ahead, right = foot_heading(rig, frame, up_ws)
+        pitch = rise_angle(ground.ankle, ground.toe, ahead, up_ws)
+        roll = rise_angle(ground.ankle, ground.corner, right, up_ws)
+        tilt = quat.multiply(quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, -roll))
+        level = quat.multiply(upright(ahead, up_ws), quat.conjugate(rig.ankle_from_foot))
+        flat = quat.multiply(at_most(tilt, self.max_tilt, gate), level)
+        return quat.nlerp(animated(frame).rot, flat, ground.ankle.found)
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        effector: Effector,
+        bend: Bend,
+        gate: AbstractGate,
+    ) -> Planted:
+        return turned(frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
+
+
+class KeepFoot(AbstractAnimatedFoot):
+    """Feet keep their animated rotation in the world (Unreal, seed 001)."""
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        effector: Effector,
+        bend: Bend,
+        gate: AbstractGate,
+    ) -> Planted:
+        return turned(frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight))
+
+
+def turned(frame: Frame, effector: Effector, bend: Bend, rot_ws: Array, reached: Array) -> Planted:
+    """The legs with their ankles turned to `rot_ws` in the world, each by its share of foot IK."""
+    wanted = quat.multiply(quat.conjugate(frame.world_from_model.rot), rot_ws)
+    rot = quat.nlerp(bend.pose.ankle.rot, wanted, effector.weight)
+    full = jnp.where(effector.weight >= 1, 1.0, 0.0)
+    return with_ankle(frame, bend, rot, reached * full)
+
+
+def with_ankle(frame: Frame, bend: Bend, rot: Array, reached: Array) -> Planted:
+    """The legs with this rotation of their ankles, model space; the toe goes with it."""
+    carried = bend.pose.ankle
+    ankle = Transform(carried.pos, rot)
+    toe = ankle @ (frame.pose.ankle.inverse() @ frame.pose.toe)
+    pose = LegPose(bend.pose.hip, bend.pose.knee, ankle, toe)
+    return Planted(pose, quat.multiply(quat.conjugate(carried.rot), rot), reached)
+
+
+def rise_angle(low: Hit, high: Hit, along: Array, up_ws: Array) -> Array:
+    """Angle, rad, by which the ground rises from one hit to another along a level direction."""
+    across = high.point - low.point
+    return high.found * vec.safe_arctan2(vec.dot(across, up_ws), vec.dot(across, along))
+
+
+def upright(ahead: Array, up_ws: Array) -> Array:
+    """Rotation of a foot with its y along up and its z along `ahead`, unit and at right angles."""
+    raised = quat.arc(vec.constant(UP, ahead), up_ws, vec.constant(LEFT, ahead))
+    return quat.multiply(
+        turn_about(up_ws, quat.rotate(raised, vec.constant(FORWARD, ahead)), ahead), raised
+    )
+
+
+def at_most(rot: Array, limit: Array, gate: AbstractGate) -> Array:
+    """The rotation with its angle limited, rad; its axis stays."""
+    w, x, y, z = quat.components(jnp.where(rot[..., :1] < 0, -rot, rot))
+    sin = vec.safe_sqrt(x * x + y * y + z * z)
+    angle = 2.0 * jnp.arctan2(sin, w)
+    # As a share, so that a softened limit leaves small turns alone; a far limit stays a number.
+    wide = angle > LEAST_SHARE * limit
+    share = vec.safe_divide(limit, jnp.where(wide, angle, LEAST_SHARE * limit), otherwise=0.0)
+    share = gate.clip(share, jnp.zeros_like(share), jnp.ones_like(share), band=SHARE_BAND)
+    turning = sin > jnp.finfo(sin.dtype).eps
+    length = jnp.where(turning, angle / jnp.where(turning, sin, 1.0), 2.0)
+    return quat.from_rotvec(vec.scale(vec.stack(x, y, z), length * share))
 
 
 def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tuple[Array, Array]:
     """Pitch and roll, rad, that lay a level sole on the ground, each times the foot's contact."""
-    up, ankle, toe = sensed.up_ws, sensed.ground.ankle, sensed.ground.toe
+    up, ankle, toe = sensed.leg_up_ws, sensed.ground.ankle, sensed.ground.toe
     across = toe.point - ankle.point
     run = vec.dot(across, ahead)
     two = (toe.found * ankle.found > 0) & (run > SHORTEST_SOLE)

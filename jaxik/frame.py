@@ -1,7 +1,7 @@
 """What goes into the pipeline, and what its stages hand on. One character, one frame."""
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt
 
 from . import quat, vec
 from .skeleton import LegPose, Transform
@@ -19,8 +19,17 @@ class Frame(eqx.Module):
     weight: Float[Array, "*b legs"]  # 0..1, share of foot IK in each leg
     slide: Float[Array, "*b"]  # 0..1, 1 while the character slides
     speed: Float[Array, "*b"]  # m/s, of the character; rules that idle or move read it
+    foot_speed: Float[Array, "*b legs"]  # m/s, of the animated ankles in the world
     dt: Float[Array, "*b"]  # s, since the frame before
     platform: Transform  # world_from_platform: the ground's own motion
+
+
+class Rays(eqx.Module):
+    """How far over and under a foothold the probe looks, and at what."""
+
+    above: Float[Array, " legs"]  # m
+    below: Float[Array, " legs"]  # m
+    layers: UInt[Array, "*legs"]
 
 
 class Ground(eqx.Module):
@@ -28,6 +37,8 @@ class Ground(eqx.Module):
 
     ankle: Hit  # legs
     toe: Hit  # legs; `found` is 0 where no toe ray was cast
+    corner: Hit  # legs, beside the ankle; `found` is 0 where no such ray was cast
+    rays: Rays  # for a stage that looks under a place of its own
 
 
 class Contact(eqx.Module):
@@ -43,9 +54,10 @@ class Foothold(eqx.Module):
     """Where each foot would stand; the ankle is `lift` above it along up."""
 
     point_ws: Float[Array, "legs 3"]  # m
-    height: Float[Array, " legs"]  # m, along up
+    lift: Float[Array, " legs"]  # m
+    height: Float[Array, " legs"]  # m, of the point, along up
     ankle_height_ms: Float[Array, " legs"]  # m, of the ankle over it, in model space
-    climb: Float[Array, ""]  # model-space height gained per metre along up
+    climb: Float[Array, "*legs"]  # model-space height gained per metre along up
     found: Float[Array, " legs"]  # 0..1
 
 
@@ -61,14 +73,18 @@ class Slope(eqx.Module):
 class Sensed(eqx.Module):
     """All that one frame shows without memory."""
 
-    up_ws: Float[Array, "3"]
+    up_ws: Float[Array, "3"]  # of the body
+    leg_up_ws: Float[Array, "*legs 3"]  # of each leg, or one for all
     dt: Float[Array, ""]
     slide: Float[Array, ""]
     platform: Transform
     present: Bool[Array, " legs"]
     weight: Float[Array, " legs"]  # 0..1, share of foot IK in each leg
-    hip_ws: Float[Array, "legs 3"]
-    ankle_ws: Float[Array, "legs 3"]
+    root_ws: Float[Array, "3"]  # m, the move that brought the character to its ground
+    hip_ws: Float[Array, "legs 3"]  # animated and moved by it
+    ankle_ws: Float[Array, "legs 3"]  # likewise
+    ankle_rot_ws: Float[Array, "legs 4"]  # animated
+    rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule wants them
     thigh: Float[Array, " legs"]  # m, in this frame
     shin: Float[Array, " legs"]  # m
     ground: Ground
@@ -77,7 +93,23 @@ class Sensed(eqx.Module):
     slope: Slope
 
 
-def heading(world_from_model: Transform, up_ws: Float[Array, "3"]) -> tuple[Array, Array]:
+def animated(frame: Frame) -> Transform:
+    """The animated ankles, (legs), world space."""
+    return Transform(
+        frame.world_from_model.apply(frame.pose.ankle.pos),
+        frame.world_from_model.turn(frame.pose.ankle.rot),
+    )
+
+
+def foothold(frame: Frame, up_ws: Array, point_ws: Array, lift: Array, found: Array) -> Foothold:
+    """The foothold at a point, m, with the ankle `lift` above it, m."""
+    model_up = quat.rotate(frame.world_from_model.rot, vec.constant(UP, up_ws))
+    climb = vec.dot(model_up, up_ws)
+    base = vec.dot(point_ws - frame.world_from_model.pos, model_up)
+    return Foothold(point_ws, lift, vec.dot(point_ws, up_ws), base + lift * climb, climb, found)
+
+
+def heading(world_from_model: Transform, up_ws: Float[Array, "*legs 3"]) -> tuple[Array, Array]:
     """The character's forward and right, unit, at right angles to up, world space.
 
     Where the character looks along up, forward is its own up (a body lying on its back or front).

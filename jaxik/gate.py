@@ -79,9 +79,13 @@ class Smooth(AbstractGate):
         return no + weight * (yes - no)
 
     def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
+        # An endless limit does not bind; counted with, it would make inf - inf.
         width = band * self.softness
-        over_low = jax.nn.softplus((x - low) / width) - jax.nn.softplus((x - high) / width)
-        return low + width * over_low
+        open_low, open_high = jnp.isinf(low), jnp.isinf(high)
+        floor, roof = jnp.where(open_low, 0.0, low), jnp.where(open_high, 0.0, high)
+        above = jnp.where(open_low, x, floor + width * jax.nn.softplus((x - floor) / width))
+        over = jnp.where(open_high, 0.0, width * jax.nn.softplus((x - roof) / width))
+        return above - over
 
     def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
         # Counted from the smallest: at a small width `x / width` is too large for its rounding not

@@ -1,4 +1,4 @@
-"""Stage 4: the body's lean against the slope under the feet (the record's "undulation")."""
+"""Stage 5: the body's lean against the slope under the feet (the record's "undulation")."""
 
 from abc import abstractmethod
 from typing import Any
@@ -122,3 +122,28 @@ class SlopeLean(AbstractLean):
         )
         lean = Lean(quat.from_rotvec(turn), vec.unit(normal, up_ws))
         return LeanState(forward, side, sliding), lean
+
+
+class NoLean(AbstractLean):
+    """The body stays as upright as it was animated."""
+
+    def init(self, dtype: Any) -> None:
+        return None
+
+    def sense(
+        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+    ) -> Slope:
+        level = jnp.zeros_like(frame.dt)
+        return Slope(level, level, *heading(frame.world_from_model, up_ws))
+
+    def advance(
+        self,
+        slope: Slope,
+        up_ws: Array,
+        slide: Array,
+        dt: Array,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Lean]:
+        return None, Lean(quat.identity(up_ws.dtype), up_ws)

@@ -1,4 +1,4 @@
-"""Stage 7: two-bone legs that bring the ankles to their targets."""
+"""Stage 9: two-bone legs that bring the ankles to their targets."""
 
 from abc import abstractmethod
 
@@ -7,12 +7,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import quat, vec
+from .frame import Frame, Sensed
 from .gate import AbstractGate
-from .rule import parameter
+from .limb import (
+    LENGTH_BAND,
+    hinge_turn,
+    local,
+    opposite_side,
+    pole_bend,
+    soft_limit,
+    swing_turn,
+)
+from .rule import parameter, switch
 from .skeleton import LegPose, Rig, Transform
-
-LENGTH_BAND = 0.005  # m
-DOWN = (0.0, -1.0, 0.0)
 
 
 class Bend(eqx.Module):
@@ -31,9 +38,16 @@ class AbstractLeg(eqx.Module):
 
     @abstractmethod
     def pose(
-        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
     ) -> Bend:
-        """The leg with its ankle at `target_ms`, m."""
+        """The leg with its ankle at `target_ms`, m; `carried` is animated, on the moved body."""
 
 
 class TwoBone(AbstractLeg):
@@ -55,41 +69,23 @@ class TwoBone(AbstractLeg):
     weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
 
     def pose(
-        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
     ) -> Bend:
-        to_hip = pose.hip.pos - pose.knee.pos
-        to_ankle = pose.ankle.pos - pose.knee.pos
-        to_target = target_ms - pose.hip.pos
-        hinge = quat.rotate(pose.knee.rot, rig.knee_axis_ls)
+        to_hip, to_ankle, hinge = bones(rig, carried)
+        to_target = target_ms - carried.hip.pos
         reach, reached = self._reach(to_hip, to_ankle, to_target, gate)
-
         half_cos, half_sin = hinge_turn(to_hip, to_ankle, hinge, reach)
-        bent = quat.rotate(quat.from_half(hinge, half_cos, half_sin), to_ankle) - to_hip
+        turn = quat.from_half(hinge, half_cos, half_sin)
+        bent = quat.rotate(turn, to_ankle) - to_hip
         swing = swing_turn(bent, to_target, hinge, self.twist)
-
-        still = quat.identity(target_ms.dtype)
-        turn = quat.nlerp(still, quat.from_half(hinge, half_cos, half_sin), weight)
-        swing = quat.nlerp(still, swing, weight)
-
-        knee_pos = pose.hip.pos - quat.rotate(swing, to_hip)
-        whole = quat.multiply(swing, turn)
-        ankle_pos = knee_pos + quat.rotate(whole, to_ankle)
-        ankle = Transform(ankle_pos, quat.multiply(whole, pose.ankle.rot))
-        solved = LegPose(
-            Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
-            Transform(knee_pos, quat.multiply(whole, pose.knee.rot)),
-            ankle,
-            Transform(
-                ankle_pos + quat.rotate(whole, pose.toe.pos - pose.ankle.pos),
-                quat.multiply(whole, pose.toe.rot),
-            ),
-        )
-        return Bend(
-            solved,
-            local(pose.hip.rot, swing),
-            local(pose.knee.rot, turn),
-            reached * jnp.where(weight >= 1, 1.0, 0.0),
-        )
+        return bend_leg(carried, swing, turn, reached, weight)
 
     def _reach(
         self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate
@@ -107,81 +103,111 @@ class TwoBone(AbstractLeg):
         return allowed, inside * gate.below(distance, free, band=LENGTH_BAND)
 
 
-def local(rot: Array, turn: Array) -> Array:
-    """The correction on the right of `rot` that does what `turn` does on its left."""
-    return quat.multiply(quat.conjugate(rot), quat.multiply(turn, rot))
+class PoleLeg(AbstractLeg):
+    """ozz's two-bone job: the plane of the leg contains the pole, here the animated knee's own.
 
-
-def opposite_side(a: Array, b: Array, cos: Array) -> Array:
-    """Third side of the triangle with sides `a` and `b` and this cosine between them."""
-    return vec.safe_sqrt(a * a + b * b - 2.0 * a * b * cos)
-
-
-def soft_limit(x: Array, free: Array, limit: Array) -> Array:
-    """`x` up to `free`; beyond, an exponential of slope 1 there that tends to `limit`."""
-    room = limit - free
-    roomy = room > 0
-    over = x - free
-    beyond = over > 0
-    share = jnp.where(beyond, over, 0.0) / jnp.where(roomy, room, 1.0)
-    return jnp.where(beyond, free - jnp.where(roomy, room * jnp.expm1(-share), 0.0), x)
-
-
-def hinge_turn(to_hip: Array, to_ankle: Array, hinge: Array, reach: Array) -> tuple[Array, Array]:
-    """Cosine and sine of half the knee's turn about `hinge` that takes hip and ankle `reach` apart.
-
-    The interior angle is 0..pi after the turn, whatever side the leg was bent to before. Clamped to
-    straight or folded where the triangle does not close; no turn where a side lies along the hinge.
+    The pole is at right angles to hinge and shin: the knee's y axis of a rig whose x lies along the
+    bone and whose z is the hinge. With `enabled` off the leg stays as the body carries it.
     """
-    along_thigh, along_shin = vec.dot(to_hip, hinge), vec.dot(to_ankle, hinge)
-    thigh, shin = vec.reject(to_hip, hinge), vec.reject(to_ankle, hinge)
-    a2, b2 = vec.dot(thigh, thigh), vec.dot(shin, shin)
-    ab = vec.safe_sqrt(a2 * b2)
-    bendable = ab > jnp.finfo(ab.dtype).eps
-    ab = jnp.where(bendable, ab, 1.0)
 
-    across2 = reach * reach - (along_thigh - along_shin) ** 2
-    cosine = (a2 + b2 - across2) / (2.0 * ab)
-    open_cos = vec.safe_sqrt(bounded((1.0 + cosine) * 0.5))
-    open_sin = vec.safe_sqrt(bounded((1.0 - cosine) * 0.5))
+    enabled: Array = switch(True)
+    soften: Array = parameter(1.0, unit="1", low=0.1, high=1.0)
+    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
 
-    cos_now = vec.dot(thigh, shin) / ab
-    sin_now = vec.dot(hinge, vec.cross(thigh, shin)) / ab
-    norm = vec.length(jnp.stack([cos_now, sin_now, jnp.zeros_like(cos_now)], axis=-1))
-    norm = jnp.where(norm > 0, norm, 1.0)
-    now_cos, now_sin = quat.half_angle(cos_now / norm, sin_now / norm)
-    turn_cos = open_cos * now_cos + open_sin * now_sin
-    turn_sin = open_sin * now_cos - open_cos * now_sin
-    return jnp.where(bendable, turn_cos, 1.0), jnp.where(bendable, turn_sin, 0.0)
-
-
-def bounded(x: Array) -> Array:
-    """`x` kept within 0..1, the cosines a triangle can have."""
-    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
+    ) -> Bend:
+        _, to_ankle, hinge = bones(rig, carried)
+        pole = vec.cross(hinge, to_ankle)
+        weight = jnp.where(self.enabled, weight, 0.0)
+        return solve_to_pole(rig, carried, target_ms, pole, self.soften, self.twist, weight, gate)
 
 
-def swing_turn(bent: Array, to_target: Array, hinge: Array, twist: Array) -> Array:
-    """Rotation of the hip that takes the ankle's direction to the target's and keeps the hinge.
+class HintLeg(AbstractLeg):
+    """The same with the pole from the hip to a hint: the detected toe and the calf (Mec).
 
-    The shortest arc, then a turn about the target's direction that lines the hinge up with where it
-    was, seen along that direction; then `twist`, rad, about it.
+    The hint is the toe's place on the ground plus the animated vector from ankle to knee plus
+    `hint_offset`, in the character's axes (x left, y up, z forward).
     """
-    down = vec.constant(DOWN, bent)
-    start = vec.unit(bent, down)
-    aim = vec.unit(to_target, start)
-    square = vec.unit(vec.reject(hinge, start), vec.reject(down, start))
-    arc = quat.arc(start, aim, vec.unit(square, hinge))
-    swung = vec.reject(quat.rotate(arc, hinge), aim)
-    wanted = vec.reject(hinge, aim)
-    spans = vec.safe_sqrt(vec.dot(swung, swung) * vec.dot(wanted, wanted))
-    known = spans > jnp.finfo(spans.dtype).eps ** 0.5
-    spans = jnp.where(known, spans, 1.0)
-    cos = jnp.where(known, vec.dot(swung, wanted) / spans, 1.0)
-    sin = jnp.where(known, vec.dot(aim, vec.cross(swung, wanted)) / spans, 0.0)
-    pole = quat.unit(quat.from_cos_sin(aim, bounded_cosine(cos), sin))
-    return quat.multiply(quat.from_axis_angle(aim, twist), quat.multiply(pole, arc))
+
+    hint_offset: Array = parameter((0.0, 0.0, 0.0), unit="m", low=-0.5, high=0.5)
+    soften: Array = parameter(1.0, unit="1", low=0.1, high=1.0)
+    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
+    ) -> Bend:
+        toe = frame.world_from_model.inverse().apply(sensed.ground.toe.point)
+        calf = frame.pose.knee.pos - frame.pose.ankle.pos
+        pole = toe + calf + self.hint_offset - carried.hip.pos
+        return solve_to_pole(rig, carried, target_ms, pole, self.soften, self.twist, weight, gate)
 
 
-def bounded_cosine(x: Array) -> Array:
-    """`x` kept within -1..1 against rounding."""
-    return jnp.where(x < -1, -1.0, jnp.where(x > 1, 1.0, x))
+def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
+    """From the knee to the hip and to the ankle, m, and the knee's unit hinge; model space."""
+    to_hip = pose.hip.pos - pose.knee.pos
+    to_ankle = pose.ankle.pos - pose.knee.pos
+    return to_hip, to_ankle, quat.rotate(pose.knee.rot, rig.knee_axis_ls)
+
+
+def solve_to_pole(
+    rig: Rig,
+    carried: LegPose,
+    target_ms: Array,
+    pole_ms: Array,
+    soften: Array,
+    twist: Array,
+    weight: Array,
+    gate: AbstractGate,
+) -> Bend:
+    """The leg whose plane contains the direction `pole_ms`."""
+    to_hip, to_ankle, hinge = bones(rig, carried)
+    to_target = target_ms - carried.hip.pos
+    bend = pole_bend(to_hip, to_ankle, hinge, to_target, pole_ms, soften, twist, gate)
+    turn = quat.from_half(hinge, bend.half_cos, bend.half_sin)
+    return bend_leg(carried, bend.swing, turn, bend.reached, weight)
+
+
+def bend_leg(pose: LegPose, swing: Array, turn: Array, reached: Array, weight: Array) -> Bend:
+    """The leg with its knee turned, then its hip, each by a share `weight` of its turn."""
+    to_hip = pose.hip.pos - pose.knee.pos
+    to_ankle = pose.ankle.pos - pose.knee.pos
+    still = quat.identity(swing.dtype)
+    turn = quat.nlerp(still, turn, weight)
+    swing = quat.nlerp(still, swing, weight)
+
+    knee_pos = pose.hip.pos - quat.rotate(swing, to_hip)
+    whole = quat.multiply(swing, turn)
+    ankle_pos = knee_pos + quat.rotate(whole, to_ankle)
+    ankle = Transform(ankle_pos, quat.multiply(whole, pose.ankle.rot))
+    solved = LegPose(
+        Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
+        Transform(knee_pos, quat.multiply(whole, pose.knee.rot)),
+        ankle,
+        Transform(
+            ankle_pos + quat.rotate(whole, pose.toe.pos - pose.ankle.pos),
+            quat.multiply(whole, pose.toe.rot),
+        ),
+    )
+    return Bend(
+        solved,
+        local(pose.hip.rot, swing),
+        local(pose.knee.rot, turn),
+        reached * jnp.where(weight >= 1, 1.0, 0.0),
+    )

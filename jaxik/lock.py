@@ -1,4 +1,4 @@
-"""Stage 5: feet that keep their place in the world while they stand."""
+"""Stage 6: feet that keep their place in the world while they stand."""
 
 from abc import abstractmethod
 from typing import Any
@@ -12,11 +12,20 @@ from .frame import Sensed
 from .gate import AbstractGate
 from .rule import parameter, switch
 from .skeleton import Rig
+from .terrain import LegTerrains, Terrain, cast
 
 DISTANCE_BAND = 0.01  # m
 COSINE_BAND = 0.03  # about 2 degrees at a right angle
 SPEED_BAND = 0.05  # m/s
 FACTOR_BAND = 0.05
+
+
+class Held(eqx.Module):
+    """What locks make of the footholds."""
+
+    offset_ws: Float[Array, "legs 3"]  # m, kept from the foothold
+    rot_ws: Float[Array, "legs 4"]  # of the ankles
+    locked: Float[Array, " legs"]  # 1 where the foot keeps its place
 
 
 class AbstractLock(eqx.Module):
@@ -29,14 +38,35 @@ class AbstractLock(eqx.Module):
     @abstractmethod
     def advance(
         self,
+        terrain: Terrain | LegTerrains,
         sensed: Sensed,
         foothold_ws: Array,
         hip_ws: Array,
         state: Any,
         started: Array,
         gate: AbstractGate,
-    ) -> tuple[Any, Array]:
-        """Memory after this frame, and the offset that each foot keeps from its foothold, m."""
+    ) -> tuple[Any, Held]:
+        """Memory after this frame, and what each foot keeps."""
+
+
+class NoLock(AbstractLock):
+    """Feet follow their footholds."""
+
+    def init(self, rig: Rig, dtype: Any) -> None:
+        return None
+
+    def advance(
+        self,
+        terrain: Terrain | LegTerrains,
+        sensed: Sensed,
+        foothold_ws: Array,
+        hip_ws: Array,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Held]:
+        free = jnp.zeros_like(foothold_ws)
+        return None, Held(free, sensed.rot_ws, jnp.zeros_like(sensed.foothold.found))
 
 
 class LockState(eqx.Module):
@@ -81,13 +111,14 @@ class OffsetLock(AbstractLock):
 
     def advance(
         self,
+        terrain: Terrain | LegTerrains,
         sensed: Sensed,
         foothold_ws: Array,
         hip_ws: Array,
         state: LockState,
         started: Bool[Array, ""],
         gate: AbstractGate,
-    ) -> tuple[LockState, Array]:
+    ) -> tuple[LockState, Held]:
         moved = foothold_ws - sensed.platform.apply(state.foothold)
         moved = jnp.where(started, moved, 0.0)
         before = quat.rotate(sensed.platform.rot, state.offset)
@@ -108,7 +139,7 @@ class OffsetLock(AbstractLock):
         into_platform = sensed.platform.inverse()
         offset = quat.rotate(into_platform.rot, offset_ws)
         after = LockState(locked, factor, offset, into_platform.apply(foothold_ws))
-        return after, offset_ws
+        return after, Held(offset_ws, sensed.rot_ws, locked)
 
     def _may_start(self, sensed: Sensed, moved: Array, factor: Array, gate: AbstractGate) -> Array:
         speed = vec.safe_divide(vec.length(moved), sensed.dt)
@@ -125,7 +156,7 @@ class OffsetLock(AbstractLock):
         gate: AbstractGate,
     ) -> Array:
         """1 where nothing releases a foot that would keep its place."""
-        place = foothold_ws + offset_ws + vec.scale(sensed.up_ws, sensed.contact.lift)
+        place = foothold_ws + offset_ws + vec.scale(sensed.leg_up_ws, sensed.foothold.lift)
         leg = place - hip_ws
         squares = sensed.thigh**2 + sensed.shin**2
         cosine = vec.safe_divide(squares - vec.dot(leg, leg), 2.0 * sensed.thigh * sensed.shin)
@@ -141,3 +172,74 @@ class OffsetLock(AbstractLock):
         near = gate.below(vec.length(offset_ws), self.release_distance, band=DISTANCE_BAND)
         works = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
         return bent * short * ahead * near * works * (1.0 - sensed.contact.lifted)
+
+
+class PlantState(eqx.Module):
+    """Where planted feet stand."""
+
+    locked: Float[Array, " legs"]  # 0 or 1
+    share: Float[Array, " legs"]  # 0..1, how much planting counts
+    foothold: Float[Array, "legs 3"]  # m, in the platform's space
+    clearance: Float[Array, " legs"]  # m, of that foothold over the ground below it
+    rot: Float[Array, "legs 4"]  # of the ankles, along the platform's axes
+
+
+class PlantLock(AbstractLock):
+    """Keeps a foot where and how it first found ground until its ray finds none (Mec).
+
+    The place follows the ground below it, looked at again in every frame. How much planting counts
+    moves at `plant_speed` towards `plant_weight`: set that to 0 or 1 between steps to disable or
+    enable planting over time, or leave the speed endless to set it at once. Follows a platform.
+    """
+
+    plant: Array = switch(True)
+    plant_weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+    plant_speed: Array = parameter(float("inf"), unit="1/s", low=0.1, high=20.0, scale="log")
+
+    def init(self, rig: Rig, dtype: Any) -> PlantState:
+        each = jnp.zeros(rig.side.shape, dtype)
+        spread = jnp.zeros((*rig.side.shape, 3), dtype)
+        upright = jnp.broadcast_to(quat.identity(dtype), (*rig.side.shape, 4))
+        return PlantState(each, each, spread, each, upright)
+
+    def advance(
+        self,
+        terrain: Terrain | LegTerrains,
+        sensed: Sensed,
+        foothold_ws: Array,
+        hip_ws: Array,
+        state: PlantState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[PlantState, Held]:
+        up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
+        before = state.locked
+        kept_ws = gate.choose(before[..., None], platform.apply(state.foothold), foothold_ws)
+        kept_rot = quat.nlerp(sensed.rot_ws, platform.turn(state.rot), before)
+
+        hit = cast(
+            terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
+        )
+        over_ground = vec.dot(kept_ws - hit.point, up)
+        clearance = gate.choose(before, state.clearance, over_ground * hit.found)
+        followed = hit.point + vec.scale(up, clearance)
+        planted_ws = gate.choose(hit.found[..., None], followed, kept_ws)
+
+        locked = jnp.where(self.plant & (sensed.weight > 0), sensed.foothold.found, 0.0)
+        step = jnp.where(started, ease.step_of_speed(self.plant_speed, sensed.dt), 1.0)
+        share = ease.towards(state.share, self.plant_weight, step)
+        counts = locked * share
+        held = Held(
+            vec.scale(planted_ws - foothold_ws, counts),
+            quat.nlerp(sensed.rot_ws, kept_rot, counts),
+            locked,
+        )
+        into_platform = platform.inverse()
+        after = PlantState(
+            locked,
+            share,
+            into_platform.apply(planted_ws),
+            clearance,
+            into_platform.turn(kept_rot),
+        )
+        return after, held

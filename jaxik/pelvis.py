@@ -1,4 +1,4 @@
-"""Stage 6: how far the body sinks or rises so that the legs can reach."""
+"""Stage 7: how far the body sinks or rises so that the legs can reach."""
 
 from abc import abstractmethod
 from typing import Any
@@ -21,7 +21,15 @@ class PelvisState(eqx.Module):
     """The body's offset."""
 
     height: Float[Array, ""]  # m
+    goal: Float[Array, ""]  # m, that the height follows
     offset_ws: Float[Array, "3"]  # m
+    half_height: Float[Array, ""]  # m, of the character's capsule; 0 where a rule has none
+
+    @classmethod
+    def level(cls, dtype: Any) -> "PelvisState":
+        """Nothing moved."""
+        zero = jnp.zeros((), dtype)
+        return cls(zero, zero, jnp.zeros(3, dtype), zero)
 
 
 class AbstractPelvis(eqx.Module):
@@ -29,7 +37,7 @@ class AbstractPelvis(eqx.Module):
 
     def init(self, dtype: Any) -> PelvisState:
         """Memory before the first frame."""
-        return PelvisState(jnp.zeros((), dtype), jnp.zeros(3, dtype))
+        return PelvisState.level(dtype)
 
     @abstractmethod
     def advance(
@@ -38,10 +46,11 @@ class AbstractPelvis(eqx.Module):
         target_ws: Array,
         lean: Lean,
         state: PelvisState,
+        awake: Array,
         started: Array,
         gate: AbstractGate,
     ) -> PelvisState:
-        """The offset after this frame."""
+        """The offset after this frame; with `awake` 0 it stays as it is."""
 
 
 class LowestPelvis(AbstractPelvis):
@@ -49,9 +58,10 @@ class LowestPelvis(AbstractPelvis):
 
     Each foot asks for the height from its animated ankle to its target. A foot that does not stand
     counts, by its contact weight, as the highest of those that take part; with no foot standing the
-    goal is 0.
+    goal is 0. Without a limit and with gains of 1 it is ozz's pelvis correction.
     """
 
+    enabled: Array = switch(True)
     limit: Array = parameter(0.30, unit="m", low=0.0, high=0.6)
     on_gain: Array = parameter(0.225, unit="1/tick", low=0.01, high=0.95, scale="gain")
     off_gain: Array = parameter(0.116, unit="1/tick", low=0.01, high=0.95, scale="gain")
@@ -64,10 +74,11 @@ class LowestPelvis(AbstractPelvis):
         target_ws: Array,
         lean: Lean,
         state: PelvisState,
+        awake: Array,
         started: Bool[Array, ""],
         gate: AbstractGate,
     ) -> PelvisState:
-        asked = vec.dot(target_ws - sensed.ankle_ws, sensed.up_ws)
+        asked = asked_heights(sensed, target_ws)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         taking_part = sensed.weight > 0
         top = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
@@ -75,11 +86,97 @@ class LowestPelvis(AbstractPelvis):
         lowest = gate.least(asked, band=HEIGHT_BAND)
         standing = gate.largest(weight, band=0.1)
         goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, goal, 0.0)
         share = ease.approach(
             ease.share_of_gain(self.off_gain, sensed.dt, self.tick_hz),
             ease.share_of_gain(self.on_gain, sensed.dt, self.tick_hz),
             standing,
         )
-        height = ease.approach(state.height, goal, jnp.where(started, share, 1.0))
+        share = awake * jnp.where(started, share, 1.0)
+        height = ease.approach(state.height, goal, share)
         along = jnp.where(self.vertical_only, sensed.up_ws, lean.normal_ws)
-        return PelvisState(height, vec.scale(along, height))
+        return PelvisState(height, goal, vec.scale(along, height), jnp.zeros_like(height))
+
+
+class CapsulePelvis(AbstractPelvis):
+    """Sinks to the lowest foot and never rises; the character's capsule shrinks (Unreal, seed 001).
+
+    The offset follows the lowest height that a foot asks for, or 0 if that is above it, and the
+    capsule's half-height goes to its full one less half of that depth, both by the clamped-speed
+    law. With `enabled` off both go back.
+    """
+
+    enabled: Array = switch(True)
+    speed: Array = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    half_height: Array = parameter(0.90, unit="m", low=0.3, high=2.0)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target_ws), 0.0)
+        lowest = gate.least(asked, band=HEIGHT_BAND)
+        level = jnp.zeros_like(lowest)
+        sunk = gate.clip(lowest, level - jnp.inf, level, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, sunk, 0.0)
+
+        def follow(value: Array, goal: Array) -> Array:
+            share = ease.share_of_speed(self.speed, sensed.dt, goal - value)
+            return ease.approach(value, goal, awake * jnp.where(started, share, 1.0))
+
+        height = follow(state.height, goal)
+        half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
+        return PelvisState(height, goal, vec.scale(sensed.up_ws, height), half_height)
+
+
+class LegLengthPelvis(AbstractPelvis):
+    """Keeps the distance from each hip to its foot's goal within what a leg has (Mec).
+
+    Of the heights that do so the one nearest to the animation; where one leg would have to be
+    longer and another shorter, none is over-stretched. A foot too far aside to be reached from any
+    height asks for the one that comes nearest. Damped, the offset follows by the clamped-speed law.
+    """
+
+    enabled: Array = switch(True)
+    min_length: Array = parameter(0.50, unit="m", low=0.0, high=1.0)
+    max_length: Array = parameter(0.88, unit="m", low=0.2, high=1.5, above="min_length")
+    damp: Array = switch(True)
+    speed: Array = parameter(10.0, unit="1/s", low=0.5, high=30.0, scale="log")
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        leg = target_ws - sensed.hip_ws
+        along = vec.dot(leg, sensed.up_ws)
+        across2 = vec.dot(leg, leg) - along**2
+        lowest = along + vec.safe_sqrt(self.min_length**2 - across2)
+        highest = along + vec.safe_sqrt(self.max_length**2 - across2)
+        asks = (sensed.foothold.found > 0) & (sensed.weight > 0)
+        zero = jnp.zeros_like(along[:1])
+        lifted = jnp.concatenate([jnp.where(asks, lowest, -FAR), zero])
+        lift = gate.largest(lifted, band=HEIGHT_BAND)
+        bounds = jnp.concatenate([jnp.where(asks, highest, FAR), lift[None]])
+        goal = jnp.where(self.enabled, gate.least(bounds, band=HEIGHT_BAND), 0.0)
+
+        share = ease.share_of_speed(self.speed, sensed.dt, goal - state.height)
+        share = awake * jnp.where(started & self.damp, share, 1.0)
+        height = ease.approach(state.height, goal, share)
+        return PelvisState(height, goal, vec.scale(sensed.up_ws, height), jnp.zeros_like(height))
+
+
+def asked_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+    """Height from each animated ankle to its target along the leg's up, m."""
+    return vec.dot(target_ws - sensed.ankle_ws, sensed.leg_up_ws)

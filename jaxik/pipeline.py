@@ -13,28 +13,32 @@ from jaxtyping import Array, Bool, Float
 
 from . import quat, vec
 from .contact import AbstractContact
+from .effector import AbstractEffector, Effector
 from .foot import AbstractFoot
-from .frame import Frame, Sensed
+from .frame import Frame, Sensed, animated
 from .gate import HARD, AbstractGate
 from .lean import AbstractLean, Lean
 from .leg import AbstractLeg
-from .lock import AbstractLock
+from .lock import AbstractLock, Held
 from .pelvis import AbstractPelvis
 from .probe import AbstractProbe
+from .root import AbstractRoot
 from .skeleton import LegPose, Rig, Transform, bone_lengths
 from .target import AbstractTarget
-from .terrain import Terrain
+from .terrain import LegTerrains, Terrain
 
 
 class FootIK(eqx.Module):
     """A foot-IK system: one rule a stage, in the order in which they run."""
 
+    root: AbstractRoot
     probe: AbstractProbe
     contact: AbstractContact
     target: AbstractTarget
     lean: AbstractLean
     lock: AbstractLock
     pelvis: AbstractPelvis
+    effector: AbstractEffector
     leg: AbstractLeg
     foot: AbstractFoot
 
@@ -47,14 +51,16 @@ class State(eqx.Module):
     lean: Any
     lock: Any
     pelvis: Any
+    effector: Any
 
 
 class Advanced(eqx.Module):
     """What memory makes of a frame."""
 
     foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, before the lock
-    target_ws: Float[Array, "legs 3"]  # m, of the ankles
+    held: Held
     lean: Lean
+    effector: Effector
     state: State  # after the frame
 
 
@@ -80,6 +86,7 @@ class Result(eqx.Module):
     body: Transform  # carries the animated body to where it belongs, model space
     corrections: Corrections
     reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
+    aimed: Float[Array, "*b legs"]  # 1 where the foot is turned as its rule wants, else 0
     trace: Trace
 
 
@@ -92,31 +99,44 @@ def init(ik: FootIK, rig: Rig) -> State:
         ik.lean.init(dtype),
         ik.lock.init(rig, dtype),
         ik.pelvis.init(dtype),
+        ik.effector.init(rig, dtype),
     )
 
 
-def sense(ik: FootIK, rig: Rig, terrain: Terrain, frame: Frame, gate: AbstractGate) -> Sensed:
+def sense(
+    ik: FootIK, rig: Rig, terrain: Terrain | LegTerrains, frame: Frame, gate: AbstractGate
+) -> Sensed:
     """All that the frame shows by itself."""
-    up = terrain.up_ws
+    up = terrain.leg_up_ws
     weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
+    with jax.named_scope("root"):
+        root_ws = vec.scale(terrain.up_ws, ik.root.sense(terrain, frame))
+        frame = moved(frame, root_ws)
     with jax.named_scope("probe"):
-        ground = ik.probe.sense(rig, terrain, frame)
+        ground = ik.probe.sense(rig, terrain, frame, ik.target.foot_height, gate)
     with jax.named_scope("contact"):
         contact = ik.contact.sense(frame, gate)
     with jax.named_scope("target"):
         foothold = ik.target.sense(frame, up, ground, contact, gate)
     with jax.named_scope("lean"):
-        slope = ik.lean.sense(frame, up, ground, contact, weight)
+        slope = ik.lean.sense(frame, terrain.up_ws, ground, contact, weight)
+    with jax.named_scope("foot"):
+        rot_ws = ik.foot.sense(rig, frame, up, ground, gate)
     thigh, shin = bone_lengths(frame.pose)
+    ankle = animated(frame)
     return Sensed(
-        up_ws=up,
+        up_ws=terrain.up_ws,
+        leg_up_ws=up,
         dt=frame.dt,
         slide=frame.slide,
         platform=frame.platform,
         present=rig.present,
         weight=weight,
+        root_ws=root_ws,
         hip_ws=frame.world_from_model.apply(frame.pose.hip.pos),
-        ankle_ws=frame.world_from_model.apply(frame.pose.ankle.pos),
+        ankle_ws=ankle.pos,
+        ankle_rot_ws=ankle.rot,
+        rot_ws=rot_ws,
         thigh=thigh,
         shin=shin,
         ground=ground,
@@ -126,39 +146,58 @@ def sense(ik: FootIK, rig: Rig, terrain: Terrain, frame: Frame, gate: AbstractGa
     )
 
 
-def advance(ik: FootIK, sensed: Sensed, state: State, gate: AbstractGate) -> Advanced:
-    """Memory: the footholds, their locks, the lean and the pelvis after this frame."""
-    up, started = sensed.up_ws, state.started
+def advance(
+    ik: FootIK, terrain: Terrain | LegTerrains, sensed: Sensed, state: State, gate: AbstractGate
+) -> Advanced:
+    """Memory: footholds, locks, lean, pelvis and effectors after this frame."""
+    up, started = sensed.leg_up_ws, state.started
     with jax.named_scope("target"):
         target, rise = ik.target.advance(sensed.foothold, sensed.dt, state.target, started, gate)
         foothold_ws = sensed.foothold.point_ws + vec.scale(up, rise)
     with jax.named_scope("lean"):
         leaning, lean = ik.lean.advance(
-            sensed.slope, up, sensed.slide, sensed.dt, state.lean, started, gate
+            sensed.slope, sensed.up_ws, sensed.slide, sensed.dt, state.lean, started, gate
         )
     with jax.named_scope("lock"):
         # The hip as the frame before left it: this frame's offset follows from the locks.
         hip_ws = sensed.hip_ws + state.pelvis.offset_ws
-        lock, offset_ws = ik.lock.advance(sensed, foothold_ws, hip_ws, state.lock, started, gate)
-        target_ws = foothold_ws + offset_ws + vec.scale(up, sensed.contact.lift)
+        lock, held = ik.lock.advance(
+            terrain, sensed, foothold_ws, hip_ws, state.lock, started, gate
+        )
+        target_ws = foothold_ws + held.offset_ws + vec.scale(up, sensed.foothold.lift)
     with jax.named_scope("pelvis"):
-        pelvis = ik.pelvis.advance(sensed, target_ws, lean, state.pelvis, started, gate)
-    after = State(jnp.ones_like(started), target, leaning, lock, pelvis)
-    return Advanced(foothold_ws, target_ws, lean, after)
+        awake = ik.effector.awake(sensed, state.effector, gate)
+        pelvis = ik.pelvis.advance(sensed, target_ws, lean, state.pelvis, awake, started, gate)
+    with jax.named_scope("effector"):
+        following, effector = ik.effector.advance(
+            sensed, target_ws, held, pelvis, state.effector, started, gate
+        )
+    after = State(jnp.ones_like(started), target, leaning, lock, pelvis, following)
+    return Advanced(foothold_ws, held, lean, effector, after)
 
 
 def pose(
     ik: FootIK, rig: Rig, frame: Frame, sensed: Sensed, advanced: Advanced, gate: AbstractGate
 ) -> Result:
     """The solved legs."""
-    body = carry(rig, frame, advanced.lean.turn_ws, advanced.state.pelvis.offset_ws)
-    target_ms = frame.world_from_model.inverse().apply(advanced.target_ws)
+    offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
+    body = carry(rig, frame, advanced.lean.turn_ws, offset_ws)
+    effector = advanced.effector
+    target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
-        bend = ik.leg.pose(rig, frame.pose.moved(body), target_ms, sensed.weight, gate)
+        carried = frame.pose.moved(body)
+        bend = ik.leg.pose(rig, frame, sensed, carried, target_ms, effector.weight, gate)
     with jax.named_scope("foot"):
-        planted = ik.foot.pose(rig, frame, sensed, bend, gate)
+        planted = ik.foot.pose(rig, frame, sensed, effector, bend, gate)
     corrections = Corrections(bend.hip, bend.knee, planted.ankle)
-    return Result(planted.pose, body, corrections, bend.reached, Trace(sensed, advanced))
+    trace = Trace(sensed, advanced)
+    return Result(planted.pose, body, corrections, bend.reached, planted.reached, trace)
+
+
+def moved(frame: Frame, offset_ws: Array) -> Frame:
+    """The frame with the whole character moved, m."""
+    world = Transform(frame.world_from_model.pos + offset_ws, frame.world_from_model.rot)
+    return eqx.tree_at(lambda frame: frame.world_from_model, frame, world)
 
 
 def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform:
@@ -174,26 +213,36 @@ def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform
 
 @eqx.filter_jit
 def step(
-    ik: FootIK, rig: Rig, terrain: Terrain, state: State, frame: Frame, gate: AbstractGate = HARD
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    state: State,
+    frame: Frame,
+    gate: AbstractGate = HARD,
 ) -> tuple[State, Result]:
     """One frame of one character, live.
 
     Args:
         ik: the system; its float leaves are its parameters.
         rig: the legs.
-        terrain: the ground, world space.
+        terrain: the ground, world space; `LegTerrains` where legs differ in their up.
         state: memory, from `init` or from the step before.
         frame: the animation.
         gate: `Hard` decides as a game does; `Smooth` has slopes through decisions.
     """
     sensed = sense(ik, rig, terrain, frame, gate)
-    advanced = advance(ik, sensed, state, gate)
+    advanced = advance(ik, terrain, sensed, state, gate)
     return advanced.state, pose(ik, rig, frame, sensed, advanced, gate)
 
 
 @eqx.filter_jit
 def resume(
-    ik: FootIK, rig: Rig, terrain: Terrain, state: State, frames: Frame, gate: AbstractGate = HARD
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    state: State,
+    frames: Frame,
+    gate: AbstractGate = HARD,
 ) -> tuple[State, Result]:
     """A clip from a given memory; the leaves of `frames` have a leading axis of frames.
 
@@ -203,7 +252,7 @@ def resume(
     sensed = jax.vmap(lambda frame: sense(ik, rig, terrain, frame, gate))(frames)
 
     def scanned(state: State, sensed: Sensed) -> tuple[State, Advanced]:
-        advanced = advance(ik, sensed, state, gate)
+        advanced = advance(ik, terrain, sensed, state, gate)
         return advanced.state, advanced
 
     after, advanced = jax.lax.scan(scanned, state, sensed)
@@ -213,7 +262,9 @@ def resume(
     return after, result
 
 
-def run(ik: FootIK, rig: Rig, terrain: Terrain, frames: Frame, gate: AbstractGate = HARD) -> Result:
+def run(
+    ik: FootIK, rig: Rig, terrain: Terrain | LegTerrains, frames: Frame, gate: AbstractGate = HARD
+) -> Result:
     """A clip of one character; the leaves of `frames` and of the result lead with frames.
 
     Jit, vmap and differentiate over any argument.

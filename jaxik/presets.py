@@ -1,25 +1,97 @@
 """The systems that exist elsewhere, as choices of rules."""
 
-from .contact import HeightContact
-from .foot import PitchRollFoot
-from .lean import SlopeLean
-from .leg import TwoBone
-from .lock import OffsetLock
-from .pelvis import LowestPelvis
+import math
+
+from .contact import HeightContact, IdleContact, StandingContact
+from .effector import BodyEffector, DirectEffector, FadeEffector, FoundEffector
+from .foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
+from .lean import NoLean, SlopeLean
+from .leg import HintLeg, PoleLeg, TwoBone
+from .lock import NoLock, OffsetLock, PlantLock
+from .pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis
 from .pipeline import FootIK
-from .probe import FootProbe
-from .target import SlopeTarget
+from .probe import CornerProbe, FootProbe, RootProbe
+from .root import GroundRoot, KeepRoot
+from .target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
 
 
 def record() -> FootIK:
     """The game's foot-IK parameter record (systems.md, 4), for a 1.8 m adult."""
     return FootIK(
+        root=KeepRoot(),
         probe=FootProbe(),
         contact=HeightContact(),
         target=SlopeTarget(),
         lean=SlopeLean(),
         lock=OffsetLock(),
         pelvis=LowestPelvis(),
+        effector=DirectEffector(),
         leg=TwoBone(),
         foot=PitchRollFoot(),
+    )
+
+
+def ozz() -> FootIK:
+    """ozz-animation's foot-IK sample (systems.md, 1).
+
+    Its four switches are `root.enabled` (character height), `pelvis.enabled`, `leg.enabled`
+    (two-bone) and `foot.enabled` (aim). Nothing has memory. Partial weights blend the shorter way,
+    which ozz 0.16 does not do for its aim.
+    """
+    return FootIK(
+        root=GroundRoot(),
+        probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False),
+        contact=StandingContact(),
+        target=SoleTarget(),
+        lean=NoLean(),
+        lock=NoLock(),
+        pelvis=LowestPelvis(limit=math.inf, on_gain=1.0, off_gain=1.0),
+        effector=FoundEffector(),
+        leg=PoleLeg(),
+        foot=AimFoot(),
+    )
+
+
+def unreal() -> FootIK:
+    """An Unreal character's foot IK (systems.md, 2), faithful with its latch.
+
+    It works only while the character stands still (`contact.idle_speed`). The latch stops all
+    movement once the feet have arrived and may freeze the pelvis short of its goal: better switch
+    `effector.latch` off. The root is the bottom of the capsule, whose half-height stands twice:
+    `probe.ray_up` is where rays start, `pelvis.half_height` what shrinks. The game puts the capsule
+    on the ground; where an animation's root has stayed on its flat floor, `root.enabled` does.
+    """
+    return FootIK(
+        root=GroundRoot(enabled=False),
+        probe=RootProbe(),
+        contact=IdleContact(),
+        target=RootTarget(),
+        lean=NoLean(),
+        lock=NoLock(),
+        pelvis=CapsulePelvis(),
+        effector=BodyEffector(latch=True),
+        leg=TwoBone(max_knee_angle=math.pi, min_knee_angle=0.0, soften=1.0),
+        foot=KeepFoot(),
+    )
+
+
+def mec() -> FootIK:
+    """Mec Foot Placer (systems.md, 3).
+
+    Give `LegTerrains` for feet and hands with an up of their own. `active`, the switches and all
+    numbers of the probe, the lock and the legs may hold one value a leg. The game puts the
+    character on the ground; where an animation's root has stayed on its flat floor,
+    `root.enabled` does.
+    """
+    return FootIK(
+        root=GroundRoot(enabled=False),
+        probe=CornerProbe(),
+        contact=StandingContact(),
+        target=ContactTarget(),
+        lean=NoLean(),
+        lock=PlantLock(),
+        pelvis=LegLengthPelvis(),
+        effector=FadeEffector(),
+        leg=HintLeg(),
+        foot=FlatFoot(),
     )

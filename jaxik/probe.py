@@ -1,4 +1,4 @@
-"""Stage 1: rays that look for ground under each foot."""
+"""Stage 2: rays that look for ground under each foot."""
 
 from abc import abstractmethod
 
@@ -6,37 +6,151 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from . import quat, vec
-from .frame import Frame, Ground
+from . import quat, rule, vec
+from .frame import FORWARD, Frame, Ground, Rays, animated, heading
+from .gate import AbstractGate
 from .rule import parameter, switch
 from .skeleton import Rig
-from .terrain import Terrain, cast
+from .terrain import Hit, LegTerrains, Terrain, cast
+
+HEIGHT_BAND = 0.01  # m
+SPEED_BAND = 0.05  # m/s
+MARGIN = 0.1  # m by which a ray is cast beyond its reach, so that a softened end has two sides
 
 
 class AbstractProbe(eqx.Module):
     """Looks for ground."""
 
     @abstractmethod
-    def sense(self, rig: Rig, terrain: Terrain, frame: Frame) -> Ground:
-        """What the rays of each leg see in this frame."""
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        """What the rays of each leg see in this frame; `foot_height`, m, is sole to ankle."""
 
 
 class FootProbe(AbstractProbe):
-    """A ray at the ankle and, if wanted, one at the toe (record: useFootEndRay)."""
+    """A ray at the ankle and, if wanted, one at the toe (record: useFootEndRay; ozz without it)."""
 
     ray_up: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
     ray_down: Array = parameter(0.80, unit="m", low=0.0, high=2.0, kind="threshold")
     toe_ls: Array = parameter((0.0, -0.07, 0.20), unit="m", low=-0.4, high=0.4)
     use_toe: Array = switch(True)
+    layers: Array = rule.layers()
 
-    def sense(self, rig: Rig, terrain: Terrain, frame: Frame) -> Ground:
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
         reach = self.ray_up + self.ray_down
-        above = vec.scale(terrain.up_ws, self.ray_up)
-        ankle_ws = frame.world_from_model.apply(frame.pose.ankle.pos)
+        above = vec.scale(terrain.leg_up_ws, self.ray_up)
+        ankle_ws = animated(frame).pos
         toe_ws = frame.world_from_model.apply(toe_point(rig, frame, self.toe_ls))
-        toe = cast(terrain, toe_ws + above, reach)
-        toe = eqx.tree_at(lambda hit: hit.found, toe, jnp.where(self.use_toe, toe.found, 0.0))
-        return Ground(cast(terrain, ankle_ws + above, reach), toe)
+        ankle = cast(terrain, ankle_ws + above, reach, self.layers)
+        toe = cast(terrain, toe_ws + above, reach, self.layers)
+        toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
+        rays = _rays(ankle, self.ray_up, self.ray_down, self.layers)
+        return Ground(ankle, toe, unseen(ankle), rays)
+
+
+class RootProbe(AbstractProbe):
+    """A ray over each ankle's place on the ground plan, between two heights over the root.
+
+    Unreal's trace (seed 001): from the capsule's centre, `ray_up` (its half-height) over the root,
+    to `ray_down` (the trace distance) under it.
+    """
+
+    ray_up: Array = parameter(0.90, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_down: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    layers: Array = rule.layers()
+
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        up, ankle_ws = terrain.leg_up_ws, animated(frame).pos
+        over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
+        start = ankle_ws + vec.scale(up, self.ray_up - over_root)
+        hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
+        rays = _rays(hit, self.ray_up, self.ray_down, self.layers)
+        return Ground(hit, unseen(hit), unseen(hit), rays)
+
+
+class CornerProbe(AbstractProbe):
+    """Three rays: at the foot, ahead of it for the pitch, and to its right for the roll (Mec).
+
+    The toe's and the corner's rays start over the detected foot, along the animated foot's heading.
+    Rays end `foot_height` and an extra distance under the foot. That extra is fixed, or set by how
+    stable the foot is: the longer one while it is low, slow, or both, as the switches ask.
+    """
+
+    active: Array = switch(True)
+    ray_up: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    foot_length: Array = parameter(0.20, unit="m", low=0.02, high=0.5)
+    half_width: Array = parameter(0.05, unit="m", low=0.01, high=0.2)
+    extra: Array = parameter(0.20, unit="m", low=0.0, high=1.0, kind="threshold")
+    by_height: Array = switch(True)
+    by_speed: Array = switch(False)
+    extra_min: Array = parameter(0.0, unit="m", low=0.0, high=1.0, kind="threshold")
+    extra_max: Array = parameter(
+        0.30, unit="m", low=0.0, high=1.0, kind="threshold", above="extra_min"
+    )
+    stable_height: Array = parameter(0.15, unit="m", low=0.0, high=0.5, kind="threshold")
+    stable_speed: Array = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
+    layers: Array = rule.layers()
+
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        up, foot = terrain.leg_up_ws, animated(frame)
+        below = foot_height + self._extra(frame, foot.pos, up, gate)
+        reach = self.ray_up + below
+
+        def look(points_ws: Array) -> Hit:
+            hit = cast(terrain, points_ws + vec.scale(up, self.ray_up), reach + MARGIN, self.layers)
+            return seen_if(hit, hit.found * gate.below(hit.distance, reach, band=HEIGHT_BAND))
+
+        ankle = look(foot.pos)
+        ankle = seen_if(ankle, jnp.where(self.active, ankle.found, 0.0))
+        sole = gate.choose(
+            ankle.found[..., None], ankle.point, foot.pos - vec.scale(up, foot_height)
+        )
+        ahead, right = foot_heading(rig, frame, up)
+        over = sole + vec.scale(up, foot_height)
+        level_toe = vec.scale(ahead, self.foot_length)
+        level_corner = vec.scale(right, self.half_width)
+        toe, corner = (
+            on_level(look(over + aside), ankle.found, sole + aside, gate)
+            for aside in (level_toe, level_corner)
+        )
+        rays = _rays(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
+        return Ground(ankle, toe, corner, rays)
+
+    def _extra(self, frame: Frame, foot_ws: Array, up_ws: Array, gate: AbstractGate) -> Array:
+        """How far under a standing sole each foot's rays end, m."""
+        height = vec.dot(foot_ws - frame.world_from_model.pos, up_ws)
+        low = gate.below(height, self.stable_height, band=HEIGHT_BAND)
+        slow = gate.below(frame.foot_speed, self.stable_speed, band=SPEED_BAND)
+        stable = jnp.where(self.by_height, low, 1.0) * jnp.where(self.by_speed, slow, 1.0)
+        chosen = gate.choose(stable, self.extra_max, self.extra_min)
+        return jnp.where(self.by_height | self.by_speed, chosen, self.extra)
 
 
 def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
@@ -47,3 +161,36 @@ def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
     x, y, z = vec.components(toe_ls)
     foot = quat.multiply(frame.pose.ankle.rot, rig.ankle_from_foot)
     return frame.pose.ankle.pos + quat.rotate(foot, vec.stack(rig.side * x, y, z))
+
+
+def foot_heading(rig: Rig, frame: Frame, up_ws: Array) -> tuple[Array, Array]:
+    """Forward and right of each animated foot, unit, at right angles to up, world space.
+
+    A foot that points along up has the character's.
+    """
+    foot = quat.multiply(animated(frame).rot, rig.ankle_from_foot)
+    sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
+    ahead = vec.unit(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
+    return ahead, vec.cross(ahead, up_ws)
+
+
+def seen_if(hit: Hit, found: Array) -> Hit:
+    """The hit with another weight."""
+    return eqx.tree_at(lambda hit: hit.found, hit, found)
+
+
+def unseen(like: Hit) -> Hit:
+    """Hits of rays that were not cast."""
+    return seen_if(like, jnp.zeros_like(like.found))
+
+
+def on_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit:
+    """A hit beside a foot that was `found`; a miss lies on the level at that foot."""
+    seen = hit.found * found
+    point = gate.choose(seen[..., None], hit.point, level_ws)
+    return Hit(point, hit.normal, hit.distance, seen)
+
+
+def _rays(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
+    shape = like.found.shape
+    return Rays(jnp.broadcast_to(above, shape), jnp.broadcast_to(below, shape), layers)

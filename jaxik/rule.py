@@ -69,6 +69,14 @@ def switch(default: bool) -> Any:
     return eqx.field(default_factory=lambda: as_switch(default), converter=as_switch)
 
 
+def layers(default: int = 0xFFFFFFFF) -> Any:
+    """A mask of the layers that a rule's rays see, one bit a layer (`terrain.layer_mask`)."""
+    return eqx.field(
+        default_factory=lambda: jnp.asarray(default, jnp.uint32),
+        converter=lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.uint32),
+    )
+
+
 def declarations(module: eqx.Module, path: str = "") -> dict[str, Declaration]:
     """Every declared parameter of a rule or of a tree of rules, by dotted name."""
     found: dict[str, Declaration] = {}

@@ -117,6 +117,16 @@ class Terrain(eqx.Module):
     up_ws: Float[Array, "*t 3"]  # unit; rays run along its opposite
     surfaces: tuple[AbstractSurface, ...]
 
+    @property
+    def body(self) -> "Terrain":
+        """What rays of the root meet."""
+        return self
+
+    @property
+    def leg_up_ws(self) -> Float[Array, "*t 3"]:
+        """Up of the legs, which all share it."""
+        return self.up_ws
+
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"], surface: int = 0) -> "Terrain":
         """This terrain with one of its meshes over moved vertices; see `Mesh.with_vertices`."""
         moved = self.surfaces[surface]
@@ -127,8 +137,29 @@ class Terrain(eqx.Module):
         )
 
 
+class LegTerrains(eqx.Module):
+    """The same world as each leg meets it: rays of leg i run along the opposite of its own up.
+
+    For feet on walls and hands on ladders. A mesh is gridded for one up, so that each up that
+    occurs needs the mesh once more; legs that share an up share its terrain.
+    """
+
+    body: Terrain  # up of the body, and the ground that rays of the root meet
+    legs: tuple[Terrain, ...]  # one a leg
+
+    @property
+    def up_ws(self) -> Float[Array, "3"]:
+        """Up of the body."""
+        return self.body.up_ws
+
+    @property
+    def leg_up_ws(self) -> Float[Array, "legs 3"]:
+        """Up of each leg."""
+        return jnp.stack([terrain.up_ws for terrain in self.legs])
+
+
 def cast(
-    terrain: Terrain,
+    terrain: Terrain | LegTerrains,
     origins_ws: Float[Array, "*b 3"],
     reach: Float[Array, "*#b"] | float,
     mask: UInt[Array, "*#b"] | int = ALL_LAYERS,
@@ -140,13 +171,20 @@ def cast(
 
     Args:
         terrain: what there is to meet.
-        origins_ws: where the rays start, m.
+        origins_ws: where the rays start, m; with `LegTerrains` (..., legs, 3).
         reach: their lengths, m; above `HORIZON`, infinite too, it counts as `HORIZON`.
         mask: the layers that each ray sees, one bit a layer (`layer_mask`).
     """
-    return _nearest(
-        terrain, origins_ws, jnp.asarray(reach, origins_ws.dtype), jnp.asarray(mask, jnp.uint32)
-    )
+    reach, mask = jnp.asarray(reach, origins_ws.dtype), jnp.asarray(mask, jnp.uint32)
+    if isinstance(terrain, Terrain):
+        return _nearest(terrain, origins_ws, reach, mask)
+    reach, mask = (jnp.broadcast_to(x, origins_ws.shape[:-1]) for x in (reach, mask))
+    hits = [
+        _nearest(one, origins_ws[..., leg, :], reach[..., leg], mask[..., leg])
+        for leg, one in enumerate(terrain.legs)
+    ]
+    axis = origins_ws.ndim - 2
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=axis), *hits)
 
 
 @jax.jit  # a call outside jit compiles once a shape, not once an operation

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from reference import maths, poses
 from reference import record as reference
+from reference.terrain import LegTerrains
 from reference.terrain import Terrain as PlainTerrain
 
 import jaxik
@@ -100,23 +101,32 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
         pose=jaxik.LegPose(*map(transform, ("hip", "knee", "ankle", "toe"))),
         weight=jnp.asarray(np.stack([frame.weight for frame in frames])),
         slide=jnp.asarray([float(frame.slide) for frame in frames]),
-        speed=jnp.zeros(len(frames)),
+        speed=jnp.asarray([float(frame.speed) for frame in frames]),
+        foot_speed=jnp.asarray(np.stack([frame.foot_speed for frame in frames])),
         dt=jnp.asarray([float(frame.dt) for frame in frames]),
         platform=transform("platform"),
     )
 
 
-def to_ik(values: dict[str, Any]) -> jaxik.FootIK:
-    return rule.replace(jaxik.presets.record(), values)
+def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
+    return rule.replace(getattr(jaxik.presets, preset)(), values)
 
 
 def to_terrain(ground: PlainTerrain) -> terrain.Terrain:
-    surfaces = [terrain.plane(point, normal, up=ground.up) for point, normal in ground.planes]
+    surfaces = [
+        terrain.plane(point, normal, up=ground.up, layer=layer)
+        for (point, normal), layer in zip(ground.planes, ground.plane_layers, strict=True)
+    ]
     if len(ground.triangles):
         vertices = np.asarray(ground.triangles).reshape(-1, 3)
         triangles = np.arange(len(vertices)).reshape(-1, 3)
-        surfaces.append(terrain.mesh(vertices, triangles, up=ground.up))
+        layers = np.asarray(ground.triangle_layers)
+        surfaces.append(terrain.mesh(vertices, triangles, up=ground.up, layer=layers))
     return terrain.combine(*surfaces)
+
+
+def to_leg_terrains(ground: LegTerrains) -> terrain.LegTerrains:
+    return terrain.LegTerrains(to_terrain(ground.body), tuple(map(to_terrain, ground.legs)))
 
 
 def make_rig(seed: int = 0, legs: int = 2) -> reference.Rig:
@@ -155,6 +165,8 @@ def animate(
     foot: Any = 0.0,
     slide: Any = 0.0,
     weight: Any = 1.0,
+    speed: Any = 0.0,
+    foot_speed: Any = 0.0,
     platform: Any = poses.STILL,
 ) -> list[reference.Frame]:
     """Frames of two legs from what may each be a number, or a function of time, s.
@@ -170,6 +182,8 @@ def animate(
         foot: pitch of the feet, rad, toes up.
         slide: 0..1.
         weight: 0..1, one for both legs or one each.
+        speed: that the character is said to have, m/s.
+        foot_speed: likewise the animated ankles, one for both legs or one each.
         platform: world_from_platform.
     """
 
@@ -189,13 +203,15 @@ def animate(
             world_from_model=root,
             slide=at(slide, time),
             weight=np.broadcast_to(at(weight, time), len(rig.side)).astype(float),
+            speed=at(speed, time),
+            foot_speed=np.broadcast_to(at(foot_speed, time), len(rig.side)).astype(float),
             dt=1.0 / hz,
             platform=at(platform, time),
         )
         tilt = maths.turn(-maths.X, at(foot, time))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
         frames.append(dataclasses.replace(frame, ankle=frame.ankle._replace(rot=rot)))
-    return frames
+    return poses.with_speeds(frames)
 
 
 def stepping(rig: reference.Rig, drift: float = 0.0, **changes: Any) -> list[reference.Frame]:
@@ -228,25 +244,39 @@ def padded(frames: list, count: int = FRAMES) -> list:
     return frames + [frames[-1]] * (count - len(frames))
 
 
-def wandering(rig: reference.Rig, rng: np.random.Generator, count: int = FRAMES) -> list:
+def wandering(
+    rig: reference.Rig,
+    rng: np.random.Generator,
+    count: int = FRAMES,
+    stand: tuple[float, float] | None = None,
+) -> list:
     """A clip that meets everything: steps, drifting feet, slides, half-weighted legs, odd frame
     times, a turning root, swinging hips, tilted feet.
+
+    Between the shares `stand` of the clip the root stands where it is, at a speed of exactly 0, and
+    the feet, held in their step, only sway and bob a little.
     """
     legs = len(rig.side)
     frames = []
-    heading, place, phase = 0.3, np.array([-2.2, 0.0, -2.4]), 0.0
+    heading, place, phase, stood = 0.3, np.array([-2.2, 0.0, -2.4]), 0.0, 0.0
     for index in range(count):
         dt = 1 / 60 if index % 97 else 1 / 30
-        phase += dt / 1.05
-        heading += 0.25 * dt * np.sin(phase)
+        sway = np.zeros(3)
+        if stand is not None and stand[0] <= index / count < stand[1]:
+            stood += dt
+            sway = np.array([0.004, 0.01, 0.004]) * np.sin(np.array([5.0, 9.0, 7.0]) * stood)
+        else:
+            phase += dt / 1.05
+            heading += 0.25 * dt * np.sin(phase)
+            place = place + dt * 0.6 * np.array([np.sin(heading), 0.0, np.cos(heading)])
         turned = maths.turn(maths.Y, heading)
-        place = place + dt * 0.6 * np.array([np.sin(heading), 0.0, np.cos(heading)])
         ankles = []
         for leg in range(legs):
             cycle = (phase + leg / legs) % 1.0
             swing = np.sin(np.pi * np.clip((cycle - 0.55) / 0.4, 0.0, 1.0))
             x = 0.1 * rig.side[leg] + 0.01 * np.sin(3.1 * phase)
-            ankles.append([x, 0.08 + 0.12 * swing, 0.18 * np.cos(2 * np.pi * cycle)])
+            ankle = [x, 0.08 + 0.12 * swing, 0.18 * np.cos(2 * np.pi * cycle)]
+            ankles.append(ankle + sway * (-1.0) ** leg)
         share = index / count
         weight = np.ones(legs)
         if 0.67 < share < 0.73:
@@ -267,7 +297,7 @@ def wandering(rig: reference.Rig, rng: np.random.Generator, count: int = FRAMES)
         tilt = maths.turn(axis / np.linalg.norm(axis), rng.uniform(0.0, 0.2))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
         frames.append(dataclasses.replace(frame, ankle=frame.ankle._replace(rot=rot)))
-    return frames
+    return poses.with_speeds(frames)
 
 
 def at(tree: Any, index: Any) -> Any:

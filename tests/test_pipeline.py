@@ -46,10 +46,10 @@ def test_600_frames_agree_with_the_reference(name, values, legs):
     if values.get("lock.enabled", True):
         assert 0.1 < expected["locked"].mean() < 0.9
     pairs = {
-        "offset_ws": result.trace.advanced.target_ws
+        "offset_ws": result.trace.advanced.effector.target_ws
         - result.trace.advanced.foothold_ws
         - result.trace.sensed.contact.lift[..., None] * result.trace.sensed.up_ws[:, None],
-        "target_ws": result.trace.advanced.target_ws,
+        "target_ws": result.trace.advanced.effector.target_ws,
         "ground_height": after.target.height,
         "pelvis_offset_ws": after.pelvis.offset_ws,
         "slide_weight": after.lean.slide,

@@ -66,7 +66,7 @@ def offset_of(result: jaxik.Result) -> np.ndarray:
     """The lock's offset, world, m (frames, legs, 3)."""
     advanced, sensed = result.trace.advanced, result.trace.sensed
     lift = sensed.contact.lift[..., None] * sensed.up_ws[:, None]
-    return np.asarray(advanced.target_ws - advanced.foothold_ws - lift)
+    return np.asarray(advanced.effector.target_ws - advanced.foothold_ws - lift)
 
 
 def assert_same_rot(came, wanted, tolerance: float) -> None:
@@ -209,8 +209,8 @@ def test_moving_and_turning_the_world_moves_and_turns_the_answer(kind, name):
     assert_same_pose(after.pose, before.pose)
     assert_same_transform(after.body, before.body)
     np.testing.assert_array_equal(after.reached, before.reached)
-    target_ws = to_transform(by).apply(before.trace.advanced.target_ws)
-    np.testing.assert_allclose(after.trace.advanced.target_ws, target_ws, atol=EXACT)
+    target_ws = to_transform(by).apply(before.trace.advanced.effector.target_ws)
+    np.testing.assert_allclose(after.trace.advanced.effector.target_ws, target_ws, atol=EXACT)
     for joint in ("hip", "knee", "ankle"):
         assert_same_rot(
             getattr(after.corrections, joint), getattr(before.corrections, joint), EXACT
@@ -292,7 +292,7 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
         )
         assert_same_rot(turned, getattr(result.pose, joint).rot, EXACT)
     target = jax.vmap(lambda w, t: w.inverse().apply(t))(
-        frames.world_from_model, result.trace.advanced.target_ws
+        frames.world_from_model, result.trace.advanced.effector.target_ws
     )
     gap = np.linalg.norm(result.pose.ankle.pos - target, axis=-1)
     reached = np.asarray(result.reached) > 0.5
@@ -372,7 +372,8 @@ def three_legged(rig: jaxik.Rig, frames: jaxik.Frame) -> tuple[jaxik.Rig, jaxik.
     wide = dataclasses.replace(wide, names=names, joints=joints, pelvis=12)
     pose = padded_leg(frames.pose, 3, axis=1)
     weight = jnp.concatenate([frames.weight, jnp.ones((FRAMES, 1))], axis=1)
-    return wide, dataclasses.replace(frames, pose=pose, weight=weight)
+    speeds = padded_leg(frames.foot_speed, 3, axis=1)
+    return wide, dataclasses.replace(frames, pose=pose, weight=weight, foot_speed=speeds)
 
 
 CROWD_GROUNDS = (BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)))

@@ -1,15 +1,15 @@
-"""What the `record` reference is given and what it remembers: parameters, rig, frames, state."""
+"""What the references are given: parameters, rig, frames; and what `record`'s remembers."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
 from . import maths
 from .maths import Array, Transform
-from .terrain import Hit
+from .terrain import ALL_LAYERS, Hit, LegTerrains
 
 # The record's defaults of a 1.8 m adult; gains per tick of 30 Hz; then the group it lacks.
 DEFAULTS: dict[str, Any] = {
@@ -66,17 +66,33 @@ class Ground(Protocol):
 
     up: Array
 
-    def cast(self, origin: Array, reach: float) -> Hit: ...
+    def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit: ...
+
+
+def under(terrain: Ground, leg: int) -> Ground:
+    """The ground as `leg` meets it."""
+    return terrain.legs[leg] if isinstance(terrain, LegTerrains) else terrain
 
 
 class Parameters:
-    """Values by dotted name; a value is shared, or has one row a leg."""
+    """Values by dotted name; a value is shared, or has one row a leg.
 
-    def __init__(self, changes: Mapping[str, Any] | None = None) -> None:
-        unknown = set(changes or {}) - set(DEFAULTS)
+    Args:
+        changes: values other than the default.
+        defaults: those of one system; `record`'s unless given.
+
+    Raises:
+        ValueError: a name that the system does not have.
+    """
+
+    def __init__(
+        self, changes: Mapping[str, Any] | None = None, defaults: Mapping[str, Any] = DEFAULTS
+    ) -> None:
+        unknown = set(changes or {}) - set(defaults)
         if unknown:
-            raise ValueError(f"no parameters {sorted(unknown)}; there are {sorted(DEFAULTS)}")
-        self.values = {**DEFAULTS, **(changes or {})}
+            raise ValueError(f"no parameters {sorted(unknown)}; there are {sorted(defaults)}")
+        self.defaults = defaults
+        self.values = {**defaults, **(changes or {})}
 
     def __getitem__(self, name: str) -> Any:
         return self.values[name]
@@ -84,7 +100,7 @@ class Parameters:
     def of_leg(self, name: str, leg: int) -> Any:
         """The value that `leg` sees."""
         value = np.asarray(self.values[name])
-        return value[leg] if value.ndim > np.ndim(DEFAULTS[name]) else self.values[name]
+        return value[leg] if value.ndim > np.ndim(self.defaults[name]) else self.values[name]
 
 
 @dataclass
@@ -98,7 +114,11 @@ class Rig:
 
 @dataclass
 class Frame:
-    """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space."""
+    """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space.
+
+    `speed` is the character's and `foot_speed` (legs) that of the animated ankles, m/s in the
+    world; both are 0 unless given.
+    """
 
     world_from_model: Transform
     hip: Transform
@@ -109,6 +129,12 @@ class Frame:
     slide: float
     dt: float
     platform: Transform
+    speed: float = 0.0
+    foot_speed: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if len(self.foot_speed) == 0:
+            self.foot_speed = np.zeros(len(self.weight))
 
 
 @dataclass
@@ -151,3 +177,27 @@ def world_from_foot(rig: Rig, frame: Frame, leg: int) -> Array:
     """Rotation from the animated foot's axes (x left, y up, z forward) to the world's."""
     world_from_ankle = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
     return maths.multiply(world_from_ankle, rig.ankle_from_foot[leg])
+
+
+def joints(legs: Sequence[Sequence[Transform]]) -> dict[str, Array]:
+    """Outputs of the solved joints, from hip, knee, ankle and toe of each leg, model space."""
+    output = {}
+    for index, name in enumerate(("hip", "knee", "ankle", "toe")):
+        output[f"{name}_pos"] = np.array([leg[index].pos for leg in legs])
+        output[f"{name}_rot"] = np.array([leg[index].rot for leg in legs])
+    return output
+
+
+def run(
+    step: Callable[..., tuple[Any, dict[str, Array]]],
+    parameters: Parameters,
+    rig: Rig,
+    terrain: Ground,
+    frames: Sequence[Frame],
+) -> dict[str, Array]:
+    """A clip from its first frame: every output of `step`, stacked over the frames."""
+    state, outputs = None, []
+    for frame in frames:
+        state, output = step(parameters, rig, terrain, state, frame)
+        outputs.append(output)
+    return {name: np.stack([output[name] for output in outputs]) for name in outputs[0]}

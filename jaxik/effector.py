@@ -1,0 +1,203 @@
+"""Stage 8: where each leg is sent once the body has moved, and how much of foot IK it gets."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from . import ease, quat, vec
+from .frame import Sensed
+from .gate import AbstractGate
+from .lock import Held
+from .pelvis import PelvisState, asked_heights
+from .rule import parameter, switch
+from .skeleton import Rig
+
+HEIGHT_BAND = 0.01  # m
+
+
+class Effector(eqx.Module):
+    """What the legs are solved for."""
+
+    target_ws: Float[Array, "legs 3"]  # m, of the ankles
+    rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule takes it
+    weight: Float[Array, " legs"]  # 0..1, share of foot IK
+
+
+class AbstractEffector(eqx.Module):
+    """Follows the targets."""
+
+    @abstractmethod
+    def init(self, rig: Rig, dtype: Any) -> Any:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def awake(self, sensed: Sensed, state: Any, gate: AbstractGate) -> Float[Array, ""]:
+        """0 while the body shall stay as it is, else 1."""
+
+    @abstractmethod
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: Any,
+        started: Array,
+        gate: AbstractGate,
+    ) -> tuple[Any, Effector]:
+        """Memory after this frame, and where the legs go."""
+
+
+class AbstractInstantEffector(AbstractEffector):
+    """Follows by the present frame alone."""
+
+    def init(self, rig: Rig, dtype: Any) -> None:
+        return None
+
+    def awake(self, sensed: Sensed, state: None, gate: AbstractGate) -> Float[Array, ""]:
+        return jnp.ones_like(sensed.dt)
+
+
+class DirectEffector(AbstractInstantEffector):
+    """The targets as they are; a foot without ground goes where it was animated."""
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Effector]:
+        return None, Effector(target_ws, held.rot_ws, sensed.weight)
+
+
+class FoundEffector(AbstractInstantEffector):
+    """The targets of feet that found ground; other legs stay as the body carries them (ozz)."""
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Effector]:
+        return None, Effector(target_ws, held.rot_ws, sensed.weight * sensed.foothold.found)
+
+
+class BodyState(eqx.Module):
+    """Feet relative to the body."""
+
+    height: Float[Array, " legs"]  # m, of the ankles over the moved body's animation
+    asleep: Float[Array, ""]  # 0 or 1
+
+
+class BodyEffector(AbstractEffector):
+    """Smooths each foot's height relative to the body, after the body has moved (Unreal, seed 001).
+
+    The height goes to the asked one less the pelvis' goal by the clamped-speed law, and the foot
+    moves with the pelvis. With `latch` on everything stops once all feet are within
+    `latch_distance` of their goals, until the character moves: a pelvis slower than the feet then
+    freezes short of its goal, which is the original's trap. Off is recommended.
+    """
+
+    speed: Array = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    latch: Array = switch(False)
+    latch_distance: Array = parameter(0.01, unit="m", low=0.0, high=0.05, kind="threshold")
+    mesh_scale: Array = parameter(1.0, unit="1", low=0.5, high=2.0)
+
+    def init(self, rig: Rig, dtype: Any) -> BodyState:
+        return BodyState(jnp.zeros(rig.side.shape, dtype), jnp.zeros((), dtype))
+
+    def awake(self, sensed: Sensed, state: BodyState, gate: AbstractGate) -> Float[Array, ""]:
+        return 1.0 - state.asleep * self._still(sensed, gate)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: BodyState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[BodyState, Effector]:
+        awake = self.awake(sensed, state, gate)
+        asked = asked_heights(sensed, target_ws)
+        goal = asked - pelvis.goal
+        share = ease.share_of_speed(self.speed, sensed.dt, goal - state.height)
+        share = awake * jnp.where(started, share, 1.0)
+        height = ease.approach(state.height, goal, share)
+
+        near = gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
+        arrived = jnp.prod(jnp.where(sensed.weight > 0, near, 1.0))
+        falls = jnp.where(self.latch, self._still(sensed, gate), 0.0)
+        asleep = falls * (1.0 - awake * (1.0 - arrived))
+
+        moved = vec.scale(sensed.leg_up_ws, height / self.mesh_scale - asked) + pelvis.offset_ws
+        effector = Effector(target_ws + moved, held.rot_ws, sensed.weight)
+        return BodyState(height, asleep), effector
+
+    def _still(self, sensed: Sensed, gate: AbstractGate) -> Float[Array, ""]:
+        """1 while all feet stand."""
+        standing = jnp.where(sensed.weight > 0, sensed.contact.planted, 1.0)
+        return gate.least(standing, band=0.1)
+
+
+class FadeState(eqx.Module):
+    """How far each leg has come, and what its last ground asked of it."""
+
+    share: Float[Array, " legs"]  # 0..1
+    offset_ws: Float[Array, "legs 3"]  # m, from the animated ankle to the target
+    turn_ws: Float[Array, "legs 4"]  # from the animated ankle's rotation to the wanted one
+
+
+class FadeEffector(AbstractEffector):
+    """Fades each leg in while it finds ground and out while it does not, at one pace (Mec).
+
+    On the way out the leg keeps what the last ground asked of it: the same offset from its
+    animation, and the same turn.
+    """
+
+    transition_time: Array = parameter(0.20, unit="s", low=0.0, high=1.0)
+
+    def init(self, rig: Rig, dtype: Any) -> FadeState:
+        upright = jnp.broadcast_to(quat.identity(dtype), (*rig.side.shape, 4))
+        return FadeState(
+            jnp.zeros(rig.side.shape, dtype), jnp.zeros((*rig.side.shape, 3), dtype), upright
+        )
+
+    def awake(self, sensed: Sensed, state: FadeState, gate: AbstractGate) -> Float[Array, ""]:
+        return jnp.ones_like(sensed.dt)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: FadeState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[FadeState, Effector]:
+        found = sensed.foothold.found
+        step = jnp.where(started, ease.step_of_time(self.transition_time, sensed.dt), 1.0)
+        share = ease.towards(state.share, found, step)
+        asked = target_ws - sensed.ankle_ws
+        offset_ws = gate.choose(found[..., None], asked, state.offset_ws)
+        turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        turn_ws = quat.nlerp(state.turn_ws, turn, found)
+        effector = Effector(
+            sensed.ankle_ws + offset_ws,
+            quat.multiply(turn_ws, sensed.ankle_rot_ws),
+            sensed.weight * share,
+        )
+        return FadeState(share, offset_ws, turn_ws), effector

@@ -1,0 +1,224 @@
+"""Solving a two-bone limb: the triangle, the turn of the knee, the swing of the hip."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import quat, vec
+from .gate import AbstractGate
+
+LENGTH_BAND = 0.005  # m
+DOWN = (0.0, -1.0, 0.0)
+LEFT = (1.0, 0.0, 0.0)
+
+
+def local(rot: Array, turn: Array) -> Array:
+    """The correction on the right of `rot` that does what `turn` does on its left."""
+    return quat.multiply(quat.conjugate(rot), quat.multiply(turn, rot))
+
+
+def opposite_side(a: Array, b: Array, cos: Array) -> Array:
+    """Third side of the triangle with sides `a` and `b` and this cosine between them."""
+    return vec.safe_sqrt(a * a + b * b - 2.0 * a * b * cos)
+
+
+def soft_limit(x: Array, free: Array, limit: Array) -> Array:
+    """`x` up to `free`; beyond, an exponential of slope 1 there that tends to `limit`."""
+    room = limit - free
+    roomy = room > 0
+    over = x - free
+    beyond = over > 0
+    share = jnp.where(beyond, over, 0.0) / jnp.where(roomy, room, 1.0)
+    return jnp.where(beyond, free - jnp.where(roomy, room * jnp.expm1(-share), 0.0), x)
+
+
+def quartic_limit(x: Array, free: Array, limit: Array) -> Array:
+    """`x` up to `free`; beyond, ozz's curve of slope 4/3 there that tends to `limit`.
+
+    At first it overshoots `x`, by 2.8 % of the room at most. Without room `x` passes as it is.
+    """
+    room = limit - free
+    roomy = room > 0
+    beyond = roomy & (x > free)
+    share = jnp.where(beyond, x - free, 0.0) / jnp.where(roomy, room, 1.0)
+    left = (3.0 / (share + 3.0)) ** 4
+    return jnp.where(beyond, limit - room * left, x)
+
+
+def hinge_turn(to_hip: Array, to_ankle: Array, hinge: Array, reach: Array) -> tuple[Array, Array]:
+    """Cosine and sine of half the knee's turn about `hinge` that takes hip and ankle `reach` apart.
+
+    The interior angle is 0..pi after the turn, whatever side the leg was bent to before. Clamped to
+    straight or folded where the triangle does not close; no turn where a side lies along the hinge.
+    """
+    along_thigh, along_shin = vec.dot(to_hip, hinge), vec.dot(to_ankle, hinge)
+    thigh, shin = vec.reject(to_hip, hinge), vec.reject(to_ankle, hinge)
+    a2, b2 = vec.dot(thigh, thigh), vec.dot(shin, shin)
+    across2 = reach * reach - (along_thigh - along_shin) ** 2
+    cos_now, sin_now = vec.dot(thigh, shin), vec.dot(hinge, vec.cross(thigh, shin))
+    return _opening(a2, b2, across2, cos_now, sin_now)
+
+
+def _opening(
+    a2: Array, b2: Array, apart2: Array, cos_now: Array, sin_now: Array
+) -> tuple[Array, Array]:
+    """Cosine and sine of half the turn that sets the angle between two sides of a triangle.
+
+    The sides' squares are `a2` and `b2`, that of the third side is to be `apart2`; `cos_now` and
+    `sin_now` belong to the present angle and are both times the two sides' lengths.
+    """
+    ab = vec.safe_sqrt(a2 * b2)
+    bendable = ab > jnp.finfo(ab.dtype).eps
+    ab = jnp.where(bendable, ab, 1.0)
+    cosine = (a2 + b2 - apart2) / (2.0 * ab)
+    open_cos = vec.safe_sqrt(bounded((1.0 + cosine) * 0.5))
+    open_sin = vec.safe_sqrt(bounded((1.0 - cosine) * 0.5))
+
+    cos_now, sin_now = cos_now / ab, sin_now / ab
+    norm = vec.length(jnp.stack([cos_now, sin_now, jnp.zeros_like(cos_now)], axis=-1))
+    norm = jnp.where(norm > 0, norm, 1.0)
+    now_cos, now_sin = quat.half_angle(cos_now / norm, sin_now / norm)
+    turn_cos = open_cos * now_cos + open_sin * now_sin
+    turn_sin = open_sin * now_cos - open_cos * now_sin
+    return jnp.where(bendable, turn_cos, 1.0), jnp.where(bendable, turn_sin, 0.0)
+
+
+def bounded(x: Array) -> Array:
+    """`x` kept within 0..1, the cosines a triangle can have."""
+    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
+
+
+def swing_turn(bent: Array, to_target: Array, hinge: Array, twist: Array) -> Array:
+    """Rotation of the hip that takes the ankle's direction to the target's and keeps the hinge.
+
+    The shortest arc, then a turn about the target's direction that lines the hinge up with where it
+    was, seen along that direction; then `twist`, rad, about it.
+    """
+    start = vec.unit(bent, vec.constant(DOWN, bent))
+    aim = vec.unit(to_target, start)
+    arc = arc_beside(start, aim, hinge)
+    facing = turn_about(aim, quat.rotate(arc, hinge), hinge)
+    return quat.multiply(quat.from_axis_angle(aim, twist), quat.multiply(facing, arc))
+
+
+def arc_beside(start: Array, aim: Array, side: Array) -> Array:
+    """Shortest rotation between two unit vectors; half a turn about `side` where they are opposed.
+
+    Of `side` the part at right angles to `start` is taken, or of down where it has none.
+    """
+    down, left = vec.constant(DOWN, start), vec.constant(LEFT, start)
+    square = vec.unit(vec.reject(side, start), vec.reject(down, start))
+    return quat.arc(start, aim, vec.unit(square, left))
+
+
+def turn_about(axis: Array, start: Array, aim: Array) -> Array:
+    """Turn about the unit `axis` that lines `start` up with `aim`, both unit, seen along the axis.
+
+    The identity where one of them lies along the axis or is zero.
+    """
+    cos, sin, _ = _angle_about(axis, start, aim)
+    return quat.unit(quat.from_cos_sin(axis, cos, sin))
+
+
+def _angle_about(axis: Array, start: Array, aim: Array) -> tuple[Array, Array, Array]:
+    """Cosine and sine of the angle from `start` to `aim` about `axis`, and whether it is known."""
+    start, aim = vec.reject(start, axis), vec.reject(aim, axis)
+    spans = vec.safe_sqrt(vec.dot(start, start) * vec.dot(aim, aim))
+    known = spans > jnp.finfo(spans.dtype).eps ** 0.5
+    spans = jnp.where(known, spans, 1.0)
+    cos = jnp.where(known, vec.dot(start, aim) / spans, 1.0)
+    sin = jnp.where(known, vec.dot(axis, vec.cross(start, aim)) / spans, 0.0)
+    return bounded_cosine(cos), sin, known
+
+
+def bounded_cosine(x: Array) -> Array:
+    """`x` kept within -1..1 against rounding."""
+    return jnp.where(x < -1, -1.0, jnp.where(x > 1, 1.0, x))
+
+
+class PoleBend(eqx.Module):
+    """A limb that bends towards a pole."""
+
+    swing: Float[Array, "*b 4"]  # of the hip, on the left of its rotation
+    half_cos: Float[Array, "*k"]  # of half the knee's turn about its hinge; comes before the swing
+    half_sin: Float[Array, "*k"]
+    reached: Float[Array, "*r"]  # 1 where the ankle can be at the target, else 0
+
+
+def pole_bend(
+    to_hip: Float[Array, "*h 3"],
+    to_ankle: Float[Array, "*a 3"],
+    hinge: Float[Array, "*i 3"],
+    to_target: Float[Array, "*t 3"],
+    pole: Float[Array, "*p 3"],
+    soften: Float[Array, "*s"],
+    twist: Float[Array, "*w"],
+    gate: AbstractGate,
+) -> PoleBend:
+    """Bends a limb to its target in the plane that contains the pole, as ozz's two-bone job does.
+
+    From systems.md, 0. The bones' whole lengths make the triangle: unlike with `hinge_turn`, a
+    hinge that is not square to the limb leaves the ankle beside its target, and the plane beside
+    the pole. All vectors are in one rigid space and are broadcast.
+
+    A target on the hip folds the knee and leaves the hip as it is. No turn to a pole along the
+    target, no arc for an ankle folded onto the hip, no bend with a zero bone. `reached` is told
+    from the lengths alone.
+
+    Args:
+        to_hip: from the knee, m.
+        to_ankle: from the knee, m.
+        hinge: unit; a positive turn opens the knee.
+        to_target: from the hip, m.
+        pole: where the knee points, of any length.
+        soften: part of the bones' length up to which the limb follows; counts as 0..1.
+        twist: of the limb about the target's direction, in the end, rad.
+        gate: how `reached` is decided.
+    """
+    a2, b2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
+    thigh, shin = vec.safe_sqrt(a2), vec.safe_sqrt(b2)
+    distance = vec.length(to_target)
+    free = bounded(soften) * (thigh + shin)
+    reach = quartic_limit(distance, free, thigh + shin)
+    too_near = gate.below(distance, jnp.abs(thigh - shin), band=LENGTH_BAND)
+    reached = (1.0 - too_near) * gate.below(distance, free, band=LENGTH_BAND)
+
+    # A bent limb's normal: one part along the hinge, and one across it if the hinge is tilted.
+    normal = vec.dot(hinge, vec.cross(to_hip, to_ankle))
+    across = vec.scale(to_ankle, vec.dot(to_hip, hinge)) - vec.scale(
+        to_hip, vec.dot(to_ankle, hinge)
+    )
+    sin_now = _lengthened(normal, vec.dot(across, across), normal, a2 * b2)
+    half_cos, half_sin = _opening(a2, b2, reach * reach, vec.dot(to_hip, to_ankle), sin_now)
+
+    bent = quat.rotate(quat.from_half(hinge, half_cos, half_sin), to_ankle) - to_hip
+    return PoleBend(_pole_swing(bent, to_target, hinge, pole, twist), half_cos, half_sin, reached)
+
+
+def _pole_swing(bent: Array, to_target: Array, hinge: Array, pole: Array, twist: Array) -> Array:
+    """Rotation of the hip that points the bent limb at its target and its knee at the pole."""
+    away = vec.dot(to_target, to_target) > jnp.finfo(to_target.dtype).eps ** 2
+    aim = vec.unit(to_target, vec.constant(DOWN, to_target))
+    arc = arc_beside(vec.unit(bent, aim), aim, hinge)
+    normal = quat.rotate(arc, hinge)
+    pole = vec.unit(pole, vec.constant((0.0, 0.0, 0.0), pole))
+    cos, sin, known = _angle_about(aim, normal, vec.cross(aim, pole))
+    # Ozz takes the angle between the normals, not between their parts across the target. The two
+    # are the same unless the hinge is tilted.
+    along = vec.dot(normal, aim)
+    sin = _lengthened(sin, (along * cos) ** 2, vec.dot(normal, pole), jnp.ones_like(along))
+    cos = cos * vec.length(vec.reject(normal, aim))
+    facing = quat.from_cos_sin(aim, jnp.where(known, cos, 1.0), jnp.where(known, sin, 0.0))
+    swing = quat.multiply(quat.unit(facing), arc)
+    swing = quat.multiply(quat.from_axis_angle(aim, twist), swing)
+    return jnp.where(away[..., None], swing, quat.identity(swing.dtype))
+
+
+def _lengthened(x: Array, across2: Array, sign: Array, scale2: Array) -> Array:
+    """Length, with this sign, of what measures `x` one way and the root of `across2` across it.
+
+    `x` itself, with its slope through zero, where `across2` is rounding beside `scale2`.
+    """
+    tilted = across2 > (8.0 * jnp.finfo(x.dtype).eps) ** 2 * scale2
+    length = vec.safe_sqrt(x * x + jnp.where(tilted, across2, 0.0))
+    return jnp.where(tilted, jnp.where(sign < 0, -length, length), x)
