@@ -225,7 +225,7 @@ class PlantLock(AbstractLock):
         followed = hit.point + vec.scale(up, clearance)
         planted_ws = gate.choose(hit.found[..., None], followed, kept_ws)
 
-        locked = jnp.where(self.plant & (sensed.weight > 0), sensed.foothold.found, 0.0)
+        locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
         step = jnp.where(started, ease.step_of_speed(self.plant_speed, sensed.dt), 1.0)
         share = ease.towards(state.share, self.plant_weight, step)
         counts = locked * share

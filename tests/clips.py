@@ -165,8 +165,6 @@ def animate(
     foot: Any = 0.0,
     slide: Any = 0.0,
     weight: Any = 1.0,
-    speed: Any = 0.0,
-    foot_speed: Any = 0.0,
     platform: Any = poses.STILL,
 ) -> list[reference.Frame]:
     """Frames of two legs from what may each be a number, or a function of time, s.
@@ -182,8 +180,6 @@ def animate(
         foot: pitch of the feet, rad, toes up.
         slide: 0..1.
         weight: 0..1, one for both legs or one each.
-        speed: that the character is said to have, m/s.
-        foot_speed: likewise the animated ankles, one for both legs or one each.
         platform: world_from_platform.
     """
 
@@ -203,8 +199,6 @@ def animate(
             world_from_model=root,
             slide=at(slide, time),
             weight=np.broadcast_to(at(weight, time), len(rig.side)).astype(float),
-            speed=at(speed, time),
-            foot_speed=np.broadcast_to(at(foot_speed, time), len(rig.side)).astype(float),
             dt=1.0 / hz,
             platform=at(platform, time),
         )
@@ -248,21 +242,22 @@ def wandering(
     rig: reference.Rig,
     rng: np.random.Generator,
     count: int = FRAMES,
-    stand: tuple[float, float] | None = None,
+    stand: tuple[float, ...] = (),
 ) -> list:
     """A clip that meets everything: steps, drifting feet, slides, half-weighted legs, odd frame
     times, a turning root, swinging hips, tilted feet.
 
-    Between the shares `stand` of the clip the root stands where it is, at a speed of exactly 0, and
-    the feet, held in their step, only sway and bob a little.
+    Between the shares `stand` of the clip (from, to, and again from, to) the root stands where it
+    is, at a speed of exactly 0, and the feet, held in their step, only sway and bob a little.
     """
+    stands = list(zip(stand[::2], stand[1::2], strict=True))
     legs = len(rig.side)
     frames = []
     heading, place, phase, stood = 0.3, np.array([-2.2, 0.0, -2.4]), 0.0, 0.0
     for index in range(count):
         dt = 1 / 60 if index % 97 else 1 / 30
         sway = np.zeros(3)
-        if stand is not None and stand[0] <= index / count < stand[1]:
+        if any(start <= index / count < end for start, end in stands):
             stood += dt
             sway = np.array([0.004, 0.01, 0.004]) * np.sin(np.array([5.0, 9.0, 7.0]) * stood)
         else:

@@ -20,7 +20,7 @@ def body(frame: Frame, offset_ws: Array, turn_ws: Array) -> Transform:
     return Transform(pivot + rotate(model_from_world, offset_ws) - rotate(rot, pivot), rot)
 
 
-def _carry(transform: Transform, joint: Transform, leg: int) -> Transform:
+def carry(transform: Transform, joint: Transform, leg: int) -> Transform:
     """One leg's joint, carried rigidly."""
     return Transform(
         apply(transform, joint.pos[leg]), maths.multiply(transform.rot, joint.rot[leg])
@@ -31,7 +31,7 @@ def solve_leg(
     parameters: Parameters, rig: Rig, leg: int, frame: Frame, body: Transform, target: Array
 ) -> tuple[Transform, Transform, Transform, bool]:
     """Hip, knee and ankle that bring the ankle to `target`, and whether they do; model space."""
-    hip, knee, ankle = (_carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle))
+    hip, knee, ankle = (carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle))
     weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
     axis = rotate(knee.rot, rig.knee_axis_ls[leg])
     distance = length(target - hip.pos)
@@ -52,6 +52,18 @@ def solve_leg(
         bent - hip.pos, target - hip.pos, axis, parameters.of_leg("leg.twist", leg)
     )
 
+    return *turned(hip, knee, ankle, hip_turn, knee_turn, weight), reached
+
+
+def turned(
+    hip: Transform,
+    knee: Transform,
+    ankle: Transform,
+    hip_turn: Array,
+    knee_turn: Array,
+    weight: float,
+) -> tuple[Transform, Transform, Transform]:
+    """Hip, knee and ankle after a share of both turns, that of the knee first."""
     knee_turn = maths.nlerp(maths.IDENTITY, knee_turn, weight)
     hip_turn = maths.nlerp(maths.IDENTITY, hip_turn, weight)
     bent = knee.pos + rotate(knee_turn, ankle.pos - knee.pos)
@@ -62,7 +74,6 @@ def solve_leg(
             hip.pos + rotate(hip_turn, knee.pos - hip.pos), maths.multiply(shin_turn, knee.rot)
         ),
         Transform(hip.pos + rotate(hip_turn, bent - hip.pos), maths.multiply(shin_turn, ankle.rot)),
-        reached,
     )
 
 

@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 # A vector shorter than this (in its own unit) has no direction.
 DIRECTIONLESS = 1e-9
 
+# Gap in m that the clamped-speed law jumps over.
+JUMP = 1e-4
+
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 X, Y, Z = np.eye(3)
 
@@ -161,6 +164,23 @@ def share_of_half_life(half_life: float, dt: float) -> float:
     if half_life <= 0.0:
         return 1.0
     return 1.0 - 2.0 ** (-dt / half_life)
+
+
+def ease_by_speed(value: float, goal: float, speed: float, dt: float) -> float:
+    """The clamped-speed law: `value` after `dt` s, `dt * speed` of the way to `goal`, at most all.
+
+    A speed <= 0 jumps, and so does a gap below `JUMP` m.
+    """
+    if speed <= 0.0 or abs(goal - value) < JUMP:
+        return goal
+    return value + clip(dt * speed, 0.0, 1.0) * (goal - value)
+
+
+def move_towards(value: float, goal: float, step: float) -> float:
+    """`value` after at most `step` straight towards `goal`."""
+    if abs(goal - value) <= step:
+        return goal
+    return value + step if goal > value else value - step
 
 
 def apply(transform: Transform, point: Array) -> Array:

@@ -64,13 +64,36 @@ def make_frame(
     joints = {name: Transform(np.array(pos), np.array(rot)) for name, (pos, rot) in columns.items()}
     frame = Frame(
         world_from_model=STILL,
-        **joints,
+        hip=joints["hip"],
+        knee=joints["knee"],
+        ankle=joints["ankle"],
+        toe=joints["toe"],
         weight=np.ones(len(ankles)),
         slide=0.0,
         dt=1 / 60,
         platform=STILL,
     )
     return dataclasses.replace(frame, **changes)
+
+
+def with_speeds(frames: list[Frame]) -> list[Frame]:
+    """The clip, its frames' speeds made of the differences from the frame before.
+
+    The first frame, which has none, is as fast as the second.
+    """
+    roots = [frame.world_from_model.pos for frame in frames]
+    ankles = [
+        np.array([maths.apply(frame.world_from_model, pos) for pos in frame.ankle.pos])
+        for frame in frames
+    ]
+    timed = []
+    for index, frame in enumerate(frames):
+        now = max(index, min(1, len(frames) - 1))
+        before, dt = max(now - 1, 0), frames[now].dt
+        speed = float(np.linalg.norm(roots[now] - roots[before])) / dt
+        foot_speed = np.linalg.norm(ankles[now] - ankles[before], axis=-1) / dt
+        timed.append(dataclasses.replace(frame, speed=speed, foot_speed=foot_speed))
+    return timed
 
 
 def standing(heights: tuple[float, ...] = (ANKLE, ANKLE), forward: float = 0.05) -> np.ndarray:
@@ -96,7 +119,7 @@ def stepping(rig: Rig, count: int = 60) -> list[Frame]:
             ankles.append([0.1 - 0.2 * leg, height, stride - 0.3 * index / 30 + 0.05])
         root = maths.rotate(turned, np.array([0.3, 0.0, 0.3 * index / 30]))
         frames.append(make_frame(rig, np.array(ankles), world_from_model=Transform(root, turned)))
-    return frames
+    return with_speeds(frames)
 
 
 def plane(slope_forward: float, slope_left: float, height: float = 0.0) -> Terrain:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from . import ground, limb, maths
+from . import ground, limb, maths, things
 from .maths import Transform
 from .things import DEFAULTS, Frame, Ground, Parameters, Rig, State
 
@@ -87,9 +87,7 @@ def step(
         "pelvis_height": np.array(pelvis),
         "pelvis_offset_ws": pelvis_offset_ws,
     }
-    for index, joint in enumerate(("hip", "knee", "ankle", "toe")):
-        output[f"{joint}_pos"] = np.array([row[index].pos for row in solved])
-        output[f"{joint}_rot"] = np.array([row[index].rot for row in solved])
+    output |= things.joints([row[:4] for row in solved])
     return state, output
 
 
@@ -97,8 +95,4 @@ def run(
     parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
 ) -> dict[str, np.ndarray]:
     """A clip from its first frame: every output of `step`, stacked over the frames."""
-    state, outputs = None, []
-    for frame in frames:
-        state, output = step(parameters, rig, terrain, state, frame)
-        outputs.append(output)
-    return {name: np.stack([output[name] for output in outputs]) for name in outputs[0]}
+    return things.run(step, parameters, rig, terrain, frames)

@@ -1,20 +1,24 @@
 """Rays down onto planes and triangle lists, by trying every surface."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .maths import Array
 
 # Cosine between a surface's normal and up below which a vertical ray runs along the surface.
 EDGE_ON = 1e-9
+ALL_LAYERS = 0xFFFFFFFF
 # Barycentric slack, so that a ray through a shared edge meets at least one of its triangles.
 SLACK = 1e-12
 
 
 class Hit(NamedTuple):
-    """Where a ray ended. Without a find: the ray's end, and up as normal."""
+    """Where a ray ended. Without a find: the ray's end, or start if endless, and up as normal."""
 
     found: bool
     point: Array
@@ -29,13 +33,21 @@ class Terrain:
         up: unit (3); rays run against it.
         planes: pairs of a point (3) and a normal (3, any length), seen from both sides.
         triangles: (count, 3 corners, 3), m, seen from both sides, in any winding.
+        plane_layers: layer of each plane, 0 to 31; all on layer 0 unless given.
+        triangle_layers: (count), layer of each triangle, likewise.
     """
 
     up: Array
     planes: list[tuple[Array, Array]] = field(default_factory=list)
     triangles: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    plane_layers: list[int] = field(default_factory=list)
+    triangle_layers: Sequence[int] | NDArray[np.integer] = ()
 
     def __post_init__(self) -> None:
+        self.plane_layers = list(self.plane_layers) or [0] * len(self.planes)
+        if len(self.triangle_layers) == 0:
+            self.triangle_layers = np.zeros(len(self.triangles), int)
+        self.triangle_layers = np.asarray(self.triangle_layers)
         self._corner = self.triangles[:, 0]
         self._first = self.triangles[:, 1] - self._corner
         self._second = self.triangles[:, 2] - self._corner
@@ -50,13 +62,16 @@ class Terrain:
         self._usable = solid & (self._normal @ self.up > EDGE_ON)
         self._scale = np.where(self._usable, 1.0 / np.where(self._usable, volume, 1.0), 0.0)
 
-    def cast(self, origin: Array, reach: float) -> Hit:
+    def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:
         """The first surface at most `reach` m below `origin`, its normal towards up.
 
-        Among surfaces at the same distance the first in the list wins, planes before triangles.
+        Surfaces whose layer's bit `mask` lacks are passed through. Among surfaces at the same
+        distance the first in the list wins, planes before triangles.
         """
         nearest, normal, found = reach, self.up, False
-        for point, plane_normal in self.planes:
+        for (point, plane_normal), layer in zip(self.planes, self.plane_layers, strict=True):
+            if not mask >> layer & 1:
+                continue
             facing = plane_normal / np.linalg.norm(plane_normal)
             facing = -facing if facing @ self.up < 0.0 else facing
             if facing @ self.up <= EDGE_ON:
@@ -65,11 +80,14 @@ class Terrain:
             if 0.0 <= distance <= reach and (not found or distance < nearest):
                 nearest, normal, found = distance, facing, True
         if len(self.triangles):
-            distances = self._distances(origin)
+            seen = (mask >> np.asarray(self.triangle_layers)) & 1 == 1
+            distances = np.where(seen, self._distances(origin), np.inf)
             best = int(np.argmin(distances))
             distance = float(distances[best])
-            if distance <= reach and (not found or distance < nearest):
+            if math.isfinite(distance) and distance <= reach and (not found or distance < nearest):
                 nearest, normal, found = distance, self._normal[best], True
+        if math.isinf(nearest):
+            return Hit(found, origin, normal)
         return Hit(found, origin - self.up * nearest, normal)
 
     def _distances(self, origin: Array) -> Array:
@@ -81,3 +99,20 @@ class Terrain:
         distance = np.sum(turned * self._second, axis=-1) * self._scale
         inside = (first >= -SLACK) & (second >= -SLACK) & (first + second <= 1.0 + SLACK)
         return np.where(self._usable & inside & (distance >= 0.0), distance, np.inf)
+
+
+@dataclass
+class LegTerrains:
+    """The world as each leg meets it, under the leg's own up; the body has a terrain too."""
+
+    body: Terrain
+    legs: Sequence[Terrain]
+
+    @property
+    def up(self) -> Array:
+        """The body's up."""
+        return self.body.up
+
+    def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:
+        """The body's ray."""
+        return self.body.cast(origin, reach, mask)

@@ -64,7 +64,8 @@ DEFAULTS: dict[str, Any] = {
 class Ground(Protocol):
     """What a ray can be cast onto."""
 
-    up: Array
+    @property
+    def up(self) -> Array: ...
 
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit: ...
 

@@ -1,0 +1,243 @@
+"""The `ozz` pipeline in plain NumPy float64, after the foot IK sample of ozz-animation.
+
+One character, one leg, one frame at a time, written from the rules alone. Metres, radians; suffixes
+_ws world, _ms model. `up` is the body's, and of a leg's rays and ankle height the leg's own.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import ground, limb, maths, pole, things
+from .maths import Array, Transform, apply, cross, length, rotate, turn, unit
+from .terrain import Hit
+from .things import Frame, Ground, Parameters, Rig
+
+DEFAULTS: dict[str, Any] = {
+    "root.enabled": True,
+    "root.ray_up": 10.0,
+    "root.ray_down": math.inf,
+    "probe.ray_up": 0.5,
+    "probe.ray_down": math.inf,
+    "target.foot_height": 0.12,
+    "target.max_slope": 1.5,
+    "pelvis.enabled": True,
+    "pelvis.limit": math.inf,
+    "pelvis.on_gain": 1.0,
+    "pelvis.off_gain": 1.0,
+    "pelvis.tick_hz": 30.0,
+    "leg.enabled": True,
+    "leg.soften": 1.0,
+    "leg.twist": 0.0,
+    "leg.weight": 1.0,
+    "foot.enabled": True,
+    "foot.twist": 0.0,
+    "foot.weight": 1.0,
+    "foot.offset": np.zeros(3),
+}
+
+
+@dataclass
+class State:
+    """What the next frame needs."""
+
+    pelvis_height: float
+
+
+@dataclass
+class Foot:
+    """One leg's readings, world, the character standing on the ground already."""
+
+    ankle_ws: Array
+    hit: Hit
+    target_ws: Array
+    share: float
+
+
+def step(
+    parameters: Parameters, rig: Rig, terrain: Ground, state: State | None, frame: Frame
+) -> tuple[State, dict[str, Array]]:
+    """One frame."""
+    up = terrain.up
+    legs = range(len(frame.weight))
+    lift = root_lift(parameters, terrain, frame)
+    shares = ground.taking_part(parameters, frame)
+    feet = [
+        sense(parameters, things.under(terrain, leg), frame, leg, up * lift, shares[leg])
+        for leg in legs
+    ]
+    pelvis = pelvis_height(parameters, feet, up, state, frame)
+    body_offset_ws = up * lift + up * pelvis
+    body = limb.body(frame, body_offset_ws, maths.IDENTITY)
+
+    solved, reached, foot_reached, weights = [], [], [], []
+    for leg, foot in zip(legs, feet, strict=True):
+        weight = foot.share if foot.hit.found else 0.0
+        leg_weight = weight if parameters.of_leg("leg.enabled", leg) else 0.0
+        hip, knee, ankle, arrived = solve_leg(parameters, rig, leg, frame, body, foot, leg_weight)
+        rot, aimed = aim_foot(parameters, rig, leg, frame, foot, ankle, weight)
+        ankle = Transform(ankle.pos, rot)
+        solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle)))
+        reached.append(arrived)
+        foot_reached.append(aimed)
+        weights.append(leg_weight)
+
+    output = {
+        "body_pos": body.pos,
+        "body_rot": body.rot,
+        "lift": np.array(lift),
+        "pelvis_height": np.array(pelvis),
+        "pelvis_offset_ws": up * pelvis,
+        "body_offset_ws": body_offset_ws,
+        "found": np.array([foot.hit.found for foot in feet]),
+        "target_ws": np.array([foot.target_ws for foot in feet]),
+        "weight": np.array(weights),
+        "reached": np.array(reached),
+        "foot_reached": np.array(foot_reached),
+    }
+    return State(pelvis), output | things.joints(solved)
+
+
+def run(
+    parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
+) -> dict[str, Array]:
+    """A clip from its first frame: every output of `step`, stacked over the frames."""
+    return things.run(step, parameters, rig, terrain, frames)
+
+
+def root_lift(parameters: Parameters, terrain: Ground, frame: Frame) -> float:
+    """Height in m of the ground at the character's origin over that origin."""
+    if not parameters["root.enabled"]:
+        return 0.0
+    origin = frame.world_from_model.pos
+    ray_up = parameters["root.ray_up"]
+    hit = terrain.cast(origin + terrain.up * ray_up, ray_up + parameters["root.ray_down"])
+    return float(terrain.up @ (hit.point - origin)) if hit.found else 0.0
+
+
+def sense(
+    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, lift_ws: Array, share: float
+) -> Foot:
+    """Ray and ankle target of one leg."""
+    up = terrain.up
+    ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg]) + lift_ws
+    ray_up = parameters.of_leg("probe.ray_up", leg)
+    reach = ray_up + parameters.of_leg("probe.ray_down", leg)
+    hit = terrain.cast(ankle_ws + up * ray_up, reach)
+    target = ankle_ws
+    if hit.found:
+        steepest = math.cos(parameters.of_leg("target.max_slope", leg))
+        cosine = max(float(hit.normal @ up), steepest)
+        target = hit.point + up * (parameters.of_leg("target.foot_height", leg) / cosine)
+    return Foot(ankle_ws=ankle_ws, hit=hit, target_ws=target, share=share)
+
+
+def pelvis_height(
+    parameters: Parameters, feet: list[Foot], up: Array, state: State | None, frame: Frame
+) -> float:
+    """Height in m of the body over its animated place, along up.
+
+    A foot that sees ground with part of its share only counts as far between the highest foot and
+    itself.
+    """
+    gaps, weights = [], []
+    for foot in feet:
+        if foot.share > 0.0:
+            gaps.append(float(up @ (foot.target_ws - foot.ankle_ws)))
+            weights.append(foot.share if foot.hit.found else 0.0)
+    contact = max(weights, default=0.0)
+    if not parameters["pelvis.enabled"]:
+        contact = 0.0
+    top = max(gaps, default=0.0)
+    low = min((top + w * (gap - top) for w, gap in zip(weights, gaps, strict=True)), default=0.0)
+    limit = parameters["pelvis.limit"]
+    goal = contact * maths.clip(low, -limit, limit)
+    if state is None:
+        return goal
+    hz = parameters["pelvis.tick_hz"]
+    on = maths.share_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
+    off = maths.share_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
+    return maths.lerp(state.pelvis_height, goal, maths.lerp(off, on, contact))
+
+
+def solve_leg(
+    parameters: Parameters,
+    rig: Rig,
+    leg: int,
+    frame: Frame,
+    body: Transform,
+    foot: Foot,
+    weight: float,
+) -> tuple[Transform, Transform, Transform, bool]:
+    """Hip, knee and ankle, model space; the pole is the carried knee's y axis."""
+    knee = limb.carry(body, frame.knee, leg)
+    ankle = limb.carry(body, frame.ankle, leg)
+    hinge = rotate(knee.rot, rig.knee_axis_ls[leg])
+    along_shin = unit(ankle.pos - knee.pos, np.zeros(3))
+    return pole.solve_leg(
+        rig,
+        leg,
+        frame,
+        body,
+        target=maths.unapply(frame.world_from_model, foot.target_ws),
+        pole=cross(hinge, along_shin),
+        soften=parameters.of_leg("leg.soften", leg),
+        twist=parameters.of_leg("leg.twist", leg),
+        weight=weight,
+    )
+
+
+def aim_foot(
+    parameters: Parameters,
+    rig: Rig,
+    leg: int,
+    frame: Frame,
+    foot: Foot,
+    ankle: Transform,
+    weight: float,
+) -> tuple[Array, bool]:
+    """Model-space rotation of the ankle, its sole along the ground, and whether that was met."""
+    weight = weight * parameters.of_leg("foot.weight", leg)
+    if not parameters.of_leg("foot.enabled", leg):
+        weight = 0.0
+    carried_ws = maths.multiply(frame.world_from_model.rot, ankle.rot)
+    world_from_foot = maths.multiply(carried_ws, rig.ankle_from_foot[leg])
+    toes = rotate(world_from_foot, maths.Z)
+    looked_at = foot.target_ws + foot.hit.normal
+    correction, met = aim(
+        forward=rotate(world_from_foot, maths.Y),
+        offset=rotate(world_from_foot, np.asarray(parameters.of_leg("foot.offset", leg))),
+        up=toes,
+        target=looked_at - apply(frame.world_from_model, ankle.pos),
+        pole=toes,
+        twist=parameters.of_leg("foot.twist", leg),
+    )
+    correction = maths.nlerp(maths.IDENTITY, correction, weight)
+    model_from_world = maths.inverse(frame.world_from_model.rot)
+    rot = maths.multiply(model_from_world, maths.multiply(correction, carried_ws))
+    return rot, met and weight >= 1.0
+
+
+def aim(
+    forward: Array, offset: Array, up: Array, target: Array, pole: Array, twist: float
+) -> tuple[Array, bool]:
+    """The turn after which the ray from `offset` along `forward` meets `target`; whether it does.
+
+    `up` then faces `pole`. All (3) in one space, from the joint. The identity where the offset is
+    farther than the target, or the target on the joint.
+    """
+    along = float(offset @ forward)
+    root = float(target @ target) - float(offset @ offset) + along**2
+    if root < 0.0:
+        return maths.IDENTITY, False
+    distance = length(target)
+    if distance < maths.DIRECTIONLESS:
+        return maths.IDENTITY, True
+    direction = target / distance
+    reach = offset + forward * (math.sqrt(root) - along)
+    arc = maths.shortest_arc(unit(reach, direction), direction, up)
+    to_pole = turn(direction, maths.signed_angle(rotate(arc, up), pole, direction))
+    return maths.multiply(turn(direction, twist), maths.multiply(to_pole, arc)), True

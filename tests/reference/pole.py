@@ -1,0 +1,96 @@
+"""The two-bone leg whose bend plane a pole gives, after ozz's job: `ozz` and `mec` share it.
+
+Points and directions in one space, whichever it is; model space for `solve_leg`.
+"""
+
+import math
+
+from . import limb, maths
+from .maths import Array, Transform, cross, length, rotate, turn, unit
+from .things import Frame, Rig
+
+
+def solve_leg(
+    rig: Rig,
+    leg: int,
+    frame: Frame,
+    body: Transform,
+    target: Array,
+    pole: Array,
+    soften: float,
+    twist: float,
+    weight: float,
+) -> tuple[Transform, Transform, Transform, bool]:
+    """Hip, knee and ankle that bring the ankle to `target`, and whether they do; model space.
+
+    Args:
+        rig: whose hinge the knee turns about.
+        leg: which.
+        frame: the animated pose, which `body` carries first.
+        body: model space before to model space after.
+        target: of the ankle (3), m.
+        pole: direction (3, any length) that the bend plane shall contain.
+        soften: share of the leg's length from which on the target is softened, 0..1.
+        twist: further turn about the direction of the target, rad.
+        weight: share of both turns, 0..1.
+    """
+    hip, knee, ankle = (
+        limb.carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle)
+    )
+    hinge = rotate(knee.rot, rig.knee_axis_ls[leg])
+    hip_turn, knee_turn, in_reach = turns(
+        knee.pos - hip.pos, ankle.pos - hip.pos, hinge, target - hip.pos, pole, soften, twist
+    )
+    reached = in_reach and weight >= 1.0
+    return *limb.turned(hip, knee, ankle, hip_turn, knee_turn, weight), reached
+
+
+def turns(
+    knee: Array,
+    ankle: Array,
+    hinge: Array,
+    target: Array,
+    pole: Array,
+    soften: float,
+    twist: float,
+) -> tuple[Array, Array, bool]:
+    """Turns of the hip and, before it, of the knee; whether the target is within reach.
+
+    Places (3) are seen from the hip, m; `hinge` (3) is unit, and a turn about it opens the knee.
+    """
+    thigh, shin, distance = length(knee), length(ankle - knee), length(target)
+    soft_from = maths.clip(soften, 0.0, 1.0) * (thigh + shin)
+    wanted = softened(distance, soft_from, thigh + shin)
+    in_reach = abs(thigh - shin) < distance <= soft_from
+
+    # The hinge is not asked whether it is at right angles to the bones: full lengths count.
+    present = maths.interior_angle(thigh, shin, float(ankle @ ankle))
+    if hinge @ cross(-knee, ankle - knee) < 0.0:
+        present = -present
+    knee_turn = turn(hinge, maths.interior_angle(thigh, shin, wanted**2) - present)
+
+    bent = knee + rotate(knee_turn, ankle - knee)
+    if distance < maths.DIRECTIONLESS:
+        return maths.IDENTITY, knee_turn, in_reach
+    direction = target / distance
+    arc = maths.shortest_arc(unit(bent, direction), direction, hinge)
+    level = _to_pole(rotate(arc, hinge), direction, pole)
+    return maths.multiply(turn(direction, twist), maths.multiply(level, arc)), knee_turn, in_reach
+
+
+def softened(distance: float, soft_from: float, chain: float) -> float:
+    """Distance that is aimed at, m: past `soft_from` it nears the chain's length."""
+    room = chain - soft_from
+    if distance <= soft_from or room <= 0.0:
+        return distance
+    alpha = (distance - soft_from) / room
+    return soft_from + room * (1.0 - (3.0 / (alpha + 3.0)) ** 4)
+
+
+def _to_pole(hinge: Array, direction: Array, pole: Array) -> Array:
+    """Turn about the unit `direction` that brings `pole` into the plane across `hinge`."""
+    wanted = cross(direction, unit(pole, direction))
+    if length(wanted) < maths.DIRECTIONLESS:
+        return maths.IDENTITY
+    angle = math.acos(maths.clip(float(wanted @ hinge) / length(wanted), -1.0, 1.0))
+    return turn(direction, -angle if hinge @ pole < 0.0 else angle)

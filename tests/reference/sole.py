@@ -1,0 +1,117 @@
+"""Three rays under a foot of the `mec` reference, and the foot laid on what they meet; world."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import ground, maths, things
+from .maths import Array, across, apply, cross, rotate, turn, unit
+from .things import Frame, Ground, Parameters, Rig
+
+
+@dataclass
+class Foot:
+    """One leg's readings of this frame, world. Without a hit the point is not to be used."""
+
+    up: Array
+    share: float
+    ankle_ws: Array
+    animated_rot: Array  # of the foot, from its axes to the world
+    extra: float
+    found: bool
+    point: Array
+    ahead: Array
+    pitch: float
+    roll: float
+    toe_point: Array
+
+
+def extra_length(
+    parameters: Parameters, frame: Frame, leg: int, up: Array, ankle_ws: Array
+) -> float:
+    """How far in m rays look below the sole."""
+    by_height = parameters.of_leg("probe.by_height", leg)
+    by_speed = parameters.of_leg("probe.by_speed", leg)
+    if not by_height and not by_speed:
+        return parameters.of_leg("probe.extra", leg)
+    height = float(up @ (ankle_ws - frame.world_from_model.pos))
+    stable = True
+    if by_height and height > parameters.of_leg("probe.stable_height", leg):
+        stable = False
+    if by_speed and frame.foot_speed[leg] > parameters.of_leg("probe.stable_speed", leg):
+        stable = False
+    return parameters.of_leg("probe.extra_max" if stable else "probe.extra_min", leg)
+
+
+def sense(
+    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, share: float
+) -> Foot:
+    """The foot's three rays, and what they say of its tilt."""
+    up = terrain.up
+    ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
+    animated_rot = things.world_from_foot(rig, frame, leg)
+    looking = rotate(animated_rot, np.asarray(parameters.of_leg("probe.forward", leg)))
+    ahead = unit(across(looking, up), ground.forward(frame.world_from_model.rot, up))
+    right = cross(ahead, up)
+
+    extra = extra_length(parameters, frame, leg, up, ankle_ws)
+    sole = parameters.of_leg("target.foot_height", leg)
+    above = up * parameters.of_leg("probe.ray_up", leg)
+    reach = parameters.of_leg("probe.ray_up", leg) + sole + extra
+    mask = int(parameters.of_leg("probe.layers", leg))
+    foot_length = parameters.of_leg("probe.foot_length", leg)
+    half_width = parameters.of_leg("probe.half_width", leg)
+
+    hit = terrain.cast(ankle_ws + above, reach, mask)
+    pitch, roll = 0.0, 0.0
+    if not (hit.found and parameters.of_leg("probe.active", leg)):
+        found = False
+        toe_point = ankle_ws - up * sole + ahead * foot_length
+    else:
+        found = True
+        goal = hit.point + up * sole
+        toe_point = hit.point + ahead * foot_length
+        toe = terrain.cast(goal + ahead * foot_length + above, reach, mask)
+        if toe.found:
+            toe_point = toe.point
+            pitch = math.atan2(float(up @ (toe.point - hit.point)), foot_length)
+        corner = terrain.cast(goal + right * half_width + above, reach, mask)
+        if corner.found:
+            roll = math.atan2(float(up @ (corner.point - hit.point)), half_width)
+    return Foot(
+        up=up,
+        share=share,
+        ankle_ws=ankle_ws,
+        animated_rot=animated_rot,
+        extra=float(extra),
+        found=found,
+        point=hit.point,
+        ahead=ahead,
+        pitch=pitch,
+        roll=roll,
+        toe_point=toe_point,
+    )
+
+
+def flat_foot(parameters: Parameters, leg: int, foot: Foot) -> Array:
+    """Rotation from the foot's axes to the world that lays it on the ground, its yaw kept."""
+    pitch = turn(cross(foot.ahead, foot.up), foot.pitch)
+    tilt = limited(
+        maths.multiply(pitch, turn(foot.ahead, -foot.roll)),
+        parameters.of_leg("foot.max_tilt", leg),
+    )
+    upright = maths.shortest_arc(maths.Y, foot.up, maths.X)
+    forward = np.asarray(parameters.of_leg("probe.forward", leg))
+    level = unit(across(forward, maths.Y), maths.Z)
+    yaw = maths.signed_angle(rotate(upright, level), foot.ahead, foot.up)
+    return maths.multiply(tilt, maths.multiply(turn(foot.up, yaw), upright))
+
+
+def limited(rot: Array, most: float) -> Array:
+    """The turn `rot`, of less than half a circle, by at most `most` rad about its axis."""
+    sine = maths.length(rot[1:])
+    angle = 2.0 * math.atan2(sine, float(rot[0]))
+    if angle <= most:
+        return rot
+    return turn(rot[1:] / sine, most)
