@@ -10,12 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
 
 HALF_WIDTH = 2.0  # m
 COLUMNS = 4  # of quads across a strip
 CELL = 0.4  # m, of rubble
 STEP_HEIGHTS = (0.12, 0.18, 0.08, 0.14)  # m
 TREAD = 0.62  # m
+HOLD, HOLDS = 0.125, 0.3  # m from hold to hold on a wall, and the share that stands out
+WALL_UP = (0.0, 0.0, -1.0)  # normal of the wall: a climber looks along +z
+WALL_FROM_FLOOR = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class Mesh(NamedTuple):
@@ -129,6 +133,40 @@ def uneven() -> Mesh:
             Knot(top.z + 6.0, 0.05, -0.08), Knot(top.z + 8.0, 0.05, -0.08),
         ]),
     )  # fmt: skip
+
+
+def stop_and_go() -> Mesh:
+    """The course of the experiments in which a walk stops, 11 m long.
+
+    The stands are half way up a tilted slope, with a foot on either side of a riser, and on rubble.
+    """
+    down = stairs(Knot(3.9, 0.25), (-0.12, -0.20, -0.08), tread=1.0)
+    foot = Knot(6.4, down[-1].height)
+    stones = Knot(8.4, -0.10)
+    return join(
+        strip([
+            Knot(-1.5, 0.0), Knot(1.4, 0.0), Knot(1.7, 0.03, 0.1), Knot(3.4, 0.25, 0.1),
+            Knot(3.9, 0.25), *down[:-1], foot,
+        ]),
+        rubble(foot, stones, seed=7),
+        strip([stones, Knot(9.0, 0.0, -0.1), Knot(11.0, 0.0, -0.1)]),
+    )  # fmt: skip
+
+
+def meadow() -> Mesh:
+    """Tussocks on gently rolling ground, 8 m long."""
+    knots = Knot(-1.5, 0.0), Knot(1.5, 0.08, 0.06), Knot(4.0, -0.08, -0.05), Knot(6.5, 0.05)
+    pieces = zip(knots, knots[1:], strict=False)
+    return join(*(rubble(*ends, seed=13 + piece, size=0.04) for piece, ends in enumerate(pieces)))
+
+
+def wall() -> Mesh:
+    """A wall 3.5 m high and 2 m wide in the plane z = 0, with holds 2 to 6 cm proud of it."""
+    rng = np.random.default_rng(17)
+    x, up = np.meshgrid(np.arange(-1.0, 1.01, HOLD), np.arange(0.0, 3.51, HOLD))
+    proud = np.where(rng.uniform(size=x.shape) < HOLDS, rng.uniform(0.02, 0.06, x.shape), 0.0)
+    floor = np.stack([x, proud, up], axis=-1).reshape(-1, 3)
+    return Mesh(floor @ WALL_FROM_FLOOR.as_matrix().T, _quads(*x.shape))
 
 
 def _quads(rows: int, columns: int) -> Int64[np.ndarray, "faces 3"]:

@@ -1,5 +1,7 @@
 """Between clips and the pipeline: a clip as frames to solve, and a clip of what was solved."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +9,15 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from jaxik import quat
+from jaxik.frame import UP
 
 from .clips.clip import Clip
 from .clips.recording import localise
 
+Direction = Sequence[float] | np.ndarray
 
-def frames_of(clip: Clip, *, floor: float = 0.0) -> jaxik.Frame:
+
+def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik.Frame:
     """The clip as the pipeline's input, its leaves leading with frames, in JAX's default precision.
 
     Foot IK has its whole weight, the ground does not move, and the character slides where the clip
@@ -21,13 +26,14 @@ def frames_of(clip: Clip, *, floor: float = 0.0) -> jaxik.Frame:
     Args:
         clip: with legs.
         floor: height of the floor on which the clip was animated, m; model space begins there.
+        up_ws: that floor's normal, unit; another one for a clip on a wall.
     """
-    world = clip.world_from_model(floor)
+    world = clip.world_from_model(floor, up_ws)
     pose = jax.vmap(lambda world, pose: pose.moved(world.inverse()))(world, clip.leg_pose_ws())
     legs = len(clip.rig.joints)
     pos = np.asarray(world.pos)
-    steps = np.linalg.norm(np.diff(pos[:, [0, 2]], axis=0), axis=-1)
-    steps = np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(1)
+    steps = _steps(pos)
+    foot_steps = _steps(clip.joints_ws(2))
     slide = np.zeros(clip.frames) if clip.slide is None else clip.slide
     still = jaxik.Transform(
         jnp.zeros_like(world.pos), jnp.broadcast_to(quat.identity(world.rot.dtype), world.rot.shape)
@@ -38,12 +44,21 @@ def frames_of(clip: Clip, *, floor: float = 0.0) -> jaxik.Frame:
         weight=jnp.ones((clip.frames, legs), world.pos.dtype),
         slide=jnp.asarray(slide, world.pos.dtype),
         speed=jnp.asarray(steps * clip.fps, world.pos.dtype),
+        foot_speed=jnp.asarray(foot_steps * clip.fps, world.pos.dtype),
         dt=jnp.full(clip.frames, 1.0 / clip.fps, world.pos.dtype),
         platform=still,
     )
 
 
-def solved_clip(clip: Clip, result: jaxik.Result, *, floor: float = 0.0) -> Clip:
+def _steps(places: np.ndarray) -> np.ndarray:
+    """How far points (frames, ..., axes) came since the frame before, m; at first as at second."""
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
+    return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(places.shape[:-1])
+
+
+def solved_clip(
+    clip: Clip, result: jaxik.Result, *, floor: float = 0.0, up_ws: Direction = UP
+) -> Clip:
     """The clip as the pipeline left it.
 
     Hips, knees, ankles and toes are the solved ones; joints that hang on them keep their place on
@@ -52,9 +67,9 @@ def solved_clip(clip: Clip, result: jaxik.Result, *, floor: float = 0.0) -> Clip
     Args:
         clip: the input, from which `frames_of` made the frames.
         result: of all its frames.
-        floor: m, as given to `frames_of`.
+        floor, up_ws: as given to `frames_of`.
     """
-    world = clip.world_from_model(floor)
+    world = clip.world_from_model(floor, up_ws)
     body = jax.vmap(lambda world, body: world @ body @ world.inverse())(world, result.body)
     solved = jax.vmap(lambda world, pose: pose.moved(world))(world, result.pose)
     carry_rot, carry_pos = _rotation(body.rot), np.asarray(body.pos)

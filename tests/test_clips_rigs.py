@@ -69,6 +69,19 @@ def test_any_number_of_legs_is_given_by_hand():
     assert roles.legs[2].joints == (9, 10, 11, 12)
 
 
+def test_sides_by_hand_are_told_by_the_end_of_the_suffix():
+    suffixes = ("fore_left", "fore_right", "left", "r", "weft", "light")
+    names, parents, joints = ["body"], [-1], {"pelvis": "body"}
+    for leg in suffixes:
+        for index, part in enumerate(PARTS[1:]):
+            names.append(f"{part}{leg}")
+            parents.append(len(names) - 2 if index else 0)
+            joints[f"{part}_{leg}"] = names[-1]
+    roles = find_roles(tuple(names), tuple(parents), joints)
+    assert [leg.side for leg in roles.legs] == [1, -1, 1, -1, 0, 0]
+    assert [leg.name for leg in roles.legs[:2]] == ["fore_left", "fore_right"]
+
+
 @pytest.mark.parametrize(
     ("joints", "said"),
     [

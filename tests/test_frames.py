@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting import frames, gait, walker
+from fitting import frames, gait, pace, walker
 from jaxik import rule, terrain
 
 FPS = 60.0
@@ -17,7 +17,7 @@ SLOPE = 0.15  # rise per metre of z
 
 @pytest.fixture(scope="module")
 def clip():
-    return walker.walk(2.0, FPS, slides=[walker.Slide(1.0, 1.5)])
+    return walker.walk(2.0, FPS, slides=[pace.Slide(1.0, 1.5)])
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting import gait, walker
+from fitting import frames, gait, pace, walker
 from fitting.clips import contacts, load_clip, save_clip
 from fitting.clips.recording import localise
 
@@ -35,8 +35,12 @@ def heel(clip, leg):
 
 
 def test_the_ball_of_a_standing_foot_does_not_move(clip):
+    balls_stand(clip, 9)
+
+
+def balls_stand(clip, least):
     for leg, joints in enumerate(clip.rig.joints):
-        assert len(stances(clip, leg)) >= 9
+        assert len(stances(clip, leg)) >= least
         for first, last in stances(clip, leg):
             ball = clip.positions_ws[first : last + 1, joints[3]]
             assert np.ptp(ball, axis=0).max() < EXACT
@@ -112,17 +116,17 @@ def test_a_seed_gives_the_same_walk_and_another_one_another():
 
 def test_a_slip_carries_standing_feet_along_by_its_share():
     share, start, end = 0.06, 2.0, 5.0
-    slipping = walker.walk(8.0, FPS, turn=0.0, slips=[walker.Slip(start, end, share)])
+    slipping = walker.walk(8.0, FPS, turn=0.0, slips=[pace.Slip(start, end, share)])
     still = walker.walk(8.0, FPS, turn=0.0)
     moved = slipping.positions_ws - still.positions_ws
     np.testing.assert_allclose(moved, moved[:, :1] * np.ones((1, 9, 1)), rtol=0, atol=EXACT)
     assert np.abs(moved[: round(start * FPS)]).max() < EXACT
-    full = (end - start - walker.EASE) * share * gait.STRIDE / gait.PERIOD
+    full = (end - start - pace.EASE) * share * gait.STRIDE / gait.PERIOD
     assert moved[-1, 0, 2] == pytest.approx(full, rel=0.01)
 
 
 def test_a_slide_freezes_the_walk_with_both_feet_down_and_keeps_the_speed():
-    clip = walker.walk(8.0, FPS, slides=[walker.Slide(3.0, 5.0)])
+    clip = walker.walk(8.0, FPS, slides=[pace.Slide(3.0, 5.0)])
     assert clip.slide is not None
     np.testing.assert_array_equal(np.flatnonzero(clip.slide), np.arange(180, 300))
     frozen = slice(round(4.5 * FPS), round(4.85 * FPS))
@@ -134,8 +138,57 @@ def test_a_slide_freezes_the_walk_with_both_feet_down_and_keeps_the_speed():
     np.testing.assert_allclose(travel, gait.STRIDE / gait.PERIOD, rtol=0.01)
 
 
+@pytest.fixture(scope="module")
+def stopping():
+    """A walk that stands from 2.5 s to 3.7 s and from 5.8 s to 7.2 s."""
+    return walker.walk(9.0, FPS, 4, stops=[pace.Stop(1.6, 3.7), pace.Stop(5.0, 7.2)])
+
+
+def test_a_stop_stands_exactly_still_on_two_flat_feet_and_walks_on(stopping):
+    speed = np.asarray(frames.frames_of(stopping).speed)
+    stands = contacts.runs(speed == 0.0)
+    assert len(stands) == 2
+    for (first, last), end in zip(stands, (3.7, 7.2), strict=True):
+        assert 1.0 <= (last - first) / FPS <= 1.5
+        assert last == pytest.approx(end * FPS, abs=2)
+        still = slice(first + 3, last - 2)
+        assert stopping.stance[still].all()
+        assert all(len(contacts.runs(stopping.stance[first:last, leg])) == 1 for leg in (0, 1))
+        for _, _, ankle, toe in stopping.rig.joints:
+            for joint, height in ((ankle, gait.ANKLE_HEIGHT), (toe, gait.BALL_HEIGHT)):
+                place = stopping.positions_ws[still, joint]
+                assert np.ptp(place, axis=0).max() < 1e-6
+                np.testing.assert_allclose(place[:, 1], height, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(speed[-30:], gait.STRIDE / gait.PERIOD, rtol=0.02)
+
+
+def test_the_foot_in_front_stays_flat_as_the_walk_goes_on(stopping):
+    for end in (3.7, 7.2):
+        frame = round(end * FPS)
+        ahead = int(np.argmax(stopping.joints_ws(3)[frame, :, 2]))
+        gone_on = slice(frame, frame + round(0.4 * FPS))
+        ankle = stopping.joints_ws(2)[gone_on, ahead]
+        assert stopping.stance[gone_on, ahead].all()
+        np.testing.assert_allclose(ankle[:, 1], gait.ANKLE_HEIGHT, rtol=0, atol=1e-6)
+
+
+def test_the_pelvis_of_a_standing_body_breathes_up_and_down_only(stopping):
+    speed = np.asarray(frames.frames_of(stopping).speed)
+    for first, last in contacts.runs(speed == 0.0):
+        range_of = np.ptp(stopping.positions_ws[first : last + 1, 0], axis=0)
+        assert range_of[0] == range_of[2] == 0.0
+        assert 0.0005 < range_of[1] < 0.004
+
+
+def test_feet_bones_and_smoothness_of_a_walk_that_stops_are_as_without(stopping):
+    balls_stand(stopping, 3)
+    test_bones_keep_their_lengths_and_joints_their_places_on_each_other(stopping)
+    test_motion_is_smooth_where_a_foot_is_taken_up_and_put_down(stopping)
+    test_no_foot_sinks_into_the_floor(stopping)
+
+
 def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
-    clip = walker.walk(6.0, FPS, slides=[walker.Slide(3.0, 5.0)])
+    clip = walker.walk(6.0, FPS, slides=[pace.Slide(3.0, 5.0)])
     save_clip(tmp_path / "walk.npz", clip)
     loaded, trimmed = load_clip(tmp_path / "walk.npz"), clip.at(slice(0, 200))
     assert clip.slide is not None and loaded.slide is not None and trimmed.slide is not None
@@ -149,8 +202,9 @@ def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
     [
         ({"seconds": 0.0}, "above 0, got 0.0 s"),
         ({"fps": -60.0}, "-60.0 fps"),
-        ({"slips": [walker.Slip(1.0, 9.0, 0.1)]}, r"Slip\(start=1.0, end=9.0.*5.0 s"),
-        ({"slides": [walker.Slide(3.0, 2.0)]}, r"Slide\(start=3.0, end=2.0\)"),
+        ({"slips": [pace.Slip(1.0, 9.0, 0.1)]}, r"Slip\(start=1.0, end=9.0.*5.0 s"),
+        ({"slides": [pace.Slide(3.0, 2.0)]}, r"Slide\(start=3.0, end=2.0\)"),
+        ({"stops": [pace.Stop(-1.0, 2.0)]}, r"Stop\(start=-1.0, end=2.0\)"),
     ],
 )
 def test_impossible_walks_are_refused(options, said):

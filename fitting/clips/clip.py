@@ -1,5 +1,6 @@
 """A captured or made animation: joints in world space over frames, and what its legs are."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.spatial.transform import Rotation
 
 from jaxik.skeleton import LegPose, Rig, Skeleton, Transform
 
@@ -102,24 +104,30 @@ class Clip:
         side = np.asarray(rig.side, np.float64)
         return lateral(self.positions_ws, self.rotations_ws, rig.pelvis, hips, side)
 
-    def world_from_model(self, floor: float = 0.0) -> Transform:
+    def world_from_model(
+        self, floor: float = 0.0, up_ws: Sequence[float] | np.ndarray = (0.0, 1.0, 0.0)
+    ) -> Transform:
         """The character's root, (frames): on the floor under the pelvis, facing forward.
 
         Forward is at right angles, in the ground plane, to the character's left. While that points
         up or down the heading is carried over from the frames around.
 
         Args:
-            floor: height of the floor, m.
+            floor: height of the floor along up, m.
+            up_ws: unit; on a wall its normal, and the wall is the floor.
         """
-        yaw = self._heading()
-        pos = self.positions_ws[:, self.rig.pelvis] * [1.0, 0.0, 1.0] + [0.0, floor, 0.0]
+        upright = _upright(np.asarray(up_ws, np.float64))
+        yaw = self._heading(upright)
+        pos = self.positions_ws[:, self.rig.pelvis] @ upright.as_matrix().T
+        pos = upright.inv().apply(pos * [1.0, 0.0, 1.0] + [0.0, floor, 0.0])
         zero = np.zeros_like(yaw)
         rot = np.stack([np.cos(yaw / 2), zero, np.sin(yaw / 2), zero], axis=-1)
-        return Transform(jnp.asarray(pos), jnp.asarray(rot))
+        turned = upright.inv() * Rotation.from_quat(rot, scalar_first=True)
+        return Transform(jnp.asarray(pos), jnp.asarray(turned.as_quat(scalar_first=True)))
 
-    def _heading(self) -> Float64[np.ndarray, " frames"]:
+    def _heading(self, upright: Rotation) -> Float64[np.ndarray, " frames"]:
         """Yaw of the character, rad, without jumps; 0 looks along +z, pi/2 along +x (left)."""
-        flat = self.left_ws()[:, [0, 2]]
+        flat = upright.apply(self.left_ws())[:, [0, 2]]
         known = np.linalg.norm(flat, axis=-1) > 0.1
         if not known.any():
             return np.zeros(len(flat))
@@ -141,3 +149,9 @@ class Clip:
             mask=None if self.mask is None else self.mask[frames],
             slide=None if self.slide is None else self.slide[frames],
         )
+
+
+def _upright(up_ws: Float64[np.ndarray, "3"]) -> Rotation:
+    """The shortest turn that takes up to the y axis; a half turn about x for the opposite one."""
+    quat = np.array([-up_ws[2], 0.0, up_ws[0], 1.0 + up_ws[1]])
+    return Rotation.from_quat(quat if quat.any() else [1.0, 0.0, 0.0, 0.0])

@@ -199,11 +199,15 @@ def positions_clip(
     fps: float,
     source: str,
     stance: np.ndarray,
+    joints: Mapping[str, str] | None = None,
 ) -> Clip:
-    """A clip in our units from joints in world space, its legs named as in the dialect "jaxik"."""
+    """A clip in our units from joints in world space.
+
+    Its legs are named as in the dialect "jaxik", or by `joints`, see `find_roles`.
+    """
     rotations_ws = continuous(rotations_ws)
     positions_ls, _ = localise(parents, positions_ws, rotations_ws)
-    roles = find_roles(names, parents)
+    roles = find_roles(names, parents, joints)
     rig = measure_rig(roles, positions_ws, rotations_ws, stance)
     return Clip(
         names, parents, np.median(positions_ls, axis=0), positions_ws, rotations_ws, fps, 1.0 / fps,

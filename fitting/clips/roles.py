@@ -98,7 +98,7 @@ def _by_hand(names: tuple[str, ...], parents: tuple[int, ...], joints: Mapping[s
     for suffix in suffixes:
         index = [known.get(joints.get(f"{part}_{suffix}", "")) for part in
                  ("hip", "knee", "ankle", "toe")]  # fmt: skip
-        letter = {"left": "l", "right": "r"}.get(suffix, suffix)[-1:]
+        letter = re.sub(r"(?<=l)eft$|(?<=r)ight$", "", suffix)[-1:]
         name = LEG_NAMES.get(suffix, suffix)
         legs.append(_leg(names, parents, name, SIDES.get(letter, 0.0), *index))
     return Roles("by hand", known[joints["pelvis"]], tuple(legs))
