@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from .plots import AFTER, BEFORE, CAPTURED, styled
+from .panels import AFTER, BEFORE, CAPTURED, styled
 from .posterior import Posterior
 
 SAMPLES = 20_000  # at most, in the corner

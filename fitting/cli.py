@@ -22,6 +22,8 @@ EXAMPLES = """examples:
   jaxik sample runs/walk                                       its posterior; again goes on
   jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
   jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --preset record
+  jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
+  jaxik translate --from mec --to record --clip walk.bvh --terrain steps.obj -o translated
   jaxik inspect walk.bvh
   jaxik record to-toml footik.bin -o footik.toml
 
@@ -122,6 +124,63 @@ def parser() -> argparse.ArgumentParser:
     system.add_argument("--preset", default="record", help="of jaxik.presets (default: record)")
     system.add_argument("--parameters", type=Path, metavar="TOML", help="instead of a preset")
 
+    compare = _add(
+        commands, "compare", "run several systems on a clip and measure them side by side",
+        """
+        jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
+        jaxik compare walk.bvh --terrain steps.obj --presets record --parameters a.toml,b.toml -o ab
+        """,
+    )  # fmt: skip
+    _clip_and_ground(compare, output="DIR")
+    for option, what in (("--presets", "of jaxik.presets"), ("--parameters", "TOML files")):
+        compare.add_argument(
+            option, dest="systems", action="append", default=[], metavar="NAME,...",
+            type=lambda text, option=option: (option, text), help=f"{what}, in this order",
+        )  # fmt: skip
+
+    compare.add_argument(
+        "--roots", choices=("ground", "animated"), default="ground",
+        help="where unreal and mec, whose games put characters on the ground, have the root",
+    )  # fmt: skip
+
+    translate = _add(
+        commands, "translate", "fit a system's parameters to what another makes of a clip",
+        """
+        jaxik translate --from mec.toml --to record --clip walk.bvh --terrain hill.obj -o runs/mec
+        jaxik translate --from unreal --to record --fps 30 --clip a.npz --terrain a.obj -o runs/a
+
+        Ctrl-C ends the search; the best point so far is written as any other fit, with status 130.
+        The folder is a run: `jaxik sample` and `jaxik apply` take it.
+        """,
+    )  # fmt: skip
+    for option, dest, what in (
+        ("--from", "source", "whose motion is reproduced"),
+        ("--to", "target", "whose parameters are fitted, from these values on"),
+    ):
+        translate.add_argument(
+            option, dest=dest, required=True, metavar="SYSTEM",
+            help=f"preset or parameter .toml {what}",
+        )  # fmt: skip
+    for option, metavar, what in (
+        ("--clip", "CLIP", "over flat ground, as `jaxik run` takes it"),
+        ("--terrain", "MESH", "of the clip in the same place"),
+    ):
+        translate.add_argument(
+            option, type=Path, action="append", required=True, metavar=metavar,
+            help=f"{what}; may be given several times",
+        )  # fmt: skip
+    translate.add_argument(
+        "--free", metavar="NAME,...", help="what is fitted, or a .toml with a [free] table "
+        "(default: every parameter that moves these clips)",
+    )  # fmt: skip
+    translate.add_argument(
+        "--fps", type=_finite, metavar="HZ", help="resample the clips first (default: as they are)"
+    )
+    translate.add_argument(
+        "--file-up", choices=("y", "z"), default="y", help="up axis of the meshes"
+    )
+    translate.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+
     inspect = _add(
         commands, "inspect", "print what a loader understood of a clip",
         """
@@ -200,7 +259,7 @@ def _add(commands: Any, name: str, what: str, example: str) -> argparse.Argument
     )
 
 
-def _clip_and_ground(command: argparse.ArgumentParser) -> None:
+def _clip_and_ground(command: argparse.ArgumentParser, output: str = "OUT.npz") -> None:
     command.add_argument(
         "clip", type=Path, metavar="CLIP",
         help=".bvh, .amc or .npz over flat ground; of a blocks .npz its base",
@@ -212,7 +271,7 @@ def _clip_and_ground(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--floor", type=_finite, default=0.0, metavar="M", help="height of the clip's floor, m"
     )
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.npz")
+    command.add_argument("-o", "--output", type=Path, required=True, metavar=output)
 
 
 def _finite(text: str) -> float:

@@ -7,7 +7,8 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,28 @@ import numpy as np
 import jaxik
 from jaxik import record, rule
 
-from . import checks, clips, experiment, files, frames, report, scenes, settings, store, study
+from . import (
+    checks,
+    clips,
+    experiment,
+    files,
+    frames,
+    report,
+    scenes,
+    settings,
+    store,
+    study,
+    tables,
+    translate,
+    translate_report,
+)
+from . import compare as comparing
 from .base import load_base
 from .clips import inspect as inspection
 from .identify import identify
 from .posterior import SamplingProgress
-from .solution import Progress
+from .solution import Progress, Solution
+from .space import Problem
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -35,15 +52,10 @@ def fit(options: argparse.Namespace) -> int:
     print(f"fitting {len(asked.free)} parameters of {asked.preset} to {len(asked.clips)} clip(s)")
     with _Line(_fit_line) as line:
         solution = study.search(problem, asked, line)
-    store.save_solution(options.output, asked, problem, solution)
-    fitted = study.Fit(asked, problem, solution, identify(problem, solution))
-    store.save_fit(options.output, fitted)
+    fitted = _keep_fit(options.output, asked, problem, solution)
     report.write_fit(options.output, fitted)
     print("\n" + report.fit_text(store.describe_fit(fitted), truth))
-    print(f"written to {options.output}; read {options.output / store.SUMMARY}")
-    if solution.interrupted:
-        raise KeyboardInterrupt  # all is written: it may go on
-    return 0
+    return _told_where(options.output, fitted)
 
 
 def sample(options: argparse.Namespace) -> int:
@@ -89,6 +101,45 @@ def run(options: argparse.Namespace) -> int:
     return _solve_clip(experiment.name_preset(options.preset), options)
 
 
+def compare(options: argparse.Namespace) -> int:
+    """Runs several systems on a clip, and leaves a folder with their measures and a figure."""
+    _prepare_jax()
+    systems = comparing.name_systems(options.systems, grounded=options.roots == "ground")
+    store.check_place(options.output)
+    base = load_base(options.clip)
+    ground = scenes.load_terrain(options.terrain, file_up=options.file_up)
+    title = f"{options.clip.name} on {options.terrain.name}"
+    compared = comparing.compare(
+        systems, base, ground, floor=options.floor, title=title, during=_timed
+    )
+    comparing.write(options.output, compared)
+    print(tables.aligned([list(row) for row in zip(*comparing.table(compared), strict=True)]))
+    print(f"written to {options.output}; read {options.output / comparing.TABLE}")
+    return 0
+
+
+def translation(options: argparse.Namespace) -> int:
+    """The word `translate`: fits one system to another's motion, and leaves a run folder."""
+    _prepare_jax()
+    source = translate.read_system(options.source, "--from")
+    target = translate.read_system(options.target, "--to")
+    named = None if options.free is None else translate.read_free(options.free, target.ik)
+    translate.check_place(options.output)
+    made = translate.plan(
+        source, target, options.clip, options.terrain, options.output,
+        named=named, fps=options.fps, file_up=options.file_up,
+    )  # fmt: skip
+    count, several = len(made.experiment.free), len(made.motions)
+    print(f"fitting {count} parameters of {target.name} to {source.name} on {several} clip(s)")
+    with _Line(_fit_line) as line:
+        start = translate.approach(made.problem)
+        solution = study.search(made.problem, made.experiment, line, start)
+    translate.save_source(options.output, made)
+    fitted = _keep_fit(options.output, made.experiment, made.problem, solution)
+    print("\n" + translate_report.write(options.output, made, fitted))
+    return _told_where(options.output, fitted)
+
+
 def inspect(options: argparse.Namespace) -> int:
     """Prints what a loader understood of a clip."""
     clip = clips.load_clip(options.clip, asf=options.asf, scale=options.scale)
@@ -128,6 +179,8 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "sample": sample,
     "apply": apply,
     "run": run,
+    "compare": compare,
+    "translate": translation,
     "inspect": inspect,
     "record": convert,
 }
@@ -143,6 +196,24 @@ def _prepare_jax() -> None:
     warnings.filterwarnings("ignore", message=".*persistent compilation cache.*")
 
 
+def _keep_fit(
+    run: Path, asked: experiment.Experiment, problem: Problem, solution: Solution
+) -> study.Fit:
+    """Writes a solution before anything may go wrong with it, then what is known of it."""
+    store.save_solution(run, asked, problem, solution)
+    fitted = study.Fit(asked, problem, solution, identify(problem, solution))
+    store.save_fit(run, fitted)
+    return fitted
+
+
+def _told_where(run: Path, fitted: study.Fit) -> int:
+    """The last words of a fit, and its exit status."""
+    print(f"written to {run}; read {run / store.SUMMARY}")
+    if fitted.solution.interrupted:
+        raise KeyboardInterrupt  # all is written: it may go on
+    return 0
+
+
 def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
     if options.output.suffix.lower() != ".npz":
         raise ValueError(f"{options.output}: wanted a name that ends in .npz")
@@ -152,10 +223,7 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
     motion = frames.frames_of(base, floor=options.floor)
     experiment.check_shapes(ik, base.rig, ground, motion)
     began = time.perf_counter()
-    result = jaxik.run(ik, base.rig, ground, motion)
-    solved = frames.solved_clip(base, result, floor=options.floor)
-    if not np.isfinite(solved.positions_ws).all():
-        raise ValueError("these parameters give poses that are not finite; nothing was written")
+    result, solved = comparing.solve(ik, base, ground, motion, options.floor)
     clips.save_clip(options.output, solved, joints=frames.named_joints(solved))
     reached = float(np.mean(result.reached))
     found = float(np.mean(result.trace.sensed.foothold.found))
@@ -164,6 +232,18 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
         f"the feet, {reached:.1%} of the targets reached; written to {options.output}"
     )
     return 0
+
+
+@contextmanager
+def _timed(name: str) -> Iterator[None]:
+    """Tells on stderr what is being run, and then how long it took."""
+    print(f"{name} ... ", end="", file=sys.stderr, flush=True)
+    began, took = time.perf_counter(), "stopped"
+    try:
+        yield
+        took = f"{time.perf_counter() - began:.1f} s"
+    finally:
+        print(took, file=sys.stderr, flush=True)
 
 
 def _read_bytes(path: Path) -> record.Record:

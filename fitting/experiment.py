@@ -14,7 +14,7 @@ contact.planted_height = { low = 0.05, high = 0.2 }
 ankle = 0.02
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -58,6 +58,8 @@ class ClipEntry:
     start: float = 0.0  # s
     end: float | None = None  # s
     file_up: str = "y"  # of the terrain
+    label: str = "captured"  # what pictures call the reference
+    mask_pops: bool = True  # leaves out frames in which a captured marker jumps
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,10 @@ class Experiment:
 
 
 # What the tables of the file hold.
-CLIP: dict[str, checks.Kind] = dict.fromkeys(("reference", "terrain", "base", "truth"), checks.TEXT)
+FILES = ("reference", "terrain", "base", "truth")
+CLIP: dict[str, checks.Kind] = dict.fromkeys((*FILES, "label"), checks.TEXT)
 CLIP |= {"start": checks.TIME, "end": checks.TIME, "file_up": checks.one_of(("y", "z"))}
+CLIP |= {"mask_pops": checks.SWITCH}
 FREE: dict[str, checks.Kind] = dict.fromkeys(("low", "high", "prior_mean"), checks.NUMBER)
 FREE |= {"prior_sd": checks.POSITIVE, "kind": checks.TEXT, "scale": checks.TEXT}
 SIGMA = dict.fromkeys(SIGMAS, checks.POSITIVE) | {"correlation": checks.SHARE}
@@ -137,10 +141,7 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     check_table(content.get("sigmas", {}), SIGMA, f"{path} [sigmas]")
     made = dict(content)
     made["clips"] = tuple(_entry(entry, path) for entry in content["clips"])
-    made["free"] = {
-        name: check_table(given, FREE, f"{path} [free] {name}")
-        for name, given in flat(content["free"], 2).items()
-    }
+    made["free"] = free_table(content["free"], f"{path} [free]")
     made["parameters"] = flat(content.get("parameters", {}), 2)
     made["fit"] = FitOptions(**check_table(content.get("fit", {}), FIT, f"{path} [fit]"))
     sample = check_table(content.get("sample", {}), SAMPLE, f"{path} [sample]")
@@ -150,6 +151,12 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
             posterior.check_walkers(len(made["free"]), sample["walkers"])
     made.setdefault("name", path.stem)
     return Experiment(path=path, **made)
+
+
+def free_table(given: Mapping[str, Any], where: str) -> dict[str, Mapping[str, Any]]:
+    """What a [free] table says of each parameter, by dotted name."""
+    named = flat(given, 2)
+    return {name: check_table(one, FREE, f"{where} {name}") for name, one in named.items()}
 
 
 def name_preset(name: object) -> jaxik.FootIK:
@@ -210,8 +217,9 @@ def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Cl
     """The reference clip, its flat base and the terrain, over the same frames."""
     ground = scenes.load_terrain(entry.terrain, file_up=entry.file_up)
     captured = clips.load_clip(entry.reference)
-    with checks.located(entry.reference):
-        captured = edit.mask_pops(captured)  # at its own rate: a pop is shorter than other frames
+    if entry.mask_pops:
+        with checks.located(entry.reference):
+            captured = edit.mask_pops(captured)  # at its own rate: a pop is shorter than others
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
         return reference, flat_base(reference, scenes.heights(ground)), ground
@@ -232,9 +240,13 @@ def _cut(clip: clips.Clip, path: Path, entry: ClipEntry, fps: float | None) -> c
 
 
 def make_scene(
-    reference: clips.Clip, base: clips.Clip, ground: Terrain, sigmas: Mapping[str, float]
+    reference: clips.Clip,
+    base: clips.Clip,
+    ground: Terrain,
+    sigmas: Mapping[str, float],
+    label: str = "captured",
 ) -> Scene:
-    """The data of one clip."""
+    """The data of one clip; `label` is what pictures call the reference."""
     animation = frames.frames_of(base)
     pelvis = _joint_ws(base, base.rig.pelvis)
     legs = reference.leg_pose_ws()
@@ -255,6 +267,7 @@ def make_scene(
             ankle=legs.ankle,
             contact=jnp.asarray(labels),
             seen=jnp.asarray(seen),
+            label=label,
         ),
         sigmas=Sigmas(**{name: jnp.asarray(value, float) for name, value in given.items()}),
     )
@@ -272,13 +285,24 @@ def make_problem(experiment: Experiment) -> Problem:
     Raises:
         ValueError: for anything in the experiment that does not fit its clips or its preset.
     """
+    return problem_of(experiment, (load_pair(one, experiment.fps) for one in experiment.clips))
+
+
+def problem_of(
+    experiment: Experiment, pairs: Iterable[tuple[clips.Clip, clips.Clip, Terrain]]
+) -> Problem:
+    """The problem of clips that need not be files: for each the reference, its base, the terrain.
+
+    Raises:
+        ValueError: as `make_problem`.
+    """
     ik = system(experiment)
     frees = free_parameters(experiment, ik)
     with checks.located(f"{experiment.path} [free]"):
         space = make_space(ik, frees)
     made = []
-    for entry in experiment.clips:
-        scene = make_scene(*load_pair(entry, experiment.fps), experiment.sigmas)
+    for entry, pair in zip(experiment.clips, pairs, strict=True):
+        scene = make_scene(*pair, experiment.sigmas, entry.label)
         with checks.located(f"{experiment.path} [parameters]"):
             check_shapes(ik, scene.rig, scene.terrain, scene.frames)
         made.append(scene)
@@ -311,7 +335,7 @@ def _entry(given: Any, path: Path) -> ClipEntry:
     for key in ("reference", "terrain"):
         if key not in table:
             raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
-    for key in ("reference", "terrain", "base", "truth"):
+    for key in FILES:
         if key in table:
             made[key] = (path.parent / table[key]).resolve()
             if not made[key].is_file():

@@ -60,6 +60,7 @@ class Playback(eqx.Module):
     errors: Mapping[str, Float[Series, "rows ..."]]  # of `after`, by kind of residual, in its unit
     rows: Mapping[str, Float[Series, "rows ..."]]  # the same as the fit sees them, in sigmas
     sigmas: Mapping[str, Float[Series, ""]]
+    label: str = eqx.field(static=True)  # what pictures call the captured motion
 
     @cached_property
     def time(self) -> Float[np.ndarray, " frames"]:
@@ -125,6 +126,7 @@ def _watch(scene: Scene, result: jaxik.Result) -> Playback:
         errors=errors,
         rows=rows_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},
+        label=reference.label,
     )
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,17 +10,28 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatter
 
+from .panels import (
+    AFTER,
+    BEFORE,
+    CAPTURED,
+    EARTH,
+    GROUND,
+    LOCKED,
+    SLIDING,
+    STAGES,
+    STANDING,
+    earth,
+    legend,
+    spans,
+    stretch,
+    styled,
+    whole_and_part,
+)
+from .panels import STYLE as STYLE
 from .playback import Motion, Playback
 from .solution import Progress
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
-BEFORE, AFTER, CAPTURED = "#8c8c8c", "#0072B2", "#D55E00"
-STANDING, LOCKED, SLIDING = "#56B4E9", "#009E73", "#CC79A7"
-STAGES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
-GROUND, EARTH = "#5f5236", "#ece5d6"
-SPAN = 5.0  # s, of the stretch that is also shown enlarged
 STRIDE = 0.3  # m, between two drawn legs
-LONG = 8.0  # s; shorter clips need no enlargement
 WORDS = {
     "ankle": ("Ankle position", "cm", 100.0),
     "knee": ("Knee position", "cm", 100.0),
@@ -32,24 +42,6 @@ WORDS = {
     "smooth": ("Ankle acceleration", "m/s²", 1.0),
 }
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
-STYLE: Any = {
-    "font.size": 13,
-    "axes.titlesize": 14,
-    "axes.labelsize": 13,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "figure.titlesize": 18,
-    "legend.frameon": False,
-    "legend.fontsize": 13,
-    "lines.linewidth": 1.6,
-    "savefig.dpi": 100,
-}
-styled = matplotlib.rc_context(STYLE)
 
 
 @styled
@@ -60,21 +52,21 @@ def motion(play: Playback, legs: Sequence[str], title: str) -> Figure:
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
             _three(axes, play, lambda one, leg=leg: 100 * play.height(one.ankle[:, leg]))
-            _earth(axes, play.time, ground[:, leg])
-            axes.set_title(f"{name.capitalize()} ankle, over the ground under the captured one")
+            earth(axes, play.time, ground[:, leg])
+            axes.set_title(f"{name.capitalize()} ankle, over the ground under it ({play.label})")
         _three(shown[-1], play, lambda one: 100 * play.height(one.pelvis))
-        _earth(shown[-1], play.time, ground.mean(axis=1))
+        earth(shown[-1], play.time, ground.mean(axis=1))
         shown[-1].set_title("Pelvis, over the mean of the ground under the feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
-    _legend(figure, *_MOTIONS, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
+    legend(figure, *_lines(play), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
     return figure
 
 
 @styled
 def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
     """Legs from the side over the ground, in the stretch of the clip that climbs most."""
-    start, end = stretch(play)
+    start, end = stretch(play.time, play.height(play.captured.pelvis))
     inside = slice(start, end + 1)
     way = play.travelled[inside]
     apart = max(STRIDE, (np.max(way) - np.min(way)) / 20)
@@ -93,13 +85,13 @@ def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
             axes.plot(*pelvis, color=colour, linewidth=2.6)
         along = play.along(play.ground_ws)[inside, leg]
         order = np.argsort(along, kind="stable")
-        _earth(axes, along[order], play.ground_height()[inside, leg][order])
+        earth(axes, along[order], play.ground_height()[inside, leg][order])
         axes.set_aspect("equal")
         axes.set_title(f"{name.capitalize()} leg every {100 * apart:.0f} cm, and the pelvis' way")
         axes.set_ylabel("height, m")
     rows[-1].set_xlabel("distance travelled, m")
     ground = Patch(facecolor=EARTH, edgecolor=GROUND, label="ground under this foot's track")
-    _legend(figure, *_MOTIONS, ground)
+    legend(figure, *_lines(play), ground)
     return figure
 
 
@@ -107,7 +99,7 @@ def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
 def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
     """Knee angles over time with the fitted limits; whole clip and a stretch."""
     figure, columns = _whole_and_part(play, len(legs), title)
-    lines = list(_MOTIONS)
+    lines = _lines(play)
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=True)):
             _three(axes, play, lambda one, leg=leg: np.degrees(one.knee_angle[:, leg]))
@@ -120,7 +112,7 @@ def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: s
         axes.set_ylabel("knee angle, degrees")
     if limits:
         lines.append(Line2D([], [], **SIGMA, label="limits"))
-    _legend(figure, *lines)
+    legend(figure, *lines)
     return figure
 
 
@@ -146,7 +138,7 @@ def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
         side.set_title(f"{words}: spread of the residuals")
     grid[-1, 0].set_xlabel("time, s")
     grid[-1, 1].set_xlabel("residual as the fit sees it, in sigmas")
-    _legend(
+    legend(
         figure,
         Line2D([], [], color=BEFORE, linewidth=3, label="with the preset's parameters"),
         Line2D([], [], color=AFTER, linewidth=3, label="with the fitted parameters"),
@@ -165,18 +157,20 @@ def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
         if locking:
             lanes.append((f"{name} foot locked", LOCKED, np.asarray(play.locked)[:, leg]))
         if labelled:
-            lanes.append((f"{name} captured stance", CAPTURED, np.asarray(play.stance)[:, leg]))
+            lanes.append(
+                (f"{name} stance, {play.label}", CAPTURED, np.asarray(play.stance)[:, leg])
+            )
     if np.any(play.slide):
         lanes.append(("sliding", SLIDING, np.asarray(play.slide)))
-    spans = _spans(play)
-    tall = (0.55 * len(lanes) + 1.3) * len(spans) + 1.3
+    parts = spans(play.time, play.height(play.captured.pelvis))
+    tall = (0.55 * len(lanes) + 1.3) * len(parts) + 1.3
     figure = Figure(figsize=(17, tall), layout="constrained")
     figure.suptitle(title if locking else f"{title} (no foot ever locks)")
-    rows = figure.subplots(len(spans), 1, squeeze=False)[:, 0]
-    for axes, (start, end) in zip(rows, spans, strict=True):
+    rows = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
+    for axes, (start, end) in zip(rows, parts, strict=True):
         _draw_lanes(axes, play.time, lanes)
         axes.set_xlim(play.time[start], play.time[end])
-        whole = (start, end) == spans[0]
+        whole = (start, end) == parts[0]
         axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(play, start, end)}")
         axes.set_xlabel("time, s")
     released = Line2D([], [], color="black", marker="v", linestyle="", label="released")
@@ -184,10 +178,10 @@ def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
         (True, Patch(color=STANDING, label="contact weight, 0 to 1")),
         (locking, Patch(color=LOCKED, label="foot locked")),
         (locking, released),
-        (labelled, Patch(color=CAPTURED, label="captured stance")),
+        (labelled, Patch(color=CAPTURED, label=f"stance, {play.label}")),
         (bool(np.any(play.slide)), Patch(color=SLIDING, label="sliding")),
     ]
-    _legend(figure, *(entry for there, entry in shown if there))
+    legend(figure, *(entry for there, entry in shown if there))
     return figure
 
 
@@ -216,48 +210,24 @@ def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
         ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
     axes.set_xlabel("time since the fit began, compilation included, s")
     axes.set_ylabel("cost: half the sum of squared residuals")
-    _legend(figure, *axes.get_legend_handles_labels()[0])
+    legend(figure, *axes.get_legend_handles_labels()[0])
     return figure
 
 
-def stretch(play: Playback) -> tuple[int, int]:
-    """First and last frame of the seconds in which the captured pelvis climbs and sinks most."""
-    time = play.time
-    if time[-1] <= LONG:
-        return 0, len(time) - 1
-    frames = int(np.searchsorted(time, SPAN))
-    steps = np.abs(np.diff(play.height(play.captured.pelvis), append=np.nan)[:-1])
-    sums = np.concatenate([[0.0], np.cumsum(steps)])
-    start = int(np.argmax(sums[frames:] - sums[:-frames]))
-    return start, start + frames
-
-
-_MOTIONS = (
-    Line2D([], [], color=BEFORE, linewidth=3, label="before: animation on a flat floor"),
-    Line2D([], [], color=AFTER, linewidth=3, label="after fitted foot IK"),
-    Line2D([], [], color=CAPTURED, linewidth=3, label="captured"),
-)
-
-
-def _spans(play: Playback) -> list[tuple[int, int]]:
-    """First and last frames of what is shown: the whole clip and, of a long one, a stretch."""
-    whole = 0, len(play.time) - 1
-    return list(dict.fromkeys([whole, stretch(play)]))
+def _lines(play: Playback) -> list[Line2D]:
+    """What the colours of the three motions mean."""
+    shown = (
+        (BEFORE, "before: animation on a flat floor"),
+        (AFTER, "after fitted foot IK"),
+        (CAPTURED, play.label),
+    )
+    return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in shown]
 
 
 def _whole_and_part(play: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
-    """A figure with a column for the whole clip and, for a long clip, one for a stretch of it."""
-    spans = _spans(play)
     figure = Figure(figsize=(17, 3.4 * rows + 1.6), layout="constrained")
     figure.suptitle(title)
-    ratios = [1.6, 1.0][: len(spans)]
-    grid = figure.subplots(rows, len(spans), squeeze=False, sharey="row", width_ratios=ratios)
-    for column, (start, end) in zip(grid.T, spans, strict=True):
-        for axes in column:
-            axes.set_xlim(play.time[start], play.time[end])
-        enlarged = "" if (start, end) == spans[0] else ", enlarged"
-        column[-1].set_xlabel(f"time, s{enlarged}")
-    return figure, [list(column) for column in grid.T]
+    return figure, whole_and_part(figure, play.time, play.height(play.captured.pelvis), rows)
 
 
 def _motions(play: Playback) -> list[tuple[str, Motion]]:
@@ -269,14 +239,6 @@ def _three(axes: Axes, play: Playback, of: Callable[[Motion], np.ndarray]) -> No
     """One number of the animation, the capture and the result, over time."""
     for colour, one in _motions(play):
         axes.plot(play.time, of(one), color=colour, linewidth=1.2 if colour == BEFORE else 1.7)
-
-
-def _earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
-    """Ground as an area with an edge, down to the end of what the axes show by now."""
-    axes.plot(across, height, color=GROUND, linewidth=1.4)
-    low, high = axes.get_ylim()
-    axes.fill_between(across, height, low, where=np.isfinite(height), color=EARTH, linewidth=0)
-    axes.set_ylim(low, high)
 
 
 def _size(play: Playback, kind: str) -> np.ndarray:
@@ -327,7 +289,3 @@ def _draw_lanes(axes: Axes, time: np.ndarray, lanes: Sequence[tuple[str, str, np
 
 def _seconds(play: Playback, start: int, end: int) -> str:
     return f"{play.time[start]:.1f} s to {play.time[end]:.1f} s"
-
-
-def _legend(figure: Figure, *entries: Any) -> None:
-    figure.legend(handles=entries, loc="outside lower center", ncols=min(4, len(entries)))

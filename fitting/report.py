@@ -1,14 +1,14 @@
 """What is read after a fit or a sampling: texts for the terminal, and the run's summary.md."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from . import chain_plots, files, playback, plots, store, tables
+from . import chain_plots, files, panels, playback, plots, store, tables
 from .checks import flat, read_toml
 from .exercise import exercise, flipped_decisions
 from .experiment import Experiment, name_preset, with_parameters
@@ -66,15 +66,21 @@ def fit_text(told: Mapping[str, Any], truth: Truth) -> str:
     return "\n".join(parts)
 
 
-def write_fit(run: Path, fitted: Fit) -> None:
-    """Writes the pictures of a fit and a new summary.md into the folder of its run."""
+def write_fit(
+    run: Path, fitted: Fit, opening: Sequence[str] = (), details: Sequence[str] = ()
+) -> None:
+    """Writes the pictures of a fit and a new summary.md into the folder of its run.
+
+    Paragraphs of Markdown may be added: an `opening` before the parameters, `details` before the
+    pictures.
+    """
     pictures: Pictures = {}
     for index in range(len(fitted.problem.data)):
         pictures |= _draw_clip(run, fitted, index)
     title = f"{fitted.experiment.name}: cost of the fit over time"
     figure = plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
     pictures |= _keep(run, "cost.png", title, figure)
-    files.write_text(run / store.SUMMARY, _fit_summary(fitted, pictures))
+    files.write_text(run / store.SUMMARY, _fit_summary(fitted, pictures, opening, details))
 
 
 def posterior_text(posterior: Posterior, truth: Truth) -> str:
@@ -142,8 +148,7 @@ def _draw_clip(run: Path, fitted: Fit, index: int) -> Pictures:
 
 def _keep(run: Path, name: str, caption: str, figure: Figure) -> Pictures:
     """Saves a figure and tells where."""
-    look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
-    files.write(run / name, lambda path: figure.savefig(path, **look))
+    panels.save(run / name, figure)
     return {name: caption}
 
 
@@ -173,13 +178,15 @@ def _health(posterior: Posterior) -> list[str]:
     ]
 
 
-def _fit_summary(fitted: Fit, pictures: Pictures) -> str:
+def _fit_summary(
+    fitted: Fit, pictures: Pictures, opening: Sequence[str], details: Sequence[str]
+) -> str:
     experiment, found = fitted.experiment, fitted.identification
     told, truth = store.describe_fit(fitted), truth_of(experiment)
     rows = told["parameters"]
     parts = [f"# {experiment.name}", f"{told['message']} {_cost(told)}"]
     parts.append(f"Preset `{experiment.preset}`, loss `{experiment.loss}`, seed {experiment.seed}.")
-    parts += ["## Parameters", markdown(tables.fit_table(rows, truth))]
+    parts += [*opening, "## Parameters", markdown(tables.fit_table(rows, truth))]
     if truth:
         parts.append(f"{tables.recovered(rows, truth)}.")
     if any("half_life" in row for row in rows):
@@ -212,5 +219,5 @@ def _fit_summary(fitted: Fit, pictures: Pictures) -> str:
             "a threshold moves by 10 % of its range, and by how much the cost rises:"
         )
         parts.append(markdown(tables.flips_table(flips, found.profiles)))
-    parts += ["## Pictures", _gallery(pictures)]
+    parts += [*details, "## Pictures", _gallery(pictures)]
     return "\n\n".join(parts) + "\n"

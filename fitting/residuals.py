@@ -31,6 +31,7 @@ class Reference(eqx.Module):
     ankle: Transform  # frames legs
     contact: Float[Array, "frames legs"]  # 0 or 1
     seen: Bool[Array, " frames"]  # False where a marker popped or nothing was captured
+    label: str = eqx.field(static=True, default="captured")  # what pictures call it
 
 
 class Scene(eqx.Module):

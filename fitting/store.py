@@ -1,6 +1,6 @@
 """Runs on disk: a folder with the experiment, the fit, the chain, tables and plots.
 
-experiment.toml   what was fitted, with absolute paths
+experiment.toml   what was fitted, with absolute paths but to files of the run itself
 fit.json          the numbers of the fit
 parameters.toml   the fitted system
 chain.h5          the walkers; posterior.json their summary
@@ -50,7 +50,7 @@ def save_solution(run: Path, experiment: Experiment, problem: Problem, solution:
     run.mkdir(parents=True, exist_ok=True)
     (run / FIT).unlink(missing_ok=True)  # of an earlier fit: the run is finished when it is there
     ik = problem.space.unpack(jnp.asarray(solution.u))
-    write_text(run / EXPERIMENT, resolved(experiment))
+    write_text(run / EXPERIMENT, resolved(experiment, run))
     write_text(run / PARAMETERS, settings.to_toml(ik, experiment.preset))
 
 
@@ -60,22 +60,29 @@ def save_fit(run: Path, fitted: Fit) -> None:
     write_text(run / FIT, json.dumps(describe_fit(fitted), indent=2))
 
 
-def resolved(experiment: Experiment) -> str:
-    """The experiment as TOML with absolute paths, so that the run may lie anywhere."""
-    content = _plain(dataclasses.asdict(experiment))
+def resolved(experiment: Experiment, run: Path | None = None) -> str:
+    """The experiment as TOML with absolute paths, so that the run may lie anywhere.
+
+    Paths into the folder `run` are relative to it: these files go where it goes.
+    """
+    content = _plain(dataclasses.asdict(experiment), run and run.resolve())
     del content["path"]
     for name in ("free", "parameters"):
         content[name] = nested(content[name])
     return tomli_w.dumps(content)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, run: Path | None) -> Any:
     """What TOML can hold: no paths, and nothing where there is None."""
     if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items() if one is not None}
+        return {key: _plain(one, run) for key, one in value.items() if one is not None}
     if isinstance(value, tuple | list):
-        return [_plain(one) for one in value]
-    return str(value) if isinstance(value, Path) else value
+        return [_plain(one, run) for one in value]
+    if not isinstance(value, Path):
+        return value
+    if run is None or not value.is_relative_to(run):
+        return str(value)
+    return value.relative_to(run).as_posix()
 
 
 def describe_fit(fitted: Fit) -> dict[str, Any]:

@@ -56,18 +56,33 @@ def fit(
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
-    problem = make_problem(experiment)
-    solution = search(problem, experiment, progress)
+    return fit_problem(make_problem(experiment), experiment, progress)
+
+
+def fit_problem(
+    problem: Problem,
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+    starts: Float[np.ndarray, "starts free"] | None = None,
+) -> Fit:
+    """Fits a problem that is made already, as that of a translation is."""
+    solution = search(problem, experiment, progress, starts)
     return Fit(experiment, problem, solution, identify(problem, solution))
 
 
 def search(
-    problem: Problem, experiment: Experiment, progress: Callable[[Progress], None] | None
+    problem: Problem,
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None,
+    starts: Float[np.ndarray, "starts free"] | None = None,
 ) -> Solution:
-    """The first half of `fit`: the parameters, before anything is said of how sure they are."""
+    """The first half of `fit`: the parameters, before anything is said of how sure they are.
+
+    Starts in `u` take the place of those that the experiment asks for.
+    """
     return solve(
         problem,
-        starts=experiment.fit.starts,
+        starts=experiment.fit.starts if starts is None else starts,
         max_steps=experiment.fit.max_steps,
         seed=experiment.seed,
         progress=progress,
