@@ -34,7 +34,12 @@ def tracks(result: jaxik.Result) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     """Targets, footholds and unlocked targets (frames, legs, 3), m, and locked (frames, legs)."""
     advanced, sensed = result.trace.advanced, result.trace.sensed
     unlocked = advanced.foothold_ws + sensed.contact.lift[..., None] * sensed.up_ws[:, None]
-    tracks = advanced.effector.target_ws, advanced.foothold_ws, unlocked, advanced.state.lock.locked > 0
+    tracks = (
+        advanced.effector.target_ws,
+        advanced.foothold_ws,
+        unlocked,
+        advanced.state.lock.locked > 0,
+    )
     return tuple(map(np.asarray, tracks))  # type: ignore[return-value]
 
 

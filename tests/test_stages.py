@@ -2,20 +2,36 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from clips import FLAT, animate, at, make_rig, planes, to_frames, to_ik, to_rig
+from cases import (
+    ANKLE_DEEP,
+    KINK,
+    QUICK,
+    RAMP_DOWN,
+    RAMP_UP,
+    RIG,
+    Case,
+    assert_effect,
+    assert_slope,
+    clip,
+    has_slope,
+    measured,
+    posed,
+    still,
+    total,
+)
+from clips import FLAT, animate, at, planes, to_frames, to_ik, to_rig
 from clips import to_terrain as to_ground
 from reference import poses
 
 import jaxik
-from jaxik import HARD, Smooth, presets, quat, rule, vec
+from jaxik import HARD, Smooth, presets, rule
 from jaxik import record as game
 
 NO_LOCK = {"lock.enabled": False}
@@ -250,21 +266,6 @@ def test_slopes_with_respect_to_the_animation_and_the_ground_are_difference_quot
 
 
 # Where slopes go wrong. One frame each, so that the whole is also a clip of one frame.
-
-
-def posed(hip: Any, knee: Any, ankle: Any, **changes: Any) -> jaxik.Frame:
-    """Both legs with their joints in these places, m, model space, their spaces unturned."""
-    frame = animate(RIG, count=1, **changes)[0]
-    both = lambda place: np.tile(np.asarray(place, float), (2, 1))  # noqa: E731
-    frame = dataclasses.replace(
-        frame,
-        hip=frame.hip._replace(pos=both(hip)),
-        knee=frame.knee._replace(pos=both(knee)),
-        ankle=frame.ankle._replace(pos=both(ankle)),
-        toe=frame.toe._replace(pos=both(ankle)),
-    )
-    return to_frames([frame])
-
 
 THIGH, SHIN = poses.THIGH, poses.SHIN
 ON_HIP = {"probe.ray_up": 2.0, "target.max_ankle_height": 2.0, "pelvis.limit": 0.0}

@@ -88,8 +88,7 @@ def two_legs(result: jaxik.Result, member: int) -> jaxik.Result:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_system_works_on_the_clip(preset: str):
     result = alone(preset)
-    found = np.asarray(result.trace.sensed.foothold.found)
-    assert 0.2 < found.mean() < 1.0 or preset == "ozz", "whose rays are endless"
+    assert np.asarray(result.trace.sensed.foothold.found).mean() > 0.2
     moved = np.asarray(result.pose.ankle.pos - wander().pose.ankle.pos)
     assert np.abs(moved).max() > 0.05
 
@@ -117,7 +116,7 @@ def test_moving_and_turning_the_world_moves_and_turns_the_answer(preset: str):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_one_bad_member_does_not_spoil_the_others_of_a_batch(preset: str):
     for leaf in jax.tree.leaves(crowded(preset)):
-        assert np.isfinite(leaf).all()
+        assert not np.isnan(leaf).any()
     result = crowd_run(*crowd(preset, spoiled=True))
     assert np.isnan(result.pose.ankle.pos[2]).any()
     for member in (0, 1):
@@ -147,22 +146,14 @@ def test_legs_with_one_and_the_same_up_meet_the_same_ground(preset: str):
 def test_numbers_given_for_each_leg_do_what_shared_ones_do(preset: str):
     ik, rig, ground, frames = inputs(preset)
 
-    def widen(name: str) -> Any:
+    def widened(name: str) -> jax.Array:
         leaf = rule.get(ik, name)
-        return jnp.broadcast_to(leaf[None] if leaf.ndim else leaf, (2, *leaf.shape))
+        return jnp.broadcast_to(leaf, (2, *leaf.shape))
 
-    shared = ("root.", "contact.idle", "pelvis.", "effector.latch", "effector.mesh")
-    names = [name for name in rule.declarations(ik) if not name.startswith(shared)] + [
-        "probe.layers"
-    ]
-    result = run(
-        eqx.tree_at(
-            lambda ik: [rule.get(ik, name) for name in names], ik, [widen(name) for name in names]
-        ),
-        rig,
-        ground,
-        frames,
-    )
+    shared = ("root.", "contact.", "pelvis.")
+    names = [name for name in rule.declarations(ik) if not name.startswith(shared)]
+    values = {name: widened(name) for name in [*names, "probe.layers"]}
+    result = run(rule.replace(ik, values), rig, ground, frames)
     assert_same_pose(result.pose, alone(preset).pose)
 
 
