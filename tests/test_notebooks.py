@@ -13,8 +13,14 @@ NAMES = [path.stem for path in NOTEBOOKS]
 LIMIT = 600  # s, for one cell; on two idle cores a whole notebook takes less than a minute
 
 
-def test_the_four_notebooks_are_there():
-    assert NAMES == ["1_one_leg", "2_stage_by_stage", "3_fit_and_posterior", "4_a_crowd"]
+def test_the_five_notebooks_are_there():
+    assert NAMES == [
+        "1_one_leg",
+        "2_stage_by_stage",
+        "3_fit_and_posterior",
+        "4_a_crowd",
+        "5_other_systems",
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
