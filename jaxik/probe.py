@@ -107,7 +107,7 @@ class CornerProbe(AbstractProbe):
     extra_max: Array = parameter(
         0.30, unit="m", low=0.0, high=1.0, kind="threshold", above="extra_min"
     )
-    stable_height: Array = parameter(0.15, unit="m", low=0.0, high=0.5, kind="threshold")
+    stable_height: Array = parameter(0.12, unit="m", low=0.0, high=0.5, kind="threshold")
     stable_speed: Array = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
     layers: Array = rule.layers()
 

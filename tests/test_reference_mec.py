@@ -107,15 +107,15 @@ def test_a_tilt_is_limited_to_a_cone_about_its_own_axis():
 @pytest.mark.parametrize(
     "changes, height, speed, extra",
     [
-        ({}, 0.14, 9.0, 0.3),
+        ({}, 0.11, 9.0, 0.3),
         ({}, 0.16, 0.0, 0.0),
         ({"probe.stable_height": 0.2}, 0.16, 0.0, 0.3),
-        ({"probe.by_speed": True}, 0.14, 0.6, 0.0),
-        ({"probe.by_speed": True, "probe.stable_speed": 0.7}, 0.14, 0.6, 0.3),
+        ({"probe.by_speed": True}, 0.11, 0.6, 0.0),
+        ({"probe.by_speed": True, "probe.stable_speed": 0.7}, 0.11, 0.6, 0.3),
         ({"probe.by_height": False, "probe.by_speed": True}, 0.3, 0.4, 0.3),
         ({"probe.by_height": False}, 0.3, 9.0, 0.2),
         ({"probe.by_height": False, "probe.extra": 0.1}, 0.3, 9.0, 0.1),
-        ({"probe.extra_max": 0.5}, 0.14, 0.0, 0.5),
+        ({"probe.extra_max": 0.5}, 0.11, 0.0, 0.5),
         ({"probe.extra_min": 0.1}, 0.16, 0.0, 0.1),
     ],
 )

@@ -28,7 +28,7 @@ DEFAULTS: dict[str, Any] = {
     "probe.by_speed": False,
     "probe.extra_min": 0.0,
     "probe.extra_max": 0.3,
-    "probe.stable_height": 0.15,
+    "probe.stable_height": 0.12,
     "probe.stable_speed": 0.5,
     "probe.layers": ALL_LAYERS,
     "target.foot_height": 0.10,
