@@ -1,22 +1,16 @@
 """What each word of the command line does."""
 
 import argparse
-import csv
-import signal
-import sys
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 import jaxik
-from jaxik import record, rule
+from jaxik import record
 
 from . import (
     checks,
@@ -24,6 +18,8 @@ from . import (
     experiment,
     files,
     frames,
+    progress,
+    record_files,
     report,
     scenes,
     settings,
@@ -37,8 +33,7 @@ from . import compare as comparing
 from .base import load_base
 from .clips import inspect as inspection
 from .identify import identify
-from .posterior import SamplingProgress
-from .solution import Progress, Solution
+from .solution import Solution
 from .space import Problem
 
 
@@ -50,7 +45,7 @@ def fit(options: argparse.Namespace) -> int:
     store.check_place(options.output)
     problem = experiment.make_problem(asked)
     print(f"fitting {len(asked.free)} parameters of {asked.preset} to {len(asked.clips)} clip(s)")
-    with _Line(_fit_line) as line:
+    with progress.Line(progress.fit_line) as line:
         solution = study.search(problem, asked, line)
     fitted = _keep_fit(options.output, asked, problem, solution)
     report.write_fit(options.output, fitted)
@@ -74,7 +69,7 @@ def sample(options: argparse.Namespace) -> int:
     start_u = np.array([row["u"] for row in told["parameters"]])
     start_sd = np.array([row["start_sd"] for row in told["parameters"]])
     chain = options.run / store.CHAIN
-    with _Line(_sample_line) as line:
+    with progress.Line(progress.sample_line) as line:
         posterior = study.sample_start(problem, asked, start_u, start_sd, chain, line)
     store.save_posterior(options.run, posterior)
     report.write_posterior(options.run, asked, posterior)
@@ -110,7 +105,7 @@ def compare(options: argparse.Namespace) -> int:
     ground = scenes.load_terrain(options.terrain, file_up=options.file_up)
     title = f"{options.clip.name} on {options.terrain.name}"
     compared = comparing.compare(
-        systems, base, ground, floor=options.floor, title=title, during=_timed
+        systems, base, ground, floor=options.floor, title=title, during=progress.timed
     )
     comparing.write(options.output, compared)
     print(tables.aligned([list(row) for row in zip(*comparing.table(compared), strict=True)]))
@@ -131,7 +126,7 @@ def translation(options: argparse.Namespace) -> int:
     )  # fmt: skip
     count, several = len(made.experiment.free), len(made.motions)
     print(f"fitting {count} parameters of {target.name} to {source.name} on {several} clip(s)")
-    with _Line(_fit_line) as line:
+    with progress.Line(progress.fit_line) as line:
         start = translate.approach(made.problem)
         solution = study.search(made.problem, made.experiment, line, start)
     translate.save_source(options.output, made)
@@ -152,14 +147,18 @@ def convert(options: argparse.Namespace) -> int:
     """The word `record`: shows the game's record, or turns it into or out of our parameters."""
     jax.config.update("jax_enable_x64", True)
     reading = record.Reading(options.length_unit, options.knee, options.lean_sign, options.tick_hz)
-    base = _read_bytes(options.base) if getattr(options, "base", None) is not None else None
-    read = _read_records(options.file, reading, base)
+    base = (
+        record_files.read_bytes(options.base)
+        if getattr(options, "base", None) is not None
+        else None
+    )
+    read = record_files.read(options.file, reading, base)
     if options.way == "show":
         if options.csv:
             print(record.to_csv(read).rstrip())
         else:
             with checks.located(options.file):
-                print("\n\n".join(_shown(one, reading) for one in read))
+                print("\n\n".join(record_files.shown(one, reading) for one in read))
         return 0
     (only, *more) = read
     if more:
@@ -232,118 +231,3 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
         f"the feet, {reached:.1%} of the targets reached; written to {options.output}"
     )
     return 0
-
-
-@contextmanager
-def _timed(name: str) -> Iterator[None]:
-    """Tells on stderr what is being run, and then how long it took."""
-    print(f"{name} ... ", end="", file=sys.stderr, flush=True)
-    began, took = time.perf_counter(), "stopped"
-    try:
-        yield
-        took = f"{time.perf_counter() - began:.1f} s"
-    finally:
-        print(took, file=sys.stderr, flush=True)
-
-
-def _read_bytes(path: Path) -> record.Record:
-    if not path.is_file():
-        raise ValueError(f"{path}: {checks.missing(path)}, wanted a record")
-    with checks.located(path):
-        return record.from_bytes(path.read_bytes())
-
-
-def _read_records(
-    path: Path, reading: record.Reading, base: record.Record | None
-) -> list[record.Record]:
-    """The records of a file; `base` completes one that is made from parameters."""
-    kind = path.suffix.lower()
-    if kind == ".toml":
-        return [record.from_ik(settings.from_toml(path)[0], base, reading)]
-    if base is not None:
-        raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
-    if kind != ".csv" or not path.is_file():
-        return [_read_bytes(path)]
-    try:
-        read = record.from_csv(path.read_text(encoding="utf-8"))
-    except (ValueError, csv.Error) as error:
-        raise ValueError(f"{path}: {error}") from None
-    if not read:
-        raise ValueError(f"{path}: the CSV has no row")
-    return read
-
-
-def _shown(one: record.Record, reading: record.Reading) -> str:
-    ik = record.to_ik(one, reading)
-    declared = rule.declarations(ik)
-    axis = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")[one.knee_axis_type]
-    lines = [f"{'kneeAxisType':30} {one.knee_axis_type} ({axis})"]
-    for _, name, ours in record.FLAGS:
-        lines.append(f"{name:30} {'on' if one.flag(name) else 'off':>12}   {ours}")
-    for name, ours, _ in record.FLOATS:
-        leaf, _, index = ours.partition("[")
-        value = rule.get(ik, leaf)
-        value = float(value[int(index[:-1])] if index else value)
-        meaning = f"{ours} = {value:.6g} {declared[leaf].unit}"
-        lines.append(f"{name:30} {one.value(name):12.6g}   {meaning}")
-    return "\n".join(lines)
-
-
-class _Line:
-    """Progress on one line of a terminal, on a line every ten seconds elsewhere.
-
-    Within it no Ctrl-C is lost: one that comes while Python collects garbage ends in a hook of JAX,
-    which goes on; it is raised again at the next report.
-    """
-
-    def __init__(self, show: Callable):
-        self.show = show
-        self.live = sys.stderr.isatty()
-        self.last = -1e9
-        self.handler: Any = None
-        self.interrupted = False
-
-    def __enter__(self) -> "_Line":
-        own = threading.current_thread() is threading.main_thread()
-        if own and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self.handler = signal.signal(signal.SIGINT, self._interrupt)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self.handler is not None:
-            signal.signal(signal.SIGINT, self.handler)
-
-    def _interrupt(self, *_: object) -> None:
-        self.interrupted = True
-        raise KeyboardInterrupt
-
-    def __call__(self, progress: Progress | SamplingProgress) -> None:
-        if self.interrupted:
-            raise KeyboardInterrupt
-        now = time.monotonic()
-        if now - self.last < (0.1 if self.live else 10.0):
-            return
-        self.last = now
-        text = self.show(progress)
-        print(
-            f"\r{text:<100}" if self.live else text,
-            end="" if self.live else "\n",
-            file=sys.stderr,
-            flush=True,
-        )
-
-
-def _fit_line(progress: Progress) -> str:
-    return (
-        f"{progress.seconds:6.1f} s  start {progress.start + 1}  {progress.stage:<9} step "
-        f"{progress.step:<4} cost {progress.cost:.6g}  best {progress.best:.6g}"
-    )
-
-
-def _sample_line(progress: SamplingProgress) -> str:
-    time_now = progress.autocorrelation_time
-    slowest = "" if np.isnan(time_now) else f"  slowest autocorrelation {time_now:.0f} steps"
-    return (
-        f"{progress.elapsed:6.1f} s  step {progress.step} of at most {progress.max_steps}  "
-        f"acceptance {progress.acceptance:.2f}  log p {progress.log_probability:.1f}{slowest}"
-    )

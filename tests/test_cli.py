@@ -20,7 +20,7 @@ from clips_made import BVH
 from experiments import CLIP, ROOT, write
 from test_record import ADULT, packed
 
-from fitting import cli, commands, experiment, solve, store
+from fitting import cli, commands, experiment, progress, solve, store
 from fitting.chain import journal_path
 from fitting.clips import load_clip
 from jaxik import record
@@ -193,7 +193,7 @@ def test_an_interrupted_fit_is_written_with_its_best_point(
         signal.raise_signal(signal.SIGINT)
         return ""
 
-    monkeypatch.setattr(commands, "_fit_line", interrupt)
+    monkeypatch.setattr(progress, "fit_line", interrupt)
     status = cli.main(["fit", str(asked), "-o", str(tmp_path / "run")])
     assert status == cli.INTERRUPTED == 130
     told = json.loads((tmp_path / "run" / store.FIT).read_text())
@@ -210,12 +210,12 @@ def test_an_interrupt_that_another_hook_swallows_is_raised_at_the_next_report(ca
             pass
         return "going on"
 
-    progress = solve.Progress("start", 0, 0, 1.0, 1.0, 0.0)
-    with commands._Line(show) as line:
-        line(progress)
+    told = solve.Progress("start", 0, 0, 1.0, 1.0, 0.0)
+    with progress.Line(show) as line:
+        line(told)
         assert capsys.readouterr().err == "going on\n"
         with pytest.raises(KeyboardInterrupt):
-            line(progress)
+            line(told)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -226,7 +226,7 @@ def test_an_interrupted_sampling_keeps_its_chain(quickly, run, tmp_path, monkeyp
         signal.raise_signal(signal.SIGINT)
         return ""
 
-    monkeypatch.setattr(commands, "_sample_line", interrupt)
+    monkeypatch.setattr(progress, "sample_line", interrupt)
     assert cli.main(["sample", str(copy), "--max-steps", "300"]) == cli.INTERRUPTED
     assert "Interrupted, the chain is kept" in capsys.readouterr().out
     assert len(chain_of(copy)) == 100
@@ -520,3 +520,13 @@ def test_what_is_no_record_is_refused(words, said, binary, capsys, monkeypatch):
     before = tree(binary.parent)
     assert said in refused(capsys, "record", *words)
     assert tree(binary.parent) == before
+
+
+def test_parameters_of_another_system_make_no_record(tmp_path, capsys):
+    given = tmp_path / "ozz.toml"
+    given.write_text('preset = "ozz"\n')
+    words = ["record", "to-bytes", str(given), "-o", str(tmp_path / "footik.bin")]
+    assert cli.main(words) == cli.MISTAKE
+    told = capsys.readouterr().err
+    assert told.endswith("parameters of 'ozz'; only those of 'record' make one\n")
+    assert not (tmp_path / "footik.bin").exists()

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting import (
     cli,
-    commands,
     difference,
     experiment,
     frames,
+    progress,
     relevance,
     scenes,
     settings,
@@ -222,7 +222,7 @@ def test_an_interrupted_translation_is_written_with_its_best_point(
         signal.raise_signal(signal.SIGINT)
         return ""
 
-    monkeypatch.setattr(commands, "_fit_line", interrupt)
+    monkeypatch.setattr(progress, "fit_line", interrupt)
     words = ["--from", source, "--to", "record", "--free", ",".join(quick.TARGETS)]
     words += ["--clip", clip, "--terrain", GROUND, "-o", tmp_path / "run"]
     assert cli.main(["translate", *map(str, words)]) == cli.INTERRUPTED
