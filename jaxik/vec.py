@@ -84,11 +84,6 @@ def reject(v: Float[Array, "*a 3"], direction: Float[Array, "*b 3"]) -> Float[Ar
     return v - scale(direction, dot(v, direction))
 
 
-def lerp(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"], weight: Array) -> Float[Array, "*c 3"]:
-    """`a` at weight 0, `b` at weight 1, the straight line between."""
-    return a + scale(b - a, weight)
-
-
 def constant(v: tuple[float, float, float], like: Array) -> Float[Array, "3"]:
     """A fixed vector in the dtype of `like`."""
     return jnp.asarray(v, like.dtype)

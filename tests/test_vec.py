@@ -29,7 +29,6 @@ FUNCTIONS = {
     "length": (vec.length, (A,)),
     "unit": (vec.unit, (A, B)),
     "reject": (vec.reject, (A, B)),
-    "lerp": (vec.lerp, (A, B, X)),
 }
 
 
@@ -44,7 +43,6 @@ def products(a, b, weight):
         vec.cross(a, b),
         vec.reject(a, b),
         vec.length(a),
-        vec.lerp(a, b, weight),
         vec.scale(a, weight),
         vec.fence(a),
     )
@@ -71,7 +69,6 @@ def test_one_vector_broadcasts_against_many():
     one = jnp.asarray(B[0])
     assert_allclose(vec.cross(jnp.asarray(A), one), np.cross(A, B[0]), atol=1e-15)
     assert vec.dot(one, jnp.zeros((2, 5, 3))).shape == (2, 5)
-    assert vec.lerp(one, jnp.asarray(A), jnp.asarray(0.5)).shape == (4, 3)
     assert vec.scale(one, jnp.asarray(X)).shape == (4, 3)
     assert vec.unit(jnp.zeros((2, 4, 3)), jnp.asarray(A)).shape == (2, 4, 3)
 
@@ -119,15 +116,6 @@ def test_what_is_rejected_is_at_right_angles_and_the_rest_along(v, pair):
     across = vec.reject(jnp.asarray(v), direction)
     assert_allclose(vec.dot(across, direction), 0, atol=1e-14)
     assert_allclose(np.cross(v - across, direction), 0, atol=1e-14)
-
-
-@few
-@given(vectors(), vectors(), numbers(0, 1))
-def test_a_line_starts_at_one_end_and_stops_at_the_other(a, b, weight):
-    a, b = jnp.asarray(a), jnp.asarray(b)
-    assert_allclose(vec.lerp(a, b, jnp.asarray(0.0)), a, atol=0)
-    assert_allclose(vec.lerp(a, b, jnp.asarray(1.0)), b, atol=1e-15)
-    assert_allclose(vec.lerp(a, b, jnp.asarray(weight)), (1 - weight) * a + weight * b, atol=1e-14)
 
 
 @few
