@@ -137,7 +137,7 @@ MEC = {
     "root.enabled": True,  # the ground under this walk is not the floor on which it was made
     "probe.foot_length": 0.16,
     "probe.half_width": 0.035,
-    "probe.stable_height": 0.11,
+    "probe.stable_height": 0.095,
     "target.foot_height": 0.085,
     "lock.plant_weight": 0.8,
     "pelvis.max_length": 0.80,

@@ -78,14 +78,20 @@ class TwoBone(AbstractLeg):
         weight: Array,
         gate: AbstractGate,
     ) -> Bend:
-        to_hip, to_ankle, hinge = bones(rig, carried)
-        to_target = target_ms - carried.hip.pos
+        return self.solve(rig, carried, target_ms, weight, gate)
+
+    def solve(
+        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
+    ) -> Bend:
+        """The leg by itself: `pose` with its ankle at `target_ms`, m, model space."""
+        to_hip, to_ankle, hinge = bones(rig, pose)
+        to_target = target_ms - pose.hip.pos
         reach, reached = self._reach(to_hip, to_ankle, to_target, gate)
         half_cos, half_sin = hinge_turn(to_hip, to_ankle, hinge, reach)
         turn = quat.from_half(hinge, half_cos, half_sin)
         bent = quat.rotate(turn, to_ankle) - to_hip
         swing = swing_turn(bent, to_target, hinge, self.twist)
-        return bend_leg(carried, swing, turn, reached, weight)
+        return bend_leg(pose, swing, turn, reached, weight)
 
     def _reach(
         self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate

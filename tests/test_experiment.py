@@ -20,7 +20,7 @@ MISTAKES = [
     ({"top": "seed = -1"}, "seed is -1; wanted a whole number from 0"),
     ({"top": "name = 3"}, "name is 3; wanted a text"),
     ({"top": "loss = 'l2'"}, "loss is 'l2'; wanted one of .'squares', 'huber', 'cauchy'."),
-    ({"top": "preset = 'recrod'"}, r"no preset named 'recrod'; there are \['record'\]"),
+    ({"top": "preset = 'recrod'"}, r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
     ({"top": "sigmas = 3"}, "sigmas is 3; wanted a table"),
     ({"clips": ""}, "there is no .clips."),
     ({"clips": "clips = 3\n"}, r"clips is 3; wanted \[\[clips\]\]"),

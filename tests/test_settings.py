@@ -45,7 +45,7 @@ def test_one_value_a_leg_is_taken(tmp_path):
     ("text", "said"),
     [
         ("lock = [[", "not TOML"),
-        ("preset = 'recrod'", r"no preset named 'recrod'; there are \['record'\]"),
+        ("preset = 'recrod'", r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
         ("preset = 3", "no preset named 3"),
         ("[lok]\nenabled = true", "unknown key 'lok'; nearest is 'lock' of"),
         ("[lock]\nspeed = 1.0", "unknown key 'lock.speed'; nearest is 'lock.max_speed'"),

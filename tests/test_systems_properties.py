@@ -106,11 +106,14 @@ def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(preset: str):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_moving_and_turning_the_world_moves_and_turns_the_answer(preset: str):
     before, after = (two_legs(crowded(preset), member) for member in range(2))
-    assert_same_pose(after.pose, before.pose)
+    # Mec stretches legs to their end, where the knee turns as the root of the distance: so does the
+    # rounding.
+    tolerance = 1e-7 if preset == "mec" else EXACT
+    assert_same_pose(after.pose, before.pose, tolerance)
     assert_same_transform(after.body, before.body)
     for joint in ("hip", "knee", "ankle"):
         came, wanted = (getattr(r.corrections, joint) for r in (after, before))
-        assert_same_rot(came[:, :2], wanted[:, :2], EXACT)
+        assert_same_rot(came[:, :2], wanted[:, :2], tolerance)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
