@@ -25,6 +25,7 @@ EXAMPLES = """examples:
   jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
   jaxik translate --from mec --to record --clip walk.bvh --terrain steps.obj -o translated
   jaxik inspect walk.bvh
+  jaxik terrain walk.bvh -o ground.ply
   jaxik record to-toml footik.bin -o footik.toml
 
 exit status: 0 when done, 2 for a mistake in what was given (one line says which), 130 when
@@ -192,6 +193,33 @@ def parser() -> argparse.ArgumentParser:
     inspect.add_argument("--json", action="store_true", help="as JSON")
     inspect.add_argument("--asf", type=Path, help="skeleton of an .amc, where it is not beside it")
     inspect.add_argument("--scale", type=float, help="metres per unit of the file")
+
+    terrain = _add(
+        commands, "terrain", "reconstruct the ground of a captured clip from its stances",
+        """
+        jaxik terrain walk.bvh -o ground.ply
+        jaxik terrain walk.amc -o ground.obj --sole 0.045 --model smooth --margin 2
+
+        A plane, a smooth surface and level blocks on a grid are put through the stances. The table
+        tells how well each predicts a stance from all the others; the simplest that is not clearly
+        worse is written. A picture and all numbers go beside it: ground.png, ground.json.
+        """,
+    )  # fmt: skip
+    terrain.add_argument("clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc or .npz")
+    terrain.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="MESH", help=".ply, .obj or .stl"
+    )
+    terrain.add_argument(
+        "--sole", type=_finite, default=0.055, metavar="M",
+        help="height of the ball joint over the sole, m (default: 0.055, an adult's in shoes)",
+    )  # fmt: skip
+    terrain.add_argument(
+        "--model", choices=("auto", "plane", "smooth", "blocks"), default="auto",
+        help="what is written (default: chosen by the error of prediction)",
+    )  # fmt: skip
+    terrain.add_argument(
+        "--margin", type=_finite, default=1.0, metavar="M", help="of ground around the stances, m"
+    )
 
     record = _add(
         commands, "record", "the game's parameter record: show it, or turn it around",

@@ -18,6 +18,7 @@ from . import (
     experiment,
     files,
     frames,
+    ground_report,
     progress,
     record_files,
     report,
@@ -32,6 +33,7 @@ from . import (
 from . import compare as comparing
 from .base import load_base
 from .clips import inspect as inspection
+from .ground import reconstruct
 from .identify import identify
 from .solution import Solution
 from .space import Problem
@@ -143,6 +145,23 @@ def inspect(options: argparse.Namespace) -> int:
     return 0
 
 
+def terrain(options: argparse.Namespace) -> int:
+    """Reconstructs a clip's ground, and leaves a mesh with its numbers and a picture."""
+    jax.config.update("jax_enable_x64", True)
+    for name in ("sole", "margin"):
+        if getattr(options, name) < 0:
+            raise ValueError(f"--{name} is {getattr(options, name):g}; wanted 0 or more metres")
+    ground_report.check_places(options.output)
+    clip = clips.load_clip(options.clip)
+    kind = None if options.model == "auto" else options.model
+    found = reconstruct(clip, sole=options.sole, kind=kind)
+    ground_report.write(options.output, found, clip, options.sole, options.margin)
+    print(f"{ground_report.counted(found)}\n")
+    print(tables.aligned(ground_report.table(found)))
+    print(f"\n{ground_report.sentence(found)}; written to {options.output}")
+    return 0
+
+
 def convert(options: argparse.Namespace) -> int:
     """The word `record`: shows the game's record, or turns it into or out of our parameters."""
     jax.config.update("jax_enable_x64", True)
@@ -181,6 +200,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "compare": compare,
     "translate": translation,
     "inspect": inspect,
+    "terrain": terrain,
     "record": convert,
 }
 

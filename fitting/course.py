@@ -42,7 +42,7 @@ def strip(profile: Sequence[Knot]) -> Mesh:
     x = np.linspace(-HALF_WIDTH, HALF_WIDTH, COLUMNS + 1)
     z, height, tilt = np.array([Knot(*knot) for knot in profile]).T[:, :, None]
     y, x, z = np.broadcast_arrays(height + tilt * x, x, z)
-    return Mesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), _quads(*x.shape))
+    return Mesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), quads(*x.shape))
 
 
 def rubble(start: Knot, end: Knot, seed: int, size: float = 0.06) -> Mesh:
@@ -60,7 +60,7 @@ def rubble(start: Knot, end: Knot, seed: int, size: float = 0.06) -> Mesh:
     y[inner] += rng.uniform(-size, size, shape)
     z[inner] += rng.uniform(-0.3, 0.3, shape) * CELL
     x[inner, inner] += rng.uniform(-0.3, 0.3, (rows - 2, columns - 2)) * CELL
-    return Mesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), _quads(rows, columns))
+    return Mesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), quads(rows, columns))
 
 
 def stairs(start: Knot, rises: Sequence[float] = STEP_HEIGHTS, tread: float = TREAD) -> list[Knot]:
@@ -166,10 +166,10 @@ def wall() -> Mesh:
     x, up = np.meshgrid(np.arange(-1.0, 1.01, HOLD), np.arange(0.0, 3.51, HOLD))
     proud = np.where(rng.uniform(size=x.shape) < HOLDS, rng.uniform(0.02, 0.06, x.shape), 0.0)
     floor = np.stack([x, proud, up], axis=-1).reshape(-1, 3)
-    return Mesh(floor @ WALL_FROM_FLOOR.as_matrix().T, _quads(*x.shape))
+    return Mesh(floor @ WALL_FROM_FLOOR.as_matrix().T, quads(*x.shape))
 
 
-def _quads(rows: int, columns: int) -> Int64[np.ndarray, "faces 3"]:
+def quads(rows: int, columns: int) -> Int64[np.ndarray, "faces 3"]:
     """Two triangles for each cell of a grid of vertices, facing up where rows go along z."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     near, far = corner, corner + columns

@@ -10,6 +10,7 @@ from jaxtyping import ArrayLike, Float, Int
 
 from jaxik import terrain
 
+MESHES = (".ply", ".obj", ".stl")  # what `save_mesh` writes
 # Rows give our x, y, z from the file's. A file with z up is tipped forward about x, as glTF
 # exporters do: its x stays, its z is our y and its y points to our -z.
 _WORLD_FROM_FILE = {
@@ -65,15 +66,30 @@ def load_terrain(
         raise ValueError(f"{path}: {error}") from error
 
 
+def check_mesh_name(path: str | Path) -> None:
+    """ValueError for a name whose suffix says no format of `save_mesh`."""
+    if Path(path).suffix.lower() not in MESHES:
+        raise ValueError(f"{path}: wanted a name that ends in {', '.join(MESHES)}")
+
+
 def save_mesh(
     path: str | Path,
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> None:
-    """Writes triangles, m, y up, as text PLY, which `load_terrain` reads; the same bytes always.
+    """Writes triangles, m, y up, which `load_terrain` reads; the same bytes always.
 
-    Vertices are kept to a tenth of a millimetre.
+    A PLY is text; its vertices are kept to a tenth of a millimetre.
+
+    Args:
+        path: its suffix, of `MESHES`, says the format.
+        vertices: m.
+        faces: their vertices, counterclockwise seen from above.
     """
+    check_mesh_name(path)
+    if Path(path).suffix.lower() != ".ply":
+        trimesh.Trimesh(vertices, faces, process=False).export(path)
+        return
     lines = [
         "ply", "format ascii 1.0", f"element vertex {len(vertices)}",
         *(f"property float {axis}" for axis in "xyz"),
