@@ -99,25 +99,20 @@ def ground_under(
     last theirs.
     """
     balls = clip.joints_ws(3)
-    frames = np.arange(clip.frames)
     ground = np.empty(stance.shape)
     for leg, name in enumerate(clip.rig.names):
-        spells = contacts.runs(stance[:, leg])
-        if not spells:
+        if not stance[:, leg].any():
             raise ValueError(f"{clip.source}: the {name} foot never stands, so no ground is known")
-        places = np.array([np.median(balls[a : b + 1, leg], axis=0) for a, b in spells])
+        falls = contacts.footfalls(balls[:, leg], stance[:, leg])
+        places = falls.places_ws
         heights = np.asarray(height_under(places), np.float64)
         if heights.shape != (len(places),) or not np.isfinite(heights).all():
             raise ValueError(
                 f"{clip.source}: wanted {len(places)} finite ground heights under the stances of "
                 f"the {name} foot, got {heights}"
             )
-        ground[:, leg] = heights[0]
-        for (_, end), (start, _), low, high in zip(
-            spells, spells[1:], heights, heights[1:], strict=False
-        ):
-            share = np.clip((frames[end:] - end) / (start - end), 0.0, 1.0)
-            ground[end:, leg] = low + (high - low) * share**3 * (10 - 15 * share + 6 * share**2)
+        low, high, share = heights[falls.last], heights[falls.next], falls.share
+        ground[:, leg] = low + (high - low) * share**3 * (10 - 15 * share + 6 * share**2)
     return ground
 
 

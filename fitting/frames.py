@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from jaxik import quat
-from jaxik.frame import UP
+from jaxik.frame import UP, Stride
 
+from .clips import contacts
 from .clips.clip import Clip
 from .clips.recording import localise
 
@@ -21,7 +22,7 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
     """The clip as the pipeline's input, its leaves leading with frames, in JAX's default precision.
 
     Foot IK has its whole weight, the ground does not move, and the character slides where the clip
-    says so.
+    says so. Strides are told by the clip's contacts.
 
     Args:
         clip: with legs.
@@ -31,9 +32,11 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
     world = clip.world_from_model(floor, up_ws)
     pose = jax.vmap(lambda world, pose: pose.moved(world.inverse()))(world, clip.leg_pose_ws())
     legs = len(clip.rig.joints)
-    pos = np.asarray(world.pos)
-    steps = _steps(pos)
-    foot_steps = _steps(clip.joints_ws(2))
+    dtype = world.pos.dtype
+    velocity, foot, toe = (
+        _velocity(places, clip.fps)
+        for places in (np.asarray(world.pos), clip.joints_ws(2), clip.joints_ws(3))
+    )
     slide = np.zeros(clip.frames) if clip.slide is None else clip.slide
     still = jaxik.Transform(
         jnp.zeros_like(world.pos), jnp.broadcast_to(quat.identity(world.rot.dtype), world.rot.shape)
@@ -41,19 +44,33 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
     return jaxik.Frame(
         world_from_model=world,
         pose=pose,
-        weight=jnp.ones((clip.frames, legs), world.pos.dtype),
-        slide=jnp.asarray(slide, world.pos.dtype),
-        speed=jnp.asarray(steps * clip.fps, world.pos.dtype),
-        foot_speed=jnp.asarray(foot_steps * clip.fps, world.pos.dtype),
-        dt=jnp.full(clip.frames, 1.0 / clip.fps, world.pos.dtype),
+        weight=jnp.ones((clip.frames, legs), dtype),
+        slide=jnp.asarray(slide, dtype),
+        velocity_ws=jnp.asarray(velocity, dtype),
+        foot_speed=jnp.asarray(np.linalg.norm(foot, axis=-1), dtype),
+        toe_speed=jnp.asarray(np.linalg.norm(toe, axis=-1), dtype),
+        stride=_stride(clip, dtype),
+        dt=jnp.full(clip.frames, 1.0 / clip.fps, dtype),
         platform=still,
     )
 
 
-def _steps(places: np.ndarray) -> np.ndarray:
-    """How far points (frames, ..., axes) came since the frame before, m; at first as at second."""
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=-1)
-    return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(places.shape[:-1])
+def _velocity(places: np.ndarray, fps: float) -> np.ndarray:
+    """Of points (frames, ..., 3) since the frame before, m/s; at first as at second."""
+    steps = np.diff(places, axis=0) * fps
+    return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(places.shape)
+
+
+def _stride(clip: Clip, dtype: np.dtype) -> Stride:
+    """Where each foot stood last and will stand next; a foot that never stands does not know."""
+    stance, balls = clip.standing(), clip.joints_ws(3)
+    known = np.broadcast_to(stance.any(axis=0), stance.shape)
+    last_ws, next_ws, share = np.zeros(balls.shape), np.zeros(balls.shape), np.zeros(stance.shape)
+    for leg in np.flatnonzero(known[0]):
+        falls = contacts.footfalls(balls[:, leg], stance[:, leg])
+        last_ws[:, leg], next_ws[:, leg] = falls.places_ws[falls.last], falls.places_ws[falls.next]
+        share[:, leg] = falls.share
+    return Stride(*(jnp.asarray(x, dtype) for x in (stance, last_ws, next_ws, share, known)))
 
 
 def solved_clip(

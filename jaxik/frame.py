@@ -1,6 +1,7 @@
 """What goes into the pipeline, and what its stages hand on. One character, one frame."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt
 
 from . import quat, vec
@@ -11,6 +12,26 @@ FORWARD = (0.0, 0.0, 1.0)  # model space
 UP = (0.0, 1.0, 0.0)  # model space
 
 
+class Stride(eqx.Module):
+    """Where each foot of the animation stood last and where it will stand next.
+
+    Places are those of the ball; how high they lie does not count. While a foot stands, its last
+    place is where it is.
+    """
+
+    standing: Float[Array, "*b legs"]  # 0..1, the animation's own contact label
+    last_ws: Float[Array, "*b legs 3"]  # m
+    next_ws: Float[Array, "*b legs 3"]  # m
+    share: Float[Array, "*b legs"]  # 0..1, of the swing's time that has passed; 0 while it stands
+    known: Float[Array, "*b legs"]  # 1, or 0 where nobody tells and places follow from velocity
+
+    @classmethod
+    def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":
+        """Nothing told of feet that stand, as many as `like` and of its dtype."""
+        zero, nowhere = jnp.zeros_like(like), jnp.zeros((*like.shape, 3), like.dtype)
+        return cls(jnp.ones_like(like), nowhere, nowhere, zero, zero)
+
+
 class Frame(eqx.Module):
     """The animation's frame, before foot IK."""
 
@@ -18,10 +39,17 @@ class Frame(eqx.Module):
     pose: LegPose  # legs, model space
     weight: Float[Array, "*b legs"]  # 0..1, share of foot IK in each leg
     slide: Float[Array, "*b"]  # 0..1, 1 while the character slides
-    speed: Float[Array, "*b"]  # m/s, of the character; rules that idle or move read it
+    velocity_ws: Float[Array, "*b 3"]  # m/s, of the character
     foot_speed: Float[Array, "*b legs"]  # m/s, of the animated ankles in the world
+    toe_speed: Float[Array, "*b legs"]  # m/s, of the animated toes in the world
+    stride: Stride
     dt: Float[Array, "*b"]  # s, since the frame before
     platform: Transform  # world_from_platform: the ground's own motion
+
+    @property
+    def speed(self) -> Float[Array, "*b"]:
+        """Of the character, m/s."""
+        return vec.length(self.velocity_ws)
 
 
 class Rays(eqx.Module):
@@ -84,6 +112,8 @@ class Sensed(eqx.Module):
     hip_ws: Float[Array, "legs 3"]  # animated and moved by it
     ankle_ws: Float[Array, "legs 3"]  # likewise
     ankle_rot_ws: Float[Array, "legs 4"]  # animated
+    ball_ws: Float[Array, "legs 3"]  # m, animated toes, moved likewise
+    ahead_ws: Float[Array, "legs 3"]  # unit, where each animated foot points, level
     rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule wants them
     thigh: Float[Array, " legs"]  # m, in this frame
     shin: Float[Array, " legs"]  # m

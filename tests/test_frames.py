@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting import frames, gait, pace, walker
+from fitting.clips import contacts
 from jaxik import rule, terrain
 
 FPS = 60.0
@@ -104,3 +106,36 @@ def test_on_flat_ground_the_solved_clip_is_the_clip_away_from_its_limits(clip):
     np.testing.assert_allclose(solved.positions_ws, clip.positions_ws, rtol=0, atol=1e-4)
     same = np.abs(np.sum(solved.rotations_ws * clip.rotations_ws, axis=-1))
     assert same.min() > np.cos(0.5e-3)
+
+
+def test_strides_lead_from_stance_to_stance(clip):
+    made, stance = frames.frames_of(clip).stride, clip.standing()
+    np.testing.assert_array_equal(made.standing, stance)
+    np.testing.assert_array_equal(made.known, 1.0)
+    balls = clip.joints_ws(3)
+    for leg in range(2):
+        spells = contacts.runs(stance[:, leg])
+        middles = [np.median(balls[a : b + 1, leg], axis=0) for a, b in spells]
+        for (first, last), (then, _), here, there in zip(
+            spells, spells[1:], middles, middles[1:], strict=False
+        ):
+            np.testing.assert_array_equal(made.last_ws[first:then, leg], [here] * (then - first))
+            np.testing.assert_array_equal(made.next_ws[first:then, leg], [there] * (then - first))
+            np.testing.assert_array_equal(made.share[first : last + 1, leg], 0.0)
+            np.testing.assert_allclose(
+                np.diff(made.share[last:then, leg]), 1 / (then - last), rtol=1e-9
+            )
+
+
+def test_a_foot_that_never_stands_knows_no_stride(clip):
+    stance = clip.standing().copy()
+    stance[:, 1] = False
+    made = frames.frames_of(dataclasses.replace(clip, stance=stance)).stride
+    np.testing.assert_array_equal(made.known, np.broadcast_to([1.0, 0.0], stance.shape))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(made))
+
+
+def test_toes_are_as_fast_as_they_move(clip):
+    made = frames.frames_of(clip)
+    steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
+    np.testing.assert_allclose(made.toe_speed[1:], steps, rtol=1e-9)

@@ -5,8 +5,10 @@ and leaves it downwards hangs at the top of a swing or a jump. The ground may li
 no height is compared with a floor.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 SLOW = 0.25  # m/s: the ball of a standing foot is slower; a runner's too
 WINDOW = 0.025  # s, to each side of a frame, over which speed is taken
@@ -60,6 +62,39 @@ def merged(spells: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
         else:
             joined.append((first, last))
     return joined
+
+
+@dataclass(frozen=True)
+class Footfalls:
+    """Where one foot stands, and between which stances it is in each frame."""
+
+    places_ws: Float64[np.ndarray, "stances 3"]  # m, the median place of the ball
+    last: Int64[np.ndarray, " frames"]  # the stance that it is in or comes from
+    next: Int64[
+        np.ndarray, " frames"
+    ]  # the one after; before the first and after the last the same
+    share: Float64[np.ndarray, " frames"]  # 0..1, of the swing's time that has passed
+
+
+def footfalls(
+    ball_ws: Float64[np.ndarray, "frames 3"], stance: Bool[np.ndarray, " frames"]
+) -> Footfalls:
+    """The footfalls of one foot that stands at least once.
+
+    Args:
+        ball_ws: its ball, m.
+        stance: when it stands.
+    """
+    spells = runs(stance)
+    frames = np.arange(len(stance))
+    firsts, lasts = np.array(spells).T
+    last = np.maximum(np.searchsorted(firsts, frames, side="right") - 1, 0)
+    next_ = np.where(frames < firsts[0], 0, np.minimum(last + 1, len(spells) - 1))
+    leaving, arriving = lasts[last], firsts[next_]
+    swinging = (frames > leaving) & (next_ > last)
+    share = np.where(swinging, (frames - leaving) / np.maximum(arriving - leaving, 1), 0.0)
+    places = np.array([np.median(ball_ws[a : b + 1], axis=0) for a, b in spells])
+    return Footfalls(places, last, next_, share)
 
 
 def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, around: int) -> bool:
