@@ -4,6 +4,7 @@ What has no memory is computed for all frames at once (`sense`, `pose`); only a 
 go through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -15,13 +16,13 @@ from . import quat, vec
 from .contact import AbstractContact
 from .effector import AbstractEffector, Effector
 from .foot import AbstractFoot
-from .frame import Frame, Sensed, animated
+from .frame import Contact, Frame, Sensed, animated
 from .gate import HARD, AbstractGate
 from .lean import AbstractLean, Lean
 from .leg import AbstractLeg
 from .lock import AbstractLock, Held
 from .pelvis import AbstractPelvis
-from .probe import AbstractProbe
+from .probe import AbstractProbe, foot_heading
 from .root import AbstractRoot
 from .skeleton import LegPose, Rig, Transform, bone_lengths
 from .target import AbstractTarget
@@ -31,9 +32,9 @@ from .terrain import LegTerrains, Terrain
 class FootIK(eqx.Module):
     """A foot-IK system: one rule a stage, in the order in which they run."""
 
+    contact: AbstractContact
     root: AbstractRoot
     probe: AbstractProbe
-    contact: AbstractContact
     target: AbstractTarget
     lean: AbstractLean
     lock: AbstractLock
@@ -47,6 +48,7 @@ class State(eqx.Module):
     """All that the pipeline remembers between frames."""
 
     started: Bool[Array, "*b"]  # False before the first frame, on which memory jumps to its goals
+    contact: Any
     target: Any
     lean: Any
     lock: Any
@@ -95,6 +97,7 @@ def init(ik: FootIK, rig: Rig) -> State:
     dtype = rig.side.dtype
     return State(
         jnp.zeros((), bool),
+        ik.contact.init(rig, dtype),
         ik.target.init(rig, dtype),
         ik.lean.init(dtype),
         ik.lock.init(rig, dtype),
@@ -104,18 +107,21 @@ def init(ik: FootIK, rig: Rig) -> State:
 
 
 def sense(
-    ik: FootIK, rig: Rig, terrain: Terrain | LegTerrains, frame: Frame, gate: AbstractGate
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    frame: Frame,
+    contact: Contact,
+    gate: AbstractGate,
 ) -> Sensed:
-    """All that the frame shows by itself."""
+    """All that the frame shows by itself, once it is known which feet stand."""
     up = terrain.leg_up_ws
     weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
     with jax.named_scope("root"):
         root_ws = vec.scale(terrain.up_ws, ik.root.sense(terrain, frame))
         frame = moved(frame, root_ws)
     with jax.named_scope("probe"):
-        ground = ik.probe.sense(rig, terrain, frame, ik.target.foot_height, gate)
-    with jax.named_scope("contact"):
-        contact = ik.contact.sense(frame, gate)
+        ground = ik.probe.sense(rig, terrain, frame, contact, ik.target.foot_height, gate)
     with jax.named_scope("target"):
         foothold = ik.target.sense(frame, up, ground, contact, gate)
     with jax.named_scope("lean"):
@@ -136,6 +142,8 @@ def sense(
         hip_ws=frame.world_from_model.apply(frame.pose.hip.pos),
         ankle_ws=ankle.pos,
         ankle_rot_ws=ankle.rot,
+        ball_ws=frame.world_from_model.apply(frame.pose.toe.pos),
+        ahead_ws=foot_heading(rig, frame, up)[0],
         rot_ws=rot_ws,
         thigh=thigh,
         shin=shin,
@@ -147,9 +155,17 @@ def sense(
 
 
 def advance(
-    ik: FootIK, terrain: Terrain | LegTerrains, sensed: Sensed, state: State, gate: AbstractGate
+    ik: FootIK,
+    terrain: Terrain | LegTerrains,
+    sensed: Sensed,
+    state: State,
+    standing: Any,
+    gate: AbstractGate,
 ) -> Advanced:
-    """Memory: footholds, locks, lean, pelvis and effectors after this frame."""
+    """Memory: footholds, locks, lean, pelvis and effectors after this frame.
+
+    That of the contact, `standing`, has advanced already: the senses need it.
+    """
     up, started = sensed.leg_up_ws, state.started
     with jax.named_scope("target"):
         target, rise = ik.target.advance(sensed.foothold, sensed.dt, state.target, started, gate)
@@ -172,7 +188,7 @@ def advance(
         following, effector = ik.effector.advance(
             sensed, target_ws, held, pelvis, state.effector, started, gate
         )
-    after = State(jnp.ones_like(started), target, leaning, lock, pelvis, following)
+    after = State(jnp.ones_like(started), standing, target, leaning, lock, pelvis, following)
     return Advanced(foothold_ws, held, lean, effector, after)
 
 
@@ -192,6 +208,28 @@ def pose(
     corrections = Corrections(bend.hip, bend.knee, planted.ankle)
     trace = Trace(sensed, advanced)
     return Result(planted.pose, body, corrections, bend.reached, planted.reached, trace)
+
+
+def contacts_of(
+    rule: AbstractContact, frames: Frame, state: State, gate: AbstractGate
+) -> tuple[Any, Contact]:
+    """Memory after the last frame, and the contacts of all, in a scan of their own.
+
+    A rule without memory needs none.
+    """
+    with jax.named_scope("contact"):
+        seen = jax.vmap(lambda frame: rule.sense(frame, gate))(frames)
+        if not jax.tree.leaves(state.contact):
+            return state.contact, seen
+
+        def scanned(memory: tuple[Any, Array], now: tuple[Contact, Array]) -> tuple[Any, Contact]:
+            after, contact = rule.advance(*now, *memory, gate)
+            return (after, jnp.ones_like(memory[1])), contact
+
+        (after, _), contacts = jax.lax.scan(
+            scanned, (state.contact, state.started), (seen, frames.dt)
+        )
+        return after, contacts
 
 
 def moved(frame: Frame, offset_ws: Array) -> Frame:
@@ -230,8 +268,11 @@ def step(
         frame: the animation.
         gate: `Hard` decides as a game does; `Smooth` has slopes through decisions.
     """
-    sensed = sense(ik, rig, terrain, frame, gate)
-    advanced = advance(ik, terrain, sensed, state, gate)
+    with jax.named_scope("contact"):
+        seen = ik.contact.sense(frame, gate)
+        standing, contact = ik.contact.advance(seen, frame.dt, state.contact, state.started, gate)
+    sensed = sense(ik, rig, terrain, frame, contact, gate)
+    advanced = advance(ik, terrain, sensed, state, standing, gate)
     return advanced.state, pose(ik, rig, frame, sensed, advanced, gate)
 
 
@@ -249,13 +290,16 @@ def resume(
     Equal to `step` for each frame in turn. Returns the memory after the last frame, so that a clip
     may be cut anywhere.
     """
-    sensed = jax.vmap(lambda frame: sense(ik, rig, terrain, frame, gate))(frames)
+    standing, contacts = contacts_of(ik.contact, frames, state, gate)
+    sensed = jax.vmap(lambda frame, contact: sense(ik, rig, terrain, frame, contact, gate))(
+        frames, contacts
+    )
 
     def scanned(state: State, sensed: Sensed) -> tuple[State, Advanced]:
-        advanced = advance(ik, terrain, sensed, state, gate)
+        advanced = advance(ik, terrain, sensed, state, standing, gate)
         return advanced.state, advanced
 
-    after, advanced = jax.lax.scan(scanned, state, sensed)
+    after, advanced = jax.lax.scan(scanned, replace(state, contact=standing), sensed)
     result = jax.vmap(lambda frame, s, a: pose(ik, rig, frame, s, a, gate))(
         frames, sensed, advanced
     )

@@ -1,4 +1,4 @@
-"""Stage 1: the character's height over the ground at its root."""
+"""Stage 2: the character's height over the ground at its root."""
 
 from abc import abstractmethod
 
