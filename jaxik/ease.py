@@ -72,13 +72,35 @@ def spring(
     `x'' = -w² (x - goal) - 2 w x'` solved exactly, with `w = 2 ln 2 / half_life`; a half-life of
     0 or less jumps and stops.
     """
-    damped = half_life > 0
-    rate = 2.0 * LN2 / jnp.where(damped, half_life, 1.0)
+    return _sprung(value, velocity, goal, share_of_half_life(half_life, dt), dt)
+
+
+def follow(
+    value: Array, velocity: Array, goal: Array, share: Array, dt: Array, springy: Array
+) -> tuple[Array, Array]:
+    """Value and velocity after `dt` s on the way to `goal`, by an exponential or a `spring`.
+
+    The exponential closes `share` of the gap and has no velocity; the spring, where `springy`, has
+    the half-life of that exponential. A share of 1 jumps and stops.
+    """
+    sprung, speed = _sprung(value, velocity, goal, share, dt)
+    eased = approach(value, goal, share)
+    return jnp.where(springy, sprung, eased), jnp.where(springy, speed, jnp.zeros_like(speed))
+
+
+def _sprung(
+    value: Array, velocity: Array, goal: Array, share: Array, dt: Array
+) -> tuple[Array, Array]:
+    """The spring whose exponential closes `share` of a gap in `dt` s: `w dt = -2 ln(1 - share)`."""
+    damped = share < 1
+    turned = -2.0 * jnp.log1p(-jnp.where(damped, share, 0.0))
+    lasting = dt > 0
+    rate = jnp.where(lasting, turned, 0.0) / jnp.where(lasting, dt, 1.0)
     gap = value - goal
-    push = velocity + rate * gap
-    decay = jnp.exp(-rate * dt)
-    moved = goal + decay * (gap + push * dt)
-    speed = decay * (velocity - rate * push * dt)
+    pushed = velocity * dt + turned * gap
+    decay = jnp.exp(-turned)
+    moved = goal + decay * (gap + pushed)
+    speed = decay * (velocity - rate * pushed)
     return jnp.where(damped, moved, goal), jnp.where(damped, speed, 0.0)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from . import ease, quat, vec
 from .frame import Contact, Frame, Ground, Slope, heading
 from .gate import AbstractGate
-from .rule import constant, parameter
+from .rule import constant, parameter, switch
 
 
 class Lean(eqx.Module):
@@ -53,6 +53,8 @@ class LeanState(eqx.Module):
     forward: Float[Array, ""]  # rad
     side: Float[Array, ""]  # rad
     slide: Float[Array, ""]  # 0..1
+    forward_speed: Float[Array, ""]  # rad/s, of a spring
+    side_speed: Float[Array, ""]  # rad/s, likewise
 
 
 class SlopeLean(AbstractLean):
@@ -60,7 +62,8 @@ class SlopeLean(AbstractLean):
 
     The slope comes from the normals under the feet that stand. Rate +1 lays the body's up on the
     normal, a negative rate leans into the hill. The slope is smoothed before the rates are applied,
-    so that the smoothed normal exists by itself.
+    so that the smoothed normal exists by itself; with `spring` on critically damped, with the
+    half-lives of the same gains.
     """
 
     forward_rate: Array = parameter(-0.30, unit="1", low=-1.0, high=1.0)
@@ -71,11 +74,12 @@ class SlopeLean(AbstractLean):
     gain_slide: Array = parameter(0.294, unit="1/tick", low=0.01, high=0.95, scale="gain")
     slide_on_gain: Array = parameter(0.226, unit="1/tick", low=0.01, high=0.95, scale="gain")
     slide_off_gain: Array = parameter(0.135, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    spring: Array = switch(False)
     tick_hz: Array = constant(30.0)
 
     def init(self, dtype: Any) -> LeanState:
         zero = jnp.zeros((), dtype)
-        return LeanState(zero, zero, zero)
+        return LeanState(zero, zero, zero, zero, zero)
 
     def sense(
         self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
@@ -109,8 +113,12 @@ class SlopeLean(AbstractLean):
 
         gain = ease.approach(self.gain, self.gain_slide, sliding)
         share = jnp.where(started, ease.share_of_gain(gain, dt, self.tick_hz), 1.0)
-        forward = ease.approach(state.forward, slope.forward, share)
-        side = ease.approach(state.side, slope.side, share)
+        forward, forward_speed = ease.follow(
+            state.forward, state.forward_speed, slope.forward, share, dt, self.spring
+        )
+        side, side_speed = ease.follow(
+            state.side, state.side_speed, slope.side, share, dt, self.spring
+        )
 
         lean_forward = forward * ease.approach(self.forward_rate, self.forward_rate_slide, sliding)
         lean_side = side * ease.approach(self.side_rate, self.side_rate_slide, sliding)
@@ -121,7 +129,7 @@ class SlopeLean(AbstractLean):
             - vec.scale(slope.right_ws, jnp.tan(side))
         )
         lean = Lean(quat.from_rotvec(turn), vec.unit(normal, up_ws))
-        return LeanState(forward, side, sliding), lean
+        return LeanState(forward, side, sliding, forward_speed, side_speed), lean
 
 
 class NoLean(AbstractLean):

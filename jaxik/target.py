@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from . import ease, vec
 from .frame import Contact, Foothold, Frame, Ground, animated, foothold
 from .gate import AbstractGate
-from .rule import parameter
+from .rule import parameter, switch
 from .skeleton import Rig
 
 HEIGHT_BAND = 0.01  # m
@@ -54,6 +54,7 @@ class TargetState(eqx.Module):
     """Smoothed height of the ground under each foot."""
 
     height: Float[Array, " legs"]  # m, along up
+    velocity: Float[Array, " legs"]  # m/s, of a spring
 
 
 class SlopeTarget(AbstractTarget):
@@ -61,8 +62,9 @@ class SlopeTarget(AbstractTarget):
 
     The ankle goes to `I + u (l + h (1/(n·u) - 1))` (ozz's construction with the animated lift `l`
     added): on a slope the ankle of a sole that lies flat is `h / (n·u)` above the hit. The height
-    follows the ground with one half-life up and one down; the ankle stays between two heights in
-    model space. Where no ground was found the foothold is the animation's own.
+    follows the ground with one half-life up and one down, as an exponential or, with `spring` on,
+    critically damped; the ankle stays between two heights in model space. Where no ground was found
+    the foothold is the animation's own.
     """
 
     min_ankle_height: Array = parameter(-0.30, unit="m", low=-1.0, high=0.5)
@@ -71,9 +73,11 @@ class SlopeTarget(AbstractTarget):
     max_slope: Array = parameter(1.0471975512, unit="rad", low=0.1, high=1.5)
     rise_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
     fall_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Array = switch(False)
 
     def init(self, rig: Rig, dtype: Any) -> TargetState:
-        return TargetState(jnp.zeros(rig.side.shape, dtype))
+        each = jnp.zeros(rig.side.shape, dtype)
+        return TargetState(each, each)
 
     def sense(
         self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, gate: AbstractGate
@@ -101,11 +105,18 @@ class SlopeTarget(AbstractTarget):
             ease.share_of_half_life(self.rise_half_life, dt),
             ease.share_of_half_life(self.fall_half_life, dt),
         )
-        height = ease.approach(state.height, foothold.height, jnp.where(started, share, 1.0))
+        height, velocity = ease.follow(
+            state.height,
+            state.velocity,
+            foothold.height,
+            jnp.where(started, share, 1.0),
+            dt,
+            self.spring,
+        )
         rise = height - foothold.height
         ankle = foothold.ankle_height_ms + rise * foothold.climb
         kept = gate.clip(ankle, self.min_ankle_height, self.max_ankle_height, band=HEIGHT_BAND)
-        return TargetState(height), rise + (kept - ankle)
+        return TargetState(height, velocity), rise + (kept - ankle)
 
 
 class SoleTarget(AbstractInstantTarget):
