@@ -1,4 +1,4 @@
-"""Stage 2: rays that look for ground under each foot."""
+"""Stage 3: rays that look for ground under each foot."""
 
 from abc import abstractmethod
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import quat, rule, vec
-from .frame import FORWARD, Frame, Ground, Rays, animated, heading
+from .frame import FORWARD, Contact, Frame, Ground, Rays, animated, heading
 from .gate import AbstractGate
 from .rule import parameter, switch
 from .skeleton import Rig
@@ -27,6 +27,7 @@ class AbstractProbe(eqx.Module):
         rig: Rig,
         terrain: Terrain | LegTerrains,
         frame: Frame,
+        contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
     ) -> Ground:
@@ -47,6 +48,7 @@ class FootProbe(AbstractProbe):
         rig: Rig,
         terrain: Terrain | LegTerrains,
         frame: Frame,
+        contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
     ) -> Ground:
@@ -57,7 +59,7 @@ class FootProbe(AbstractProbe):
         ankle = cast(terrain, ankle_ws + above, reach, self.layers)
         toe = cast(terrain, toe_ws + above, reach, self.layers)
         toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
-        rays = _rays(ankle, self.ray_up, self.ray_down, self.layers)
+        rays = rays_of(ankle, self.ray_up, self.ray_down, self.layers)
         return Ground(ankle, toe, unseen(ankle), rays)
 
 
@@ -77,6 +79,7 @@ class RootProbe(AbstractProbe):
         rig: Rig,
         terrain: Terrain | LegTerrains,
         frame: Frame,
+        contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
     ) -> Ground:
@@ -84,7 +87,7 @@ class RootProbe(AbstractProbe):
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
         start = ankle_ws + vec.scale(up, self.ray_up - over_root)
         hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
-        rays = _rays(hit, self.ray_up, self.ray_down, self.layers)
+        rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
         return Ground(hit, unseen(hit), unseen(hit), rays)
 
 
@@ -116,6 +119,7 @@ class CornerProbe(AbstractProbe):
         rig: Rig,
         terrain: Terrain | LegTerrains,
         frame: Frame,
+        contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
     ) -> Ground:
@@ -140,7 +144,7 @@ class CornerProbe(AbstractProbe):
             on_level(look(over + aside), ankle.found, sole + aside, gate)
             for aside in (level_toe, level_corner)
         )
-        rays = _rays(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
+        rays = rays_of(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
         return Ground(ankle, toe, corner, rays)
 
     def _extra(self, frame: Frame, foot_ws: Array, up_ws: Array, gate: AbstractGate) -> Array:
@@ -191,6 +195,7 @@ def on_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit
     return Hit(point, hit.normal, hit.distance, seen)
 
 
-def _rays(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
+def rays_of(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
+    """Rays as many as hits, all of the same reach, m."""
     shape = like.found.shape
     return Rays(jnp.broadcast_to(above, shape), jnp.broadcast_to(below, shape), layers)
