@@ -4,6 +4,7 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -21,6 +22,7 @@ class PelvisState(eqx.Module):
     """The body's offset."""
 
     height: Float[Array, ""]  # m
+    velocity: Float[Array, ""]  # m/s, of a spring; 0 where a rule has none
     goal: Float[Array, ""]  # m, that the height follows
     offset_ws: Float[Array, "3"]  # m
     half_height: Float[Array, ""]  # m, of the character's capsule; 0 where a rule has none
@@ -29,7 +31,13 @@ class PelvisState(eqx.Module):
     def level(cls, dtype: Any) -> "PelvisState":
         """Nothing moved."""
         zero = jnp.zeros((), dtype)
-        return cls(zero, zero, jnp.zeros(3, dtype), zero)
+        return cls(zero, zero, zero, jnp.zeros(3, dtype), zero)
+
+    @classmethod
+    def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
+        """At a height along up, without memory of anything else."""
+        zero = jnp.zeros_like(height)
+        return cls(height, zero, goal, vec.scale(up_ws, height), zero)
 
 
 class AbstractPelvis(eqx.Module):
@@ -95,7 +103,7 @@ class LowestPelvis(AbstractPelvis):
         share = awake * jnp.where(started, share, 1.0)
         height = ease.approach(state.height, goal, share)
         along = jnp.where(self.vertical_only, sensed.up_ws, lean.normal_ws)
-        return PelvisState(height, goal, vec.scale(along, height), jnp.zeros_like(height))
+        return PelvisState.at(height, goal, along)
 
 
 class CapsulePelvis(AbstractPelvis):
@@ -122,8 +130,8 @@ class CapsulePelvis(AbstractPelvis):
     ) -> PelvisState:
         asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target_ws), 0.0)
         lowest = gate.least(asked, band=HEIGHT_BAND)
-        level = jnp.zeros_like(lowest)
-        sunk = gate.clip(lowest, level - jnp.inf, level, band=HEIGHT_BAND)
+        zero = jnp.zeros_like(lowest)
+        sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, sunk, 0.0)
 
         def follow(value: Array, goal: Array) -> Array:
@@ -132,7 +140,8 @@ class CapsulePelvis(AbstractPelvis):
 
         height = follow(state.height, goal)
         half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
-        return PelvisState(height, goal, vec.scale(sensed.up_ws, height), half_height)
+        level = PelvisState.at(height, goal, sensed.up_ws)
+        return eqx.tree_at(lambda state: state.half_height, level, half_height)
 
 
 class LegLengthPelvis(AbstractPelvis):
@@ -159,13 +168,10 @@ class LegLengthPelvis(AbstractPelvis):
         started: Bool[Array, ""],
         gate: AbstractGate,
     ) -> PelvisState:
-        leg = target_ws - sensed.hip_ws
-        along = vec.dot(leg, sensed.up_ws)
-        across2 = vec.dot(leg, leg) - along**2
-        lowest = along + vec.safe_sqrt(self.min_length**2 - across2)
-        highest = along + vec.safe_sqrt(self.max_length**2 - across2)
+        lowest = rise_to_length(sensed, target_ws, self.min_length)
+        highest = rise_to_length(sensed, target_ws, self.max_length)
         asks = (sensed.foothold.found > 0) & (sensed.weight > 0)
-        zero = jnp.zeros_like(along[:1])
+        zero = jnp.zeros_like(lowest[:1])
         lifted = jnp.concatenate([jnp.where(asks, lowest, -FAR), zero])
         lift = gate.largest(lifted, band=HEIGHT_BAND)
         bounds = jnp.concatenate([jnp.where(asks, highest, FAR), lift[None]])
@@ -174,7 +180,113 @@ class LegLengthPelvis(AbstractPelvis):
         share = ease.share_of_speed(self.speed, sensed.dt, goal - state.height)
         share = awake * jnp.where(started & self.damp, share, 1.0)
         height = ease.approach(state.height, goal, share)
-        return PelvisState(height, goal, vec.scale(sensed.up_ws, height), jnp.zeros_like(height))
+        return PelvisState.at(height, goal, sensed.up_ws)
+
+
+class AbstractFollowingPelvis(AbstractPelvis):
+    """Follows a goal by one half-life up and one down, as an exponential or a spring."""
+
+    rise_half_life: eqx.AbstractVar[Array]
+    fall_half_life: eqx.AbstractVar[Array]
+    spring: eqx.AbstractVar[Array]
+
+    @abstractmethod
+    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
+        """Height over the animation to go to, m; `otherwise` where no foot has a say."""
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        goal = self.goal(sensed, target_ws, state.goal, gate)
+        gap = goal - state.height
+        share = gate.choose(
+            gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
+            ease.share_of_half_life(self.rise_half_life, sensed.dt),
+            ease.share_of_half_life(self.fall_half_life, sensed.dt),
+        )
+        share = awake * jnp.where(started, share, 1.0)
+        height, velocity = ease.follow(
+            state.height, state.velocity, goal, share, sensed.dt, self.spring
+        )
+        after = PelvisState.at(height, goal, sensed.up_ws)
+        return eqx.tree_at(lambda state: state.velocity, after, velocity)
+
+
+class SupportPelvis(AbstractFollowingPelvis):
+    """Follows the feet that stand, with a share of the lowest foot.
+
+    The goal is the mean of what the standing feet ask, by their contact weights, pulled by
+    `lowest_share` towards the lowest of all. With no foot standing it stays where it was. The
+    human pelvis rides on its support: of the pelvis rules of games this one was nearest to capture
+    before reach was thought of (the blocks benchmark's table).
+    """
+
+    lowest_share: Array = parameter(0.30, unit="1", low=0.0, high=1.0)
+    rise_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Array = switch(False)
+
+    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
+        asked = asked_heights(sensed, target_ws)
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
+        total = jnp.sum(weight)
+        taking_part = sensed.weight > 0
+        lowest = gate.least(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
+        support = vec.safe_divide(jnp.sum(weight * asked), total)
+        return jnp.where(total > 0, ease.approach(support, lowest, self.lowest_share), otherwise)
+
+
+class ReachPelvis(AbstractFollowingPelvis):
+    """Goes where the feet want it, as far as the legs reach: human pelvis height on uneven ground.
+
+    The feet want a mix of the mean and the highest of what they ask. No leg is to become longer
+    than `extension` times its length: of the wanted height and those at which each leg is that long
+    a soft least is taken, `-k log Σ exp(-x / k)` with `k = softness`. The same of the animation is
+    taken away, so that on the ground for which it was made nothing moves, whatever its legs do.
+    Found on the blocks benchmark, where reach explains most of a walker's pelvis height.
+    """
+
+    highest_share: Array = parameter(0.75, unit="1", low=0.0, high=1.2)
+    extension: Array = parameter(0.958, unit="1", low=0.85, high=1.0)
+    softness: Array = parameter(0.025, unit="m", low=0.002, high=0.1, scale="log")
+    rise_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Array = switch(False)
+
+    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
+        asked = asked_heights(sensed, target_ws)
+        taking_part = sensed.weight > 0
+        mean = vec.safe_divide(jnp.sum(sensed.weight * asked), jnp.sum(sensed.weight))
+        highest = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
+        highest = jnp.where(jnp.any(taking_part), highest, mean)
+        wanted = ease.approach(mean, highest, self.highest_share)
+        longest = self.extension * (sensed.thigh + sensed.shin)
+
+        def reachable(ankle_ws: Array, wanted: Array) -> Array:
+            rises = jnp.where(taking_part, rise_to_length(sensed, ankle_ws, longest), FAR)
+            rises = jnp.concatenate([rises, wanted[None]])
+            return -self.softness * jax.nn.logsumexp(-rises / self.softness)
+
+        animated = reachable(sensed.ankle_ws, jnp.zeros_like(wanted))
+        return reachable(target_ws, wanted) - animated
+
+
+def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:
+    """How far the body would rise until each hip is `length`, m, from its ankle.
+
+    Where an ankle is further aside than that, the height at which it is nearest.
+    """
+    leg = ankle_ws - sensed.hip_ws
+    along = vec.dot(leg, sensed.up_ws)
+    across2 = vec.dot(leg, leg) - along**2
+    return along + vec.safe_sqrt(length**2 - across2)
 
 
 def asked_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
