@@ -76,6 +76,8 @@ class LockState(eqx.Module):
     factor: Float[Array, " legs"]  # 0..1, rises while locked, decays after release
     offset: Float[Array, "legs 3"]  # m, along the platform's axes
     foothold: Float[Array, "legs 3"]  # m, of the frame before, in the platform's space
+    ball: Float[Array, "legs 3"]  # m, likewise
+    ahead: Float[Array, "legs 3"]  # unit, where the foot pointed as it locked, platform's axes
 
 
 class OffsetLock(AbstractLock):
@@ -83,14 +85,20 @@ class OffsetLock(AbstractLock):
 
     The target is the foothold plus an offset. Locked, the offset loses the foothold's displacement
     since the frame before (as seen from a moving platform), so the foot stays while its lift still
-    follows the animation; released, the offset decays. Neither edge pops. A foot locks when the
-    contact says planted and it is slower than `max_speed`; it is released when the contact says
-    lifted, or early: when staying would bend or straighten the knee too far, when hip to place
-    leaves hip to animated ankle by more than `release_cone`, or when the offset grows beyond
-    `release_distance`. A released foot locks again once its factor is at most `relock_threshold`.
+    follows the animation; released, the offset decays. Neither edge pops. With `hold_ball` on it is
+    the ball's displacement along the ground that is taken out, so that the ball stays while the
+    heel rises.
+
+    A foot locks when the contact says planted and it is slower than `max_speed`; it is released
+    when the contact says lifted, or early: when staying would bend or straighten the knee too far,
+    when hip to place leaves hip to animated ankle by more than `release_cone`, when the offset
+    grows beyond `release_distance`, when the animated foot points elsewhere by `release_heading`,
+    or when it would move faster than `release_speed`. A released foot locks again once its factor
+    is at most `relock_threshold`.
     """
 
     enabled: Array = switch(True)
+    hold_ball: Array = switch(False)
     release_min_angle: Array = parameter(
         0.8726646260, unit="rad", low=0.0, high=1.8, kind="threshold"
     )
@@ -99,6 +107,10 @@ class OffsetLock(AbstractLock):
     )
     release_cone: Array = parameter(0.4363323130, unit="rad", low=0.0, high=1.5, kind="threshold")
     release_distance: Array = parameter(0.20, unit="m", low=0.0, high=0.5, kind="threshold")
+    release_heading: Array = parameter(
+        3.1415926536, unit="rad", low=0.1, high=3.1415926536, kind="threshold"
+    )
+    release_speed: Array = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
     relock_threshold: Array = parameter(0.20, unit="1", low=0.0, high=1.0, kind="threshold")
     max_speed: Array = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
     lock_half_life: Array = parameter(0.05, unit="s", low=0.002, high=0.5, scale="log")
@@ -107,7 +119,7 @@ class OffsetLock(AbstractLock):
     def init(self, rig: Rig, dtype: Any) -> LockState:
         each = jnp.zeros(rig.side.shape, dtype)
         spread = jnp.zeros((*rig.side.shape, 3), dtype)
-        return LockState(each, each, spread, spread)
+        return LockState(each, each, spread, spread, spread, spread)
 
     def advance(
         self,
@@ -119,10 +131,16 @@ class OffsetLock(AbstractLock):
         started: Bool[Array, ""],
         gate: AbstractGate,
     ) -> tuple[LockState, Held]:
-        moved = foothold_ws - sensed.platform.apply(state.foothold)
-        moved = jnp.where(started, moved, 0.0)
-        before = quat.rotate(sensed.platform.rot, state.offset)
+        up, platform = sensed.leg_up_ws, sensed.platform
+        moved = foothold_ws - platform.apply(state.foothold)
+        slid = vec.reject(sensed.ball_ws - platform.apply(state.ball), up)
+        slid += vec.scale(up, vec.dot(moved, up))
+        moved = jnp.where(started, jnp.where(self.hold_ball, slid, moved), 0.0)
+        before = quat.rotate(platform.rot, state.offset)
+        pointed = quat.rotate(platform.rot, state.ahead)
+        pointed = gate.choose(state.locked[..., None], pointed, sensed.ahead_ws)
         stays = self._may_stay(sensed, foothold_ws, hip_ws, before - moved, gate)
+        stays = stays * self._goes_along(sensed, moved, pointed, gate)
         starts = stays * self._may_start(sensed, moved, state.factor, gate)
 
         one, zero = jnp.ones_like(state.locked), jnp.zeros_like(state.locked)
@@ -136,9 +154,15 @@ class OffsetLock(AbstractLock):
         held = before - vec.scale(moved, risen)
         decayed = vec.scale(before, 1.0 - off)
         offset_ws = gate.choose(locked[..., None], held, decayed)
-        into_platform = sensed.platform.inverse()
-        offset = quat.rotate(into_platform.rot, offset_ws)
-        after = LockState(locked, factor, offset, into_platform.apply(foothold_ws))
+        into_platform = platform.inverse()
+        after = LockState(
+            locked,
+            factor,
+            quat.rotate(into_platform.rot, offset_ws),
+            into_platform.apply(foothold_ws),
+            into_platform.apply(sensed.ball_ws),
+            quat.rotate(into_platform.rot, pointed),
+        )
         return after, Held(offset_ws, sensed.rot_ws, locked)
 
     def _may_start(self, sensed: Sensed, moved: Array, factor: Array, gate: AbstractGate) -> Array:
@@ -172,6 +196,17 @@ class OffsetLock(AbstractLock):
         near = gate.below(vec.length(offset_ws), self.release_distance, band=DISTANCE_BAND)
         works = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
         return bent * short * ahead * near * works * (1.0 - sensed.contact.lifted)
+
+    def _goes_along(
+        self, sensed: Sensed, moved: Array, pointed: Array, gate: AbstractGate
+    ) -> Array:
+        """1 where the animated foot turns and moves little enough for one that keeps its place."""
+        alignment = vec.dot(pointed, sensed.ahead_ws)
+        along = gate.above(alignment, jnp.cos(self.release_heading), band=COSINE_BAND)
+        # Half a turn is as far as a foot can point elsewhere.
+        along = jnp.where(self.release_heading < jnp.pi, along, 1.0)
+        speed = vec.safe_divide(vec.length(moved), sensed.dt)
+        return along * gate.below(speed, self.release_speed, band=SPEED_BAND)
 
 
 class PlantState(eqx.Module):
