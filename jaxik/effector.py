@@ -16,6 +16,7 @@ from .rule import parameter, switch
 from .skeleton import Rig
 
 HEIGHT_BAND = 0.01  # m
+ANGLE_BAND = 0.035  # rad, 2 degrees
 
 
 class Effector(eqx.Module):
@@ -91,6 +92,66 @@ class FoundEffector(AbstractInstantEffector):
         gate: AbstractGate,
     ) -> tuple[None, Effector]:
         return None, Effector(target_ws, held.rot_ws, sensed.weight * sensed.foothold.found)
+
+
+class HeelEffector(AbstractInstantEffector):
+    """Lifts a heel where its leg would otherwise be too long, as a walker's trailing foot does.
+
+    The foot turns about its ball, toes down, until the ankle is within `extension` of the leg's
+    length of the hip, or within the animated distance where that is longer, by `max_lift` at most
+    (as the heel lift of locomotion systems after Johansen, 2009).
+    """
+
+    extension: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
+    max_lift: Array = parameter(0.60, unit="rad", low=0.0, high=1.2)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Effector]:
+        turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        arm = quat.rotate(turn, sensed.ankle_ws - sensed.ball_ws)
+        ball = target_ws - arm
+        axis = vec.cross(sensed.ahead_ws, sensed.leg_up_ws)
+        spare = vec.length(sensed.ankle_ws - sensed.hip_ws)
+        longest = self.extension * (sensed.thigh + sensed.shin)
+        longest = jnp.where(spare > longest, spare, longest)
+        hip = sensed.hip_ws + pelvis.offset_ws
+        angle = heel_angle(ball - hip, arm, axis, longest)
+        level = jnp.zeros_like(angle)
+        angle = gate.clip(angle, level, level + self.max_lift, band=ANGLE_BAND)
+        lift = quat.from_axis_angle(axis, -angle)
+        rot_ws = quat.multiply(lift, held.rot_ws)
+        return None, Effector(ball + quat.rotate(lift, arm), rot_ws, sensed.weight)
+
+
+def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[Array, " legs"]:
+    """Turn of `arm`, rad, toes down about `axis`, after which `to_ball + arm` is `length` long.
+
+    Below 0 where it is shorter as it is; where it never gets so short, the turn that comes nearest;
+    0 where it would only get longer. The squared length is `c + P cos + Q sin` of the turn.
+    """
+    along = vec.scale(axis, vec.dot(arm, axis))
+    across = arm - along
+    start = to_ball + along
+    constant = vec.dot(start, start) + vec.dot(across, across)
+    cos_part = 2.0 * vec.dot(start, across)
+    sin_part = 2.0 * vec.dot(start, vec.cross(across, axis))
+    size = vec.safe_sqrt(cos_part**2 + sin_part**2)
+    helps = sin_part < 0
+    cosine = vec.safe_divide(length**2 - constant, size)
+    inside = (cosine > -1) & (cosine < 1)
+    edge = jnp.where(cosine < 0, jnp.pi, 0.0)
+    safe = jnp.where(inside, cosine, 0.0)
+    turned = jnp.where(inside, jnp.arctan2(vec.safe_sqrt(1.0 - safe**2), safe), edge)
+    phase = vec.safe_arctan2(jnp.where(helps, sin_part, -1.0), cos_part)
+    return jnp.where(helps, turned + phase, 0.0)
 
 
 class BodyState(eqx.Module):

@@ -57,6 +57,7 @@ class TwoBone(AbstractLeg):
     axis, and the triangle is closed across it. Half-angle algebra throughout (systems.md, 0, after
     ozz's two-bone job). Knee limits and softening act on the distance from hip to ankle, never on
     the angle: from `soften` times the longest reach the leg approaches that reach exponentially.
+    With `as_animated` on, a leg that the animation holds straighter or more bent may stay so.
 
     Beyond reach the leg points at the target; with the target on the hip it keeps its direction; a
     leg with a zero bone, or lying along its hinge, does not bend.
@@ -65,6 +66,7 @@ class TwoBone(AbstractLeg):
     max_knee_angle: Array = parameter(3.0000531803, unit="rad", low=2.0, high=3.1415926536)
     min_knee_angle: Array = parameter(0.6982008392, unit="rad", low=0.0, high=1.8)
     soften: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
+    as_animated: Array = switch(False)
     twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
     weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
 
@@ -100,7 +102,11 @@ class TwoBone(AbstractLeg):
         thigh, shin = vec.length(to_hip), vec.length(to_ankle)
         longest = opposite_side(thigh, shin, jnp.cos(self.max_knee_angle))
         shortest = opposite_side(thigh, shin, jnp.cos(self.min_knee_angle))
+        animated = vec.length(to_ankle - to_hip)
         free = self.soften * longest
+        longest = jnp.where(self.as_animated & (animated > longest), animated, longest)
+        free = jnp.where(self.as_animated & (animated > free), animated, free)
+        shortest = jnp.where(self.as_animated & (animated < shortest), animated, shortest)
         distance = vec.length(to_target)
         allowed = gate.clip(
             soft_limit(distance, free, longest), shortest, longest, band=LENGTH_BAND
