@@ -1,17 +1,18 @@
-"""The systems that exist elsewhere, as choices of rules."""
+"""Whole systems as choices of rules: those that exist elsewhere, and one for human strides."""
 
 import math
 
-from .contact import HeightContact, IdleContact, StandingContact
-from .effector import BodyEffector, DirectEffector, FadeEffector, FoundEffector
+from .contact import HeightContact, IdleContact, LabelContact, StandingContact
+from .effector import BodyEffector, DirectEffector, FadeEffector, FoundEffector, HeelEffector
 from .foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
 from .lean import NoLean, SlopeLean
 from .leg import HintLeg, PoleLeg, TwoBone
 from .lock import NoLock, OffsetLock, PlantLock
-from .pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis
+from .pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
 from .pipeline import FootIK
 from .probe import CornerProbe, FootProbe, RootProbe
 from .root import GroundRoot, KeepRoot
+from .stride import StrideProbe
 from .target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
 
 
@@ -98,4 +99,27 @@ def mec() -> FootIK:
         effector=FadeEffector(),
         leg=HintLeg(),
         foot=FlatFoot(),
+    )
+
+
+def stride() -> FootIK:
+    """Foot IK that knows its next foothold: people on uneven ground.
+
+    Each foot goes from the ground of its last stance to that of its next, the pelvis where the feet
+    want it as far as the legs reach, a trailing heel rises before its leg is too long, and a
+    standing foot keeps its ball in place if `lock.enabled` asks for it. Give `Frame.stride` where
+    the animation knows its footholds; else they follow from the character's velocity. On the flat
+    floor for which an animation was made nothing changes.
+    """
+    return FootIK(
+        root=KeepRoot(),
+        probe=StrideProbe(),
+        contact=LabelContact(),
+        target=SlopeTarget(max_ankle_height=0.8),
+        lean=NoLean(),
+        lock=OffsetLock(enabled=False, hold_ball=True),
+        pelvis=ReachPelvis(),
+        effector=HeelEffector(),
+        leg=TwoBone(as_animated=True),
+        foot=PitchRollFoot(),
     )
