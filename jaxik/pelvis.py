@@ -204,19 +204,22 @@ class AbstractFollowingPelvis(AbstractPelvis):
         started: Bool[Array, ""],
         gate: AbstractGate,
     ) -> PelvisState:
-        goal = self.goal(sensed, target_ws, state.goal, gate)
+        asked = asked_heights(sensed, target_ws)
+        otherwise = jnp.where(started, state.goal, mean_height(sensed, asked))
+        goal = self.goal(sensed, target_ws, otherwise, gate)
         gap = goal - state.height
         share = gate.choose(
             gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
             ease.share_of_half_life(self.rise_half_life, sensed.dt),
             ease.share_of_half_life(self.fall_half_life, sensed.dt),
         )
-        share = awake * jnp.where(started, share, 1.0)
+        share = jnp.where(started, share, 1.0)
         height, velocity = ease.follow(
             state.height, state.velocity, goal, share, sensed.dt, self.spring
         )
+        height = ease.approach(state.height, height, awake)
         after = PelvisState.at(height, goal, sensed.up_ws)
-        return eqx.tree_at(lambda state: state.velocity, after, velocity)
+        return eqx.tree_at(lambda state: state.velocity, after, awake * velocity)
 
 
 class SupportPelvis(AbstractFollowingPelvis):
@@ -263,7 +266,7 @@ class ReachPelvis(AbstractFollowingPelvis):
     def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
         asked = asked_heights(sensed, target_ws)
         taking_part = sensed.weight > 0
-        mean = vec.safe_divide(jnp.sum(sensed.weight * asked), jnp.sum(sensed.weight))
+        mean = mean_height(sensed, asked)
         highest = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
         highest = jnp.where(jnp.any(taking_part), highest, mean)
         wanted = ease.approach(mean, highest, self.highest_share)
@@ -276,6 +279,11 @@ class ReachPelvis(AbstractFollowingPelvis):
 
         animated = reachable(sensed.ankle_ws, jnp.zeros_like(wanted))
         return reachable(target_ws, wanted) - animated
+
+
+def mean_height(sensed: Sensed, asked: Array) -> Float[Array, ""]:
+    """Mean of what legs ask for, m, by their share of foot IK; 0 where none takes part."""
+    return vec.safe_divide(jnp.sum(sensed.weight * asked), jnp.sum(sensed.weight))
 
 
 def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:

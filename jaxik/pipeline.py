@@ -4,7 +4,6 @@ What has no memory is computed for all frames at once (`sense`, `pose`); only a 
 go through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -213,7 +212,7 @@ def pose(
 def contacts_of(
     rule: AbstractContact, frames: Frame, state: State, gate: AbstractGate
 ) -> tuple[Any, Contact]:
-    """Memory after the last frame, and the contacts of all, in a scan of their own.
+    """Memory after each frame and the contacts, in a scan of their own.
 
     A rule without memory needs none.
     """
@@ -222,14 +221,11 @@ def contacts_of(
         if not jax.tree.leaves(state.contact):
             return state.contact, seen
 
-        def scanned(memory: tuple[Any, Array], now: tuple[Contact, Array]) -> tuple[Any, Contact]:
+        def scanned(memory: tuple[Any, Array], now: tuple[Contact, Array]) -> tuple[Any, Any]:
             after, contact = rule.advance(*now, *memory, gate)
-            return (after, jnp.ones_like(memory[1])), contact
+            return (after, jnp.ones_like(memory[1])), (after, contact)
 
-        (after, _), contacts = jax.lax.scan(
-            scanned, (state.contact, state.started), (seen, frames.dt)
-        )
-        return after, contacts
+        return jax.lax.scan(scanned, (state.contact, state.started), (seen, frames.dt))[1]
 
 
 def moved(frame: Frame, offset_ws: Array) -> Frame:
@@ -295,11 +291,12 @@ def resume(
         frames, contacts
     )
 
-    def scanned(state: State, sensed: Sensed) -> tuple[State, Advanced]:
+    def scanned(state: State, now: tuple[Sensed, Any]) -> tuple[State, Advanced]:
+        sensed, standing = now
         advanced = advance(ik, terrain, sensed, state, standing, gate)
         return advanced.state, advanced
 
-    after, advanced = jax.lax.scan(scanned, replace(state, contact=standing), sensed)
+    after, advanced = jax.lax.scan(scanned, state, (sensed, standing))
     result = jax.vmap(lambda frame, s, a: pose(ik, rig, frame, s, a, gate))(
         frames, sensed, advanced
     )

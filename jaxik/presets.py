@@ -120,6 +120,6 @@ def stride() -> FootIK:
         lock=OffsetLock(enabled=False, hold_ball=True),
         pelvis=ReachPelvis(),
         effector=HeelEffector(),
-        leg=TwoBone(as_animated=True),
+        leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
         foot=PitchRollFoot(),
     )
