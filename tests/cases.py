@@ -9,9 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from clips import animate, make_rig, padded, planes, to_frames, to_ik, to_rig
+from clips import FRAMES, animate, make_rig, padded, planes, to_frames, to_ik, to_rig
 from clips import to_terrain as to_ground
-from reference import poses
+from reference import poses, things
+from strides import walk
 
 import jaxik
 from jaxik import HARD, quat, rule, vec
@@ -56,6 +57,9 @@ def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
         "slip": vec.length(place[1:] - place[:-1]),
         "miss": vec.length(place - effector.target_ws),
     }
+    ball = jax.vmap(lambda w, a: w.apply(a))(frames.world_from_model, result.pose.toe.pos)
+    stood = result.trace.sensed.contact.planted[1:]
+    numbers["ball slip"] = stood * vec.length(ball[1:] - ball[:-1])
     if isinstance(after.lock, jaxik.lock.LockState):
         numbers |= {"locked": after.lock.locked, "offset": vec.length(after.lock.offset)}
     means = {name: jnp.mean(number) for name, number in numbers.items()}
@@ -134,6 +138,45 @@ CLIPS: dict[str, dict[str, Any]] = {
     "sinks": {"place": drifting(0.02), "hip_height": lambda time: 0.9 - 0.1 * time},
     "stops": {"place": lambda time: [0.0, 0.0, 0.6 * min(time, 1.0)]},
 }
+
+
+def speeding_up(time: float) -> list[float]:
+    return [0.0, 0.0, 0.1 * time**2]
+
+
+def rising(time: float) -> np.ndarray:
+    return poses.standing((0.08 + 0.03 * time, 0.08 + 0.03 * time))
+
+
+def swinging(share: float, told: bool = True) -> list[things.Frame]:
+    """Feet half way from the last place to the next, in plan, when `share` of the time is over.
+
+    Untold, they are where they are by the speed of the character.
+    """
+    frame = animate(RIG, poses.standing((0.15, 0.15)), count=1)[0]
+    half_way = 0.4 * np.asarray(FORWARD)
+    stride = things.Stride(
+        standing=np.zeros(2),
+        last_ws=frame.toe.pos - half_way,
+        next_ws=frame.toe.pos + half_way,
+        share=np.full(2, share),
+        known=np.full(2, float(told)),
+    )
+    velocity = 0.8 * np.asarray(FORWARD)
+    return padded([dataclasses.replace(frame, stride=stride, velocity_ws=velocity)])
+
+
+CLIPS |= {
+    "speeds up": {"place": speeding_up},
+    "lifts its feet slowly": {"ankles": rising},
+    "turns": {"heading": lambda time: 0.2 * time},
+}
+STRIDES: dict[str, Callable[[], list[things.Frame]]] = {
+    "walks": lambda: walk(RIG, FRAMES),
+    "lifts off": lambda: swinging(0.25),
+    "comes down": lambda: swinging(0.75),
+    "swings untold": lambda: swinging(0.5, told=False),
+}
 ANKLE_DEEP = planes((0.2, 0.0, 0.3))
 RAMP_UP, RAMP_DOWN = planes((0, 0, 0), (0.2, 0, -0.1)), planes((0, 0, 0), (-0.2, 0, 0.2))
 DESCENT = planes((-0.1, 0, 0))
@@ -142,7 +185,7 @@ KINK = planes((0, 0, 0), (0.5, 0, -0.125))  # begins to rise 0.2 m ahead of the 
 
 @functools.cache
 def clip(name: str) -> jaxik.Frame:
-    return to_frames(animate(RIG, **CLIPS[name]))
+    return to_frames(STRIDES[name]() if name in STRIDES else animate(RIG, **CLIPS[name]))
 
 
 def posed(hip: Any, knee: Any, ankle: Any, count: int = 1) -> jaxik.Frame:

@@ -5,19 +5,19 @@ equal shapes share one compiled program.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from reference import maths, poses
+from reference import maths, poses, things
 from reference import record as reference
 from reference.terrain import LegTerrains
 from reference.terrain import Terrain as PlainTerrain
 
 import jaxik
-from jaxik import rule, terrain
+from jaxik import contact, pelvis, rule, terrain
 
 FRAMES = 240
 HZ = 60.0
@@ -34,6 +34,7 @@ ODD: dict[str, Any] = {  # every parameter away from its default
     "target.max_slope": 0.3,
     "target.rise_half_life": 0.03,
     "target.fall_half_life": 0.06,
+    "target.spring": True,
     "lean.forward_rate": 0.5,
     "lean.side_rate": -0.4,
     "lean.forward_rate_slide": -0.6,
@@ -42,12 +43,16 @@ ODD: dict[str, Any] = {  # every parameter away from its default
     "lean.gain_slide": 0.5,
     "lean.slide_on_gain": 0.3,
     "lean.slide_off_gain": 0.2,
+    "lean.spring": True,
     "lock.release_min_angle": 1.2,
     "lock.release_max_angle": 2.9,
     "lock.release_cone": 0.2,
     "lock.release_distance": 0.12,
     "lock.relock_threshold": 0.4,
     "lock.max_speed": 0.9,
+    "lock.hold_ball": True,
+    "lock.release_heading": 0.15,
+    "lock.release_speed": 1.2,
     "lock.lock_half_life": 0.02,
     "lock.unlock_half_life": 0.07,
     "pelvis.limit": 0.05,
@@ -58,6 +63,7 @@ ODD: dict[str, Any] = {  # every parameter away from its default
     "leg.min_knee_angle": 1.6,
     "leg.soften": 0.94,
     "leg.twist": 0.1,
+    "leg.as_animated": True,
     "leg.weight": 0.9,
     "foot.max_pitch": 0.1,
     "foot.min_pitch": -0.15,
@@ -90,6 +96,9 @@ def to_rig(rig: reference.Rig) -> jaxik.Rig:
 def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
     """The frames stacked on a leading axis."""
 
+    def stacked(rows: Iterable[np.ndarray]) -> jax.Array:
+        return jnp.asarray(np.stack(list(rows)))
+
     def transform(name: str) -> jaxik.Transform:
         each = [getattr(frame, name) for frame in frames]
         return to_transform(
@@ -99,17 +108,34 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
     return jaxik.Frame(
         world_from_model=transform("world_from_model"),
         pose=jaxik.LegPose(*map(transform, ("hip", "knee", "ankle", "toe"))),
-        weight=jnp.asarray(np.stack([frame.weight for frame in frames])),
+        weight=stacked(frame.weight for frame in frames),
         slide=jnp.asarray([float(frame.slide) for frame in frames]),
-        speed=jnp.asarray([float(frame.speed) for frame in frames]),
-        foot_speed=jnp.asarray(np.stack([frame.foot_speed for frame in frames])),
+        velocity_ws=stacked(frame.travel_ws for frame in frames),
+        foot_speed=stacked(frame.foot_speed for frame in frames),
+        toe_speed=stacked(frame.toe_speed for frame in frames),
+        stride=jaxik.frame.Stride(
+            **{
+                field.name: stacked(getattr(frame.stride, field.name) for frame in frames)
+                for field in dataclasses.fields(things.Stride)
+            }
+        ),
         dt=jnp.asarray([float(frame.dt) for frame in frames]),
         platform=transform("platform"),
     )
 
 
+def by_speed() -> jaxik.FootIK:
+    """`stride` with the rules for animations without labels, and the other pelvis."""
+    rules = {"contact": contact.SpeedContact(), "pelvis": pelvis.SupportPelvis()}
+    return dataclasses.replace(jaxik.presets.stride(), **rules)
+
+
+BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
+
+
 def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
-    return rule.replace(getattr(jaxik.presets, preset)(), values)
+    """The preset or the blend of that name with other values."""
+    return rule.replace((BLENDS.get(preset) or getattr(jaxik.presets, preset))(), values)
 
 
 def to_terrain(ground: PlainTerrain) -> terrain.Terrain:
@@ -245,7 +271,7 @@ def wandering(
     stand: tuple[float, ...] = (),
 ) -> list:
     """A clip that meets everything: steps, drifting feet, slides, half-weighted legs, odd frame
-    times, a turning root, swinging hips, tilted feet.
+    times, a turning root, swinging hips, tilted feet. Its stride is told in the first half.
 
     Between the shares `stand` of the clip (from, to, and again from, to) the root stands where it
     is, at a speed of exactly 0, and the feet, held in their step, only sway and bob a little.
@@ -265,10 +291,11 @@ def wandering(
             heading += 0.25 * dt * np.sin(phase)
             place = place + dt * 0.6 * np.array([np.sin(heading), 0.0, np.cos(heading)])
         turned = maths.turn(maths.Y, heading)
-        ankles = []
+        ankles, swung = [], []
         for leg in range(legs):
             cycle = (phase + leg / legs) % 1.0
-            swing = np.sin(np.pi * np.clip((cycle - 0.55) / 0.4, 0.0, 1.0))
+            swung.append(np.clip((cycle - 0.55) / 0.4, 0.0, 1.0) % 1.0)
+            swing = np.sin(np.pi * swung[-1])
             x = 0.1 * rig.side[leg] + 0.01 * np.sin(3.1 * phase)
             ankle = [x, 0.08 + 0.12 * swing, 0.18 * np.cos(2 * np.pi * cycle)]
             ankles.append(ankle + sway * (-1.0) ** leg)
@@ -291,8 +318,23 @@ def wandering(
         axis = rng.normal(size=3)
         tilt = maths.turn(axis / np.linalg.norm(axis), rng.uniform(0.0, 0.2))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
-        frames.append(dataclasses.replace(frame, ankle=frame.ankle._replace(rot=rot)))
+        stride = _strides(frame, np.array(swung), known=share < 0.5)
+        ankle = frame.ankle._replace(rot=rot)
+        frames.append(dataclasses.replace(frame, ankle=ankle, stride=stride))
     return poses.with_speeds(frames)
+
+
+def _strides(frame: reference.Frame, share: np.ndarray, known: bool) -> things.Stride:
+    """Strides of half a metre forward, of which each foot has come the share (legs)."""
+    balls = np.array([maths.apply(frame.world_from_model, pos) for pos in frame.toe.pos])
+    forward = 0.5 * maths.rotate(frame.world_from_model.rot, maths.Z)
+    return things.Stride(
+        standing=(share == 0.0).astype(float),
+        last_ws=balls - share[:, None] * forward,
+        next_ws=balls + (1.0 - share[:, None]) * forward,
+        share=share,
+        known=np.full(len(share), float(known)),
+    )
 
 
 def at(tree: Any, index: Any) -> Any:

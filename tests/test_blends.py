@@ -9,7 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import QUICK, RIG
-from clips import BROKEN, FLAT, animate, assert_close, at, to_frames, to_rig, to_terrain, wandering
+from clips import (
+    BROKEN,
+    FLAT,
+    animate,
+    assert_close,
+    at,
+    by_speed,
+    to_frames,
+    to_rig,
+    to_terrain,
+    wandering,
+)
 from reference import poses
 
 import jaxik
@@ -17,7 +28,7 @@ from jaxik import contact, effector, presets, rule, target
 from jaxik.skeleton import bone_lengths
 
 COUNT = 60  # frames
-DRAWN = 4
+DRAWN = 5
 JOINTS = ("hip", "knee", "ankle", "toe")
 WEIGHTS = jnp.array([1.0, 0.7])
 TWISTS = jnp.array([0.0, 0.2])
@@ -60,6 +71,9 @@ BLENDS = {
     "record with ozz's root": blend(RECORD, OZZ, "root"),
     "ozz with mec's fade and unreal's idling": dataclasses.replace(
         OZZ, contact=contact.IdleContact(), effector=effector.FadeEffector()
+    ),
+    "stride by speed, with springs": rule.replace(
+        by_speed(), {"target.spring": True, "pelvis.spring": True, "contact.half_life": 0.03}
     ),
     **draw(),
 }

@@ -25,6 +25,7 @@ FUNCTIONS = {
     "share_of_half_life": (ease.share_of_half_life, (X, X)),
     "share_of_speed": (ease.share_of_speed, (X, X, X)),
     "spring": (ease.spring, (X, -X, 2 * X, X, X)),
+    "follow": (ease.follow, (X, -X, 2 * X, X, X, X > 0.3)),
     "half_life_of_gain": (ease.half_life_of_gain, (X, 30 * X)),
     "gain_of_half_life": (ease.gain_of_half_life, (X, 30 * X)),
     "half_life_of_speed": (ease.half_life_of_speed, (X, X)),
@@ -180,6 +181,35 @@ def test_the_spring_solves_its_differential_equation():
     start, velocity = jnp.full(8, 2.0), jnp.full(8, -3.0)
     moved = call(ease.spring, start, velocity, goal, 0.2, times)
     assert_allclose(moved, answer.y, atol=1e-9)
+
+
+def test_what_follows_goals_told_frame_by_frame_solves_the_equation_of_each():
+    """With one half-life up and one down, chosen as each frame begins."""
+    rng, dt = np.random.default_rng(0), 1 / 30
+    sprung = wanted = np.array([0.4, 0.0])
+    eased = 0.4
+    for goal in np.repeat(rng.normal(size=12), 4):
+        half_life = 0.15 if goal > wanted[0] else 0.06
+        rate = 2 * np.log(2) / half_life
+        wanted = solve_ivp(
+            lambda _, x, w=rate, g=goal: [x[1], -(w**2) * (x[0] - g) - 2 * w * x[1]],
+            (0, dt),
+            wanted,
+            rtol=1e-11,
+            atol=1e-12,
+        ).y[:, -1]
+        share = call(ease.share_of_half_life, half_life, dt)
+        sprung = np.array(call(ease.follow, *sprung, goal, share, dt, True))
+        assert_allclose(sprung, wanted, atol=1e-8)
+        moved, velocity = call(ease.follow, eased, 3.0, goal, share, dt, False)
+        assert_allclose(moved, goal + (eased - goal) * 2 ** (-dt / half_life), rtol=1e-12)
+        assert velocity == 0
+        eased = float(moved)
+
+
+def test_a_share_of_one_jumps_and_stops():
+    for springy in (False, True):
+        assert call(ease.follow, 3.0, 2.0, 1.0, 1.0, 1 / 60, springy) == (1.0, 0.0)
 
 
 def test_a_spring_at_rest_creeps_to_its_goal_without_passing_it_and_stays():

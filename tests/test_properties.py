@@ -181,6 +181,12 @@ def moved_frames(frames: jaxik.Frame, by: Transform) -> jaxik.Frame:
         frames,
         world_from_model=by @ frames.world_from_model,
         platform=by @ frames.platform,
+        velocity_ws=quat.rotate(by.rot, frames.velocity_ws),
+        stride=dataclasses.replace(
+            frames.stride,
+            last_ws=by.apply(frames.stride.last_ws),
+            next_ws=by.apply(frames.stride.next_ws),
+        ),
     )
 
 
@@ -372,8 +378,11 @@ def three_legged(rig: jaxik.Rig, frames: jaxik.Frame) -> tuple[jaxik.Rig, jaxik.
     wide = dataclasses.replace(wide, names=names, joints=joints, pelvis=12)
     pose = padded_leg(frames.pose, 3, axis=1)
     weight = jnp.concatenate([frames.weight, jnp.ones((FRAMES, 1))], axis=1)
-    speeds = padded_leg(frames.foot_speed, 3, axis=1)
-    return wide, dataclasses.replace(frames, pose=pose, weight=weight, foot_speed=speeds)
+    told = {
+        name: padded_leg(getattr(frames, name), 3, axis=1)
+        for name in ("foot_speed", "toe_speed", "stride")
+    }
+    return wide, dataclasses.replace(frames, pose=pose, weight=weight, **told)
 
 
 CROWD_GROUNDS = (BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)))

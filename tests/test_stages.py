@@ -186,6 +186,8 @@ EXTRA = (
     ),
     Case("lock.release_distance", "drifts", FLAT, (0.05, 0.15), "locked", 1),
     Case("lock.max_speed", "drifts", FLAT, (0.2, 0.4), "locked", 1),
+    Case("lock.release_heading", "turns", FLAT, (0.2, 0.5), "locked", 1, LOOSE),
+    Case("lock.release_speed", "speeds up", FLAT, (0.2, 0.4), "locked", 1, LOOSE),
     Case("leg.soften", "standing", planes((0, 0, -0.3)), (0.85, 0.95), "knee angle", 1, STIFF),
     Case("leg.twist", "standing", FLAT, (0.0, 0.2), "knee left", -1),
     Case("leg.weight", "standing", planes((0, 0, 0.1)), (0.3, 0.8), "miss", -1, STIFF),
@@ -200,7 +202,43 @@ EXTRA = (
         {"lean.forward_rate": 0.8},
     ),
 )
-CASES = (*RECORD, *EXTRA)
+LATE = planes((0, 0, 0), (0.5, 0, -1.2))  # begins to rise where "goes forward" ends
+RULES = (  # switches of the rules that the record does not have, which change nothing when off
+    Case(
+        "target.spring",
+        "goes forward",
+        RAMP_UP,
+        (False, True),
+        "target height",
+        -1,
+        NO_LOCK | {"target.rise_half_life": 0.2},
+    ),
+    Case(
+        "lean.spring",
+        "goes forward",
+        LATE,
+        (False, True),
+        "lean forward",
+        1,
+        {"lean.forward_rate": 0.8},
+    ),
+    Case(
+        "lock.hold_ball",  # of feet that count as standing until their heels are well up
+        "walks",
+        FLAT,
+        (False, True),
+        "ball slip",
+        -1,
+        LOOSE
+        | {
+            "lock.lock_half_life": 0.005,
+            "contact.planted_height": 0.15,
+            "contact.raised_height": 0.2,
+        },
+    ),
+    Case("leg.as_animated", "walks", FLAT, (False, True), "knee angle", 1),
+)
+CASES = (*RECORD, *EXTRA, *RULES)
 SLOPED = [case for case in CASES if has_slope(case, "record")]
 
 
@@ -216,6 +254,8 @@ def test_every_field_of_the_record_and_every_parameter_has_a_case():
     ]
     switches = {ours for _, _, ours in game.FLAGS}
     assert {case.name for case in RECORD} == {ours for _, ours, _ in game.FLOATS} | switches
+    assert not any(bool(rule.get(presets.record(), case.leaf)) for case in RULES)
+    switches |= {case.leaf for case in RULES}
     declared = set(rule.declarations(presets.record())) | {"lean.tick_hz", "pelvis.tick_hz"}
     assert {case.leaf for case in CASES} == declared | switches
 

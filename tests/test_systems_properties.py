@@ -1,4 +1,4 @@
-"""What ozz, Unreal and Mec keep: symmetries, ups of legs, padding, batches, dtypes, programs."""
+"""What the other systems keep: symmetries, ups of legs, padding, batches, dtypes, programs."""
 
 import dataclasses
 import functools
@@ -29,11 +29,13 @@ from test_properties import (
 import jaxik
 from jaxik import HARD, Smooth, rule, terrain
 
-PRESETS = ("ozz", "unreal", "mec")
+PRESETS = ("ozz", "unreal", "mec", "stride", "by speed")
 AWAKE: dict[str, dict[str, Any]] = {  # rules at work all the way along the clip
     "ozz": {"root.enabled": False},
     "unreal": {"contact.idle_speed": 2.0, "effector.latch": False},
     "mec": {"probe.by_height": False},
+    "stride": {"lock.enabled": True},
+    "by speed": {"lock.enabled": True, "contact.half_life": 0.05, "pelvis.spring": True},
 }
 BAD = slice(40, 50)  # frames
 

@@ -8,14 +8,20 @@ import math
 import numpy as np
 
 from . import maths
-from .maths import Array, across, apply, clip, cross, length, lerp, rotate, unit
+from .maths import Array, Eased, across, apply, clip, cross, length, lerp, rotate, unapply, unit
 from .terrain import Hit
-from .things import Foot, Frame, Ground, Parameters, Rig, State, world_from_foot
+from .things import Foot, Frame, Ground, Hold, Parameters, Rig, State, world_from_foot
 
 
 def forward(turned: Array, up: Array) -> Array:
     """The model's forward in the plane at right angles to up; of its up where it looks along up."""
     return unit(across(rotate(turned, maths.Z), up), unit(across(rotate(turned, maths.Y), up), up))
+
+
+def heading(rig: Rig, frame: Frame, leg: int, up: Array) -> Array:
+    """The animated foot's forward at right angles to up; the model's where it points along up."""
+    sole = rotate(world_from_foot(rig, frame, leg), maths.Z)
+    return unit(across(sole, up), forward(frame.world_from_model.rot, up))
 
 
 def sense(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int) -> Foot:
@@ -41,24 +47,31 @@ def sense(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: 
     else:
         toe_hit = Hit(False, ankle_ws, up)
 
-    if hit.found:
-        steepest = math.cos(parameters.of_leg("target.max_slope", leg))
-        cosine = max(float(hit.normal @ up), steepest)
-        sole = parameters.of_leg("target.foot_height", leg)
-        foothold = hit.point + up * (sole * (1.0 / cosine - 1.0))
-    else:
-        foothold = ankle_ws - up * lift
     return Foot(
         hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
         ankle_ws=ankle_ws,
+        ball_ws=apply(frame.world_from_model, frame.toe.pos[leg]),
+        heading_ws=heading(rig, frame, leg, up),
         lift=float(lift),
         contact=float(contact),
         planted=bool(lift <= planted_height),
         lifted=bool(lift >= raised_height),
         hit=hit,
         toe_hit=toe_hit,
-        foothold_ws=foothold,
+        foothold_ws=foothold(parameters, leg, hit, ankle_ws, float(lift), up),
     )
+
+
+def foothold(
+    parameters: Parameters, leg: int, hit: Hit, ankle_ws: Array, lift: float, up: Array
+) -> Array:
+    """Where the foot would stand: the hit, raised as a flat sole on its slope raises the ankle."""
+    if not hit.found:
+        return ankle_ws - up * lift
+    steepest = math.cos(parameters.of_leg("target.max_slope", leg))
+    cosine = max(float(hit.normal @ up), steepest)
+    sole = parameters.of_leg("target.foot_height", leg)
+    return hit.point + up * (sole * (1.0 / cosine - 1.0))
 
 
 def lean(
@@ -68,7 +81,7 @@ def lean(
     up: Array,
     state: State | None,
     frame: Frame,
-) -> tuple[float, Array, Array, Array]:
+) -> tuple[float, list[Eased], Array, Array]:
     """Slide weight, smoothed slope (2), the body's turn (4) and the smoothed normal (3), world."""
     right = cross(forward, up)
     shares = taking_part(parameters, frame)
@@ -78,42 +91,41 @@ def lean(
         normal = normal + weight * foot.hit.normal
     if sum(weights) == 0.0:
         normal = up
-    goal = np.array(
-        [
-            math.atan2(-float(normal @ forward), float(normal @ up)),
-            math.atan2(-float(normal @ right), float(normal @ up)),
-        ]
-    )
+    goals = [math.atan2(-float(normal @ way), float(normal @ up)) for way in (forward, right)]
 
     hz = parameters["lean.tick_hz"]
     if state is None:
-        slide, slope = float(frame.slide), goal
+        slide, slope = float(frame.slide), [Eased(goal, 0.0) for goal in goals]
     else:
         rising = frame.slide > state.slide_weight
         slide_gain = parameters["lean.slide_on_gain" if rising else "lean.slide_off_gain"]
         share = maths.share_of_gain(slide_gain, hz, frame.dt)
         slide = lerp(state.slide_weight, float(frame.slide), share)
         gain = lerp(parameters["lean.gain"], parameters["lean.gain_slide"], slide)
-        slope = state.slope + maths.share_of_gain(gain, hz, frame.dt) * (goal - state.slope)
+        half_life, spring = maths.half_life_of_gain(gain, hz), parameters["lean.spring"]
+        slope = [
+            maths.follow(before, goal, half_life, frame.dt, spring)
+            for before, goal in zip(state.slope, goals, strict=True)
+        ]
 
+    angles = [eased.value for eased in slope]
     lean_forward, lean_side = (
         lerp(parameters[f"lean.{name}_rate"], parameters[f"lean.{name}_rate_slide"], slide) * angle
-        for name, angle in zip(("forward", "side"), slope, strict=True)
+        for name, angle in zip(("forward", "side"), angles, strict=True)
     )
     body_turn = maths.turn_by_vector(right * lean_forward - forward * lean_side)
-    smooth_normal = unit(up - math.tan(slope[0]) * forward - math.tan(slope[1]) * right, up)
+    smooth_normal = unit(up - math.tan(angles[0]) * forward - math.tan(angles[1]) * right, up)
     return slide, slope, body_turn, smooth_normal
 
 
 def smooth_height(
-    parameters: Parameters, leg: int, foot: Foot, up: Array, before: float | None, dt: float
-) -> float:
+    parameters: Parameters, leg: int, foot: Foot, up: Array, before: Eased | None, dt: float
+) -> Eased:
     """Smoothed height of the foothold along up, m."""
     goal = float(up @ foot.foothold_ws)
-    if before is None:
-        return goal
-    name = "target.rise_half_life" if goal > before else "target.fall_half_life"
-    return lerp(before, goal, maths.share_of_half_life(parameters.of_leg(name, leg), dt))
+    rises = before is None or goal > before.value
+    half_life = parameters.of_leg(f"target.{'rise' if rises else 'fall'}_half_life", leg)
+    return maths.follow(before, goal, half_life, dt, parameters.of_leg("target.spring", leg))
 
 
 def clamped_target(
@@ -135,18 +147,29 @@ def lock(
     foot: Foot,
     foothold: Array,
     up: Array,
-    state: State | None,
+    before: Hold | None,
+    pelvis_offset: Array,
     frame: Frame,
-) -> tuple[bool, float, Array]:
-    """Whether the foot is locked, its lock factor, and the target's offset in world space (3)."""
-    if state is None:
-        was_locked, factor, offset = False, 0.0, np.zeros(3)
-        moved, pelvis_offset = np.zeros(3), np.zeros(3)
+) -> tuple[Hold, Array]:
+    """What the foot's lock remembers, and the target's offset in world space (3).
+
+    `pelvis_offset` is that of the frame before, world (3).
+    """
+    if before is None:
+        was_locked, factor = False, 0.0
+        offset = moved = np.zeros(3)
     else:
-        was_locked, factor = bool(state.locked[leg]), float(state.factor[leg])
-        offset = rotate(frame.platform.rot, state.offset_in_platform[leg])
-        pelvis_offset = state.pelvis_offset_ws
-        moved = foothold - apply(frame.platform, state.foothold_in_platform[leg])
+        was_locked, factor = before.locked, before.factor
+        offset = rotate(frame.platform.rot, before.offset)
+        moved = foothold - apply(frame.platform, before.foothold)
+        if parameters.of_leg("lock.hold_ball", leg):
+            rolled = foot.ball_ws - apply(frame.platform, before.ball)
+            moved = across(rolled, up) + up * float(up @ moved)
+
+    # It points where it did when it was last free.
+    pointed = foot.heading_ws
+    if before is not None and was_locked:
+        pointed = rotate(frame.platform.rot, before.heading)
 
     # Where the ankle would be if the foot stayed, seen from where the hip probably is.
     hip = foot.hip_ws + pelvis_offset
@@ -162,25 +185,44 @@ def lock(
         or knee_angle > parameters.of_leg("lock.release_max_angle", leg)
         or deviation > parameters.of_leg("lock.release_cone", leg)
         or length(offset - moved) > parameters.of_leg("lock.release_distance", leg)
+        or maths.angle_between(pointed, foot.heading_ws)
+        > parameters.of_leg("lock.release_heading", leg)
+        or not is_slow(parameters, "lock.release_speed", leg, moved, frame.dt)
         or not parameters.of_leg("lock.enabled", leg)
         or not takes_part
     )
     if was_locked:
         locked = not must_release
     else:
-        max_speed = parameters.of_leg("lock.max_speed", leg)
-        slow = math.isinf(max_speed) or length(moved) <= max_speed * frame.dt
+        slow = is_slow(parameters, "lock.max_speed", leg, moved, frame.dt)
         relockable = factor <= parameters.of_leg("lock.relock_threshold", leg)
         locked = foot.planted and relockable and slow and foot.hit.found and not must_release
 
     if locked:
         half_life = parameters.of_leg("lock.lock_half_life", leg)
         factor += maths.share_of_half_life(half_life, frame.dt) * (1.0 - factor)
-        return True, factor, offset - factor * moved
-    kept_share = 1.0 - maths.share_of_half_life(
-        parameters.of_leg("lock.unlock_half_life", leg), frame.dt
+        offset = offset - factor * moved
+    else:
+        kept_share = 1.0 - maths.share_of_half_life(
+            parameters.of_leg("lock.unlock_half_life", leg), frame.dt
+        )
+        factor, offset, pointed = factor * kept_share, offset * kept_share, foot.heading_ws
+    into_platform = maths.inverse(frame.platform.rot)
+    after = Hold(
+        locked,
+        factor,
+        rotate(into_platform, offset),
+        unapply(frame.platform, foothold),
+        unapply(frame.platform, foot.ball_ws),
+        rotate(into_platform, pointed),
     )
-    return False, factor * kept_share, offset * kept_share
+    return after, offset
+
+
+def is_slow(parameters: Parameters, name: str, leg: int, moved: Array, dt: float) -> bool:
+    """Whether a move, m, in `dt` s keeps to the speed limit of that name; an endless one does."""
+    limit = parameters.of_leg(name, leg)
+    return math.isinf(limit) or length(moved) <= limit * dt
 
 
 def taking_part(parameters: Parameters, frame: Frame) -> list[float]:

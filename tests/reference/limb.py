@@ -6,7 +6,7 @@ import numpy as np
 
 from . import maths
 from .maths import Array, Transform, across, apply, clip, cross, length, rotate, turn, unit
-from .things import Foot, Frame, Parameters, Rig, world_from_foot
+from .things import Foot, Frame, Parameters, Rig
 
 # Forward distance in m from ankle hit to toe hit below which their heights say no pitch.
 SHORT_FOOT = 0.01
@@ -36,6 +36,7 @@ def solve_leg(
     axis = rotate(knee.rot, rig.knee_axis_ls[leg])
     distance = length(target - hip.pos)
 
+    as_animated = parameters.of_leg("leg.as_animated", leg)
     nearest, soft_from, wanted = _wanted_distance(
         length(hip.pos - knee.pos),
         length(ankle.pos - knee.pos),
@@ -43,6 +44,7 @@ def solve_leg(
         parameters.of_leg("leg.min_knee_angle", leg),
         parameters.of_leg("leg.max_knee_angle", leg),
         parameters.of_leg("leg.soften", leg),
+        length(ankle.pos - hip.pos) if as_animated else None,
     )
     reached = nearest <= distance <= soft_from and weight >= 1.0
 
@@ -78,12 +80,24 @@ def turned(
 
 
 def _wanted_distance(
-    a: float, b: float, distance: float, min_angle: float, max_angle: float, soften: float
+    a: float,
+    b: float,
+    distance: float,
+    min_angle: float,
+    max_angle: float,
+    soften: float,
+    animated: float | None,
 ) -> tuple[float, float, float]:
-    """Nearest hip-ankle distance, where softening starts, and the softened distance, all m."""
+    """Nearest hip-ankle distance, where softening starts, and the softened distance, all m.
+
+    Nothing limits or softens the distance `animated`, if it is given.
+    """
     nearest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(min_angle), 0.0))
     farthest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(max_angle), 0.0))
     soft_from = soften * farthest
+    if animated is not None:
+        nearest, farthest = min(nearest, animated), max(farthest, animated)
+        soft_from = max(soft_from, animated)
     room = farthest - soft_from
     wanted = distance
     if distance > soft_from:
@@ -123,12 +137,13 @@ def foot(
     frame: Frame,
     knee: Transform,
     ankle: Transform,
+    rot_ws: Array,
     forward: Array,
     up: Array,
 ) -> Array:
-    """Model-space rotation of the ankle: the animated one, tilted onto the ground within limits."""
+    """Model-space rotation of the ankle: `rot_ws`, tilted onto the ground within limits."""
     world_from_model = frame.world_from_model.rot
-    foot_rot = world_from_foot(rig, frame, leg)
+    foot_rot = maths.multiply(rot_ws, rig.ankle_from_foot[leg])
     foot_forward = rotate(foot_rot, maths.Z)
     heading = unit(across(foot_forward, up), forward)
     right = cross(heading, up)
@@ -156,8 +171,7 @@ def foot(
         roll_axis = rotate(tilt, unit(cross(lateral, up), heading))
         tilt = maths.multiply(turn(roll_axis, roll - joint_roll), tilt)
 
-    tilt_ms = maths.conjugate(tilt, maths.inverse(world_from_model))
-    wanted = maths.multiply(tilt_ms, frame.ankle.rot[leg])
+    wanted = maths.multiply(maths.inverse(world_from_model), maths.multiply(tilt, rot_ws))
     weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
     return maths.nlerp(ankle.rot, wanted, weight)
 

@@ -29,6 +29,13 @@ class Transform(NamedTuple):
     rot: Array
 
 
+class Eased(NamedTuple):
+    """A number that follows its goal, and how fast it moves, per second; 0 but for springs."""
+
+    value: float
+    velocity: float
+
+
 def length(v: Array) -> float:
     """Euclidean length."""
     return math.sqrt(float(v @ v))
@@ -174,6 +181,38 @@ def ease_by_speed(value: float, goal: float, speed: float, dt: float) -> float:
     if speed <= 0.0 or abs(goal - value) < JUMP:
         return goal
     return value + clip(dt * speed, 0.0, 1.0) * (goal - value)
+
+
+def half_life_of_gain(gain: float, tick_hz: float) -> float:
+    """Half-life in s of a gain per tick; 0 for a gain of 1 or more, endless for one of 0."""
+    if gain >= 1.0:
+        return 0.0
+    if gain == 0.0:
+        return math.inf
+    return math.log(0.5) / math.log(1.0 - gain) / tick_hz
+
+
+def follow(before: Eased | None, goal: float, half_life: float, dt: float, spring: bool) -> Eased:
+    """The number after `dt` s: exponential, or a critically damped spring to a goal that is still.
+
+    The spring is `goal + (a + b t) e^(-w t)` with `w = 2 ln 2 / half_life`. On the goal, at rest,
+    without a number before; a half-life <= 0 s jumps.
+    """
+    if before is None or half_life <= 0.0:
+        return Eased(goal, 0.0)
+    if not spring:
+        return Eased(lerp(before.value, goal, share_of_half_life(half_life, dt)), 0.0)
+    w = 2.0 * math.log(2.0) / half_life
+    a = before.value - goal
+    b = before.velocity + w * a
+    left = math.exp(-w * dt)
+    return Eased(goal + (a + b * dt) * left, (b - w * (a + b * dt)) * left)
+
+
+def smooth01(x: float) -> float:
+    """The cubic from 0 at 0 to 1 at 1, flat at either and beyond them."""
+    x = clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 def move_towards(value: float, goal: float, step: float) -> float:

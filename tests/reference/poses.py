@@ -82,17 +82,27 @@ def with_speeds(frames: list[Frame]) -> list[Frame]:
     The first frame, which has none, is as fast as the second.
     """
     roots = [frame.world_from_model.pos for frame in frames]
-    ankles = [
-        np.array([maths.apply(frame.world_from_model, pos) for pos in frame.ankle.pos])
-        for frame in frames
-    ]
+    ankles, toes = (
+        [
+            np.array(
+                [maths.apply(frame.world_from_model, pos) for pos in getattr(frame, joint).pos]
+            )
+            for frame in frames
+        ]
+        for joint in ("ankle", "toe")
+    )
     timed = []
     for index, frame in enumerate(frames):
         now = max(index, min(1, len(frames) - 1))
         before, dt = max(now - 1, 0), frames[now].dt
-        speed = float(np.linalg.norm(roots[now] - roots[before])) / dt
-        foot_speed = np.linalg.norm(ankles[now] - ankles[before], axis=-1) / dt
-        timed.append(dataclasses.replace(frame, speed=speed, foot_speed=foot_speed))
+        velocity = (roots[now] - roots[before]) / dt
+        motion = {
+            "speed": float(np.linalg.norm(velocity)),
+            "velocity_ws": velocity,
+            "foot_speed": np.linalg.norm(ankles[now] - ankles[before], axis=-1) / dt,
+            "toe_speed": np.linalg.norm(toes[now] - toes[before], axis=-1) / dt,
+        }
+        timed.append(dataclasses.replace(frame, **motion))
     return timed
 
 

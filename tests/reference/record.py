@@ -32,17 +32,25 @@ def step(
 
     heights, footholds, targets = [], [], []
     for leg in legs:
-        before = None if state is None else state.ground_height[leg]
+        before = None if state is None else state.ground[leg]
         height = ground.smooth_height(parameters, leg, feet[leg], up, before, frame.dt)
-        foothold, target = ground.clamped_target(parameters, leg, feet[leg], up, height, frame)
+        foothold, target = ground.clamped_target(
+            parameters, leg, feet[leg], up, height.value, frame
+        )
         heights.append(height)
         footholds.append(foothold)
         targets.append(target)
 
-    locks = [
-        ground.lock(parameters, leg, feet[leg], footholds[leg], up, state, frame) for leg in legs
-    ]
-    targets = [target + offset for target, (_, _, offset) in zip(targets, locks, strict=True)]
+    holds, offsets = [], []
+    pelvis_before = np.zeros(3) if state is None else state.pelvis_offset_ws
+    for leg in legs:
+        before = None if state is None else state.holds[leg]
+        hold, offset = ground.lock(
+            parameters, leg, feet[leg], footholds[leg], up, before, pelvis_before, frame
+        )
+        holds.append(hold)
+        offsets.append(offset)
+    targets = [target + offset for target, offset in zip(targets, offsets, strict=True)]
 
     pelvis = ground.pelvis_height(parameters, feet, targets, up, state, frame)
     pelvis_offset_ws = pelvis * (up if parameters["pelvis.vertical_only"] else smooth_normal)
@@ -52,38 +60,31 @@ def step(
     for leg in legs:
         target_ms = maths.unapply(frame.world_from_model, targets[leg])
         hip, knee, ankle, reached = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
-        rot = limb.foot(parameters, rig, leg, feet[leg], frame, knee, ankle, forward, up)
+        rot_ws = maths.multiply(turned, frame.ankle.rot[leg])
+        rot = limb.foot(parameters, rig, leg, feet[leg], frame, knee, ankle, rot_ws, forward, up)
         ankle = Transform(ankle.pos, rot)
         solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle), reached))
 
     state = State(
-        ground_height=np.array(heights),
+        ground=heights,
         slope=slope,
         slide_weight=slide,
         pelvis_height=pelvis,
         pelvis_offset_ws=pelvis_offset_ws,
-        offset_ws=np.array([offset for _, _, offset in locks]),
-        offset_in_platform=np.array(
-            [maths.rotate(maths.inverse(frame.platform.rot), offset) for _, _, offset in locks]
-        ),
-        locked=np.array([locked for locked, _, _ in locks]),
-        factor=np.array([factor for _, factor, _ in locks]),
-        foothold_in_platform=np.array(
-            [maths.unapply(frame.platform, foothold) for foothold in footholds]
-        ),
+        holds=holds,
     )
     output = {
         "body_pos": body.pos,
         "body_rot": body.rot,
         "reached": np.array([reached for *_, reached in solved]),
         "contact": np.array([foot.contact for foot in feet]),
-        "locked": state.locked,
-        "factor": state.factor,
-        "offset_ws": state.offset_ws,
+        "locked": np.array([hold.locked for hold in holds]),
+        "factor": np.array([hold.factor for hold in holds]),
+        "offset_ws": np.array(offsets),
         "target_ws": np.array(targets),
-        "slope": slope,
+        "slope": np.array([eased.value for eased in slope]),
         "slide_weight": np.array(slide),
-        "ground_height": state.ground_height,
+        "ground_height": np.array([eased.value for eased in heights]),
         "pelvis_height": np.array(pelvis),
         "pelvis_offset_ws": pelvis_offset_ws,
     }

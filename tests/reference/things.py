@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from . import maths
-from .maths import Array, Transform
+from .maths import Array, Eased, Transform
 from .terrain import ALL_LAYERS, Hit, LegTerrains
 
 # The record's defaults of a 1.8 m adult; gains per tick of 30 Hz; then the group it lacks.
@@ -26,6 +26,7 @@ DEFAULTS: dict[str, Any] = {
     "target.max_slope": math.radians(60.0),
     "target.rise_half_life": 0.0,
     "target.fall_half_life": 0.0,
+    "target.spring": False,
     "lean.forward_rate": -0.30,
     "lean.side_rate": -0.10,
     "lean.forward_rate_slide": 0.80,
@@ -35,6 +36,7 @@ DEFAULTS: dict[str, Any] = {
     "lean.slide_on_gain": 0.226,
     "lean.slide_off_gain": 0.135,
     "lean.tick_hz": 30.0,
+    "lean.spring": False,
     "lock.enabled": True,
     "lock.release_min_angle": math.radians(50.0),
     "lock.release_max_angle": math.radians(172.0),
@@ -44,6 +46,9 @@ DEFAULTS: dict[str, Any] = {
     "lock.unlock_half_life": 0.10,
     "lock.release_distance": 0.20,
     "lock.max_speed": math.inf,
+    "lock.hold_ball": False,
+    "lock.release_heading": math.pi,
+    "lock.release_speed": math.inf,
     "pelvis.limit": 0.30,
     "pelvis.on_gain": 0.225,
     "pelvis.off_gain": 0.116,
@@ -53,6 +58,7 @@ DEFAULTS: dict[str, Any] = {
     "leg.min_knee_angle": math.acos(0.766),
     "leg.soften": 0.98,
     "leg.twist": 0.0,
+    "leg.as_animated": False,
     "leg.weight": 1.0,
     "foot.max_pitch": 0.52,
     "foot.min_pitch": -0.79,
@@ -114,11 +120,34 @@ class Rig:
 
 
 @dataclass
+class Stride:
+    """Where each leg is in its stride: what an animation's own labels tell.
+
+    `standing` (legs) is 0..1; `last_ws` and `next_ws` (legs 3), m, are where the ball stood and
+    will stand, while it stands where it does; `share` (legs) is the part of the swing's time that
+    has passed, 0 while standing; where `known` (legs) is 0 only `standing` is told.
+    """
+
+    standing: Array
+    last_ws: Array
+    next_ws: Array
+    share: Array
+    known: Array
+
+    @classmethod
+    def unknown(cls, legs: int) -> "Stride":
+        """Of an animation without labels."""
+        place = np.zeros((legs, 3))
+        return cls(np.ones(legs), place, place, np.zeros(legs), np.zeros(legs))
+
+
+@dataclass
 class Frame:
     """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space.
 
-    `speed` is the character's and `foot_speed` (legs) that of the animated ankles, m/s in the
-    world; both are 0 unless given.
+    `speed` is the character's, `foot_speed` (legs) that of the animated ankles and `toe_speed` that
+    of the toes, m/s in the world; all are 0 unless given. Without `velocity_ws` (3), m/s, the
+    character moves forward.
     """
 
     world_from_model: Transform
@@ -132,34 +161,62 @@ class Frame:
     platform: Transform
     speed: float = 0.0
     foot_speed: Array = field(default_factory=lambda: np.zeros(0))
+    velocity_ws: Array | None = None
+    toe_speed: Array = field(default_factory=lambda: np.zeros(0))
+    stride: Stride | None = None
 
     def __post_init__(self) -> None:
+        legs = len(self.weight)
         if len(self.foot_speed) == 0:
-            self.foot_speed = np.zeros(len(self.weight))
+            self.foot_speed = np.zeros(legs)
+        if len(self.toe_speed) == 0:
+            self.toe_speed = np.zeros(legs)
+        if self.stride is None:
+            self.stride = Stride.unknown(legs)
+
+    @property
+    def travel_ws(self) -> Array:
+        """The character's velocity, m/s."""
+        if self.velocity_ws is not None:
+            return self.velocity_ws
+        return self.speed * maths.rotate(self.world_from_model.rot, maths.Z)
+
+
+@dataclass
+class Hold:
+    """What one foot's lock remembers, along the axes of the platform or in its space."""
+
+    locked: bool
+    factor: float
+    offset: Array
+    foothold: Array
+    ball: Array
+    heading: Array
 
 
 @dataclass
 class State:
-    """What the next frame needs; rows are legs."""
+    """What the next frame needs; of the lists one each for a leg."""
 
-    ground_height: Array
-    slope: Array
+    ground: list[Eased]
+    slope: list[Eased]  # ahead and to the right
     slide_weight: float
     pelvis_height: float
     pelvis_offset_ws: Array
-    offset_ws: Array
-    offset_in_platform: Array
-    locked: Array
-    factor: Array
-    foothold_in_platform: Array
+    holds: list[Hold]
 
 
 @dataclass
 class Foot:
-    """One leg's readings of this frame: animated joints, contact, hits and foothold, world."""
+    """One leg's readings of this frame: animated joints, contact, hits and foothold, world.
+
+    `ball_ws` is the toe joint; `heading_ws` the foot's forward at right angles to up, unit.
+    """
 
     hip_ws: Array
     ankle_ws: Array
+    ball_ws: Array
+    heading_ws: Array
     lift: float
     contact: float
     planted: bool

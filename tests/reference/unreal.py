@@ -31,6 +31,7 @@ DEFAULTS: dict[str, Any] = {
     "leg.max_knee_angle": math.pi,
     "leg.soften": 1.0,
     "leg.twist": 0.0,
+    "leg.as_animated": False,
     "leg.weight": 1.0,
 }
 

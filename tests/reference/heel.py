@@ -1,0 +1,51 @@
+"""The heels of the `stride` reference: they rise where a leg would be too long.
+
+One leg, one frame, written from the rules alone.
+"""
+
+import math
+
+from . import maths
+from .maths import Array, across, clip, cross, length, rotate
+from .things import Foot, Frame, Parameters
+
+
+def leg_length(frame: Frame, leg: int) -> float:
+    """Thigh and shin together, m."""
+    hip, knee, ankle = (joint.pos[leg] for joint in (frame.hip, frame.knee, frame.ankle))
+    return length(hip - knee) + length(knee - ankle)
+
+
+def raised(
+    parameters: Parameters,
+    frame: Frame,
+    leg: int,
+    foot: Foot,
+    target: Array,
+    offset_ws: Array,
+    up: Array,
+) -> tuple[Array, Array, float]:
+    """Ankle target, ankle rotation and by how much the heel rose about the ball, rad."""
+    rot_ws = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
+    from_ball = foot.ankle_ws - foot.ball_ws
+    ball = target - from_ball
+    hip = foot.hip_ws + offset_ws
+    longest = max(
+        parameters.of_leg("effector.extension", leg) * leg_length(frame, leg),
+        length(foot.ankle_ws - foot.hip_ws),
+    )
+    axis = cross(foot.heading_ws, up)
+    square = across(from_ball, axis)
+    to_ball = ball - hip
+    fixed = to_ball + (from_ball - square)
+    middle = float(fixed @ fixed) + float(square @ square)
+    by_cosine = 2.0 * float(fixed @ square)
+    by_sine = -2.0 * float(fixed @ cross(axis, square))
+    lift = 0.0
+    if by_sine < 0.0:
+        reach = math.hypot(by_cosine, by_sine)
+        angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
+        angle += math.atan2(by_sine, by_cosine)
+        lift = clip(angle, 0.0, parameters.of_leg("effector.max_lift", leg))
+    turn = maths.turn(axis, -lift)
+    return ball + rotate(turn, from_ball), maths.multiply(turn, rot_ws), lift

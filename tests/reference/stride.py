@@ -1,0 +1,333 @@
+"""The `stride` pipeline in plain NumPy float64: feet that meet the ground where they will stand.
+
+One character, one leg, one frame at a time, written from the rules alone. Metres, radians, seconds;
+suffixes _ws world, _ms model. Every foot has its own up, which its terrain says; the body has one.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import ground, heel, limb, maths, record, things, way
+from .maths import Array, Eased, Transform, apply, length, lerp
+from .terrain import ALL_LAYERS
+from .things import Foot, Frame, Ground, Hold, Parameters, Rig
+
+# The rules that may stand in the stages which have two.
+CONTACTS: dict[str, dict[str, Any]] = {
+    "label": {"contact.ground_height": 0.0},
+    "speed": {
+        "contact.ground_height": 0.0,
+        "contact.planted_height": 0.075,
+        "contact.raised_height": 0.10,
+        "contact.planted_speed": 0.25,
+        "contact.raised_speed": 0.50,
+        "contact.half_life": 0.0,
+    },
+}
+PELVISES: dict[str, dict[str, Any]] = {
+    "reach": {
+        "pelvis.highest_share": 0.75,
+        "pelvis.extension": 0.958,
+        "pelvis.softness": 0.025,
+        "pelvis.rise_half_life": 0.0,
+        "pelvis.fall_half_life": 0.0,
+        "pelvis.spring": False,
+    },
+    "support": {
+        "pelvis.lowest_share": 0.3,
+        "pelvis.rise_half_life": 0.1,
+        "pelvis.fall_half_life": 0.1,
+        "pelvis.spring": False,
+    },
+}
+
+
+def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
+    """Every parameter of the system with these rules."""
+    kept = ("target.", "lock.", "leg.", "foot.")
+    return {
+        **{name: value for name, value in record.DEFAULTS.items() if name.startswith(kept)},
+        **CONTACTS[contact],
+        **PELVISES[pelvis],
+        "probe.ray_up": 1.0,
+        "probe.ray_down": 1.0,
+        "probe.layers": ALL_LAYERS,
+        "probe.rise_start": 0.0,
+        "probe.rise_end": 1.0,
+        "probe.steepness": 1.875,
+        "probe.max_step": 0.6,
+        "probe.max_slope": 1.05,
+        "probe.clearance": 0.0,
+        "probe.way_slope": 1.5,
+        "probe.heel_length": 0.07,
+        "probe.ball_height": 0.055,
+        "probe.stance_time": 0.65,
+        "probe.swing_time": 0.45,
+        "target.max_ankle_height": 0.8,
+        "lock.enabled": False,
+        "lock.hold_ball": True,
+        "effector.extension": 0.98,
+        "effector.max_lift": 0.6,
+        "leg.max_knee_angle": math.pi,
+        "leg.soften": 0.985,
+        "leg.as_animated": True,
+    }
+
+
+@dataclass
+class Standing:
+    """Contact of one foot: whether it stands, and how far that counts by now."""
+
+    standing: bool
+    weight: float
+
+
+@dataclass
+class State:
+    """What the next frame needs; of the lists one each for a leg."""
+
+    standing: list[Standing]
+    ground: list[Eased]
+    holds: list[Hold]
+    pelvis: Eased
+    pelvis_goal: float
+    pelvis_offset_ws: Array
+
+
+def step(
+    parameters: Parameters,
+    rig: Rig,
+    terrain: Ground,
+    state: State | None,
+    frame: Frame,
+    contact: str = "label",
+    pelvis: str = "reach",
+) -> tuple[State, dict[str, Array]]:
+    """One frame. Without a state it is the first: smoothed values start on their goals."""
+    legs = range(len(frame.weight))
+    ups = [things.under(terrain, leg).up for leg in legs]
+    offset_before = np.zeros(3) if state is None else state.pelvis_offset_ws
+    standing, feet, heights, holds, footholds, targets = [], [], [], [], [], []
+    swings = []
+    for leg, up in zip(legs, ups, strict=True):
+        before = None if state is None else state.standing[leg]
+        if contact == "speed":
+            stands = stand_by_speed(parameters, frame, leg, before)
+        else:
+            label = float(frame.stride.standing[leg])
+            stands = Standing(label > 0.5, label)
+        below = things.under(terrain, leg)
+        foot, swing = sense(parameters, rig, below, frame, leg, stands)
+
+        eased = ground.smooth_height(
+            parameters, leg, foot, up, None if state is None else state.ground[leg], frame.dt
+        )
+        foothold, target = ground.clamped_target(parameters, leg, foot, up, eased.value, frame)
+        hold = None if state is None else state.holds[leg]
+        hold, offset = ground.lock(parameters, leg, foot, foothold, up, hold, offset_before, frame)
+        standing.append(stands)
+        feet.append(foot)
+        swings.append(swing)
+        heights.append(eased)
+        holds.append(hold)
+        footholds.append(foothold)
+        targets.append(target + offset)
+
+    goal = pelvis_goal(parameters, pelvis, feet, targets, ups, terrain.up, state, frame)
+    eased = follow_goal(parameters, state, goal, frame.dt)
+    offset_ws = terrain.up * eased.value
+    body = limb.body(frame, offset_ws, maths.IDENTITY)
+
+    forward = ground.forward(frame.world_from_model.rot, terrain.up)
+    solved, reached, stretches, lifts, aims = [], [], [], [], []
+    for leg, up in zip(legs, ups, strict=True):
+        aim_ws, rot_ws, lift = heel.raised(
+            parameters, frame, leg, feet[leg], targets[leg], offset_ws, up
+        )
+        aim_ms = maths.unapply(frame.world_from_model, aim_ws)
+        hip, knee, ankle, arrived = limb.solve_leg(parameters, rig, leg, frame, body, aim_ms)
+        rot = limb.foot(parameters, rig, leg, feet[leg], frame, knee, ankle, rot_ws, forward, up)
+        ankle = Transform(ankle.pos, rot)
+        solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle)))
+        reached.append(arrived)
+        leg_of_animation = frame.ankle.pos[leg] - frame.hip.pos[leg]
+        stretches.append(length(aim_ms - hip.pos) - length(leg_of_animation))
+        lifts.append(lift)
+        aims.append(aim_ws)
+
+    output = {
+        "body_pos": body.pos,
+        "body_rot": body.rot,
+        "contact": np.array([stands.weight for stands in standing]),
+        "standing": np.array([stands.standing for stands in standing]),
+        "found": np.array([foot.hit.found for foot in feet]),
+        "share": np.array([swing.share for swing in swings]),
+        "hit_ws": np.array([foot.hit.point for foot in feet]),
+        "normal": np.array([foot.hit.normal for foot in feet]),
+        "ground_height": np.array([eased.value for eased in heights]),
+        "ground_velocity": np.array([eased.velocity for eased in heights]),
+        "foothold_ws": np.array(footholds),
+        "locked": np.array([hold.locked for hold in holds]),
+        "factor": np.array([hold.factor for hold in holds]),
+        "before_heel_ws": np.array(targets),
+        "pelvis_goal": np.array(goal),
+        "pelvis_height": np.array(eased.value),
+        "pelvis_velocity": np.array(eased.velocity),
+        "heel_lift": np.array(lifts),
+        "target_ws": np.array(aims),
+        "reached": np.array(reached),
+        "stretch": np.array(stretches),  # by which the target is farther than animated
+    }
+    after = State(standing, heights, holds, eased, goal, offset_ws)
+    return after, output | things.joints(solved)
+
+
+def run(
+    parameters: Parameters,
+    rig: Rig,
+    terrain: Ground,
+    frames: Sequence[Frame],
+    contact: str = "label",
+    pelvis: str = "reach",
+) -> dict[str, Array]:
+    """A clip from its first frame: every output of `step`, stacked over the frames."""
+    exchanged = functools.partial(step, contact=contact, pelvis=pelvis)
+    return things.run(exchanged, parameters, rig, terrain, frames)
+
+
+def stand_by_speed(
+    parameters: Parameters, frame: Frame, leg: int, before: Standing | None
+) -> Standing:
+    """A foot stands once its toe is low and slow, until it is high or fast."""
+    height = frame.toe.pos[leg][1] - parameters.of_leg("contact.ground_height", leg)
+    speed = frame.toe_speed[leg]
+    is_planted = height <= parameters.of_leg(
+        "contact.planted_height", leg
+    ) and speed <= parameters.of_leg("contact.planted_speed", leg)
+    is_lifted = height > parameters.of_leg(
+        "contact.raised_height", leg
+    ) or speed > parameters.of_leg("contact.raised_speed", leg)
+    if is_lifted:
+        stands = False
+    elif is_planted or before is None:
+        stands = is_planted
+    else:
+        stands = before.standing
+    if before is None:
+        return Standing(stands, float(stands))
+    share = maths.share_of_half_life(parameters.of_leg("contact.half_life", leg), frame.dt)
+    return Standing(stands, lerp(before.weight, float(stands), share))
+
+
+def sense(
+    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, stands: Standing
+) -> tuple[Foot, way.Swing]:
+    """One leg's readings of this frame, and where it is in its stride."""
+    ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
+    lift = float(frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg))
+    hit, swing = way.ground_of_stride(parameters, rig, terrain, frame, leg, stands.standing)
+    foot = Foot(
+        hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
+        ankle_ws=ankle_ws,
+        ball_ws=apply(frame.world_from_model, frame.toe.pos[leg]),
+        heading_ws=ground.heading(rig, frame, leg, terrain.up),
+        lift=lift,
+        contact=stands.weight,
+        planted=stands.standing,
+        lifted=not stands.standing,
+        hit=hit,
+        toe_hit=hit._replace(found=False),
+        foothold_ws=ground.foothold(parameters, leg, hit, ankle_ws, lift, terrain.up),
+    )
+    return foot, swing
+
+
+def pelvis_goal(
+    parameters: Parameters,
+    pelvis: str,
+    feet: list[Foot],
+    targets: list[Array],
+    ups: list[Array],
+    up: Array,
+    state: State | None,
+    frame: Frame,
+) -> float:
+    """Height for the body, m, by the rule of that name."""
+    shares = ground.taking_part(parameters, frame)
+    asked = [
+        float((target - foot.ankle_ws) @ leg_up)
+        for foot, target, leg_up in zip(feet, targets, ups, strict=True)
+    ]
+    if pelvis == "reach":
+        return reach_goal(parameters, feet, targets, shares, asked, up, frame)
+    return support_goal(parameters, feet, shares, asked, state)
+
+
+def support_goal(
+    parameters: Parameters,
+    feet: list[Foot],
+    shares: list[float],
+    asked: list[float],
+    state: State | None,
+) -> float:
+    """What the standing feet ask for, and a share of what the lowest foot does."""
+    asking = [gap for gap, share in zip(asked, shares, strict=True) if share > 0.0]
+    weights = [foot.seen * share for foot, share in zip(feet, shares, strict=True)]
+    if sum(weights) == 0.0:
+        if state is not None:
+            return state.pelvis_goal
+        total = sum(share * gap for share, gap in zip(shares, asked, strict=True))
+        return total / sum(shares) if asking else 0.0
+    support = sum(w * gap for w, gap in zip(weights, asked, strict=True)) / sum(weights)
+    return support + parameters["pelvis.lowest_share"] * (min(asking) - support)
+
+
+def reach_goal(
+    parameters: Parameters,
+    feet: list[Foot],
+    targets: list[Array],
+    shares: list[float],
+    asked: list[float],
+    up: Array,
+    frame: Frame,
+) -> float:
+    """Between what all feet ask for on average and what the highest does, within reach."""
+    if sum(shares) == 0.0:
+        return 0.0
+    mean = sum(w * gap for w, gap in zip(shares, asked, strict=True)) / sum(shares)
+    highest = max(gap for gap, share in zip(asked, shares, strict=True) if share > 0.0)
+    wanted, untouched = [lerp(mean, highest, parameters["pelvis.highest_share"])], [0.0]
+    for leg, share in enumerate(shares):
+        if share > 0.0:
+            hip = feet[leg].hip_ws
+            longest = parameters["pelvis.extension"] * heel.leg_length(frame, leg)
+            wanted.append(highest_hip(targets[leg] - hip, longest, up))
+            untouched.append(highest_hip(feet[leg].ankle_ws - hip, longest, up))
+    softness = parameters["pelvis.softness"]
+    return soft_least(wanted, softness) - soft_least(untouched, softness)
+
+
+def highest_hip(to_foot: Array, longest: float, up: Array) -> float:
+    """How far the hip may rise, m, until the leg to that foot is `longest` m."""
+    aside = maths.across(to_foot, up)
+    return float(to_foot @ up) + math.sqrt(max(0.0, longest**2 - float(aside @ aside)))
+
+
+def soft_least(values: list[float], softness: float) -> float:
+    """A smooth lower bound of the values, m."""
+    least = min(values)
+    return least - softness * math.log(sum(math.exp((least - x) / softness) for x in values))
+
+
+def follow_goal(parameters: Parameters, state: State | None, goal: float, dt: float) -> Eased:
+    """The body's height on its way to the goal, m."""
+    if state is None:
+        return Eased(goal, 0.0)
+    way = "rise" if goal > state.pelvis.value else "fall"
+    half_life = parameters[f"pelvis.{way}_half_life"]
+    return maths.follow(state.pelvis, goal, half_life, dt, parameters["pelvis.spring"])

@@ -1,0 +1,149 @@
+"""The probe of the `stride` reference: the ground between a foot's last place and its next.
+
+One leg, one frame at a time, written from the rules alone. Everything is in world space; heights
+are over the root, along the leg's up, m.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
+from .terrain import Hit
+from .things import Frame, Ground, Parameters, Rig, world_from_foot
+
+WAY_POINTS = 8
+FADE = 0.10  # m or rad over which what goes beyond a limit ceases to count
+EDGE_SHARE = 0.15  # share of the swing's time in which the way ceases to count at either end
+
+
+class Swing(NamedTuple):
+    """Where a leg is in its stride, the places at the root's level."""
+
+    last: Array
+    next: Array
+    share: float
+
+
+def level(frame: Frame, up: Array, point: Array) -> Array:
+    """The point at the root's level."""
+    return point - up * height(frame, up, point)
+
+
+def height(frame: Frame, up: Array, point: Array) -> float:
+    """Of the point."""
+    return float((point - frame.world_from_model.pos) @ up)
+
+
+def look(parameters: Parameters, terrain: Ground, leg: int, level_point: Array) -> Hit:
+    """The ground at that place, from `ray_up` over the root's level to `ray_down` under it."""
+    above = parameters.of_leg("probe.ray_up", leg)
+    reach = above + parameters.of_leg("probe.ray_down", leg)
+    mask = int(parameters.of_leg("probe.layers", leg))
+    return terrain.cast(level_point + terrain.up * above, reach, mask)
+
+
+def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bool) -> Swing:
+    """As the animation tells it; where it does not, from the character's velocity."""
+    stride = frame.stride
+    if stride.known[leg] > 0.5:
+        places = (level(frame, up, place[leg]) for place in (stride.last_ws, stride.next_ws))
+        return Swing(*places, float(stride.share[leg]))
+    stance_time = parameters.of_leg("probe.stance_time", leg)
+    swing_time = parameters.of_leg("probe.swing_time", leg)
+    velocity = across(frame.travel_ws, up)
+    here, hip, ankle = (
+        apply(frame.world_from_model, getattr(frame, joint).pos[leg])
+        for joint in ("toe", "hip", "ankle")
+    )
+    here = level(frame, up, here)
+    ahead = 0.0  # s by which the foot is ahead of its hip
+    if velocity @ velocity > 0.0:
+        ahead = float((ankle - hip) @ velocity / (velocity @ velocity))
+    ahead = clip(ahead, -stance_time / 2.0, stance_time / 2.0)
+    if planted:
+        return Swing(here, here + velocity * (stance_time + swing_time), 0.0)
+    share = 0.5 + ahead / stance_time
+    to_come = (stance_time / 2.0 - ahead) + (1.0 - share) * swing_time
+    gone = (stance_time / 2.0 + ahead) + share * swing_time
+    return Swing(here - velocity * gone, here + velocity * to_come, share)
+
+
+def ground_of_stride(
+    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, planted: bool
+) -> tuple[Hit, Swing]:
+    """What the leg is told of the ground under its ankle, and the swing that this comes from."""
+    up = terrain.up
+    stride = swing(parameters, frame, leg, up, planted)
+    here = level(frame, up, apply(frame.world_from_model, frame.ankle.pos[leg]))
+    last, following = (
+        look(parameters, terrain, leg, place) for place in (stride.last, stride.next)
+    )
+    if not last.found and not following.found:
+        return Hit(False, here, up), stride
+    last = last if last.found else following
+    following = following if following.found else last
+
+    low, high = height(frame, up, last.point), height(frame, up, following.point)
+    max_step = parameters.of_leg("probe.max_step", leg)
+    steepness = math.acos(clip(float(following.normal @ up), -1.0, 1.0))
+    too_high = smooth01((abs(high - low) - max_step) / FADE)
+    too_steep = smooth01((steepness - parameters.of_leg("probe.max_slope", leg)) / FADE)
+    sure = (1.0 - too_high) * (1.0 - too_steep)
+    high = lerp(low, high, sure)
+    next_normal = last.normal + sure * (following.normal - last.normal)
+
+    start = parameters.of_leg("probe.rise_start", leg)
+    end = parameters.of_leg("probe.rise_end", leg)
+    x = clip((stride.share - start) / (end - start), 0.0, 1.0)
+    k = parameters.of_leg("probe.steepness", leg)
+    risen = x**k / (x**k + (1.0 - x) ** k)
+    ground = lerp(low, high, risen)
+    normal = unit(last.normal + risen * (next_normal - last.normal), up)
+
+    need = lift_over_edges(parameters, rig, terrain, frame, leg, stride, ground, max(low, high))
+    window = smooth01(stride.share / EDGE_SHARE) * smooth01((1.0 - stride.share) / EDGE_SHARE)
+    return Hit(True, here + up * (ground + window * need), normal), stride
+
+
+def lift_over_edges(
+    parameters: Parameters,
+    rig: Rig,
+    terrain: Ground,
+    frame: Frame,
+    leg: int,
+    stride: Swing,
+    ground: float,
+    top: float,
+) -> float:
+    """How far the ground must be raised for the animated sole to clear what is on its way, m."""
+    up = terrain.up
+    axes = world_from_foot(rig, frame, leg)
+    behind = np.array(
+        [
+            0.0,
+            -parameters.of_leg("target.foot_height", leg),
+            -parameters.of_leg("probe.heel_length", leg),
+        ]
+    )
+    heel = apply(frame.world_from_model, frame.ankle.pos[leg]) + rotate(axes, behind)
+    toe = apply(frame.world_from_model, frame.toe.pos[leg])
+    ball = toe - up * parameters.of_leg("probe.ball_height", leg)
+
+    need = 0.0
+    for index in range(WAY_POINTS):
+        place = stride.last + (stride.next - stride.last) * (index + 0.5) / WAY_POINTS
+        hit = look(parameters, terrain, leg, place)
+        if not hit.found:
+            continue
+        edge = height(frame, up, hit.point)
+        beyond = edge - top - parameters.of_leg("probe.max_step", leg)
+        counts = 1.0 - smooth01(beyond / FADE)
+        for point in (heel, ball):
+            away = length(across(point - place, up))
+            over = edge - parameters.of_leg("probe.way_slope", leg) * away - ground
+            # What the animation itself does over its floor is not to be mended.
+            lift = height(frame, up, point) - parameters.of_leg("probe.clearance", leg)
+            need = max(need, counts * over - max(lift, 0.0))
+    return need
