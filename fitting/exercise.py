@@ -12,8 +12,8 @@ import jaxik
 from jaxik import rule
 
 from .identify import NUDGE
+from .problem import Problem
 from .residuals import Scene
-from .space import Problem
 
 CHANGED = 1e-7  # m, and of quaternions: a smaller difference is rounding
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import population
+from .problem import Problem
 from .solution import Solution
-from .space import Problem
 
 CONTRACTED = 0.5  # below it a parameter counts as undetermined
 CORRELATED = 0.9  # correlations of the posterior from here on are named

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .space import EDGE, Problem, Space
+from .problem import Problem
+from .space import EDGE, Space
 
 POPULATION = 64  # candidates in one vmapped call
 SWEEP = 14  # values of one parameter, spread over its range

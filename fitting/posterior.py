@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from . import diagnostics
 from .chain import Chain, Identity, Last
-from .space import Problem
+from .problem import Problem
 
 DRAWS = 100  # rounds of start walkers
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .space import Problem
+from .problem import Problem
 
 Model = Callable[[Array, Problem, Array], tuple[Array, Array]]
 

@@ -25,9 +25,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .population import POPULATION, count_rows, evaluate, sweep, vary
+from .problem import Problem
 from .slopes import Model, ensemble, hard, with_slopes
 from .solution import Progress, Solution
-from .space import Problem
 
 MARCH = 8  # steps of Levenberg–Marquardt in one call, between two reports
 ROUNDING = 1e-9  # relative: two programs do not sum a cost alike

@@ -1,4 +1,4 @@
-"""What a fit may change, as one unbounded vector, and what it is held against.
+"""What a fit may change, as one unbounded vector.
 
 `u` is the vector of the free parameters in coordinates without bounds. Per parameter
 
@@ -17,17 +17,15 @@ width and centre it is nearly flat over the range (within a factor of two betwee
 import dataclasses
 import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from jaxik import rule
-
-from .robust import Loss, robustify
 
 PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
 CENTRE_LIMIT = 3.0  # of u: a prior centred at a bound would hide the rest of the range
@@ -309,42 +307,3 @@ def _order(frees: Sequence[Free]) -> tuple[int, ...]:
             raise ValueError(f"these stay above one another: {[frees[i].name for i in waiting]}")
         done += ready
     return tuple(done)
-
-
-class Problem(eqx.Module):
-    """A space and what its systems are held against.
-
-    `residuals(ik, data)` gives the residuals in sigmas, a masked row being 0. It is static, so it
-    must be a function of a module: a new lambda per call would compile anew.
-    """
-
-    space: Space
-    data: PyTree
-    residuals: Callable[[Any, Any], Array] = eqx.field(static=True)
-    loss: Loss = eqx.field(static=True, default="squares")
-
-    def rows(self, u: Float[Array, " free"]) -> Float[Array, " rows"]:
-        """Robust residuals and prior rows; half their sum of squares is the cost."""
-        residuals = robustify(self.residuals(self.space.unpack(u), self.data), self.loss)
-        return jnp.concatenate([residuals, self.space.prior_rows(u)])
-
-    def cost(self, u: Float[Array, " free"]) -> Float[Array, ""]:
-        """Minus the log-probability where that is finite, NaN or infinite where residuals are."""
-        return 0.5 * jnp.sum(self.rows(u) ** 2)
-
-    def jacobian(self, u: Float[Array, " free"]) -> Float[Array, "rows free"]:
-        """Slopes of the rows, by forward mode; zero where a threshold moves hard decisions only.
-
-        Not `jax.jacfwd`, which took the wrong branch of a minimum in a pipeline-sized program.
-        """
-        return self.rows_and_jacobian(u)[1]
-
-    def rows_and_jacobian(self, u: Float[Array, " free"]) -> tuple[Array, Array]:
-        """Both from one linearisation."""
-        rows, slope = jax.linearize(self.rows, u)
-        return rows, jax.vmap(slope, out_axes=-1)(jnp.eye(u.size, dtype=u.dtype))
-
-    def log_probability(self, u: Float[Array, " free"]) -> Float[Array, ""]:
-        """Unnormalised log-density of the posterior in `u`; -inf where a residual is not finite."""
-        cost = self.cost(u)
-        return jnp.where(jnp.isfinite(cost), -cost, -jnp.inf)

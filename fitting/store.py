@@ -25,8 +25,8 @@ from .checks import nested
 from .experiment import Experiment, load_experiment
 from .files import write_text
 from .posterior import Posterior
+from .problem import Problem
 from .solution import Solution
-from .space import Problem
 from .study import Fit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"

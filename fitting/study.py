@@ -13,9 +13,9 @@ import jaxik
 from .experiment import Experiment, load_experiment, make_problem
 from .identify import Identification, identify
 from .posterior import Posterior, SamplingProgress, sample_problem
+from .problem import Problem
 from .solution import Progress, Solution
 from .solve import solve
-from .space import Problem
 
 THRESHOLD_SD = 0.05  # of u, around the fit: a Laplace ball at a threshold has the prior's width
 LEAST_SD, MOST_SD = 1e-3, 0.5  # of u

@@ -8,13 +8,14 @@ import pytest
 import toy
 
 from fitting import identify, population, solve, space
+from fitting.problem import Problem
 
 SEED = 5  # a toy clip that determines every threshold
 BLUNT = 2  # one in which the foot is always lifted before it is fast
 TRUTH = np.asarray([toy.TRUTH.get(name, np.nan) for name in toy.NAMES])
 
 
-def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[space.Problem, solve.Solution]:
+def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, solve.Solution]:
     """A solution found in a few steps, as it starts where it should end."""
     problem = toy.make_problem(seed, truth=truth)
     start = np.clip(np.asarray(problem.space.pack(truth)), -5, 5)

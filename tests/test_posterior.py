@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 from fitting import diagnostics, posterior
 from fitting.chain import Chain, Identity, journal_path
 from fitting.posterior import sample_problem
-from fitting.space import PRIOR_SD, Problem, free, make_space
+from fitting.problem import Problem
+from fitting.space import PRIOR_SD, free, make_space
 from jaxik import rule
 
 ROOT = Path(__file__).resolve().parents[1]

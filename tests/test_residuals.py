@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting import experiment, residuals
+from fitting.problem import Problem
 from fitting.report import truth_of
-from fitting.space import Problem
 
 BESIDE = 0.1  # in u, away from where the clip was made
 STEP = 1e-6  # of u, to either side

@@ -10,6 +10,7 @@ import pytest
 import toy
 
 from fitting import population, solve, space
+from fitting.problem import Problem
 from jaxik import rule
 
 CLIPS = (1, 5)  # seeds of toy clips that determine every threshold
@@ -46,23 +47,23 @@ def curve_problem(
     walls: tuple[float, float] = (-1.0, 9.0),
     outliers: float = 0.0,
     **options,
-) -> space.Problem:
+) -> Problem:
     base = Curve(turn=jnp.asarray(0.7 if "turn" in names else CURVE_TRUTH["turn"]))
     random = np.random.default_rng(3)
     clean = curve(Curve(**{name: jnp.asarray(value) for name, value in CURVE_TRUTH.items()}))
     gross = (random.random(TIME.size) < outliers) * random.uniform(1, 3, TIME.size)
     data = clean + random.normal(0, 0.02, TIME.size) + gross
     made = space.make_space(base, [space.free(base, name) for name in names])
-    return space.Problem(made, (data, jnp.asarray(walls)), curve_residuals, **options)
+    return Problem(made, (data, jnp.asarray(walls)), curve_residuals, **options)
 
 
-def errors(problem: space.Problem, values: np.ndarray, truth: dict[str, float]) -> np.ndarray:
+def errors(problem: Problem, values: np.ndarray, truth: dict[str, float]) -> np.ndarray:
     """Distance from the truth in shares of the range; NaN where there is no truth."""
     known = np.asarray([truth.get(name, np.nan) for name in problem.space.names])
     return np.abs(values - known) / np.asarray(problem.space.high - problem.space.low)
 
 
-def cost_of(problem: space.Problem, u: np.ndarray) -> float:
+def cost_of(problem: Problem, u: np.ndarray) -> float:
     return float(population.evaluate(problem, u[None]).cost[0])
 
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fitting import robust, space
+from fitting.problem import Problem
 from jaxik import ease
 
 NAMES = ("lock.height_off", "lock.height_on", "body.gain", "foot.limit[1]", "lock.release")
@@ -195,7 +196,7 @@ def residuals(ik: toy.Toy, data: jax.Array) -> jax.Array:
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_the_log_probability_is_minus_half_the_losses_and_prior(loss):
-    problem = space.Problem(make("foot.share"), jnp.asarray([-9.0, 0.1]), residuals, loss)
+    problem = Problem(make("foot.share"), jnp.asarray([-9.0, 0.1]), residuals, loss)
     u = jnp.asarray([0.7])
     z = np.asarray(problem.space.values(u)[0] - problem.data)
     prior = float(problem.space.prior_rows(u)[0])
@@ -205,7 +206,7 @@ def test_the_log_probability_is_minus_half_the_losses_and_prior(loss):
 
 
 def test_the_log_probability_of_residuals_that_are_not_finite_is_minus_infinity():
-    problem = space.Problem(make("foot.share"), jnp.asarray([0.9]), residuals)
+    problem = Problem(make("foot.share"), jnp.asarray([0.9]), residuals)
     assert problem.log_probability(jnp.asarray([-3.0])) == -jnp.inf
 
 
@@ -213,12 +214,12 @@ def test_other_data_bounds_and_centres_do_not_compile_again():
     traces = []
 
     @eqx.filter_jit
-    def cost(problem: space.Problem, u: jax.Array) -> jax.Array:
+    def cost(problem: Problem, u: jax.Array) -> jax.Array:
         traces.append(1)
         return problem.cost(u)
 
     for value in (0.1, 0.2):
         made = make("foot.share")
         made = eqx.tree_at(lambda s: (s.low, s.u0), made, (made.low - value, made.u0 + value))
-        cost(space.Problem(made, jnp.asarray([value]), residuals), jnp.asarray([value]))
+        cost(Problem(made, jnp.asarray([value]), residuals), jnp.asarray([value]))
     assert len(traces) == 1

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting import robust, solve, space
+from fitting.problem import Problem
 from jaxik import ease, rule
 from jaxik.gate import HARD
 
@@ -179,7 +180,7 @@ NAMES = (*THRESHOLDS, *SMOOTH, "foot.idle")
 
 
 @functools.cache
-def solved(seed: int) -> tuple[space.Problem, solve.Solution]:
+def solved(seed: int) -> tuple[Problem, solve.Solution]:
     """A problem and its solution, made once for all tests."""
     problem = make_problem(seed)
     return problem, solve.solve(problem)
@@ -192,9 +193,9 @@ def make_problem(
     truth: dict[str, float] = TRUTH,
     outliers: float = 0.0,
     loss: robust.Loss = "squares",
-) -> space.Problem:
+) -> Problem:
     """The defaults as a start, the truth in the data."""
     made = space.make_space(Toy(), [space.free(Toy(), name) for name in names])
     held = space.make_space(Toy(), [space.free(Toy(), name) for name in TRUTH])
     clean = held.unpack(held.pack(truth))
-    return space.Problem(made, make_data(clean, seed, frames, outliers), residuals, loss)
+    return Problem(made, make_data(clean, seed, frames, outliers), residuals, loss)
