@@ -51,9 +51,13 @@ class Playback(eqx.Module):
     forward_ws: Float[Series, "frames 3"]
     ground_ws: Float[Series, "frames legs 3"]  # under the captured ankles
     grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
+    ball_ground_ws: Float[Series, "frames legs 3"]  # under the captured toes
+    ball_grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
+    floor: Float[Series, " frames"]  # m, height of the floor of the animation
     dt: Float[Series, " frames"]
     contact: Float[Series, "frames legs"]  # weight that the system gives each foot
     locked: Float[Series, "frames legs"]
+    reached: Float[Series, "frames legs"]  # 1 where the ankle is at its target
     stance: Float[Series, "frames legs"]  # captured contact labels; all 0 where there are none
     slide: Float[Series, " frames"]
     seen: Bool[Series, " frames"]
@@ -107,7 +111,10 @@ def _watch(scene: Scene, result: jaxik.Result) -> Playback:
     # The reference knows no hips and toes: they hang on the pelvis and the ankles as in the base.
     hips = _per_leg(reference.pelvis).apply(_per_leg(base).inverse().apply(animated.hip.pos))
     toes = reference.ankle.apply(animated.ankle.inverse().apply(animated.toe.pos))
-    hit = cast(scene.terrain, reference.ankle.pos + vec.scale(up, jnp.asarray(ABOVE)), REACH)
+    under, under_ball = (
+        cast(scene.terrain, joints + vec.scale(up, jnp.asarray(ABOVE)), REACH)
+        for joints in (reference.ankle.pos, toes)
+    )
     errors = errors_of(scene, result)
     return Playback(
         before=Motion(base.pos, *_positions(animated)),
@@ -115,11 +122,15 @@ def _watch(scene: Scene, result: jaxik.Result) -> Playback:
         captured=Motion(reference.pelvis.pos, hips, reference.knee_ws, reference.ankle.pos, toes),
         up_ws=up,
         forward_ws=jax.vmap(lambda one: frame.heading(one, up)[0])(world),
-        ground_ws=hit.point,
-        grounded=hit.found,
+        ground_ws=under.point,
+        grounded=under.found,
+        ball_ground_ws=under_ball.point,
+        ball_grounded=under_ball.found,
+        floor=vec.dot(world.pos, up),
         dt=scene.frames.dt,
         contact=result.trace.sensed.contact.weight,
         locked=result.trace.advanced.held.locked,
+        reached=result.reached,
         stance=reference.contact,
         slide=scene.frames.slide,
         seen=reference.seen,

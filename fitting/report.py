@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from . import chain_plots, files, panels, playback, plots, store, tables
+from . import chain_plots, files, panels, playback, plots, store, tables, worst, worst_plots
 from .checks import flat, read_toml
 from .exercise import exercise, flipped_decisions
-from .experiment import Experiment, name_preset, with_parameters
+from .experiment import Experiment, bare_system
+from .playback import Playback
 from .posterior import Posterior
 from .study import Fit
+from .systems import with_parameters
 from .tables import Truth, markdown
 
 HEADING = "## Posterior"  # what follows it in summary.md is of `write_posterior`
+WORST = "## The worst two seconds"
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
 Pictures = dict[str, str]  # captions by file name
 
@@ -33,7 +36,7 @@ def truth_of(experiment: Experiment) -> dict[str, float] | None:
     path = next((clip.truth for clip in experiment.clips if clip.truth is not None), None)
     if path is None:
         return None
-    ik = name_preset(experiment.preset)
+    ik = bare_system(experiment)
     content = read_toml(path, "a truth")
     values = flat({stage: table for stage, table in content.items() if stage in vars(ik)}, 2)
     with_parameters(ik, values, str(path))
@@ -75,12 +78,14 @@ def write_fit(
     pictures.
     """
     pictures: Pictures = {}
-    for index in range(len(fitted.problem.data)):
-        pictures |= _draw_clip(run, fitted, index)
+    last = [playback.play(fitted.ik, scene) for scene in fitted.problem.data]
+    for index, play in enumerate(last):
+        pictures |= _draw_clip(run, fitted, index, play)
+    told = [*_worst(run, fitted, last), *details]
     title = f"{fitted.experiment.name}: cost of the fit over time"
     figure = plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
     pictures |= _keep(run, "cost.png", title, figure)
-    files.write_text(run / store.SUMMARY, _fit_summary(fitted, pictures, opening, details))
+    files.write_text(run / store.SUMMARY, _fit_summary(fitted, pictures, opening, told))
 
 
 def posterior_text(posterior: Posterior, truth: Truth) -> str:
@@ -124,13 +129,31 @@ def write_posterior(run: Path, experiment: Experiment, posterior: Posterior) -> 
     files.write_text(summary, kept + "\n\n" + "\n\n".join(parts) + "\n")
 
 
-def _draw_clip(run: Path, fitted: Fit, index: int) -> Pictures:
-    """The pictures of one clip."""
-    scene, several = fitted.problem.data[index], len(fitted.problem.data) > 1
+def _names(fitted: Fit, index: int) -> tuple[str, str]:
+    """What titles call a clip, and how the names of its pictures end."""
+    several = len(fitted.problem.data) > 1
     clip = fitted.experiment.name + (f", clip {index + 1}" if several else "")
-    end = f"_{index + 1}.png" if several else ".png"
+    return clip, f"_{index + 1}.png" if several else ".png"
+
+
+def _worst(run: Path, fitted: Fit, plays: Sequence[Playback]) -> list[str]:
+    """Draws the worst two seconds of each clip; the section that tells of them."""
+    parts = [WORST]
+    for index, play in enumerate(plays):
+        legs, found = fitted.problem.data[index].rig.names, worst.find_worst(play)
+        clip, end = _names(fitted, index)
+        title = f"{clip}: the worst {play.time[found.end] - play.time[found.start]:.1f} seconds"
+        picture = _keep(run, f"worst{end}", title, worst_plots.worst(play, legs, found, title))
+        parts.append("\n".join(f"- {line}" for line in worst.told(play, found, legs)))
+        parts.append(_gallery(picture))
+    return parts
+
+
+def _draw_clip(run: Path, fitted: Fit, index: int, last: Playback) -> Pictures:
+    """The pictures of one clip, which is played as it was fitted."""
+    scene = fitted.problem.data[index]
+    clip, end = _names(fitted, index)
     first = playback.play(fitted.problem.space.unpack(fitted.problem.space.pack({})), scene)
-    last = playback.play(fitted.ik, scene)
     legs, leg = scene.rig.names, fitted.ik.leg
     limits = [float(np.mean(getattr(leg, name))) for name in KNEE_LIMITS if hasattr(leg, name)]
     found: Pictures = {}
@@ -185,7 +208,10 @@ def _fit_summary(
     told, truth = store.describe_fit(fitted), truth_of(experiment)
     rows = told["parameters"]
     parts = [f"# {experiment.name}", f"{told['message']} {_cost(told)}"]
-    parts.append(f"Preset `{experiment.preset}`, loss `{experiment.loss}`, seed {experiment.seed}.")
+    other = "".join(f", `{stage}` by `{name}`" for stage, name in experiment.rules.items())
+    parts.append(
+        f"Preset `{experiment.preset}`{other}, loss `{experiment.loss}`, seed {experiment.seed}."
+    )
     parts += [*opening, "## Parameters", markdown(tables.fit_table(rows, truth))]
     if truth:
         parts.append(f"{tables.recovered(rows, truth)}.")

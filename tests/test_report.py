@@ -14,7 +14,8 @@ from fitting import exercise, playback, report, residuals, solve, store, study, 
 from fitting.experiment import ClipEntry, Experiment, free_parameters, make_scene, system
 from fitting.identify import Identification, Profile
 from fitting.posterior import Posterior
-from fitting.space import Problem, make_space
+from fitting.problem import Problem
+from fitting.space import make_space
 from jaxik import rule, terrain
 
 VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
@@ -173,6 +174,7 @@ def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
     text = (tmp_path / store.SUMMARY).read_text()
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     wanted = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
+    wanted |= {"worst.png"}
     assert set(names) == wanted
     assert {path.name for path in tmp_path.iterdir()} == wanted | {store.SUMMARY}
     for name in names:
@@ -193,11 +195,16 @@ def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monke
     monkeypatch.setattr(report, "_keep", lambda run, name, caption, figure: {name: caption})
     problem = fitted.problem
     twice = Problem(problem.space, problem.data * 2, problem.residuals, problem.loss)
-    pictures = report._draw_clip(tmp_path, replace(fitted, problem=twice), 1)
+    played = playback.play(fitted.ik, problem.data[0])
+    pictures = report._draw_clip(tmp_path, replace(fitted, problem=twice), 1, played)
     assert set(pictures) == {
         "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png"
     }  # fmt: skip
     assert all(caption.startswith("hill, clip 2: ") for caption in pictures.values())
+    section = report._worst(tmp_path, replace(fitted, problem=twice), [played, played])
+    assert [part for part in section if part.startswith("![")] == [
+        f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)" for number in (1, 2)
+    ]
 
 
 def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
