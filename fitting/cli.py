@@ -19,6 +19,7 @@ MISTAKE, INTERRUPTED = 2, 130  # exit status
 
 EXAMPLES = """examples:
   jaxik fit data/experiments/uneven_walk.toml -o runs/walk     fit, with plots and a summary
+  jaxik contribution data/experiments/blocks.toml -o runs/c    the fit without each of its rules
   jaxik sample runs/walk                                       its posterior; again goes on
   jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
   jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --preset record
@@ -29,7 +30,8 @@ EXAMPLES = """examples:
   jaxik record to-toml footik.bin -o footik.toml
 
 exit status: 0 when done, 2 for a mistake in what was given (one line says which), 130 when
-interrupted with Ctrl-C: `fit` then has written the best point so far, and `sample` its chain.
+interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` its chain, and
+`contribution` each finished fit.
 `jaxik COMMAND --help` has more examples.
 """
 
@@ -89,6 +91,24 @@ def parser() -> argparse.ArgumentParser:
         "experiment", type=Path, metavar="EXPERIMENT.toml", help="clips, terrain, free parameters"
     )
     fit.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="run folder")
+
+    contribution = _add(
+        commands, "contribution", "fit an experiment without each of its rules, cross-validated",
+        """
+        jaxik contribution data/experiments/blocks.toml -o runs/contribution
+        jaxik contribution data/experiments/blocks.toml --folds 3 -o runs/thirds
+
+        The experiment's [[without]] tables say what is left out. Each fit is kept when it is done:
+        after Ctrl-C (status 130) the same command goes on.
+        """,
+    )  # fmt: skip
+    contribution.add_argument(
+        "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
+    )
+    contribution.add_argument(
+        "--folds", type=int, default=2, metavar="N", help="parts of each clip (default: 2)"
+    )
+    contribution.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
 
     sample = _add(
         commands, "sample", "sample the posterior around a run's fit; goes on where it was",

@@ -13,8 +13,10 @@ import jaxik
 from jaxik import record
 
 from . import (
+    agreement,
     checks,
     clips,
+    contribution_report,
     experiment,
     files,
     frames,
@@ -26,17 +28,20 @@ from . import (
     settings,
     store,
     study,
+    systems,
     tables,
     translate,
     translate_report,
 )
 from . import compare as comparing
+from . import contribution as contributing
 from .base import load_base
 from .clips import inspect as inspection
+from .clips.npz import is_blocks
 from .ground import reconstruct
 from .identify import identify
+from .problem import Problem
 from .solution import Solution
-from .space import Problem
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -53,6 +58,23 @@ def fit(options: argparse.Namespace) -> int:
     report.write_fit(options.output, fitted)
     print("\n" + report.fit_text(store.describe_fit(fitted), truth))
     return _told_where(options.output, fitted)
+
+
+def contribution(options: argparse.Namespace) -> int:
+    """Fits an experiment without each of its rules, and leaves a folder with what that costs."""
+    _prepare_jax()
+    asked = experiment.load_experiment(options.experiment)
+    store.check_place(options.output)
+    with progress.Line(progress.fit_line) as line:
+        rows = contributing.contribution(
+            asked, options.folds, options.output,
+            progress=line, told=contribution_report.tell, between=jax.clear_caches,
+        )  # fmt: skip
+    contribution_report.write(options.output, asked, rows)
+    for part, title in contribution_report.titles(rows).items():
+        print(f"\n{title}:\n\n{tables.aligned(contribution_report.group(rows, part))}")
+    print(f"written to {options.output}; read {options.output / contribution_report.TABLE}")
+    return 0
 
 
 def sample(options: argparse.Namespace) -> int:
@@ -95,7 +117,7 @@ def run(options: argparse.Namespace) -> int:
     _prepare_jax()
     if options.parameters is not None:
         return _solve_clip(settings.from_toml(options.parameters)[0], options)
-    return _solve_clip(experiment.name_preset(options.preset), options)
+    return _solve_clip(systems.name_preset(options.preset), options)
 
 
 def compare(options: argparse.Namespace) -> int:
@@ -194,6 +216,7 @@ def convert(options: argparse.Namespace) -> int:
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "fit": fit,
+    "contribution": contribution,
     "sample": sample,
     "apply": apply,
     "run": run,
@@ -250,4 +273,8 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
         f"{base.frames} frames in {time.perf_counter() - began:.1f} s: ground under {found:.1%} of "
         f"the feet, {reached:.1%} of the targets reached; written to {options.output}"
     )
+    if is_blocks(options.clip):
+        captured = clips.load_clip(options.clip)
+        found = agreement.agreement([agreement.errors_of_clips(solved, captured, base)])
+        print("\n" + tables.aligned(agreement.table(found)))
     return 0

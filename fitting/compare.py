@@ -17,9 +17,10 @@ from jaxik.terrain import Terrain, cast
 from . import compare_plots, files, frames, measures, panels, settings, tables
 from .checks import located
 from .clips.clip import Clip
-from .experiment import check_shapes, leaf_names, name_preset
+from .experiment import check_shapes
 from .measures import COLUMNS, Measures
 from .playback import ABOVE, Motion
+from .systems import leaf_names, name_preset
 
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
 TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"

@@ -1,6 +1,7 @@
 """Experiment files: what is fitted to what, read from TOML and turned into a `Problem`.
 
 preset = "record"                    # a function of jaxik.presets
+rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
 [[clips]]
 reference = "walk.npz"               # the captured motion; paths are relative to the file
 base = "walk_base.npz"               # the flat animation; without it `base.flat_base` makes one
@@ -12,6 +13,9 @@ pelvis.on_gain = {}
 contact.planted_height = { low = 0.05, high = 0.2 }
 [sigmas]
 ankle = 0.02
+[[without]]                          # see `variants`
+name = "locks"
+parameters = { lock.enabled = false }
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,16 +28,19 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxik
-from jaxik import presets, rule
 from jaxik.skeleton import Transform
 from jaxik.terrain import Terrain
 
 from . import checks, clips, frames, posterior, scenes
 from .base import flat_base, load_base
-from .checks import check_keys, check_table, flat
+from .checks import check_table, flat
 from .clips import edit
+from .problem import Problem
 from .residuals import Reference, Scene, Sigmas, rows_of_scenes
-from .space import Free, Loss, Problem, free, make_space
+from .robust import Loss
+from .space import Free, free, make_space
+from .systems import free_table, name_preset, with_parameters, with_rules
+from .variants import Variant, read_variants
 
 SIGMAS = {  # defaults: what a good fit of captured motion leaves
     "ankle": 0.02,  # m
@@ -91,11 +98,14 @@ class Experiment:
     name: str = ""
     fps: float | None = None  # clips are resampled to it
     loss: Loss = "squares"
+    independent_every: float = 0.0  # s, apart that residuals tell something new; 0 if all do
     seed: int = 0
+    rules: Mapping[str, str] = field(default_factory=dict)  # that differ from the preset's
     parameters: Mapping[str, Any] = field(default_factory=dict)
     sigmas: Mapping[str, float] = field(default_factory=dict)
     fit: FitOptions = FitOptions()
     sample: SampleOptions = SampleOptions()
+    without: tuple[Variant, ...] = ()  # what `contribution` leaves out in turn
 
 
 # What the tables of the file hold.
@@ -103,8 +113,6 @@ FILES = ("reference", "terrain", "base", "truth")
 CLIP: dict[str, checks.Kind] = dict.fromkeys((*FILES, "label"), checks.TEXT)
 CLIP |= {"start": checks.TIME, "end": checks.TIME, "file_up": checks.one_of(("y", "z"))}
 CLIP |= {"mask_pops": checks.SWITCH}
-FREE: dict[str, checks.Kind] = dict.fromkeys(("low", "high", "prior_mean"), checks.NUMBER)
-FREE |= {"prior_sd": checks.POSITIVE, "kind": checks.TEXT, "scale": checks.TEXT}
 SIGMA = dict.fromkeys(SIGMAS, checks.POSITIVE) | {"correlation": checks.SHARE}
 FIT = {"starts": checks.COUNT, "max_steps": checks.COUNT}
 SAMPLE: dict[str, checks.Kind] = dict.fromkeys(("walkers", "max_steps", "thin_by"), checks.COUNT)
@@ -114,9 +122,12 @@ TOP: dict[str, checks.Kind] = {
     "preset": checks.TEXT,
     "loss": checks.one_of(get_args(Loss)),
 }
-TOP |= {"fps": checks.RATE, "seed": checks.SEED}
-TOP |= dict.fromkeys(("free", "parameters", "sigmas", "fit", "sample"), checks.TABLE)
-TOP |= {"clips": checks.Kind("[[clips]], one for each clip", lambda made: isinstance(made, list))}
+TOP |= {"fps": checks.RATE, "seed": checks.SEED, "independent_every": checks.TIME}
+TOP |= dict.fromkeys(("free", "rules", "parameters", "sigmas", "fit", "sample"), checks.TABLE)
+TOP |= {
+    name: checks.Kind(f"[[{name}]], one for each {each}", lambda made: isinstance(made, list))
+    for name, each in (("clips", "clip"), ("without", "variant"))
+}
 
 
 def load_experiment(path: str | Path) -> Experiment:
@@ -137,12 +148,14 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
         if not content.get(key):
             raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
     with checks.located(path):
-        name_preset(content.get("preset", "record"))
+        ik = name_preset(content.get("preset", "record"))
+    ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
     check_table(content.get("sigmas", {}), SIGMA, f"{path} [sigmas]")
     made = dict(content)
     made["clips"] = tuple(_entry(entry, path) for entry in content["clips"])
     made["free"] = free_table(content["free"], f"{path} [free]")
     made["parameters"] = flat(content.get("parameters", {}), 2)
+    made["without"] = read_variants(content.get("without", []), ik, f"{path} [[without]]")
     made["fit"] = FitOptions(**check_table(content.get("fit", {}), FIT, f"{path} [fit]"))
     sample = check_table(content.get("sample", {}), SAMPLE, f"{path} [sample]")
     made["sample"] = SampleOptions(**sample)
@@ -153,24 +166,6 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     return Experiment(path=path, **made)
 
 
-def free_table(given: Mapping[str, Any], where: str) -> dict[str, Mapping[str, Any]]:
-    """What a [free] table says of each parameter, by dotted name."""
-    named = flat(given, 2)
-    return {name: check_table(one, FREE, f"{where} {name}") for name, one in named.items()}
-
-
-def name_preset(name: object) -> jaxik.FootIK:
-    """The preset of this name; ValueError with the list of names."""
-    known = sorted(n for n, made in vars(presets).items() if _makes_ik(made))
-    if name not in known:
-        raise ValueError(f"no preset named {name!r}; there are {known}")
-    return getattr(presets, str(name))()
-
-
-def _makes_ik(made: Any) -> bool:
-    return getattr(made, "__module__", "") == presets.__name__ and callable(made)
-
-
 def with_max_steps(experiment: Experiment, max_steps: int) -> Experiment:
     """The experiment with another limit to its sampling."""
     if max_steps < 1:
@@ -178,33 +173,16 @@ def with_max_steps(experiment: Experiment, max_steps: int) -> Experiment:
     return replace(experiment, sample=replace(experiment.sample, max_steps=max_steps))
 
 
-def system(experiment: Experiment) -> jaxik.FootIK:
-    """The preset with the experiment's fixed parameters."""
+def bare_system(experiment: Experiment) -> jaxik.FootIK:
+    """The preset with the experiment's rules."""
     ik = name_preset(experiment.preset)
+    return with_rules(ik, experiment.rules, f"{experiment.path} [rules]")
+
+
+def system(experiment: Experiment) -> jaxik.FootIK:
+    """The preset with the experiment's rules and fixed parameters."""
+    ik = bare_system(experiment)
     return with_parameters(ik, experiment.parameters, f"{experiment.path} [parameters]")
-
-
-def with_parameters(ik: jaxik.FootIK, values: Mapping[str, Any], where: str) -> jaxik.FootIK:
-    """The system with these values by dotted name, switches too; ValueError for a wrong one."""
-    leaves = leaf_names(ik)
-    check_keys(values, leaves, where)
-    for name, value in values.items():
-        old = rule.get(ik, name)
-        try:
-            new = np.asarray(value)
-        except ValueError:  # lists of unlike lengths
-            new = np.asarray(None)
-        if new.dtype.kind not in ("b" if old.dtype == bool else "if") or np.isnan(new).any():
-            kind = "true or false" if old.dtype == bool else "a number"
-            raise ValueError(f"{where}: {name} is {value!r}; wanted {kind}")
-        if new.shape != old.shape and (old.ndim, new.ndim, new.size > 0) != (0, 1, True):
-            raise ValueError(f"{where}: {name} has shape {new.shape}; wanted {old.shape}")
-    return rule.replace(ik, dict(values))
-
-
-def leaf_names(ik: jaxik.FootIK) -> list[str]:
-    """Dotted names of all parameters, conventions and switches of a system."""
-    return [f"{stage}.{one.name}" for stage, part in vars(ik).items() for one in fields(part)]
 
 
 def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[Free]:
@@ -306,7 +284,9 @@ def problem_of(
         with checks.located(f"{experiment.path} [parameters]"):
             check_shapes(ik, scene.rig, scene.terrain, scene.frames)
         made.append(scene)
-    return Problem(space, tuple(made), rows_of_scenes, experiment.loss)
+    times = np.concatenate([np.asarray(scene.frames.dt) for scene in made])
+    share = min(1.0, float(times.mean()) / max(experiment.independent_every, 1e-9))
+    return Problem(space, tuple(made), rows_of_scenes, experiment.loss, share)
 
 
 def check_shapes(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Terrain, motion: jaxik.Frame) -> None:

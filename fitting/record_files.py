@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jaxik import record, rule
 
-from . import checks, settings
+from . import checks, settings, systems
 
 
 def read_bytes(path: Path) -> record.Record:
@@ -25,14 +25,16 @@ def read(path: Path, reading: record.Reading, base: record.Record | None) -> lis
         base: completes a record that is made from parameters.
 
     Raises:
-        ValueError: what is not there or cannot be read, parameters of another preset than `record`,
-            a base for a record that is whole.
+        ValueError: what is not there or cannot be read, parameters of another preset than `record`
+            or of other rules, a base for a record that is whole.
     """
     kind = path.suffix.lower()
     if kind == ".toml":
         ik, preset = settings.from_toml(path)
         if preset != "record":
             raise ValueError(f"{path}: parameters of {preset!r}; only those of 'record' make one")
+        if other := systems.exchanged(ik, systems.name_preset(preset)):
+            raise ValueError(f"{path}: rules {other}; only those of 'record' make one")
         return [record.from_ik(ik, base, reading)]
     if base is not None:
         raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")

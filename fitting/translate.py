@@ -33,13 +33,15 @@ from . import (
     scenes,
     settings,
     store,
+    systems,
 )
 from .base import load_base
 from .clips import edit
 from .compare import solve
 from .experiment import ClipEntry, Experiment
 from .population import evaluate, sweep
-from .space import Problem, free
+from .problem import Problem
+from .space import free
 
 # Nothing is noisy here: these say how far off still counts as the same.
 SIGMAS = {
@@ -91,7 +93,7 @@ def read_system(given: str, option: str) -> System:
         ik, preset = settings.from_toml(path)
         return System(path.stem, preset, ik)
     with checks.located(f"{option} takes a preset or a parameter .toml"):
-        return System(given, given, experiment.name_preset(given))
+        return System(given, given, systems.name_preset(given))
 
 
 def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
@@ -105,7 +107,7 @@ def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
     if path.suffix.lower() == ".toml":
         content = checks.read_toml(path, "a free-parameter")
         checks.check_table(content, {"free": checks.TABLE}, given)
-        named = experiment.free_table(content.get("free", {}), f"{given} [free]")
+        named = systems.free_table(content.get("free", {}), f"{given} [free]")
     else:
         named = {one.strip(): {} for one in given.split(",") if one.strip()}
     if not named:
@@ -155,7 +157,8 @@ def plan(
             f"{len(paths)} clip(s) and {len(terrains)} terrain(s); wanted a terrain for each clip"
         )
     run = run.resolve()
-    truth = run / SOURCE if source.preset == target.preset else None
+    alike = systems.rules_of(source.ik) == systems.rules_of(target.ik)
+    truth = run / SOURCE if alike else None
     entries, pairs = [], []
     for i, (path, terrain) in enumerate(zip(paths, terrains, strict=True)):
         name = f"source_{i + 1}.npz" if len(paths) > 1 else "source.npz"
@@ -169,7 +172,8 @@ def plan(
                 label=f"source: {source.name}", mask_pops=False,
             )
         )  # fmt: skip
-    preset = experiment.name_preset(target.preset)
+    preset = systems.name_preset(target.preset)
+    rules = systems.exchanged(target.ik, preset)
     asked = Experiment(
         path=run / store.EXPERIMENT,
         clips=tuple(entries),
@@ -177,7 +181,8 @@ def plan(
         preset=target.preset,
         name=f"{source.name} to {target.name}",
         fps=fps,
-        parameters=_changed(target.ik, preset),
+        rules=rules,
+        parameters=_changed(target.ik, systems.with_rules(preset, rules, target.name)),
         sigmas=SIGMAS,
     )
     problem = experiment.problem_of(asked, pairs)
@@ -202,8 +207,8 @@ def _solved(source: System, base: clips.Clip, ground: Any) -> clips.Clip:
 
 
 def _changed(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, Any]:
-    """Values in which a system differs from its preset."""
-    values = {name: np.asarray(rule.get(ik, name)) for name in experiment.leaf_names(ik)}
+    """Values in which a system differs from its preset, whose rules are the same."""
+    values = {name: np.asarray(rule.get(ik, name)) for name in systems.leaf_names(ik)}
     return {
         name: value.tolist()
         for name, value in values.items()

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxik import rule
 
-from . import difference, experiment, files, panels, relevance, report, settings, tables
+from . import difference, files, panels, relevance, report, settings, systems, tables
 from .difference import Difference
 from .difference_plots import difference as draw
 from .study import Fit
@@ -85,19 +85,19 @@ def _opening(made: Translation, fitted: Fit, found: Sequence[Difference]) -> lis
 def _both(made: Translation, fitted: Fit) -> list[str]:
     """The section that puts all values of both systems side by side."""
     source, target = made.names
-    systems = made.source.ik, fitted.ik
-    leaves = [experiment.leaf_names(ik) for ik in systems]
-    declared = [rule.declarations(ik) for ik in systems]
+    iks = made.source.ik, fitted.ik
+    leaves = [systems.leaf_names(ik) for ik in iks]
+    declared = [rule.declarations(ik) for ik in iks]
     table = [["parameter", "unit", source, f"{target}, fitted", "remarks"]]
     free_leaves = {name.partition("[")[0] for name in made.experiment.free}
     for name in dict.fromkeys([*leaves[0], *leaves[1]]):
         units = [one[name].unit for one in declared if name in one]
         shown = [
             _shown(rule.get(ik, name)) if name in there else "–"
-            for ik, there in zip(systems, leaves, strict=True)
+            for ik, there in zip(iks, leaves, strict=True)
         ]
         stage = name.partition(".")[0]
-        rules = {type(getattr(ik, stage)) for ik in systems}
+        rules = {type(getattr(ik, stage)) for ik in iks}
         remarks = ["fitted"] if name in free_leaves else []
         remarks += ["of another rule"] if "–" not in shown and len(rules) > 1 else []
         table.append([f"`{name}`", units[0] if units else "", *shown, ", ".join(remarks)])

@@ -27,8 +27,8 @@ from jaxik import record
 
 DATA = ROOT / "data"
 COMMANDS = [
-    "fit", "sample", "apply", "run", "compare", "translate", "inspect", "terrain", "record",
-    "record show", "record to-toml", "record to-bytes",
+    "fit", "contribution", "sample", "apply", "run", "compare", "translate", "inspect", "terrain",
+    "record", "record show", "record to-toml", "record to-bytes",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
@@ -320,11 +320,14 @@ def test_apply_writes_what_the_benchmark_scores(run, mocap, tmp_path, capsys):
     out = tmp_path / "out.npz"
     words = ["apply", run, tmp_path / "blocks.npz", "--terrain", mocap / "blocks" / "terrain.ply"]
     assert cli.main([*map(str, words), "-o", str(out)]) == 0
-    assert "60 frames in" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "60 frames in" in said
     score = [sys.executable, str(mocap / "blocks" / "score.py"), "blocks.npz", "out.npz"]
     done = subprocess.run(score, cwd=tmp_path, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout)
     assert told["bone_length_error_max_mm"] < 1.0 and told["ankle_cm"] < 15.0
+    figures = [float(line.split()[-1]) for line in said.splitlines()[-len(told) :]]
+    np.testing.assert_allclose(figures, list(told.values()), atol=0.011)
     clip, captured = load_clip(out), load_clip(tmp_path / "blocks.npz")
     assert clip.positions_ws.shape == captured.positions_ws.shape
     with np.load(out) as archive:
@@ -338,7 +341,8 @@ def test_run_takes_a_bvh_and_a_parameter_file(tmp_path, capsys):
     words = ["run", tmp_path / "step.bvh", "--terrain", GROUND, "-o", tmp_path / "out.npz"]
     words += ["--parameters", tmp_path / "still.toml"]
     assert cli.main([*map(str, words)]) == 0
-    assert "3 frames in" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "3 frames in" in said and "captured" not in said
     solved, clip = load_clip(tmp_path / "out.npz"), load_clip(tmp_path / "step.bvh")
     assert solved.joint_names == clip.joint_names and solved.fps == clip.fps
     assert np.isfinite(solved.positions_ws).all()

@@ -218,5 +218,5 @@ def test_the_blocks_experiment_makes_a_problem(mocap):
     path = ROOT / "data" / "experiments" / "blocks.toml"
     problem = experiment.make_problem(experiment.load_experiment(path))
     (scene,) = problem.data
-    assert scene.frames.dt.shape == (1141,)
+    assert scene.frames.dt.shape == (1141,)  # 38 s
     assert 0.9 < float(scene.reference.seen.mean()) < 1.0

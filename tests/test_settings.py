@@ -7,7 +7,7 @@ from clips import ODD
 
 import jaxik
 from fitting import settings
-from fitting.experiment import leaf_names
+from fitting.systems import leaf_names
 from jaxik import rule
 
 
