@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   jaxik inspect walk.bvh
   jaxik terrain walk.bvh -o ground.ply
   jaxik record to-toml footik.bin -o footik.toml
+  jaxik bench --quick
 
 exit status: 0 when done, 2 for a mistake in what was given (one line says which), 130 when
 interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` its chain, and
@@ -96,7 +97,6 @@ def parser() -> argparse.ArgumentParser:
         commands, "contribution", "fit an experiment without each of its rules, cross-validated",
         """
         jaxik contribution data/experiments/blocks.toml -o runs/contribution
-        jaxik contribution data/experiments/blocks.toml --folds 3 -o runs/thirds
 
         The experiment's [[without]] tables say what is left out. Each fit is kept when it is done:
         after Ctrl-C (status 130) the same command goes on.
@@ -241,6 +241,21 @@ def parser() -> argparse.ArgumentParser:
         "--margin", type=_finite, default=1.0, metavar="M", help="of ground around the stances, m"
     )
 
+    bench = _add(
+        commands, "bench", "measure how fast all of it is on this machine",
+        """
+        jaxik bench                          everything, in half an hour
+        jaxik bench --quick                  smaller sizes, and neither fit nor curves
+        jaxik bench --only legs,rays --json bench.json
+
+        Ctrl-C prints, and writes, what was measured until then, with status 130.
+        """,
+    )  # fmt: skip
+    bench.add_argument("--quick", action="store_true", help="smaller sizes, fewer runs and rows")
+    bench.add_argument("--only", metavar="NAME,...", help="these rows (default: all of them)")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="all numbers, each run's too")
+    bench.add_argument("--plot", type=Path, metavar="FILE.png", help="curves of time against size")
+
     record = _add(
         commands, "record", "the game's parameter record: show it, or turn it around",
         """
@@ -276,9 +291,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     to_bytes.add_argument("file", type=Path, help="parameter .toml, or .csv")
     to_bytes.add_argument("-o", "--output", type=Path, required=True, metavar="BIN")
-    to_bytes.add_argument(
-        "--base", type=Path, help="record that gives padding, tail and knee axis to parameters"
-    )
+    to_bytes.add_argument("--base", type=Path, help="record with padding, tail and knee axis")
     for way in (show, to_toml, to_bytes):
         way.add_argument(
             "--length-unit", choices=("auto", "m", "cm"), default="auto",

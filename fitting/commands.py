@@ -14,6 +14,9 @@ from jaxik import record
 
 from . import (
     agreement,
+    bench,
+    bench_report,
+    bench_tasks,
     checks,
     clips,
     contribution_report,
@@ -184,6 +187,22 @@ def terrain(options: argparse.Namespace) -> int:
     return 0
 
 
+def measure(options: argparse.Namespace) -> int:
+    """The word `bench`: measures, and prints a table of what is reached; no cache of programs."""
+    tasks = bench.choose(bench_tasks.TASKS, options.only, options.quick)
+    drawn = bench_report.check_places(options.json, options.plot)
+    sizes = bench_tasks.QUICK if options.quick else bench_tasks.FULL
+    with progress.Line(str) as line:
+        measured = bench.measure(tasks, sizes, options.quick, progress.say, line)
+    written = bench_report.write(measured, options.json, drawn)
+    print(bench_report.text(measured))
+    for path in written:
+        print(f"written to {path}")
+    if measured.interrupted:
+        raise KeyboardInterrupt  # all is told: it may go on
+    return 0
+
+
 def convert(options: argparse.Namespace) -> int:
     """The word `record`: shows the game's record, or turns it into or out of our parameters."""
     jax.config.update("jax_enable_x64", True)
@@ -224,6 +243,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "translate": translation,
     "inspect": inspect,
     "terrain": terrain,
+    "bench": measure,
     "record": convert,
 }
 

@@ -42,7 +42,7 @@ class Line:
         self.interrupted = True
         raise KeyboardInterrupt
 
-    def __call__(self, progress: Progress | SamplingProgress) -> None:
+    def __call__(self, progress: object) -> None:
         if self.interrupted:
             raise KeyboardInterrupt
         now = time.monotonic()
@@ -86,3 +86,8 @@ def timed(name: str) -> Iterator[None]:
         took = f"{time.perf_counter() - began:.1f} s"
     finally:
         print(took, file=sys.stderr, flush=True)
+
+
+def say(line: str) -> None:
+    """A line on stderr that stays, over whatever a terminal shows there."""
+    print(f"\r{line:<100}" if sys.stderr.isatty() else line, file=sys.stderr, flush=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -98,6 +99,14 @@ def save_mesh(
         *(f"3 {a} {b} {c}" for a, b, c in faces),
     ]  # fmt: skip
     Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+
+
+def embree(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> Any:
+    """Embree over these triangles, a tracer of `trimesh.ray`; None where it is not installed."""
+    if not trimesh.ray.has_embree:
+        return None
+    whole = trimesh.Trimesh(vertices, faces, process=False)
+    return trimesh.ray.ray_pyembree.RayMeshIntersector(whole)  # pyright: ignore
 
 
 def _read(

@@ -28,7 +28,7 @@ from jaxik import record
 DATA = ROOT / "data"
 COMMANDS = [
     "fit", "contribution", "sample", "apply", "run", "compare", "translate", "inspect", "terrain",
-    "record", "record show", "record to-toml", "record to-bytes",
+    "bench", "record", "record show", "record to-toml", "record to-bytes",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
