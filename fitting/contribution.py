@@ -1,9 +1,10 @@
 """What each rule contributes: an experiment as it is, and without each of its rules.
 
-Every clip is cut into parts of one length. A variant is fitted on all parts but one and measured on
-that one, for each part in turn, at the clip's own rate; then it is fitted and measured on
-everything. Each finished fit is kept at once in `contribution.json`, from which an interrupted call
-goes on.
+Every clip is cut into parts. A variant is fitted on all parts but one and measured on that one, for
+each part in turn, at the clip's own rate; then it is fitted and measured on everything. The part
+that is held out is not seen by the fit, but its animation is played: feet keep their strides over
+the cuts, and all fits of a variant share their compiled programs. Each finished fit is kept at once
+in `contribution.json`, from which an interrupted call goes on.
 """
 
 import hashlib
@@ -65,7 +66,7 @@ class Split:
 
     name: str
     fitted: Sequence[tuple[ClipEntry, Pair]]
-    measured: Sequence[tuple[ClipEntry, Pair]]
+    measured: Sequence[tuple[Pair, slice]]  # clips, and the frames of them that count
 
 
 def contribution(
@@ -152,43 +153,41 @@ def changed(experiment: Experiment, variant: Variant) -> Experiment:
 def split(entries: Sequence[ClipEntry], pairs: Sequence[Pair], folds: int) -> Iterator[Split]:
     """Each part held out in turn, then everything.
 
-    All parts of a clip have one length; up to `folds` - 1 frames at its end are in none. What is
-    fitted of it is what comes before the part that is held out, and what comes after.
-
     Raises:
         ValueError: for a part in which a foot never stands.
     """
     each = list(zip(entries, pairs, strict=True))
     for entry, (captured, _, _) in each:
-        length = captured.frames // folds
         for part in range(folds):
-            stands = captured.at(slice(part * length, (part + 1) * length)).standing().any(axis=0)
+            held = _part(captured, part, folds)
+            stands = captured.at(held).standing().any(axis=0)
             if not stands.all():
                 foot = captured.rig.names[int(np.argmin(stands))]
-                start, end = (length * one / captured.fps for one in (part, part + 1))
+                start, end = (frame / captured.fps for frame in (held.start, held.stop))
                 raise ValueError(
                     f"{entry.reference}: in part {part + 1} of {folds}, {start:.2f} s to "
                     f"{end:.2f} s, the {foot} foot never stands; take fewer folds"
                 )
     for part in range(folds):
-        fitted, measured = [], []
-        for entry, pair in each:
-            length = pair[0].frames // folds
-            before, held, after = (
-                slice(0, part * length),
-                slice(part * length, (part + 1) * length),
-                slice((part + 1) * length, folds * length),
-            )
-            measured.append((entry, _cut(pair, held)))
-            fitted += [(entry, _cut(pair, one)) for one in (before, after) if one.start < one.stop]
-        yield Split(f"part {part + 1} of {folds}", fitted, measured)
-    yield Split("everything", each, each)
+        held = [_part(captured, part, folds) for captured, _, _ in pairs]
+        fitted = [
+            (entry, _without(pair, one)) for (entry, pair), one in zip(each, held, strict=True)
+        ]
+        yield Split(f"part {part + 1} of {folds}", fitted, list(zip(pairs, held, strict=True)))
+    yield Split("everything", each, [(pair, slice(None)) for pair in pairs])
 
 
-def _cut(pair: Pair, part: slice) -> Pair:
-    """The same frames of both clips: the base is a part of the whole one, and not made anew."""
+def _part(clip: Clip, part: int, folds: int) -> slice:
+    """Frames of a part; parts are as long as one another but for a frame."""
+    return slice(*(clip.frames * one // folds for one in (part, part + 1)))
+
+
+def _without(pair: Pair, held: slice) -> Pair:
+    """The clips with a part of what was captured out of sight."""
     captured, base, ground = pair
-    return captured.at(part), base.at(part), ground
+    mask = np.ones(captured.frames, bool) if captured.mask is None else captured.mask.copy()
+    mask[held] = False
+    return replace(captured, mask=mask), base, ground
 
 
 def _fit(experiment: Experiment, one: Split, progress: Callable[[Progress], None] | None) -> Row:
@@ -204,7 +203,7 @@ def _fit(experiment: Experiment, one: Split, progress: Callable[[Progress], None
         ik = problem.space.unpack(jnp.asarray(solution.u))
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
         converged, message, seconds = solution.converged, solution.message, solution.seconds
-    found = agreement([_errors(ik, pair) for _, pair in one.measured])
+    found = agreement([_errors(ik, pair, part) for pair, part in one.measured])
     return Row("", "", 0, found, values, converged, message, seconds)
 
 
@@ -215,13 +214,13 @@ def _at_rate(pair: Pair, fps: float | None) -> Pair:
     return edit.resample(captured, fps), edit.resample(base, fps), ground
 
 
-def _errors(ik: jaxik.FootIK, pair: Pair) -> Errors:
-    """How far the system is from the captured motion, at the rate of the clip."""
+def _errors(ik: jaxik.FootIK, pair: Pair, part: slice) -> Errors:
+    """How far the system is from the captured motion in these frames, at the rate of the clip."""
     captured, base, ground = pair
     motion = frames.frames_of(base)
     check_shapes(ik, base.rig, ground, motion)
     _, solved = solve(ik, base, ground, motion, 0.0)
-    return errors_of_clips(solved, captured, base)
+    return errors_of_clips(*(clip.at(part) for clip in (solved, captured, base)))
 
 
 def _named(

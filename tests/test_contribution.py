@@ -16,7 +16,6 @@ from experiments import CLIP, write
 
 from fitting import cli, contribution, contribution_report, experiment, progress
 from fitting.agreement import COLUMNS, Agreement
-from fitting.base import flat_base
 from fitting.clips import load_clip, save_clip
 from fitting.contribution import Row
 from fitting.solution import Progress, Solution
@@ -55,7 +54,7 @@ class Search:
         if progress is not None:
             progress(Progress("polish", 0, 1, 2.0, 1.0, 0.5))
         names = problem.space.names
-        frames = sum(len(scene.frames.dt) for scene in problem.data)
+        frames = sum(int(scene.reference.seen.sum()) for scene in problem.data)
         found = {name: 0.3 if name != "pelvis.on_gain" else frames / 1000 for name in names}
         u = np.asarray(problem.space.pack(found))
         values = np.asarray(problem.space.values(jnp.asarray(u)))
@@ -81,7 +80,8 @@ def without_pipeline(monkeypatch) -> None:
     make = experiment.make_scene
 
     def made(captured, base, ground, sigmas, label):
-        key = captured.positions_ws.tobytes(), tuple(sigmas.items())
+        mask = b"" if captured.mask is None else captured.mask.tobytes()
+        key = captured.positions_ws.tobytes(), mask, tuple(sigmas.items())
         if key not in SCENES:
             SCENES[key] = make(captured, base, ground, sigmas, label)
         return SCENES[key]
@@ -148,37 +148,25 @@ def test_what_is_held_out_is_not_fitted_and_all_else_is(tmp_path, folds):
     read = asked(tmp_path)
     (pair,) = pairs_of(read)
     captured, base, _ = pair
-    length = captured.frames // folds
     splits = list(contribution.split(read.clips, [pair], folds))
     assert [one.name for one in splits[:-1]] == [f"part {i + 1} of {folds}" for i in range(folds)]
-    for part, one in enumerate(splits[:-1]):
-        ((_, (held, held_base, _)),) = one.measured
-        frames = slice(part * length, (part + 1) * length)
-        np.testing.assert_array_equal(held.positions_ws, captured.positions_ws[frames])
-        np.testing.assert_array_equal(held.standing(), captured.standing()[frames])
-        np.testing.assert_array_equal(held_base.positions_ws, base.positions_ws[frames])
-        assert held.fps == captured.fps
-        rest = np.delete(captured.positions_ws[: folds * length], frames, axis=0)
-        fitted = [clip.positions_ws for _, (clip, _, _) in one.fitted]
-        assert len(fitted) == (1 if part in (0, folds - 1) else 2), "neighbours stay together"
-        np.testing.assert_array_equal(np.concatenate(fitted), rest)
-        below = np.concatenate([clip.positions_ws for _, (_, clip, _) in one.fitted])
-        rest = np.delete(base.positions_ws[: folds * length], frames, axis=0)
-        np.testing.assert_array_equal(below, rest)
+    seen = captured.mask if captured.mask is not None else np.ones(captured.frames, bool)
+    counted = np.zeros(captured.frames, int)
+    for one in splits[:-1]:
+        ((measured, part),) = one.measured
+        assert measured is pair
+        held = np.zeros(captured.frames, bool)
+        held[part] = True
+        counted += held
+        ((entry, (fitted, below, _)),) = one.fitted
+        assert entry is read.clips[0] and below is base, "the animation is played as a whole"
+        np.testing.assert_array_equal(fitted.mask, seen & ~held)
+        np.testing.assert_array_equal(fitted.positions_ws, captured.positions_ws)
+        assert held.sum() == pytest.approx(captured.frames / folds, abs=1.0)
+    np.testing.assert_array_equal(counted, 1)
     assert splits[-1].name == EVERYTHING
-    assert splits[-1].fitted == splits[-1].measured == [(read.clips[0], pair)]
-
-
-def test_a_base_that_is_made_is_made_of_the_whole_clip(tmp_path):
-    clips = "\n".join(line for line in SIX.splitlines() if not line.startswith("base")) + "\n"
-    read = asked(tmp_path, clips=clips)
-    (pair,) = pairs_of(read)
-    captured, base, _ = pair
-    first, second, _ = contribution.split(read.clips, [pair], 2)
-    pelvis = [one.measured[0][1][1].positions_ws[:, base.rig.pelvis, 1] for one in (first, second)]
-    np.testing.assert_allclose(pelvis[0], pelvis[1][0], atol=1e-12)
-    made = flat_base(captured.at(slice(0, len(pelvis[0]))), lambda points: 0.3 * points[:, 2])
-    assert abs(made.positions_ws[0, base.rig.pelvis, 1] - pelvis[0][0]) > 1e-3
+    assert splits[-1].fitted == [(read.clips[0], pair)]
+    assert splits[-1].measured == [(pair, slice(None))]
 
 
 def test_a_part_in_which_a_foot_never_stands_is_refused_before_anything_is_fitted(tmp_path, search):
@@ -215,11 +203,15 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
         ["pelvis.on_gain", "foot.max_pitch"], ["pelvis.on_gain"], []
     ]  # fmt: skip
     frames = [len(problem.data[0].frames.dt) for problem, _ in search.asked]
-    assert frames == [45, 45, 91] * 2, "at the rate of the fit, and not where nothing is free"
+    assert frames == [91] * 6, "at the rate of the fit, and not where nothing is free"
+    seen = [problem.data[0].reference.seen for problem, _ in search.asked]
+    assert not seen[0][:45].any() and not seen[1][46:].any()
+    assert seen[0][46:].mean() > 0.9 and seen[1][:45].mean() > 0.9 and seen[2].mean() > 0.9
     (captured, base, _) = pairs_of(read)[0]
     apart = (base.positions_ws - captured.positions_ws)[:, captured.rig.pelvis, 1]
-    for row, gain in zip(rows, [0.045, 0.045, 0.091] * 2 + [0.6] * 3, strict=True):
-        part = {1: slice(0, 90), 2: slice(90, 180), 0: slice(0, 181)}[row.part]
+    gains = [float(one.sum()) / 1000 for one in seen] + [0.6] * 3
+    for row, gain in zip(rows, gains, strict=True):
+        part = {1: slice(0, 90), 2: slice(90, 181), 0: slice(0, 181)}[row.part]
         expected = np.sqrt(np.mean((apart[part] + gain) ** 2))
         assert row.agreement.pelvis == pytest.approx(expected, rel=1e-6), (row.variant, row.part)
     assert rows[6].message == "Nothing is free." and rows[6].converged
