@@ -11,7 +11,8 @@ from . import vec
 
 def components(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array, Array]:
     """The w, x, y and z of `q`, each of shape `*b`."""
-    return q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    w, x, y, z = vec.numbers(q)
+    return w, x, y, z
 
 
 def stack(w: Array, x: Array, y: Array, z: Array) -> Float[Array, "*b 4"]:
@@ -56,6 +57,16 @@ def rotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c
     return vec.fence(turned)
 
 
+def axes(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
+    """The x, y and z axes turned by `q`, each `*b 3`."""
+    w, x, y, z = components(q)
+    return (
+        vec.stack(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        vec.stack(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        vec.stack(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
 def unrotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
     """`v` turned by the inverse of `q`."""
     return rotate(conjugate(q), v)
@@ -89,12 +100,17 @@ def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array,
     return jnp.where(acute, larger, sign * smaller), jnp.where(acute, smaller, sign * larger)
 
 
+def half_cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
+    """Cosine and sine of half an angle, rad."""
+    return vec.once(jnp.cos(0.5 * angle), jnp.sin(0.5 * angle))
+
+
 def from_half(
     axis: Float[Array, "*a 3"], half_cos: Float[Array, "*b"], half_sin: Float[Array, "*b"]
 ) -> Float[Array, "*c 4"]:
     """Turn about the unit `axis`, given the cosine and sine of half its angle."""
     x, y, z = vec.components(axis)
-    return stack(half_cos, x * half_sin, y * half_sin, z * half_sin)
+    return vec.fence(stack(half_cos, x * half_sin, y * half_sin, z * half_sin))
 
 
 def from_cos_sin(
@@ -106,7 +122,7 @@ def from_cos_sin(
 
 def from_axis_angle(axis: Float[Array, "*a 3"], angle: Float[Array, "*b"]) -> Float[Array, "*c 4"]:
     """Turn about the unit `axis` by `angle`, rad, right-handed."""
-    return from_half(axis, jnp.cos(0.5 * angle), jnp.sin(0.5 * angle))
+    return from_half(axis, *half_cos_sin(angle))
 
 
 def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
@@ -135,12 +151,13 @@ def arc(
     safe = jnp.where(known, w, 1.0)
     # |(w, a x b)|² = 2 w for unit vectors, but a float32 "unit" vector is not quite one.
     inverse = 1.0 / jnp.sqrt(safe * safe + jnp.where(known, x * x + y * y + z * z, 0.0))
-    return stack(
+    turn = stack(
         jnp.where(known, safe * inverse, 0.0),
         jnp.where(known, x * inverse, fx),
         jnp.where(known, y * inverse, fy),
         jnp.where(known, z * inverse, fz),
     )
+    return vec.fence(turn)
 
 
 def nlerp(
@@ -151,10 +168,24 @@ def nlerp(
     return unit(a + (near - a) * jnp.asarray(weight)[..., None])
 
 
+def part(q: Float[Array, "*a 4"], weight: Float[Array, "*w"]) -> Float[Array, "*c 4"]:
+    """A share of a turn, 0..1: `nlerp` from the identity."""
+    w, x, y, z = components(q)
+    share = jnp.where(w < 0, -weight, weight)
+    return unit(stack(1.0 - weight + w * share, x * share, y * share, z * share))
+
+
+def half_part(
+    half_cos: Float[Array, "*a"], half_sin: Float[Array, "*a"], weight: Float[Array, "*w"]
+) -> tuple[Array, Array]:
+    """`part` of a turn about a fixed axis, by the cosine (>= 0) and sine of half its angle."""
+    cos, sin = 1.0 - weight + half_cos * weight, half_sin * weight
+    inverse = 1.0 / jnp.sqrt(cos * cos + sin * sin)
+    return cos * inverse, sin * inverse
+
+
 def angle(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Array:
     """Angle of the rotation between `a` and `b`, 0..pi rad; zero slope where they are equal."""
     w, x, y, z = components(multiply(conjugate(a), b))
     sin = vec.safe_sqrt(x * x + y * y + z * z)
-    cos = jnp.abs(w)
-    same = (sin == 0) & (cos == 0)
-    return 2.0 * jnp.arctan2(sin, jnp.where(same, 1.0, cos))
+    return 2.0 * vec.safe_arctan2(sin, jnp.abs(w))

@@ -6,12 +6,20 @@ run three to four times slower than a handful of fused multiply-adds.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+
+def numbers(v: Float[Array, "*b n"]) -> tuple[Array, ...]:
+    """What stands on the last axis, one by one, each of shape `*b`."""
+    # Split, not sliced: in reverse mode a slice is a padded array, and all of them are summed.
+    parts = jax.lax.split(v, (1,) * v.shape[-1], axis=v.ndim - 1)
+    return tuple(jnp.squeeze(part, -1) for part in parts)
 
 
 def components(v: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
     """The x, y and z of `v`, each of shape `*b`."""
-    return v[..., 0], v[..., 1], v[..., 2]
+    x, y, z = numbers(v)
+    return x, y, z
 
 
 def stack(x: Array, y: Array, z: Array) -> Float[Array, "*b 3"]:
@@ -24,14 +32,21 @@ def fence(x: Array) -> Array:
 
     XLA's fusion on a CPU computes a cheap value again in each consumer; through a chain of
     quaternion products, where every component depends on every component before, that grows
-    exponentially. Fences after the products halved the compile time of the pipeline.
+    exponentially. It does not do so with what was stacked and fenced. Fences after the products
+    halved the compile time of the pipeline; after arcs and turns they halved its feet's run time.
     """
     return jax.lax.optimization_barrier(x)
 
 
+def once(*values: Array) -> tuple[Array, ...]:
+    """Numbers, broadcast against each other, stacked behind a fence: angles, cosines, lengths."""
+    return numbers(fence(jnp.stack(jnp.broadcast_arrays(*values), axis=-1)))
+
+
 def dot(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Array:
     """Scalar product."""
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    (ax, ay, az), (bx, by, bz) = components(a), components(b)
+    return ax * bx + ay * by + az * bz
 
 
 def cross(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
@@ -61,9 +76,35 @@ def safe_divide(
 
 
 def safe_arctan2(y: Float[Array, "*a"], x: Float[Array, "*b"]) -> Array:
-    """Angle of the point (x, y), rad; 0 with zero slope at the origin."""
-    known = (x != 0) | (y != 0)
-    return jnp.where(known, jnp.arctan2(y, jnp.where(known, x, 1.0)), 0.0)
+    """Angle of the point (x, y), -pi..pi rad; 0 with zero slope at the origin."""
+    return _angle(*jnp.broadcast_arrays(y, x))
+
+
+@jax.custom_jvp
+def _angle(y: Array, x: Array) -> Array:
+    # A CPU calls the C library for each arctangent: 28 ns, against 3 to 5 ns in float32 for this.
+    # Three halvings of the angle to the x axis leave a tangent under 0.2, whose series is short.
+    largest = jnp.maximum(jnp.abs(x), jnp.abs(y))
+    scale = 1.0 / jnp.where(largest > 0, largest, 1.0)
+    rise, run = y * scale, jnp.abs(x) * scale
+    tangent = rise / jnp.where(largest > 0, run + jnp.sqrt(rise * rise + run * run), 1.0)
+    for _ in range(2):
+        tangent = tangent / (1.0 + jnp.sqrt(1.0 + tangent * tangent))
+    square = -tangent * tangent
+    series = jnp.zeros_like(square)
+    for odd in range(23 if x.dtype.itemsize > 4 else 11, 0, -2):
+        series = series * square + 1.0 / odd
+    angle = 8.0 * tangent * series
+    return jnp.where(x < 0, jnp.copysign(jnp.pi, y) - angle, angle)
+
+
+@_angle.defjvp
+def _angle_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (y, x), (y_slope, x_slope) = primals, tangents
+    square = x * x + y * y
+    known = square > 0
+    inverse = jnp.where(known, 1.0 / jnp.where(known, square, 1.0), 0.0)
+    return _angle(y, x), x * inverse * y_slope - y * inverse * x_slope
 
 
 def length(v: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
@@ -71,11 +112,15 @@ def length(v: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     return safe_sqrt(dot(v, v))
 
 
+def has_direction(v: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
+    """Whether `v` is long enough to be brought to length one."""
+    return dot(v, v) > jnp.finfo(v.dtype).eps ** 2
+
+
 def unit(v: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]) -> Float[Array, "*c 3"]:
     """`v` at length one; `fallback`, flat in `v`, where `v` is too short to have a direction."""
-    square = dot(v, v)
-    known = square > jnp.finfo(v.dtype).eps ** 2
-    inverse = 1.0 / jnp.sqrt(jnp.where(known, square, 1.0))
+    known = has_direction(v)
+    inverse = 1.0 / jnp.sqrt(jnp.where(known, dot(v, v), 1.0))
     return jnp.where(known[..., None], scale(v, inverse), fallback)
 
 

@@ -35,16 +35,20 @@ FUNCTIONS = {
     "multiply": (quat.multiply, (P, Q)),
     "conjugate": (quat.conjugate, (Q,)),
     "rotate": (quat.rotate, (Q, A)),
+    "axes": (quat.axes, (Q,)),
     "unrotate": (quat.unrotate, (Q, A)),
     "dot": (quat.dot, (P, Q)),
     "unit": (quat.unit, (3.0 * Q,)),
     "half_angle": (quat.half_angle, (COS, SIN)),
+    "half_cos_sin": (quat.half_cos_sin, (ANGLE,)),
     "from_half": (quat.from_half, (AXIS, COS, SIN)),
     "from_cos_sin": (quat.from_cos_sin, (AXIS, COS, SIN)),
     "from_axis_angle": (quat.from_axis_angle, (AXIS, ANGLE)),
     "from_rotvec": (quat.from_rotvec, (A,)),
     "arc": (quat.arc, (A, B, AXIS)),
     "nlerp": (quat.nlerp, (P, Q, ANGLE)),
+    "part": (quat.part, (Q, ANGLE)),
+    "half_part": (quat.half_part, (np.abs(COS), SIN, ANGLE)),
     "angle": (quat.angle, (P, Q)),
 }
 
@@ -220,6 +224,28 @@ def test_blending_starts_at_one_turn_stops_at_the_other_and_halves_the_way(p, q)
     if abs(np.dot(p, q)) > 1e-6:  # half a turn apart, two ways are as short
         middle = Slerp([0, 1], Rotation.concatenate([scipy(p), scipy(q)]))(0.5)
         assert_same_turn(quat.nlerp(jp, jq, jnp.asarray(0.5)), middle, 1e-8)
+
+
+@few
+@given(quaternions(), directions(), numbers(-3, 3), numbers(0, 1))
+def test_a_part_of_a_turn_is_the_blend_from_no_turn(q, pair, angle, weight):
+    axis, weight = jnp.asarray(pair[0]), jnp.asarray(weight)
+    still = quat.identity()
+    assert_allclose(
+        quat.part(jnp.asarray(q), weight), quat.nlerp(still, jnp.asarray(q), weight), atol=1e-14
+    )
+    half = quat.half_cos_sin(jnp.asarray(angle))
+    assert_allclose(
+        quat.from_half(axis, *quat.half_part(*half, weight)),
+        quat.part(quat.from_half(axis, *half), weight),
+        atol=1e-14,
+    )
+
+
+@few
+@given(quaternions())
+def test_the_axes_of_a_turn_are_the_turned_axes(q):
+    assert_allclose(np.stack(quat.axes(jnp.asarray(q)), axis=-1), scipy(q).as_matrix(), atol=1e-14)
 
 
 @few

@@ -17,9 +17,11 @@ RNG = np.random.default_rng(0)
 A, B = RNG.normal(size=(2, 4, 3))
 X, Y = RNG.normal(size=(2, 4))
 FUNCTIONS = {
+    "numbers": (vec.numbers, (A,)),
     "components": (vec.components, (A,)),
     "stack": (vec.stack, (X, Y, X)),
     "fence": (vec.fence, (A,)),
+    "once": (vec.once, (X, Y)),
     "dot": (vec.dot, (A, B)),
     "cross": (vec.cross, (A, B)),
     "scale": (vec.scale, (A, X)),
@@ -88,6 +90,7 @@ def test_products_are_those_of_numpy(a, b):
     assert_allclose(vec.length(ja), np.linalg.norm(a), rtol=1e-12)
     assert_allclose(vec.stack(*vec.components(ja)), a, atol=0)
     assert_allclose(vec.fence(ja), a, atol=0)
+    assert_allclose(vec.once(ja, jnp.asarray(2.0)), (a, np.full_like(a, 2.0)), atol=0)
 
 
 def test_the_vector_product_is_right_handed():
@@ -126,6 +129,17 @@ def test_safe_functions_are_the_plain_ones_away_from_their_limits(x, y):
     assert_allclose(vec.safe_divide(jx, jy, otherwise=7.0), x / y if y else 7.0)
     if (x, y) != (0, 0):
         assert_allclose(vec.safe_arctan2(jy, jx), np.arctan2(y, x))
+
+
+def test_an_angle_is_told_to_the_last_digits_all_around_and_at_every_size():
+    angle = np.linspace(-np.pi, np.pi, 4001)[:, None]
+    for dtype, sizes in ((np.float32, (1e-30, 1.0, 1e30)), (np.float64, (1e-200, 1.0, 1e200))):
+        y = (np.sin(angle) * sizes).astype(dtype)
+        x = (np.cos(angle) * sizes).astype(dtype)
+        exact = np.arctan2(y.astype(np.float64), x.astype(np.float64))
+        answer = vec.safe_arctan2(jnp.asarray(y), jnp.asarray(x))
+        assert answer.dtype == dtype
+        assert_allclose(answer, exact, rtol=6 * np.finfo(dtype).eps)
 
 
 def test_safe_functions_are_flat_at_their_limits():
