@@ -149,7 +149,7 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
     inside = (cosine > -1) & (cosine < 1)
     edge = jnp.where(cosine < 0, jnp.pi, 0.0)
     safe = jnp.where(inside, cosine, 0.0)
-    turned = jnp.where(inside, jnp.arctan2(vec.safe_sqrt(1.0 - safe**2), safe), edge)
+    turned = jnp.where(inside, vec.safe_arctan2(vec.safe_sqrt(1.0 - safe**2), safe), edge)
     phase = vec.safe_arctan2(jnp.where(helps, sin_part, -1.0), cos_part)
     return jnp.where(helps, turned + phase, 0.0)
 

@@ -91,13 +91,12 @@ class PitchRollFoot(AbstractAnimatedFoot):
     ) -> Planted:
         world = frame.world_from_model
         up = sensed.leg_up_ws
-        foot = quat.multiply(effector.rot_ws, rig.ankle_from_foot)
-        sole = quat.rotate(foot, vec.constant(FORWARD, up))
-        outer = vec.scale(quat.rotate(foot, vec.constant(LEFT, up)), rig.side)
+        left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
+        outer = vec.scale(left, rig.side)
         ahead = vec.unit(vec.reject(sole, up), sensed.slope.forward_ws)
         right = vec.cross(ahead, up)
 
-        pitch, roll = ground_angles(sensed, ahead, right, rig.side)
+        pitch, roll = vec.once(*ground_angles(sensed, ahead, right, rig.side))
         shin = vec.unit(
             bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
@@ -106,9 +105,10 @@ class PitchRollFoot(AbstractAnimatedFoot):
         pitch = limited(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
         roll = limited(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
 
-        pitched = vec.scale(ahead, jnp.cos(pitch)) + vec.scale(up, jnp.sin(pitch))
+        pitch, roll = vec.once(pitch, roll)
+        # Rolled about the level axis and then pitched: as pitched, then rolled about the pitched.
         tilt = quat.multiply(
-            quat.from_axis_angle(pitched, roll * rig.side), quat.from_axis_angle(right, pitch)
+            quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, roll * rig.side)
         )
         cut = jnp.abs(pitch - free_pitch) + jnp.abs(roll - free_roll)
         kept = gate.below(cut, jnp.full_like(cut, SAME_ANGLE), band=ANGLE_BAND)
@@ -208,9 +208,11 @@ def turned(frame: Frame, effector: Effector, bend: Bend, rot_ws: Array, reached:
 def with_ankle(frame: Frame, bend: Bend, rot: Array, reached: Array) -> Planted:
     """The legs with this rotation of their ankles, model space; the toe goes with it."""
     carried = bend.pose.ankle
-    ankle = Transform(carried.pos, rot)
-    toe = ankle @ (frame.pose.ankle.inverse() @ frame.pose.toe)
-    pose = LegPose(bend.pose.hip, bend.pose.knee, ankle, toe)
+    ankle, toe = frame.pose.ankle, frame.pose.toe
+    turn = quat.multiply(rot, quat.conjugate(ankle.rot))
+    ball = quat.rotate(turn, toe.pos - ankle.pos)
+    toe = Transform(carried.pos + ball, quat.multiply(turn, toe.rot))
+    pose = LegPose(bend.pose.hip, bend.pose.knee, Transform(carried.pos, rot), toe)
     return Planted(pose, quat.multiply(quat.conjugate(carried.rot), rot), reached)
 
 
@@ -232,7 +234,7 @@ def at_most(rot: Array, limit: Array, gate: AbstractGate) -> Array:
     """The rotation with its angle limited, rad; its axis stays."""
     w, x, y, z = quat.components(jnp.where(rot[..., :1] < 0, -rot, rot))
     sin = vec.safe_sqrt(x * x + y * y + z * z)
-    angle = 2.0 * jnp.arctan2(sin, w)
+    angle = 2.0 * vec.safe_arctan2(sin, w)
     # As a share, so that a softened limit leaves small turns alone; a far limit stays a number.
     wide = angle > LEAST_SHARE * limit
     share = vec.safe_divide(limit, jnp.where(wide, angle, LEAST_SHARE * limit), otherwise=0.0)
@@ -247,13 +249,13 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
     up, ankle, toe = sensed.leg_up_ws, sensed.ground.ankle, sensed.ground.toe
     across = toe.point - ankle.point
     run = vec.dot(across, ahead)
-    two = (toe.found * ankle.found > 0) & (run > SHORTEST_SOLE)
-    slope = jnp.arctan2(vec.dot(across, up), jnp.where(two, run, 1.0))
     facing, rising = vec.dot(ankle.normal, up), -vec.dot(ankle.normal, ahead)
-    pitch = jnp.where(two, slope, vec.safe_arctan2(rising, facing))
-    pitched_up = vec.scale(up, jnp.cos(pitch)) - vec.scale(ahead, jnp.sin(pitch))
-    outward = side * vec.dot(ankle.normal, right)
-    roll = vec.safe_arctan2(outward, vec.dot(ankle.normal, pitched_up))
+    two = (toe.found * ankle.found > 0) & (run > SHORTEST_SOLE)
+    rise, run = jnp.where(two, vec.dot(across, up), rising), jnp.where(two, run, facing)
+    pitch = vec.safe_arctan2(rise, run)
+    # Of the normal, the part along the up of a foot so pitched.
+    upward = vec.safe_divide(run * facing + rise * rising, vec.safe_sqrt(run * run + rise * rise))
+    roll = vec.safe_arctan2(side * vec.dot(ankle.normal, right), upward)
     standing = sensed.contact.weight * ankle.found
     return pitch * standing, roll * standing
 

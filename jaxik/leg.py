@@ -88,20 +88,21 @@ class TwoBone(AbstractLeg):
         """The leg by itself: `pose` with its ankle at `target_ms`, m, model space."""
         to_hip, to_ankle, hinge = bones(rig, pose)
         to_target = target_ms - pose.hip.pos
-        reach, reached = self._reach(to_hip, to_ankle, to_target, gate)
+        reach, reached = vec.once(*self._reach(to_hip, to_ankle, to_target, gate))
         half_cos, half_sin = hinge_turn(to_hip, to_ankle, hinge, reach)
         turn = quat.from_half(hinge, half_cos, half_sin)
         bent = quat.rotate(turn, to_ankle) - to_hip
         swing = swing_turn(bent, to_target, hinge, self.twist)
-        return bend_leg(pose, swing, turn, reached, weight)
+        return bend_leg(rig, pose, swing, half_cos, half_sin, reached, weight)
 
     def _reach(
         self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate
     ) -> tuple[Array, Array]:
         """Distance from hip to ankle that the limits allow, m, and 1 where that is the target's."""
-        thigh, shin = vec.length(to_hip), vec.length(to_ankle)
-        longest = opposite_side(thigh, shin, jnp.cos(self.max_knee_angle))
-        shortest = opposite_side(thigh, shin, jnp.cos(self.min_knee_angle))
+        thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
+        product = vec.safe_sqrt(thigh2 * shin2)
+        longest = opposite_side(thigh2, shin2, product, jnp.cos(self.max_knee_angle))
+        shortest = opposite_side(thigh2, shin2, product, jnp.cos(self.min_knee_angle))
         animated = vec.length(to_ankle - to_hip)
         free = self.soften * longest
         longest = jnp.where(self.as_animated & (animated > longest), animated, longest)
@@ -192,17 +193,23 @@ def solve_to_pole(
     to_hip, to_ankle, hinge = bones(rig, carried)
     to_target = target_ms - carried.hip.pos
     bend = pole_bend(to_hip, to_ankle, hinge, to_target, pole_ms, soften, twist, gate)
-    turn = quat.from_half(hinge, bend.half_cos, bend.half_sin)
-    return bend_leg(carried, bend.swing, turn, bend.reached, weight)
+    return bend_leg(rig, carried, bend.swing, bend.half_cos, bend.half_sin, bend.reached, weight)
 
 
-def bend_leg(pose: LegPose, swing: Array, turn: Array, reached: Array, weight: Array) -> Bend:
-    """The leg with its knee turned, then its hip, each by a share `weight` of its turn."""
-    to_hip = pose.hip.pos - pose.knee.pos
-    to_ankle = pose.ankle.pos - pose.knee.pos
-    still = quat.identity(swing.dtype)
-    turn = quat.nlerp(still, turn, weight)
-    swing = quat.nlerp(still, swing, weight)
+def bend_leg(
+    rig: Rig,
+    pose: LegPose,
+    swing: Array,
+    half_cos: Array,
+    half_sin: Array,
+    reached: Array,
+    weight: Array,
+) -> Bend:
+    """The leg with its knee turned about its hinge, then its hip, each by a share `weight`."""
+    to_hip, to_ankle, hinge = bones(rig, pose)
+    half_cos, half_sin = quat.half_part(half_cos, half_sin, weight)
+    turn = quat.from_half(hinge, half_cos, half_sin)
+    swing = quat.part(swing, weight)
 
     knee_pos = pose.hip.pos - quat.rotate(swing, to_hip)
     whole = quat.multiply(swing, turn)
@@ -220,6 +227,6 @@ def bend_leg(pose: LegPose, swing: Array, turn: Array, reached: Array, weight: A
     return Bend(
         solved,
         local(pose.hip.rot, swing),
-        local(pose.knee.rot, turn),
+        quat.from_half(rig.knee_axis_ls, half_cos, half_sin),
         reached * jnp.where(weight >= 1, 1.0, 0.0),
     )

@@ -14,12 +14,13 @@ LEFT = (1.0, 0.0, 0.0)
 
 def local(rot: Array, turn: Array) -> Array:
     """The correction on the right of `rot` that does what `turn` does on its left."""
-    return quat.multiply(quat.conjugate(rot), quat.multiply(turn, rot))
+    w, x, y, z = quat.components(turn)
+    return quat.stack(w, *vec.components(quat.unrotate(rot, vec.stack(x, y, z))))
 
 
-def opposite_side(a: Array, b: Array, cos: Array) -> Array:
-    """Third side of the triangle with sides `a` and `b` and this cosine between them."""
-    return vec.safe_sqrt(a * a + b * b - 2.0 * a * b * cos)
+def opposite_side(a2: Array, b2: Array, ab: Array, cos: Array) -> Array:
+    """Third side of a triangle, by the squares and the product of two sides and their cosine."""
+    return vec.safe_sqrt(a2 + b2 - 2.0 * ab * cos)
 
 
 def soft_limit(x: Array, free: Array, limit: Array) -> Array:
@@ -69,18 +70,17 @@ def _opening(
     """
     ab = vec.safe_sqrt(a2 * b2)
     bendable = ab > jnp.finfo(ab.dtype).eps
-    ab = jnp.where(bendable, ab, 1.0)
-    cosine = (a2 + b2 - apart2) / (2.0 * ab)
-    open_cos = vec.safe_sqrt(bounded((1.0 + cosine) * 0.5))
-    open_sin = vec.safe_sqrt(bounded((1.0 - cosine) * 0.5))
-
-    cos_now, sin_now = cos_now / ab, sin_now / ab
-    norm = vec.length(jnp.stack([cos_now, sin_now, jnp.zeros_like(cos_now)], axis=-1))
-    norm = jnp.where(norm > 0, norm, 1.0)
-    now_cos, now_sin = quat.half_angle(cos_now / norm, sin_now / norm)
-    turn_cos = open_cos * now_cos + open_sin * now_sin
-    turn_sin = open_sin * now_cos - open_cos * now_sin
-    return jnp.where(bendable, turn_cos, 1.0), jnp.where(bendable, turn_sin, 0.0)
+    inverse = 1.0 / jnp.where(bendable, ab, 1.0)
+    open_cos = bounded_cosine(0.5 * (a2 + b2 - apart2) * inverse)
+    open_sin = vec.safe_sqrt((1.0 - open_cos) * (1.0 + open_cos))
+    cos = open_cos * cos_now + open_sin * sin_now
+    sin = open_sin * cos_now - open_cos * sin_now
+    norm = vec.safe_sqrt(cos * cos + sin * sin)
+    turning = bendable & (norm > 0)
+    inverse = 1.0 / jnp.where(turning, norm, 1.0)
+    return quat.half_angle(
+        jnp.where(turning, cos * inverse, 1.0), jnp.where(turning, sin * inverse, 0.0)
+    )
 
 
 def bounded(x: Array) -> Array:
@@ -96,9 +96,35 @@ def swing_turn(bent: Array, to_target: Array, hinge: Array, twist: Array) -> Arr
     """
     start = vec.unit(bent, vec.constant(DOWN, bent))
     aim = vec.unit(to_target, start)
-    arc = arc_beside(start, aim, hinge)
-    facing = turn_about(aim, quat.rotate(arc, hinge), hinge)
-    return quat.multiply(quat.from_axis_angle(aim, twist), quat.multiply(facing, arc))
+    half_cos, half_sin = _facing(start, aim, hinge)
+    twist_cos, twist_sin = quat.half_cos_sin(twist)
+    turn = quat.from_half(
+        aim,
+        half_cos * twist_cos - half_sin * twist_sin,
+        half_sin * twist_cos + half_cos * twist_sin,
+    )
+    return quat.multiply(turn, arc_beside(start, aim, hinge))
+
+
+def _facing(start: Array, aim: Array, hinge: Array) -> tuple[Array, Array]:
+    """Cosine and sine of half the turn about `aim` that lines the hinge up with where it was.
+
+    It comes after the shortest arc from `start` to `aim`, which takes v to
+    v - (start + aim) (start + aim).v / (1 + start.aim) + 2 aim (start.v). No turn where they are
+    opposed, or where the hinge lies along one of them.
+    """
+    before, after = vec.reject(hinge, start), vec.reject(hinge, aim)
+    spread = 1.0 + vec.dot(start, aim)
+    known = spread > 4.0 * jnp.finfo(spread.dtype).eps
+    share = vec.dot(before, aim) / jnp.where(known, spread, 1.0)
+    cos = vec.dot(before, after) - share * vec.dot(after, start)
+    sin = (vec.dot(hinge, start) + share) * vec.dot(hinge, vec.cross(start, aim))
+    span = vec.safe_sqrt(cos * cos + sin * sin)
+    known = known & (span > jnp.finfo(span.dtype).eps ** 0.5)
+    inverse = 1.0 / jnp.where(known, span, 1.0)
+    return quat.half_angle(
+        jnp.where(known, cos * inverse, 1.0), jnp.where(known, sin * inverse, 0.0)
+    )
 
 
 def arc_beside(start: Array, aim: Array, side: Array) -> Array:
@@ -107,8 +133,9 @@ def arc_beside(start: Array, aim: Array, side: Array) -> Array:
     Of `side` the part at right angles to `start` is taken, or of down where it has none.
     """
     down, left = vec.constant(DOWN, start), vec.constant(LEFT, start)
-    square = vec.unit(vec.reject(side, start), vec.reject(down, start))
-    return quat.arc(start, aim, vec.unit(square, left))
+    beside = vec.reject(side, start)
+    beside = jnp.where(vec.has_direction(beside)[..., None], beside, vec.reject(down, start))
+    return quat.arc(start, aim, vec.unit(beside, left))
 
 
 def turn_about(axis: Array, start: Array, aim: Array) -> Array:
