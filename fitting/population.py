@@ -23,7 +23,7 @@ class Population(eqx.Module):
 
 def count_rows(problem: Problem) -> int:
     """How many rows a problem has; nothing is computed."""
-    return len(jax.eval_shape(problem.rows, problem.space.u0))
+    return len(jax.eval_shape(lambda u: problem.rows(u), problem.space.u0))
 
 
 @eqx.filter_jit
@@ -40,14 +40,9 @@ def _values_of(space: Space, candidates: Array) -> Array:
 
 
 @eqx.filter_jit
-def _evaluate(problem: Problem, candidates: Array, slopes: Array) -> tuple[Array, Array, Array]:
+def _evaluate(problem: Problem, candidates: Array, slopes: Array) -> tuple[Array, Array]:
     rows = jax.vmap(problem.rows)(candidates)
-    gram = slopes.T @ slopes
-    empty = jnp.diag(gram) == 0  # such a column does not move
-    pulls = rows @ slopes
-    steps = -jnp.linalg.solve(gram + jnp.diag(empty.astype(gram.dtype)), pulls.T).T
-    costs = 0.5 * jnp.sum(rows**2, axis=1)
-    return costs, candidates + steps, costs + 0.5 * jnp.sum(pulls * steps, axis=1)
+    return 0.5 * jnp.sum(rows**2, axis=1), rows @ slopes
 
 
 def evaluate(
@@ -69,7 +64,11 @@ def evaluate(
         filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), dtype)
         part = _evaluate(problem, filled, jnp.asarray(slopes, dtype))
         parts.append([np.asarray(one)[: len(some)] for one in part])
-    cost, moved, promised = (np.concatenate(one) for one in zip(*parts, strict=True))
+    cost, pulls = (np.concatenate(one) for one in zip(*parts, strict=True))
+    gram = slopes.T @ slopes
+    empty = np.diag(gram) == 0  # such a column does not move
+    steps = -np.linalg.solve(gram + np.diag(empty), pulls.T).T
+    moved, promised = candidates + steps, cost + 0.5 * np.sum(pulls * steps, axis=1)
     finite = np.isfinite(cost)
     return Population(
         np.where(finite, cost, np.inf),

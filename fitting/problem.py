@@ -31,6 +31,7 @@ class Problem(eqx.Module):
         converter=jnp.asarray, default=1.0
     )
 
+    @eqx.filter_jit  # traced once for all programs around it
     def rows(self, u: Float[Array, " free"]) -> Float[Array, " rows"]:
         """Robust residuals and prior rows; half their sum of squares is the cost."""
         residuals = robustify(self.residuals(self.space.unpack(u), self.data), self.loss)
@@ -48,10 +49,18 @@ class Problem(eqx.Module):
         """
         return self.rows_and_jacobian(u)[1]
 
-    def rows_and_jacobian(self, u: Float[Array, " free"]) -> tuple[Array, Array]:
-        """Both from one linearisation."""
-        rows, slope = jax.linearize(self.rows, u)
-        return rows, jax.vmap(slope, out_axes=-1)(jnp.eye(u.size, dtype=u.dtype))
+    def rows_and_jacobian(
+        self, u: Float[Array, " free"], below: Float[Array, ""] | float = jnp.inf
+    ) -> tuple[Array, Array]:
+        """Both from one linearisation; the slopes are 0 where the cost is not at most `below`."""
+        rows, slope = jax.linearize(lambda u: self.rows(u), u)
+        basis = jnp.eye(u.size, dtype=u.dtype)
+        rounding = 1.0 + 64 * jnp.finfo(rows.dtype).eps
+        return rows, jax.lax.cond(
+            0.5 * jnp.sum(rows**2) <= below * rounding,
+            lambda: jax.vmap(slope, out_axes=-1)(basis),
+            lambda: jnp.zeros((rows.size, u.size), rows.dtype),
+        )
 
     def log_probability(self, u: Float[Array, " free"]) -> Float[Array, ""]:
         """Unnormalised log-density of the posterior in `u`; -inf where a residual is not finite."""

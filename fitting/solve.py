@@ -8,9 +8,10 @@ by two ways, and the lower cost is kept (each wins where the other fails):
 - `ensemble`: Levenberg–Marquardt on the mean residual over random shifts of the thresholds, whose
   columns come from a regression on the shifts; the shifts shrink; then blocks.
 
-Where the two end apart, a third go starts from the better one. A fit compiles three programs,
-whatever the number of starts and stages: a march of Levenberg–Marquardt on the hard rows, one on
-the ensemble's, and the population.
+Where the two end apart, a third go starts from the better one. Without thresholds neither is
+needed. A sweep of each parameter through its range frees what a clamp had taken the slope from. A
+fit compiles three programs, whatever the number of starts and stages: a step of
+Levenberg–Marquardt on the hard rows, one on the ensemble's, and the population.
 """
 
 import time
@@ -29,7 +30,7 @@ from .problem import Problem
 from .slopes import Model, ensemble, hard, with_slopes
 from .solution import Progress, Solution
 
-MARCH = 8  # steps of Levenberg–Marquardt in one call, between two reports
+MARCH = 8  # steps of Levenberg–Marquardt between two turns of the population
 ROUNDING = 1e-9  # relative: two programs do not sum a cost alike
 TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
 CALM = 2  # such steps in a row that end a march
@@ -50,60 +51,59 @@ class _Position(eqx.Module):
     """Where a march of Levenberg–Marquardt stands; all of it data."""
 
     u: Array
-    cost: Array
-    step_size: Array
+    cost: Array  # infinite before the first evaluation
     calm: Array  # accepted steps in a row that gained next to nothing
     stalls: Array  # rejected steps in a row
     steps: Array
+    solver: Any  # optimistix's own state: slopes, step size and where it looks next
 
     @property
     def done(self) -> Array:
         return (self.calm >= CALM) | (self.stalls >= STALLS)
 
+    @property
+    def slopes(self) -> Array:
+        """Of the model's rows, at `u`."""
+        return self.solver.aux
+
+
+SOLVER = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
+# Slopes as an array: linearised programs in the solver's state would compile anew in each call.
+COMMON = {"options": {"jac": "bwd"}, "tags": frozenset()}
+
 
 @eqx.filter_jit
-def _march(
-    model: Model, position: _Position, limit: Array, args: tuple[Problem, Array]
-) -> tuple[_Position, Array]:
-    """At most `limit` steps of Levenberg–Marquardt; where it came to, and the slopes there.
+def _begin(model: Model, u: Array, args: tuple[Problem, Array]) -> _Position:
+    """A march that has not evaluated anything yet."""
+    rows, zero, endless = with_slopes(model), jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
+    args = (*args, endless)
+    shape, aux_shape = jax.eval_shape(rows, u, args)
+    state = SOLVER.init(rows, u, args, f_struct=shape, aux_struct=aux_shape, **COMMON)
+    whole = jnp.ones((), u.dtype)  # optimistix's own is of JAX's default type
+    state = eqx.tree_at(lambda state: state.search_state.step_size, state, whole)
+    return _Position(u, endless, zero, zero, zero, state)
 
-    optimistix keeps the linearised program in its state, which no call can hand to the next without
-    compiling again; so a march begins by evaluating where the last one stopped, with its step size,
-    and goes on exactly as if it had not stopped.
-    """
-    rows = with_slopes(model)
-    solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
-    common = {"args": args, "options": {"jac": "fwd"}, "tags": frozenset()}
-    shape = jax.eval_shape(rows, position.u, args)[0]
-    state = solver.init(rows, position.u, f_struct=shape, aux_struct=None, **common)
-    state = eqx.tree_at(lambda s: s.search_state.step_size, state, position.step_size)
-    arrays, static = eqx.partition(state, eqx.is_array)
 
-    def advance(carry: tuple[_Position, Any]) -> tuple[_Position, Any]:
-        at, arrays = carry
-        before = eqx.combine(arrays, static)
-        u, state, _ = solver.step(rows, at.u, state=before, **common)
-        first = before.first_step  # evaluates where it stands
-        accepted = state.num_accepted_steps > before.num_accepted_steps
-        cost = state.f_info.as_min()
-        little = accepted & (at.cost - cost <= TOLERANCE * at.cost)
-        calm = jnp.where(little, at.calm + 1, jnp.where(accepted, 0, at.calm))
-        moved = _Position(
-            u=u,
-            cost=cost,
-            step_size=state.search_state.step_size,
-            calm=jnp.where(first, at.calm, calm),
-            stalls=jnp.where(first, at.stalls, jnp.where(accepted, 0, at.stalls + 1)),
-            steps=at.steps + jnp.where(first, 0, 1),
-        )
-        return moved, eqx.filter(state, eqx.is_array)
-
-    def going(carry: tuple[_Position, Any]) -> Array:
-        taken = carry[0].steps - position.steps
-        return eqx.combine(carry[1], static).first_step | (~carry[0].done & (taken < limit))
-
-    position, arrays = jax.lax.while_loop(going, advance, (position, arrays))
-    return position, eqx.combine(arrays, static).f_info.jac.as_matrix()
+@eqx.filter_jit
+def _step(model: Model, at: _Position, args: tuple[Problem, Array]) -> _Position:
+    """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
+    before = at.solver
+    # A trial that lowers no cost is rejected, whatever its slopes, and need not have any.
+    args = (*args, at.cost)
+    u, state, _ = SOLVER.step(with_slopes(model), at.u, args, state=before, **COMMON)
+    first = before.first_step
+    accepted = state.num_accepted_steps > before.num_accepted_steps
+    cost = state.f_info.as_min()
+    little = accepted & (at.cost - cost <= TOLERANCE * at.cost)
+    calm = jnp.where(little, at.calm + 1, jnp.where(accepted, 0, at.calm))
+    return _Position(
+        u=u,
+        cost=cost,
+        calm=jnp.where(first, at.calm, calm),
+        stalls=jnp.where(first | accepted, 0, at.stalls + 1),
+        steps=at.steps + jnp.where(first, 0, 1),
+        solver=state,
+    )
 
 
 class _Spent(Exception):
@@ -121,7 +121,7 @@ class _Fit:
         self.began = time.perf_counter()
         self.thresholds = np.asarray(problem.space.thresholds)
         self.rows = count_rows(problem)
-        self.still = np.zeros((self.rows, problem.space.size))  # slopes that move nothing
+        self.cost_before = np.inf  # of the base's values
         self.start = 0
         self.steps = 0  # of this start
         self.total = 0
@@ -143,34 +143,28 @@ class _Fit:
         if self.progress is not None:
             self.progress(report)
 
-    def position(self, u: np.ndarray) -> _Position:
-        dtype = self.problem.space.u0.dtype
-        one, zero = jnp.ones((), dtype), jnp.zeros((), int)
-        return _Position(jnp.asarray(u, dtype), one, one, zero, zero, zero)
-
     def descend(self, stage: str, u: np.ndarray, limit: int, shifts: Array | None = None) -> Any:
         """Levenberg–Marquardt from `u`: the point it came to, the cost and the slopes there.
 
         Without shifts the thresholds are frozen and the rows are the hard ones.
         """
-        position, slopes = self.position(u), self.still
-        model, second = (hard, position.u) if shifts is None else (ensemble, shifts)
-        while not position.done and int(position.steps) < limit:
-            left = min(MARCH, limit - int(position.steps), self.max_steps - self.steps)
-            if left <= 0:
+        u = jnp.asarray(u, self.problem.space.u0.dtype)
+        model, second = (hard, u) if shifts is None else (ensemble, shifts)
+        args = (self.problem, second)
+        at = _step(model, _begin(model, u, args), args)
+        while not at.done and int(at.steps) < limit:
+            if self.steps >= self.max_steps:
                 raise _Spent
-            before = int(position.steps)
-            args = (self.problem, second)
-            position, slopes = _march(model, position, jnp.asarray(left, int), args)
-            self.steps += int(position.steps) - before
-            self.total += int(position.steps) - before
+            at = _step(model, at, args)
+            self.steps += 1
+            self.total += 1
             if shifts is None:
-                settled = stage == "polish" and bool(position.done)
-                self.keep(stage, np.asarray(position.u), float(position.cost), settled)
+                settled = stage == "polish" and bool(at.done)
+                self.keep(stage, np.asarray(at.u), float(at.cost), settled)
             else:
-                self.report(stage, float(position.cost))
-        cost = float(position.cost) if jnp.isfinite(position.cost) else float("inf")
-        return np.asarray(position.u), cost, np.asarray(slopes)[: self.rows]
+                self.report(stage, float(at.cost))
+        cost = float(at.cost) if jnp.isfinite(at.cost) else float("inf")
+        return np.asarray(at.u), cost, np.asarray(at.slopes)[: self.rows]
 
     def breed(self, u: np.ndarray, cost: float, slopes: Any, spread: float) -> Any:
         """The best of some generations bred from `u`.
@@ -216,9 +210,9 @@ class _Fit:
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """Slopes of the problem's rows at `u`."""
-        here = self.position(u)
-        slopes = _march(hard, here, jnp.zeros((), int), (self.problem, here.u))[1]
-        return np.asarray(slopes)[: self.rows]
+        here = jnp.asarray(u, self.problem.space.u0.dtype)
+        args = (self.problem, here)
+        return np.asarray(_step(hard, _begin(hard, here, args), args).slopes)[: self.rows]
 
     def blur(self, u: np.ndarray) -> Any:
         """Levenberg–Marquardt on the mean residual over shifts that shrink."""
@@ -234,15 +228,17 @@ class _Fit:
         """Both ways from one start, then the smooth columns to their end."""
         self.start, self.steps = number, 0
         self.keep("start", u, cost)
-        ends = [self.blocks(u, 1.2)]
-        if self.thresholds.any():
-            ends.append(self.blocks(self.blur(u), 0.4))
+        u, cost = self.decide(u) if self.thresholds.any() else self.descend("slopes", u, MARCH)[:2]
+        u, _ = self.sweep(u, cost, SWEEPS)
+        self.descend("polish", u, self.max_steps)
+
+    def decide(self, u: np.ndarray) -> Any:
+        """The better of two ways to move thresholds."""
+        ends = [self.blocks(u, 1.2), self.blocks(self.blur(u), 0.4)]
         ends.sort(key=lambda end: end[1])
         if ends[-1][1] - ends[0][1] > AGREED * ends[0][1]:
             ends.insert(0, self.blocks(ends[0][0], 1.2))
-        u, cost = ends[0]
-        u, _ = self.sweep(u, cost, SWEEPS)
-        self.descend("polish", u, self.max_steps)
+        return ends[0]
 
     def sweep(self, u: np.ndarray, cost: float, rounds: int) -> Any:
         """Out of the valleys of single parameters: a clamp never reached has no slope to follow."""
@@ -257,15 +253,15 @@ class _Fit:
     def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:
         """Points of finite cost: the prior's centre, then the lowest of a population of draws."""
         space = self.problem.space
+        candidates, count = given, len(given) if isinstance(given, np.ndarray) else given
         if isinstance(given, int):
-            draws = self.random.normal(size=(POPULATION - 1, space.size))
+            draws = self.random.normal(size=(POPULATION - 2, space.size))
             u0 = np.asarray(space.u0)
             candidates = u0 + START_SPREAD * np.asarray(space.prior_sd) * draws
             candidates = np.concatenate([u0[None], candidates]).astype(u0.dtype)
-            count = given
-        else:
-            candidates, count = given, len(given)
-        costs = evaluate(self.problem, candidates, self.still).cost
+        base = np.asarray(space.pack({}))
+        costs = evaluate(self.problem, np.concatenate([base[None], candidates])).cost
+        self.cost_before, costs = float(costs[0]), costs[1:]
         order = [0, *(1 + np.argsort(costs[1:], kind="stable"))]
         finite = [(candidates[i], float(costs[i])) for i in order if np.isfinite(costs[i])]
         return finite[:count]
@@ -298,8 +294,6 @@ def solve(
     if max_steps < 1 or (starts if isinstance(starts, int) else len(starts)) < 1:
         raise ValueError(f"starts is {starts} and max_steps {max_steps}, wanted at least 1 of each")
     fit = _Fit(problem, seed, max_steps, progress)
-    base = np.asarray(problem.space.pack({}))
-    cost_before = float(evaluate(problem, base[None], fit.still).cost[0])
     spent = interrupted = False
     try:
         for number, (u, cost) in enumerate(fit.starting_points(starts)):
@@ -316,7 +310,7 @@ def solve(
         names=problem.space.names,
         u=fit.best,
         values=np.asarray(problem.space.values(jnp.asarray(fit.best, problem.space.u0.dtype))),
-        cost_before=cost_before,
+        cost_before=fit.cost_before,
         cost=fit.best_cost,
         converged=converged,
         message=_sentence(fit, converged, interrupted, spent),

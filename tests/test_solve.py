@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 import toy
 
-from fitting import population, solve, space
+from fitting import population, slopes, solve, space
 from fitting.problem import Problem
 from jaxik import rule
 
@@ -193,17 +194,42 @@ def test_a_robust_loss_keeps_outliers_from_pulling(loss):
     assert error_with_outliers(loss) < error_with_outliers("squares") / 3
 
 
-def test_a_march_in_two_parts_is_the_march_in_one():
+def test_the_steps_are_those_of_optimistix_on_the_rows_themselves():
     problem = curve_problem()
-    u, one, zero = problem.space.u0, jnp.ones(()), jnp.zeros((), int)
-    start = solve._Position(u, one, one, zero, zero, zero)
-    march = functools.partial(solve._march, solve.hard)
-    whole, slopes = march(start, jnp.asarray(6), (problem, u))
-    half, _ = march(start, jnp.asarray(3), (problem, u))
-    parts, slopes_of_parts = march(half, jnp.asarray(3), (problem, u))
-    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9)
-    np.testing.assert_allclose(slopes, slopes_of_parts, rtol=1e-9)
+    u, args = problem.space.u0, (problem, problem.space.u0)
+    at = solve._begin(solve.hard, u, args)
+    solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
+    plain, rows = u, lambda u, _: (problem.rows(u), None)
+    shape = jax.eval_shape(rows, u, None)[0]
+    common = {"options": {"jac": "fwd"}, "tags": frozenset()}
+    state = solver.init(rows, u, None, f_struct=shape, aux_struct=None, **common)
+    for _ in range(20):
+        at = solve._step(solve.hard, at, args)
+        plain, state, _ = solver.step(rows, plain, None, state=state, **common)
+        np.testing.assert_allclose(at.u, plain, rtol=1e-9)
+    assert float(at.cost) < 1e-2 * float(problem.cost(u))
+    np.testing.assert_allclose(at.cost, problem.cost(at.u), rtol=1e-12)
+    np.testing.assert_allclose(at.slopes[:-2], problem.jacobian(at.u), rtol=1e-12)
+
+
+def test_slopes_are_made_only_where_the_cost_is_low_enough():
+    problem = curve_problem()
+    u, cost = problem.space.u0, problem.cost(problem.space.u0)
+    made = eqx.filter_jit(lambda below: problem.rows_and_jacobian(u, below)[1])
+    np.testing.assert_allclose(made(cost), problem.jacobian(u), rtol=1e-12)
+    assert np.abs(made(cost)).max() > 1
+    assert not np.asarray(made(0.99 * cost)).any()
+
+
+@pytest.mark.parametrize("rows", [3, 5, 127, 128, 129, 1000, 20000])
+def test_the_triangle_of_tall_rows_has_their_squares(rows):
+    tall = np.random.default_rng(rows).normal(size=(rows, 5)) * [1.0, 1e-3, 1e3, 1.0, 1.0]
+    small = np.asarray(slopes.triangle(jnp.asarray(tall)))
+    assert small.shape == (5, 5)
+    np.testing.assert_array_equal(small, np.triu(small))
+    np.testing.assert_allclose(small.T @ small, tall.T @ tall, rtol=1e-10, atol=1e-10)
+    if rows >= 5:
+        np.testing.assert_allclose(np.abs(small), np.abs(np.linalg.qr(tall, "r")), rtol=1e-8)
 
 
 def test_the_same_seed_gives_the_same_solution():
