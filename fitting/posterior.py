@@ -211,7 +211,11 @@ def _steps(
     dtype = problem.space.u0.dtype
 
     def evaluate(u: np.ndarray) -> np.ndarray:
-        return np.asarray(_log_probabilities(problem, np.asarray(u, dtype)), float)
+        """Half of the walkers at a time, as the moves ask for them: one program."""
+        halves = np.asarray(u, dtype).reshape(-1, identity.walkers // 2, u.shape[1])
+        return np.concatenate(
+            [np.asarray(_log_probabilities(problem, half), float) for half in halves]
+        )
 
     last = chain.last or _start(identity, evaluate, start_u, start_sd)
     sampler = emcee.EnsembleSampler(
