@@ -55,8 +55,9 @@ def with_slopes(model: Model) -> Callable[[Array, Any], tuple[Array, Array]]:
 
     @rows.def_jvp
     def _(primals: Any, tangents: Any, *, args: Any) -> Any:
-        turned, steepness, slopes = _turned(model, *primals, args)
-        return (turned, slopes), (steepness @ tangents[0], jnp.zeros_like(slopes))
+        (u,), (move,) = primals, tangents
+        turned, steepness, slopes = _turned(model, u, args)
+        return (turned, slopes), (steepness @ move, jnp.zeros_like(slopes))
 
     return lambda u, args: rows(u, args=args)
 

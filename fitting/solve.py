@@ -76,9 +76,9 @@ COMMON = {"options": {"jac": "bwd"}, "tags": frozenset()}
 def _begin(model: Model, u: Array, args: tuple[Problem, Array]) -> _Position:
     """A march that has not evaluated anything yet."""
     rows, zero, endless = with_slopes(model), jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
-    args = (*args, endless)
-    shape, aux_shape = jax.eval_shape(rows, u, args)
-    state = SOLVER.init(rows, u, args, f_struct=shape, aux_struct=aux_shape, **COMMON)
+    all_args = (*args, endless)
+    shape, aux_shape = jax.eval_shape(rows, u, all_args)
+    state = SOLVER.init(rows, u, all_args, f_struct=shape, aux_struct=aux_shape, **COMMON)
     whole = jnp.ones((), u.dtype)  # optimistix's own is of JAX's default type
     state = eqx.tree_at(lambda state: state.search_state.step_size, state, whole)
     return _Position(u, endless, zero, zero, zero, state)
@@ -89,8 +89,8 @@ def _step(model: Model, at: _Position, args: tuple[Problem, Array]) -> _Position
     """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
     before = at.solver
     # A trial that lowers no cost is rejected, whatever its slopes, and need not have any.
-    args = (*args, at.cost)
-    u, state, _ = SOLVER.step(with_slopes(model), at.u, args, state=before, **COMMON)
+    below = (*args, at.cost)
+    u, state, _ = SOLVER.step(with_slopes(model), at.u, below, state=before, **COMMON)
     first = before.first_step
     accepted = state.num_accepted_steps > before.num_accepted_steps
     cost = state.f_info.as_min()
@@ -148,10 +148,10 @@ class _Fit:
 
         Without shifts the thresholds are frozen and the rows are the hard ones.
         """
-        u = jnp.asarray(u, self.problem.space.u0.dtype)
-        model, second = (hard, u) if shifts is None else (ensemble, shifts)
+        here = jnp.asarray(u, self.problem.space.u0.dtype)
+        model, second = (hard, here) if shifts is None else (ensemble, shifts)
         args = (self.problem, second)
-        at = _step(model, _begin(model, u, args), args)
+        at = _step(model, _begin(model, here, args), args)
         while not at.done and int(at.steps) < limit:
             if self.steps >= self.max_steps:
                 raise _Spent
@@ -253,12 +253,13 @@ class _Fit:
     def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:
         """Points of finite cost: the prior's centre, then the lowest of a population of draws."""
         space = self.problem.space
-        candidates, count = given, len(given) if isinstance(given, np.ndarray) else given
+        u0 = np.asarray(space.u0)
         if isinstance(given, int):
             draws = self.random.normal(size=(POPULATION - 2, space.size))
-            u0 = np.asarray(space.u0)
-            candidates = u0 + START_SPREAD * np.asarray(space.prior_sd) * draws
-            candidates = np.concatenate([u0[None], candidates]).astype(u0.dtype)
+            drawn = u0 + START_SPREAD * np.asarray(space.prior_sd) * draws
+            count, candidates = given, np.concatenate([u0[None], drawn]).astype(u0.dtype)
+        else:
+            count, candidates = len(given), given
         base = np.asarray(space.pack({}))
         costs = evaluate(self.problem, np.concatenate([base[None], candidates])).cost
         self.cost_before, costs = float(costs[0]), costs[1:]

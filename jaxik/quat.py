@@ -102,7 +102,8 @@ def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array,
 
 def half_cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
     """Cosine and sine of half an angle, rad."""
-    return vec.once(jnp.cos(0.5 * angle), jnp.sin(0.5 * angle))
+    cos, sin = vec.once(jnp.cos(0.5 * angle), jnp.sin(0.5 * angle))
+    return cos, sin
 
 
 def from_half(

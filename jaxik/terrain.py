@@ -94,13 +94,7 @@ class Mesh(AbstractSurface):
             self.vertices_ws.at[ends[..., corner]].get(mode="promise_in_bounds")
             for corner in range(3)
         )
-        # Sides in units of the longest, so that a tiny triangle has a normal too.
-        square = jnp.maximum(vec.dot(b - a, b - a), vec.dot(c - a, c - a))
-        inverse = jax.lax.stop_gradient(
-            vec.safe_divide(jnp.ones_like(square), vec.safe_sqrt(square))
-        )
-        normal = vec.unit(vec.cross(vec.scale(b - a, inverse), vec.scale(c - a, inverse)), up_ws)
-        normal = vec.scale(normal, jnp.where(vec.dot(normal, up_ws) < 0, -1.0, 1.0))
+        normal = vec.normal(a, b, c, up_ws)
         distance = _drop(origins_ws, up_ws, a, normal)
         # A ray let in by rounding lies outside its triangle by a hair, which a steep plane makes
         # long: the value stays between the corners, the slope is that of the plane.
@@ -108,7 +102,9 @@ class Mesh(AbstractSurface):
         low = jnp.minimum(jnp.minimum(drops[0], drops[1]), drops[2])
         high = jnp.maximum(jnp.maximum(drops[0], drops[1]), drops[2])
         distance += jax.lax.stop_gradient(jnp.clip(distance, low, high) - distance)
-        return distance, normal, seen
+        # Once, or all that is made of a hit would compute it from the corners again.
+        x, y, z, distance = vec.once(*vec.components(normal), distance)
+        return distance, vec.stack(x, y, z), seen
 
 
 class Terrain(eqx.Module):

@@ -132,3 +132,29 @@ def reject(v: Float[Array, "*a 3"], direction: Float[Array, "*b 3"]) -> Float[Ar
 def constant(v: tuple[float, float, float], like: Array) -> Float[Array, "3"]:
     """A fixed vector in the dtype of `like`."""
     return jnp.asarray(v, like.dtype)
+
+
+def normal(
+    a: Float[Array, "*b 3"], b: Float[Array, "*b 3"], c: Float[Array, "*b 3"], up: Float[Array, "3"]
+) -> Float[Array, "*b 3"]:
+    """Unit normal of triangles, on the side of up; up where they have no area.
+
+    By components up to the end, which halves the time of a ray's hit.
+    """
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (components(corner) for corner in (a, b, c))
+    upx, upy, upz = components(up)
+    bx, by, bz, cx, cy, cz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+    # Sides in units of the longest, so that a tiny triangle has a normal too.
+    square = jnp.maximum(bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz)
+    inverse = jax.lax.stop_gradient(safe_divide(jnp.ones_like(square), safe_sqrt(square)))
+    bx, by, bz, cx, cy, cz = (side * inverse for side in (bx, by, bz, cx, cy, cz))
+    x, y, z = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    square = x * x + y * y + z * z
+    known = square > jnp.finfo(square.dtype).eps ** 2
+    length = jnp.sqrt(jnp.where(known, square, 1.0))
+    inverse = jnp.where(x * upx + y * upy + z * upz < 0, -1.0, 1.0) / length
+    return stack(
+        jnp.where(known, x * inverse, upx),
+        jnp.where(known, y * inverse, upy),
+        jnp.where(known, z * inverse, upz),
+    )

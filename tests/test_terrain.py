@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from jax.test_util import check_grads
 
-from jaxik import grid, terrain
+from jaxik import cells, terrain
 
 # Embree computes in float32: at coordinates up to 10 m, and slopes up to 20, heights agree to this.
 EMBREE = 1e-4  # m
@@ -376,6 +376,24 @@ def test_terrains_of_the_same_shapes_are_mapped_over():
     np.testing.assert_allclose(heights, np.broadcast_to(heights[0], (3, 2)), atol=1e-12)
 
 
+def test_masks_and_rays_mapped_together_or_apart_answer_as_alone():
+    vertices, triangles = rough(6)
+    ground = terrain.mesh(vertices, triangles, layer=np.arange(len(triangles)) % 3)
+    origins = jnp.asarray(np.random.default_rng(15).uniform(-3, 3, (4, 5, 3))).at[..., 1].set(5.0)
+    masks = jnp.array([1, 2, 4, 7], jnp.uint32)
+
+    def met(origins, mask):
+        return terrain.cast(ground, origins, 9.0, mask).distance
+
+    each = jnp.stack([jnp.stack([met(rays, mask) for rays in origins]) for mask in masks])
+    both = jax.vmap(met)(origins, masks)
+    np.testing.assert_allclose(both, each[np.arange(4), np.arange(4)], atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(met, (None, 0))(origins[0], masks), each[:, 0], atol=1e-12)
+    apart = jax.vmap(jax.vmap(met, (0, None)), (None, 0))(origins, masks)
+    np.testing.assert_allclose(apart, each, atol=1e-12)
+    assert len(np.unique(each[:, 0, 0])) > 1
+
+
 def test_float32_stays_float32_under_strict_promotion():
     vertices, triangles = rough(6)
     with jax.numpy_dtype_promotion("strict"):
@@ -401,7 +419,7 @@ def test_an_uneven_mesh_keeps_its_lists_short():
     assert isinstance(surface, terrain.Mesh)
     index = surface.grid
     assert index.depth > 0
-    assert np.diff(index.first).max() <= 2 * grid.CROWD
+    assert np.diff(index.first).max() <= 2 * cells.CROWD
     assert len(index.members) < 20 * len(triangles) and len(index.children) < 20 * len(triangles)
     draw = np.random.default_rng(12)
     local = draw.uniform(-0.09, 0.09, (4000, 3)) + [30.0, 0.0, 30.0]
