@@ -86,8 +86,8 @@ class SlopeLean(AbstractLean):
     ) -> Slope:
         forward_ws, right_ws = heading(frame.world_from_model, up_ws)
         share = contact.weight * ground.ankle.found * weight
-        normal = jnp.sum(vec.scale(ground.ankle.normal, share), axis=-2)
-        normal = jnp.where(jnp.sum(share) > 0, normal, up_ws)
+        normal = vec.total_of(vec.scale(ground.ankle.normal, share))
+        normal = jnp.where(vec.total(share) > 0, normal, up_ws)
         up = vec.dot(normal, up_ws)
         return Slope(
             vec.safe_arctan2(-vec.dot(normal, forward_ws), up),

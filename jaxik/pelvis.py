@@ -239,10 +239,10 @@ class SupportPelvis(AbstractFollowingPelvis):
     def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
         asked = asked_heights(sensed, target_ws)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
-        total = jnp.sum(weight)
+        total = vec.total(weight)
         taking_part = sensed.weight > 0
         lowest = gate.least(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
-        support = vec.safe_divide(jnp.sum(weight * asked), total)
+        support = vec.safe_divide(vec.total(weight * asked), total)
         return jnp.where(total > 0, ease.approach(support, lowest, self.lowest_share), otherwise)
 
 
@@ -283,7 +283,7 @@ class ReachPelvis(AbstractFollowingPelvis):
 
 def mean_height(sensed: Sensed, asked: Array) -> Float[Array, ""]:
     """Mean of what legs ask for, m, by their share of foot IK; 0 where none takes part."""
-    return vec.safe_divide(jnp.sum(sensed.weight * asked), jnp.sum(sensed.weight))
+    return vec.safe_divide(vec.total(sensed.weight * asked), vec.total(sensed.weight))
 
 
 def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:

@@ -4,6 +4,8 @@ What has no memory is computed for all frames at once (`sense`, `pose`); only a 
 go through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
 """
 
+import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -88,7 +90,7 @@ class Result(eqx.Module):
     corrections: Corrections
     reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
     aimed: Float[Array, "*b legs"]  # 1 where the foot is turned as its rule wants, else 0
-    trace: Trace
+    trace: Trace | None  # None where `step` was not asked for it
 
 
 def init(ik: FootIK, rig: Rig) -> State:
@@ -238,14 +240,14 @@ def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform
     """The body's move in model space: a turn about the middle of the hips, then an offset."""
     into_model = quat.conjugate(frame.world_from_model.rot)
     present = rig.present.astype(offset_ws.dtype)
-    count = jnp.where(jnp.any(rig.present), jnp.sum(present), 1.0)
-    pivot = jnp.sum(vec.scale(frame.pose.hip.pos, present), axis=-2) / count
+    share = present / jnp.maximum(vec.total(present), 1.0)
+    pivot = vec.fence(vec.total_of(vec.scale(frame.pose.hip.pos, share)))
     turn = quat.multiply(into_model, quat.multiply(turn_ws, quat.conjugate(into_model)))
     offset = quat.rotate(into_model, offset_ws)
     return Transform(pivot + offset - quat.rotate(turn, pivot), turn)
 
 
-@eqx.filter_jit
+@functools.partial(jax.jit, static_argnames="trace")
 def step(
     ik: FootIK,
     rig: Rig,
@@ -253,6 +255,8 @@ def step(
     state: State,
     frame: Frame,
     gate: AbstractGate = HARD,
+    *,
+    trace: bool = False,
 ) -> tuple[State, Result]:
     """One frame of one character, live.
 
@@ -263,16 +267,20 @@ def step(
         state: memory, from `init` or from the step before.
         frame: the animation.
         gate: `Hard` decides as a game does; `Smooth` has slopes through decisions.
+        trace: whether the result tells every stage's output. A call spends a third of its time on
+            handing these out, one buffer a leaf.
     """
     with jax.named_scope("contact"):
         seen = ik.contact.sense(frame, gate)
         standing, contact = ik.contact.advance(seen, frame.dt, state.contact, state.started, gate)
     sensed = sense(ik, rig, terrain, frame, contact, gate)
     advanced = advance(ik, terrain, sensed, state, standing, gate)
-    return advanced.state, pose(ik, rig, frame, sensed, advanced, gate)
+    result = pose(ik, rig, frame, sensed, advanced, gate)
+    told = Trace(sensed, advanced) if trace else None
+    return advanced.state, dataclasses.replace(result, trace=told)
 
 
-@eqx.filter_jit
+@jax.jit
 def resume(
     ik: FootIK,
     rig: Rig,

@@ -3,6 +3,7 @@
 `q` and `-q` are the same rotation. Corrections of a local rotation are multiplied on its right.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -25,6 +26,7 @@ def identity(dtype=None) -> Float[Array, "4"]:
     return jnp.array([1.0, 0.0, 0.0, 0.0], dtype)
 
 
+@jax.jit
 def multiply(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*c 4"]:
     """`a` after `b`."""
     aw, ax, ay, az = components(a)
@@ -44,6 +46,7 @@ def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     return stack(w, -x, -y, -z)
 
 
+@jax.jit
 def rotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
     """`v` turned by `q`."""
     w, x, y, z = components(q)
@@ -84,7 +87,8 @@ def unit(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     square = dot(q, q)
     known = square > jnp.finfo(q.dtype).eps ** 2
     inverse = 1.0 / jnp.sqrt(jnp.where(known, square, 1.0))
-    return jnp.where(known[..., None], q * inverse[..., None], identity(q.dtype))
+    w, x, y, z = (jnp.where(known, part * inverse, 0.0) for part in components(q))
+    return vec.fence(stack(jnp.where(known, w, 1.0), x, y, z))
 
 
 def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array, Array]:

@@ -55,7 +55,7 @@ class Plane(AbstractSurface):
         distance = _drop(origins_ws, up_ws, self.point_ws, self.normal_ws)
         rise = vec.dot(self.normal_ws, up_ws)
         # A ray that starts on the plane meets it, whatever rounding makes of the difference.
-        size = jnp.abs(origins_ws).sum(axis=-1) + jnp.abs(self.point_ws).sum()
+        size = vec.total(jnp.abs(origins_ws)) + vec.total(jnp.abs(self.point_ws))
         allowance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(size)
         seen = (rise != 0) & (distance * jnp.abs(rise) >= -allowance) & (self.layers & mask != 0)
         normal = jnp.where(rise < 0, -self.normal_ws, self.normal_ws)

@@ -88,7 +88,7 @@ def both_ways(
 
     def one(ik: jaxik.FootIK) -> tuple[jaxik.Result, jaxik.Result]:
         def stepped(state: jaxik.State, frame: jaxik.Frame) -> tuple[jaxik.State, jaxik.Result]:
-            return jaxik.step(ik, rig, ground, state, frame)
+            return jaxik.step(ik, rig, ground, state, frame, trace=True)
 
         steps = jax.lax.scan(stepped, jaxik.init(ik, rig), frames)[1]
         return jaxik.run(ik, rig, ground, frames), steps

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -321,3 +321,36 @@ def test_legs_and_batches_are_broadcast():
     bend = limb.pole_bend(to_hip, to_ankle, hinge, target, hinge, soften, twist, HARD)
     assert bend.swing.shape == (3, 2, 4)
     assert bend.half_cos.shape == bend.half_sin.shape == bend.reached.shape == (3, 2)
+
+
+def swung(bent, to_target, hinge, twist):
+    """The axes after a swing: free of a quaternion's choice of sign."""
+    return quat.axes(limb.swing_turn(bent, to_target, hinge, twist))
+
+
+@few
+@given(vectors((1.0,)), vectors((1.0,)), vectors((1.0,)), numbers(-3, 3))
+def test_the_slopes_of_a_swing_agree_with_differences(bent, to_target, hinge, twist):
+    hinge = hinge / np.linalg.norm(hinge)
+    aims = [v / np.linalg.norm(v) for v in (bent, to_target)]
+    assume(aims[0] @ aims[1] > -0.99)
+    assume(max(abs(aims[0] @ hinge), abs(aims[1] @ hinge)) < 0.99)
+    assert_slopes_agree(swung, bent, to_target, hinge, twist)
+
+
+@few
+@given(limbs(numbers(0.1, 3.0)), st.floats(0.2, 0.9))
+def test_the_slopes_of_a_knee_agree_with_differences(drawn, share):
+    to_hip, to_ankle, hinge = drawn[:3]
+    thigh, shin = np.linalg.norm(to_hip), np.linalg.norm(to_ankle)
+    reach = abs(thigh - shin) + share * (thigh + shin - abs(thigh - shin))
+    assert_slopes_agree(limb.hinge_turn, to_hip, to_ankle, hinge, reach)
+
+
+def test_slopes_are_finite_where_a_swing_or_a_knee_has_no_single_answer():
+    swings = ((X, -X, Y), (X, -X, X), (X, Y, X), (X, Y, Y), (X, X, X), (0 * X, Y, Z))
+    for bent, target, hinge in swings:
+        finite_slopes(limb.swing_turn, bent, target, hinge, 0.3)
+    for hip, ankle, hinge in ((X, -X, Y), (X, X, Y), (X, Y, X), (0 * X, Y, Z), (X, Y, Z)):
+        for reach in (0.0, 1.0, 2.0, 3.0):
+            finite_slopes(limb.hinge_turn, hip, ankle, hinge, reach)

@@ -313,7 +313,7 @@ def test_steps_equal_the_scan():
     ik, rig, ground, frames = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
     state, whole = jaxik.init(ik, rig), wandered("odd")
     for index in range(0, FRAMES):
-        state, result = jaxik.step(ik, rig, ground, state, at(frames, index))
+        state, result = jaxik.step(ik, rig, ground, state, at(frames, index), trace=True)
         if index % 20 == 0 or index == FRAMES - 1:
             assert_close(result, at(whole, index), EXACT)
             assert_close(state, at(whole.trace.advanced.state, index), EXACT)
