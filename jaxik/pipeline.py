@@ -311,11 +311,39 @@ def resume(
     return after, result
 
 
+@functools.partial(jax.jit, static_argnames="block")
 def run(
-    ik: FootIK, rig: Rig, terrain: Terrain | LegTerrains, frames: Frame, gate: AbstractGate = HARD
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    frames: Frame,
+    gate: AbstractGate = HARD,
+    *,
+    block: int | None = None,
 ) -> Result:
     """A clip of one character; the leaves of `frames` and of the result lead with frames.
 
-    Jit, vmap and differentiate over any argument.
+    Jit, vmap and differentiate over any argument. `block` cuts a long clip: so many frames are
+    computed at a time, so that besides arguments and results one block is all that memory holds,
+    and in reverse mode one block and the state before each of them. The result is the same.
+
+    Raises:
+        ValueError: a block of no frames.
     """
-    return resume(ik, rig, terrain, init(ik, rig), frames, gate)[1]
+    if block is not None and block < 1:
+        raise ValueError(f"block is {block}, wanted 1 frame or more, or None for all at once")
+    start, count = init(ik, rig), frames.dt.shape[0]
+    if block is None or block >= count:
+        return resume(ik, rig, terrain, start, frames, gate)[1]
+    blocks = count // block
+
+    def resumed(state: State, frames: Frame) -> tuple[State, Result]:
+        return resume(ik, rig, terrain, state, frames, gate)
+
+    cut = jax.tree.map(lambda x: x[: blocks * block].reshape(blocks, block, *x.shape[1:]), frames)
+    state, results = jax.lax.scan(jax.checkpoint(resumed), start, cut)
+    whole = jax.tree.map(lambda x: x.reshape(blocks * block, *x.shape[2:]), results)
+    if blocks * block == count:
+        return whole
+    rest = resumed(state, jax.tree.map(lambda x: x[blocks * block :], frames))[1]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), whole, rest)
