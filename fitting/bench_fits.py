@@ -1,7 +1,7 @@
 """Rows of `jaxik bench` that fit: the Jacobian, a fit warm and cold, its posterior, in 64 bits.
 
-`python -m fitting.bench_fits FRAMES` fits once and prints the seconds that this took in itself:
-what a cold fit is, started in a process of its own.
+`python -m fitting.bench_fits FOLDER` fits the clip in a folder and prints the seconds that the
+search took: what a cold fit is, started in a process of its own.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,14 +24,16 @@ from . import bench_peers as peers
 from . import bench_setup as setup
 from .bench import Row, clocked, cores
 from .bench_setup import Sizes
+from .clips import load_clip, save_clip
 from .posterior import sample_problem
 from .problem import Problem
+from .scenes import load_terrain, save_mesh
 from .solution import Solution
 from .solve import solve
 
 SCIPY = {"SciPy with our slopes": True, "SciPy with differences": False}
 CALLS = 64 * 1000  # log-probabilities of the posterior that is to be reached
-LEAST = 0.5  # s that a compilation takes at least to be kept, as in the commands
+CLIPS, GROUND = ("reference.npz", "base.npz"), "ground.ply"  # of a cold fit
 
 
 def _rows(problem: Problem, u: jax.Array) -> jax.Array:
@@ -109,25 +112,30 @@ def _stages(solution: Solution) -> str:
 def _cold(row: Row, sizes: Sizes) -> None:
     """Samples of whole processes that fit, each first with an empty cache and then with a full."""
     told: list[float] = []
-    for number in range(sizes.fits):
-        with tempfile.TemporaryDirectory() as cache:
-            settings = {
-                "JAX_ENABLE_X64": "1",
-                "JAX_ENABLE_COMPILATION_CACHE": "1",
-                "JAX_COMPILATION_CACHE_DIR": cache,
-                "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(LEAST),
-            }
-            for name in ("empty", "persistent"):
-                row.tell(f"fit: cold, {name} cache, run {number + 1} of {sizes.fits}")
-                took, busy = clocked(lambda: told.append(_fit_apart(sizes.frames, settings)))  # noqa: B023
-                row.samples.setdefault(f"cold, {name} cache", []).append(took)
-                row.busy.setdefault(f"cold, {name} cache", []).append(busy)
-                row.samples.setdefault(f"its search, {name} cache", []).append(told[-1])
+    with tempfile.TemporaryDirectory() as folder:
+        reference, base, ground = setup.recording(sizes.frames)
+        for name, clip in zip(CLIPS, (reference, base), strict=True):
+            save_clip(Path(folder, name), clip)
+        save_mesh(Path(folder, GROUND), ground.vertices, ground.faces)
+        for number in range(sizes.fits):
+            with tempfile.TemporaryDirectory() as cache:
+                settings = {
+                    "JAX_ENABLE_X64": "1",
+                    "JAX_ENABLE_COMPILATION_CACHE": "1",
+                    "JAX_COMPILATION_CACHE_DIR": cache,
+                    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",  # as in the commands
+                }
+                for name in ("empty", "persistent"):
+                    row.tell(f"fit: cold, {name} cache, run {number + 1} of {sizes.fits}")
+                    took, busy = clocked(lambda: told.append(_fit_apart(folder, settings)))  # noqa: B023
+                    row.samples.setdefault(f"cold, {name} cache", []).append(took)
+                    row.busy.setdefault(f"cold, {name} cache", []).append(busy)
+                    row.samples.setdefault(f"its search, {name} cache", []).append(told[-1])
 
 
-def _fit_apart(count: int, settings: Mapping[str, str]) -> float:
+def _fit_apart(folder: str, settings: Mapping[str, str]) -> float:
     """Seconds of a search in a process of its own, to which imports and the clip come."""
-    command = [sys.executable, "-m", "fitting.bench_fits", str(count)]
+    command = [sys.executable, "-m", "fitting.bench_fits", folder]
     done = subprocess.run(
         command, env=os.environ | settings, check=True, capture_output=True, text=True
     )
@@ -166,7 +174,9 @@ def posterior(row: Row, sizes: Sizes) -> None:
 
 def main() -> None:
     """One fit; prints its seconds."""
-    problem = setup.problem(int(sys.argv[1]))
+    folder = Path(sys.argv[1])
+    reference, base = (load_clip(folder / name) for name in CLIPS)
+    problem = setup.problem_of(reference, base, load_terrain(folder / GROUND))
     print(f"{solve(problem).seconds:.2f}")
 
 

@@ -242,22 +242,33 @@ def others() -> tuple[str, ...]:
     return (*left, "probe.toe_ls[2]")
 
 
-def problem(count: int, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
-    """The fit of these parameters to a clip of `count` frames that known ones made, plus noise."""
+def recording(count: int) -> tuple[Clip, Clip, course.Mesh]:
+    """A clip of `count` frames that known parameters made, plus noise; its base, its ground."""
     random = np.random.default_rng(SEED)
-    base = walk(count, uneven_pace=True)
-    made = course.uneven()
+    base, made = walk(count, uneven_pace=True), course.uneven()
+    truth = rule.replace(jaxik.presets.record(), TRUTH)
     uneven = terrain.mesh(made.vertices, made.faces)
-    ik = jaxik.presets.record()
-    truth = rule.replace(ik, TRUTH)
-    result = jaxik.run(truth, base.rig, uneven, frames.frames_of(base))
-    solved = frames.solved_clip(base, result)
+    solved = frames.solved_clip(base, jaxik.run(truth, base.rig, uneven, frames.frames_of(base)))
     reference = solved.with_motion(
         solved.positions_ws + random.normal(0.0, POSITION_NOISE, solved.positions_ws.shape),
         _shaken(solved.rotations_ws, random),
     )
+    return reference, base, made
+
+
+def problem_of(
+    reference: Clip, base: Clip, uneven: terrain.Terrain, names: tuple[str, ...] = tuple(TRUTH)
+) -> Problem:
+    """The fit of these parameters to a recording."""
     scene = make_scene(reference, base, uneven, SIGMAS)
+    ik = jaxik.presets.record()
     return Problem(make_space(ik, [free(ik, name) for name in names]), (scene,), rows_of_scenes)
+
+
+def problem(count: int, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
+    """The fit of these parameters to a recording of `count` frames."""
+    reference, base, made = recording(count)
+    return problem_of(reference, base, terrain.mesh(made.vertices, made.faces), names)
 
 
 def _shaken(wxyz: np.ndarray, random: np.random.Generator) -> np.ndarray:

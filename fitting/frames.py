@@ -30,7 +30,7 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
         up_ws: that floor's normal, unit; another one for a clip on a wall.
     """
     world = clip.world_from_model(floor, up_ws)
-    pose = jax.vmap(lambda world, pose: pose.moved(world.inverse()))(world, clip.leg_pose_ws())
+    pose = _into(world, clip.leg_pose_ws())
     legs = len(clip.rig.joints)
     dtype = world.pos.dtype
     velocity, foot, toe = (
@@ -53,6 +53,22 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
         dt=jnp.full(clip.frames, 1.0 / clip.fps, dtype),
         platform=still,
     )
+
+
+@jax.jit  # outside jit one program, not thirty
+@jax.vmap
+def _into(world: jaxik.Transform, pose_ws: jaxik.LegPose) -> jaxik.LegPose:
+    """Legs of each frame in model space."""
+    return pose_ws.moved(world.inverse())
+
+
+@jax.jit
+@jax.vmap
+def _out_of(
+    world: jaxik.Transform, body: jaxik.Transform, pose: jaxik.LegPose
+) -> tuple[jaxik.Transform, jaxik.LegPose]:
+    """The body's move and the legs of each frame in world space."""
+    return world @ body @ world.inverse(), pose.moved(world)
 
 
 def _velocity(places: np.ndarray, fps: float) -> np.ndarray:
@@ -87,8 +103,7 @@ def solved_clip(
         floor, up_ws: as given to `frames_of`.
     """
     world = clip.world_from_model(floor, up_ws)
-    body = jax.vmap(lambda world, body: world @ body @ world.inverse())(world, result.body)
-    solved = jax.vmap(lambda world, pose: pose.moved(world))(world, result.pose)
+    body, solved = _out_of(world, result.body, result.pose)
     carry_rot, carry_pos = _rotation(body.rot), np.asarray(body.pos)
 
     places, turns = clip.positions_ws.copy(), clip.rotations_ws.copy()

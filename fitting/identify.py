@@ -176,7 +176,7 @@ def _rises(
     space = problem.space
     table = np.tile(solution.values, (len(values), 1))
     table[:, i] = values
-    candidates = np.asarray(population.from_values(space, jnp.asarray(table, space.u0.dtype)))
+    candidates = population.from_values(space, table)
     cost = np.full(len(values), np.inf)
     for _ in range(3 if follow else 1):
         born = population.evaluate(problem, candidates, solution.jacobian)

@@ -1,5 +1,7 @@
 """Many candidates at once: what they cost, and where they would go."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,17 +28,33 @@ def count_rows(problem: Problem) -> int:
     return len(jax.eval_shape(lambda u: problem.rows(u), problem.space.u0))
 
 
-@eqx.filter_jit
 def from_values(
-    space: Space, values: Float[Array, "candidates free"]
-) -> Float[Array, "candidates free"]:
+    space: Space, values: Float[np.ndarray, "candidates free"]
+) -> Float[np.ndarray, "candidates free"]:
     """`u` of many rows of values."""
+    return _in_parts(_from_values, space, values)
+
+
+@eqx.filter_jit
+def _from_values(space: Space, values: Array) -> Array:
     return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(values)
 
 
 @eqx.filter_jit
 def _values_of(space: Space, candidates: Array) -> Array:
     return jax.vmap(space.values)(candidates)
+
+
+def _in_parts(
+    convert: Callable[[Space, Array], Array], space: Space, rows: np.ndarray
+) -> np.ndarray:
+    """Any number of rows converted, POPULATION at a time, the last part filled up: one program."""
+    parts = []
+    for first in range(0, len(rows), POPULATION):
+        some = rows[first : first + POPULATION]
+        filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), space.u0.dtype)
+        parts.append(np.asarray(convert(space, filled))[: len(some)])
+    return np.concatenate(parts)
 
 
 @eqx.filter_jit
@@ -90,13 +108,13 @@ def vary(
     that it had found. Shifts are in the log-odds of the share of the range; 0 keeps a value.
     """
     low, high = np.asarray(space.low), np.asarray(space.high)
-    before = np.asarray(_values_of(space, jnp.asarray(parents, space.u0.dtype)))
+    before = _in_parts(_values_of, space, parents)
     share = np.clip((before - low) / (high - low), EDGE, 1 - EDGE)
     odds = np.log(share / (1 - share)) + shifts
     odds[renewed] = random.logistic(size=int(renewed.sum()))
     varied = low + (high - low) / (1 + np.exp(-odds))
     values = np.where((shifts != 0) | renewed, varied, before)
-    return np.asarray(from_values(space, jnp.asarray(values, space.u0.dtype)))
+    return from_values(space, values)
 
 
 def sweep(problem: Problem, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, float]:
@@ -106,21 +124,21 @@ def sweep(problem: Problem, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, 
     taken over together, as many of them, the best first, as make the lowest cost.
     """
     space = problem.space
-    size, dtype = space.size, space.u0.dtype
-    at = np.asarray(_values_of(space, jnp.asarray(u[None], dtype)))[0]
+    size = space.size
     shares = (np.arange(SWEEP) + 0.5) / SWEEP
     odds = np.tile(np.log(shares / (1 - shares))[:, None], size)
-    grid = np.asarray(_values_of(space, jnp.asarray(odds, dtype)))
+    at, *grid = _in_parts(_values_of, space, np.concatenate([u[None], odds]))
+    grid = np.asarray(grid)
     alone = np.tile(at, (size, SWEEP, 1))
     for i in range(size):
         alone[i, :, i] = grid[:, i]
-    candidates = np.asarray(from_values(space, jnp.asarray(alone.reshape(-1, size), dtype)))
+    candidates = from_values(space, alone.reshape(-1, size))
     costs = evaluate(problem, candidates).cost.reshape(size, SWEEP)
 
     together = np.tile(at, (size, 1))
     for rank, i in enumerate(np.argsort(costs.min(axis=1), kind="stable")):
         together[rank:, i] = grid[np.argmin(costs[i]), i]
-    joined = np.asarray(from_values(space, jnp.asarray(together, dtype)))
+    joined = from_values(space, together)
     every = np.concatenate([candidates, joined])
     costs = np.concatenate([costs.ravel(), evaluate(problem, joined).cost])
     best = int(np.argmin(costs))

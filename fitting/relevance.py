@@ -67,7 +67,7 @@ def _reach(space: Space, scenes: tuple[Scene, ...], place: np.ndarray) -> np.nda
     for i in range(space.size):
         table[i, :, i] = grid[:, i]
     every = np.concatenate([here[None], table.reshape(-1, space.size)])
-    candidates = np.asarray(from_values(space, jnp.asarray(every, dtype)))
+    candidates = from_values(space, every)
     first = _rows(space, scenes, candidates[:1])[0]
     moved = [
         np.abs(_rows(space, scenes, candidates[i : i + POPULATION]) - first)

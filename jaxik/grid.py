@@ -193,6 +193,7 @@ def build(
     )
 
 
+@jax.jit  # outside jit one program, not thirty
 def _corners(
     vertices: Float[Array, "vertices 3"],
     triangles: Int[Array, "triangles 3"],
