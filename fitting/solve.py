@@ -16,25 +16,22 @@ Levenberg–Marquardt on the hard rows, one on the ensemble's, and the populatio
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
+from .march import TOLERANCE, Position, evaluated, step
 from .population import POPULATION, count_rows, evaluate, sweep, vary
 from .problem import Problem
-from .slopes import Model, ensemble, hard, with_slopes
+from .slopes import ensemble, hard
 from .solution import Progress, Solution
 
 MARCH = 8  # steps of Levenberg–Marquardt between two turns of the population
 ROUNDING = 1e-9  # relative: two programs do not sum a cost alike
-TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
-CALM = 2  # such steps in a row that end a march
-STALLS = 12  # rejected steps in a row that end it: each shrinks the step to a quarter
 AGREED = 1e-3  # relative: two ways that end further apart call for a third go
 ROUNDS = 5  # of blocks
 SWEEPS = 8  # of all parameters before the last march, at most
@@ -45,65 +42,6 @@ REPEATED = 16  # children that come again after a Gauss-Newton step
 SPREADS = (0.8, 0.4, 0.2, 0.1)  # of the ensemble's shifts, in u
 PAIRS = 16  # antithetic shifts of the ensemble
 START_SPREAD = 0.5  # of a further start, in prior standard deviations
-
-
-class _Position(eqx.Module):
-    """Where a march of Levenberg–Marquardt stands; all of it data."""
-
-    u: Array
-    cost: Array  # infinite before the first evaluation
-    calm: Array  # accepted steps in a row that gained next to nothing
-    stalls: Array  # rejected steps in a row
-    steps: Array
-    solver: Any  # optimistix's own state: slopes, step size and where it looks next
-
-    @property
-    def done(self) -> Array:
-        return (self.calm >= CALM) | (self.stalls >= STALLS)
-
-    @property
-    def slopes(self) -> Array:
-        """Of the model's rows, at `u`."""
-        return self.solver.aux
-
-
-SOLVER = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
-# Slopes as an array: linearised programs in the solver's state would compile anew in each call.
-COMMON = {"options": {"jac": "bwd"}, "tags": frozenset()}
-
-
-@eqx.filter_jit
-def _begin(model: Model, u: Array, args: tuple[Problem, Array]) -> _Position:
-    """A march that has not evaluated anything yet."""
-    rows, zero, endless = with_slopes(model), jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
-    all_args = (*args, endless)
-    shape, aux_shape = jax.eval_shape(rows, u, all_args)
-    state = SOLVER.init(rows, u, all_args, f_struct=shape, aux_struct=aux_shape, **COMMON)
-    whole = jnp.ones((), u.dtype)  # optimistix's own is of JAX's default type
-    state = eqx.tree_at(lambda state: state.search_state.step_size, state, whole)
-    return _Position(u, endless, zero, zero, zero, state)
-
-
-@eqx.filter_jit
-def _step(model: Model, at: _Position, args: tuple[Problem, Array]) -> _Position:
-    """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
-    before = at.solver
-    # A trial that lowers no cost is rejected, whatever its slopes, and need not have any.
-    below = (*args, at.cost)
-    u, state, _ = SOLVER.step(with_slopes(model), at.u, below, state=before, **COMMON)
-    first = before.first_step
-    accepted = state.num_accepted_steps > before.num_accepted_steps
-    cost = state.f_info.as_min()
-    little = accepted & (at.cost - cost <= TOLERANCE * at.cost)
-    calm = jnp.where(little, at.calm + 1, jnp.where(accepted, 0, at.calm))
-    return _Position(
-        u=u,
-        cost=cost,
-        calm=jnp.where(first, at.calm, calm),
-        stalls=jnp.where(first | accepted, 0, at.stalls + 1),
-        steps=at.steps + jnp.where(first, 0, 1),
-        solver=state,
-    )
 
 
 class _Spent(Exception):
@@ -151,11 +89,12 @@ class _Fit:
         here = jnp.asarray(u, self.problem.space.u0.dtype)
         model, second = (hard, here) if shifts is None else (ensemble, shifts)
         args = (self.problem, second)
-        at = _step(model, _begin(model, here, args), args)
+        known = shifts is None and np.array_equal(here, self.first.u)
+        at = self.first if known else evaluated(model, here, args)
         while not at.done and int(at.steps) < limit:
             if self.steps >= self.max_steps:
                 raise _Spent
-            at = _step(model, at, args)
+            at = step(model, at, args)
             self.steps += 1
             self.total += 1
             if shifts is None:
@@ -211,8 +150,7 @@ class _Fit:
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """Slopes of the problem's rows at `u`."""
         here = jnp.asarray(u, self.problem.space.u0.dtype)
-        args = (self.problem, here)
-        return np.asarray(_step(hard, _begin(hard, here, args), args).slopes)[: self.rows]
+        return np.asarray(evaluated(hard, here, (self.problem, here)).slopes)[: self.rows]
 
     def blur(self, u: np.ndarray) -> Any:
         """Levenberg–Marquardt on the mean residual over shifts that shrink."""
@@ -260,8 +198,19 @@ class _Fit:
             count, candidates = given, np.concatenate([u0[None], drawn]).astype(u0.dtype)
         else:
             count, candidates = len(given), given
-        base = np.asarray(space.pack({}))
-        costs = evaluate(self.problem, np.concatenate([base[None], candidates])).cost
+        first = jnp.asarray(candidates[0], u0.dtype)
+        wide = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+        def begun() -> Position:
+            with jax.enable_x64(wide):  # a thread knows nothing of what is set around its caller
+                return evaluated(hard, first, (self.problem, first))
+
+        with ThreadPoolExecutor(1) as beside:  # the two programs compile side by side
+            coming = beside.submit(begun)
+            costs = evaluate(
+                self.problem, np.concatenate([np.asarray(space.pack({}))[None], candidates])
+            ).cost
+        self.first = coming.result()
         self.cost_before, costs = float(costs[0]), costs[1:]
         order = [0, *(1 + np.argsort(costs[1:], kind="stable"))]
         finite = [(candidates[i], float(costs[i])) for i in order if np.isfinite(costs[i])]

@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 import toy
 
-from fitting import population, slopes, solve, space
+from fitting import march, population, slopes, solve, space
 from fitting.problem import Problem
 from jaxik import rule
 
@@ -197,14 +197,14 @@ def test_a_robust_loss_keeps_outliers_from_pulling(loss):
 def test_the_steps_are_those_of_optimistix_on_the_rows_themselves():
     problem = curve_problem()
     u, args = problem.space.u0, (problem, problem.space.u0)
-    at = solve._begin(solve.hard, u, args)
+    at = march.begin(slopes.hard, u, args)
     solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
     plain, rows = u, lambda u, _: (problem.rows(u), None)
     shape = jax.eval_shape(rows, u, None)[0]
     common = {"options": {"jac": "fwd"}, "tags": frozenset()}
     state = solver.init(rows, u, None, f_struct=shape, aux_struct=None, **common)
     for _ in range(20):
-        at = solve._step(solve.hard, at, args)
+        at = march.step(slopes.hard, at, args)
         plain, state, _ = solver.step(rows, plain, None, state=state, **common)
         np.testing.assert_allclose(at.u, plain, rtol=1e-9)
     assert float(at.cost) < 1e-2 * float(problem.cost(u))

@@ -1,0 +1,79 @@
+"""Levenberg–Marquardt by optimistix, a step at a time, on few rows turned out of many."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array
+
+from .problem import Problem
+from .slopes import Model, with_slopes
+
+TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
+CALM = 2  # such steps in a row that end a march
+STALLS = 12  # rejected steps in a row that end it: each shrinks the step to a quarter
+SOLVER = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
+# Slopes as an array: linearised programs in the solver's state would compile anew in each call.
+COMMON = {"options": {"jac": "bwd"}, "tags": frozenset()}
+
+
+class Position(eqx.Module):
+    """Where a march of Levenberg–Marquardt stands; all of it data."""
+
+    u: Array
+    cost: Array  # infinite before the first evaluation
+    calm: Array  # accepted steps in a row that gained next to nothing
+    stalls: Array  # rejected steps in a row
+    steps: Array
+    solver: Any  # optimistix's own state: slopes, step size and where it looks next
+
+    @property
+    def done(self) -> Array:
+        """Whether further steps are not worth it: next to nothing gained, or none accepted."""
+        return (self.calm >= CALM) | (self.stalls >= STALLS)
+
+    @property
+    def slopes(self) -> Array:
+        """Of the model's rows, at `u`."""
+        return self.solver.aux
+
+
+@eqx.filter_jit
+def begin(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
+    """A march that has not evaluated anything yet."""
+    rows, zero, endless = with_slopes(model), jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
+    all_args = (*args, endless)
+    shape, aux_shape = jax.eval_shape(rows, u, all_args)
+    state = SOLVER.init(rows, u, all_args, f_struct=shape, aux_struct=aux_shape, **COMMON)
+    whole = jnp.ones((), u.dtype)  # optimistix's own is of JAX's default type
+    state = eqx.tree_at(lambda state: state.search_state.step_size, state, whole)
+    return Position(u, endless, zero, zero, zero, state)
+
+
+@eqx.filter_jit
+def step(model: Model, at: Position, args: tuple[Problem, Array]) -> Position:
+    """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
+    before = at.solver
+    # A trial that lowers no cost is rejected, whatever its slopes, and need not have any.
+    below = (*args, at.cost)
+    u, state, _ = SOLVER.step(with_slopes(model), at.u, below, state=before, **COMMON)
+    first = before.first_step
+    accepted = state.num_accepted_steps > before.num_accepted_steps
+    cost = state.f_info.as_min()
+    little = accepted & (at.cost - cost <= TOLERANCE * at.cost)
+    calm = jnp.where(little, at.calm + 1, jnp.where(accepted, 0, at.calm))
+    return Position(
+        u=u,
+        cost=cost,
+        calm=jnp.where(first, at.calm, calm),
+        stalls=jnp.where(first | accepted, 0, at.stalls + 1),
+        steps=at.steps + jnp.where(first, 0, 1),
+        solver=state,
+    )
+
+
+def evaluated(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
+    """Where a march begins, with its cost and slopes."""
+    return step(model, begin(model, u, args), args)
