@@ -90,14 +90,10 @@ def start(row: Row, sizes: Sizes) -> None:
 
 def _bend(batch: setup.Batch) -> Bend:
     """Solved legs."""
-
-    def one(frame: Any, sensed: Any, target_ms: jax.Array) -> Bend:
-        weight = jnp.ones_like(frame.weight)
-        return batch.ik.leg.pose(
-            batch.rig, frame, sensed, frame.pose, target_ms, weight, jaxik.HARD
-        )
-
-    return jax.vmap(one)(batch.frames, batch.sensed, batch.target_ms)
+    frame, weight = batch.frame, jnp.ones_like(batch.frame.weight)
+    return batch.ik.leg.pose(
+        batch.rig, frame, batch.sensed, frame.pose, batch.target_ms, weight, jaxik.HARD
+    )
 
 
 def corrections(batch: setup.Batch) -> tuple[jax.Array, jax.Array]:
@@ -108,14 +104,10 @@ def corrections(batch: setup.Batch) -> tuple[jax.Array, jax.Array]:
 
 def planted(batch: setup.Batch) -> tuple:
     """Legs and feet: the solved pose and all corrections."""
-    bend = _bend(batch)
-
-    def one(frame: Any, sensed: Any, bend: Bend) -> Any:
-        target_ws = frame.world_from_model.apply(bend.pose.ankle.pos)
-        effector = Effector(target_ws, sensed.rot_ws, jnp.ones_like(frame.weight))
-        return batch.ik.foot.pose(batch.rig, frame, sensed, effector, bend, jaxik.HARD)
-
-    feet = jax.vmap(one)(batch.frames, batch.sensed, bend)
+    bend, frame, sensed = _bend(batch), batch.frame, batch.sensed
+    target_ws = frame.world_from_model.apply(bend.pose.ankle.pos)
+    effector = Effector(target_ws, sensed.rot_ws, jnp.ones_like(frame.weight))
+    feet = batch.ik.foot.pose(batch.rig, frame, sensed, effector, bend, jaxik.HARD)
     return feet.pose, bend.hip, bend.knee, feet.ankle
 
 
@@ -145,7 +137,7 @@ def plain_legs(batch: setup.Batch) -> tuple[peers.Legs, float, float, float]:
     """What the NumPy leg takes: the batch, both limits of the knee, rad, and the softening."""
     leg: Any = batch.ik.leg
     limits = (float(leg.min_knee_angle), float(leg.max_knee_angle), float(leg.soften))
-    pose = batch.frames.pose
+    pose = batch.frame.pose
     axis = jnp.broadcast_to(batch.rig.knee_axis_ls, pose.hip.pos.shape)
     parts = (pose.hip.pos, pose.knee.pos, pose.ankle.pos, pose.hip.rot, pose.knee.rot, axis)
     flat = (np.asarray(x).reshape(-1, x.shape[-1]) for x in (*parts, batch.target_ms))

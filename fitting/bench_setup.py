@@ -1,7 +1,6 @@
 """What `jaxik bench` measures on: a walk, legs, grounds, a crowd, a fit."""
 
 import dataclasses
-import math
 from typing import Any
 
 import equinox as eqx
@@ -154,18 +153,18 @@ def with_legs(rig: jaxik.Rig, motion: jaxik.Frame, legs: int) -> tuple[jaxik.Rig
 
 
 class Batch(eqx.Module):
-    """Frames that have been sensed, as legs and feet get them."""
+    """Legs that have been sensed, all on one axis, as their rules get them."""
 
     ik: jaxik.FootIK
     rig: jaxik.Rig
-    frames: jaxik.Frame
+    frame: jaxik.Frame  # what a character has, each of its legs has
     sensed: Sensed
-    target_ms: Float[Array, "frames legs 3"]  # m, of the ankles
+    target_ms: Float[Array, "legs 3"]  # m, of the ankles
 
     @property
     def legs(self) -> int:
         """How many legs there are in all."""
-        return math.prod(self.target_ms.shape[:2])
+        return len(self.target_ms)
 
 
 @jax.jit
@@ -185,7 +184,18 @@ def batch(legs: int) -> Batch:
     sensed = _sensed(ik, rig, tilted, motion)
     drawn = np.random.default_rng(0).uniform(-0.06, 0.06, motion.pose.ankle.pos.shape)
     target = motion.pose.ankle.pos + jnp.asarray(drawn, jnp.float32)
-    return jax.block_until_ready(Batch(ik, rig, motion, sensed, target))
+    rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(target), *leaf.shape)), rig)
+    return jax.block_until_ready(Batch(ik, *_side_by_side((rigs, motion, sensed, target))))
+
+
+def _side_by_side(tree: Any) -> Any:
+    """Leaves (frames, 2 legs, ...) and (frames, ...) as (legs, ...)."""
+
+    def flat(leaf: Array) -> Array:
+        paired = leaf if leaf.shape[1:2] == (2,) else jnp.repeat(leaf[:, None], 2, axis=1)
+        return paired.reshape(-1, *paired.shape[2:])
+
+    return jax.tree.map(flat, tree)
 
 
 class Crowd(eqx.Module):

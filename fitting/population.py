@@ -58,9 +58,13 @@ def _in_parts(
 
 
 @eqx.filter_jit
-def _evaluate(problem: Problem, candidates: Array, slopes: Array) -> tuple[Array, Array]:
+def _evaluate(
+    problem: Problem, candidates: Array, slopes: Array, moving: Array
+) -> tuple[Array, Array]:
     rows = jax.vmap(problem.rows)(candidates)
-    return 0.5 * jnp.sum(rows**2, axis=1), rows @ slopes
+    still = jnp.zeros_like(candidates)
+    pulls = jax.lax.cond(moving, lambda: rows @ slopes, lambda: still)
+    return 0.5 * jnp.sum(rows**2, axis=1), pulls
 
 
 def evaluate(
@@ -74,22 +78,26 @@ def evaluate(
     slopes nothing moves.
     """
     dtype = problem.space.u0.dtype
-    if slopes is None:
-        slopes = np.zeros((count_rows(problem), problem.space.size))
+    shape = (count_rows(problem), problem.space.size)
+    given = jnp.zeros(shape, dtype) if slopes is None else jnp.asarray(slopes, dtype)
+    moving = jnp.asarray(slopes is not None)
     parts = []
     for first in range(0, len(candidates), POPULATION):
         some = candidates[first : first + POPULATION]
         filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), dtype)
-        part = _evaluate(problem, filled, jnp.asarray(slopes, dtype))
+        part = _evaluate(problem, filled, given, moving)
         parts.append([np.asarray(one)[: len(some)] for one in part])
     cost, pulls = (np.concatenate(one) for one in zip(*parts, strict=True))
+    finite = np.isfinite(cost)
+    cost = np.where(finite, cost, np.inf)
+    if slopes is None:
+        return Population(cost, candidates, cost)
     gram = slopes.T @ slopes
     empty = np.diag(gram) == 0  # such a column does not move
     steps = -np.linalg.solve(gram + np.diag(empty), pulls.T).T
     moved, promised = candidates + steps, cost + 0.5 * np.sum(pulls * steps, axis=1)
-    finite = np.isfinite(cost)
     return Population(
-        np.where(finite, cost, np.inf),
+        cost,
         np.where(np.isfinite(moved), moved, candidates),
         np.where(finite, promised, np.inf),
     )
