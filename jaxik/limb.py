@@ -104,10 +104,14 @@ def _half_opening_slope(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
         1.0 / jnp.where(bendable, x, 1.0) for x in (a2, b2, span2, ab)
     )
     cos = 0.5 * (a2 + b2 - apart2) * inverse_ab
-    sin = vec.safe_sqrt((1.0 - cos) * (1.0 + cos))
+    # Of a leg straight to within rounding no slope is told: it would be rounding, a hundred
+    # million times over.
+    sin2 = (1.0 - cos) * (1.0 + cos)
+    bent = sin2 > 64 * jnp.finfo(sin2.dtype).eps
+    sin = jnp.sqrt(jnp.where(bent, sin2, 1.0))
     cos_rise = 0.5 * inverse_ab * (a2_slope + b2_slope - apart2_slope)
     cos_rise -= 0.5 * cos * (inverse_a2 * a2_slope + inverse_b2 * b2_slope)
-    wanted = -cos_rise * vec.safe_divide(jnp.ones_like(sin), sin)
+    wanted = jnp.where(bent, -cos_rise / sin, 0.0)
     present = inverse_span2 * (cos_now * sin_slope - sin_now * cos_slope)
     turn = jnp.where(bendable, 0.5 * (wanted - present), 0.0)
     return (half_cos, half_sin), (-half_sin * turn, half_cos * turn)
