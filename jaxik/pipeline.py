@@ -90,7 +90,7 @@ class Result(eqx.Module):
     corrections: Corrections
     reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
     aimed: Float[Array, "*b legs"]  # 1 where the foot is turned as its rule wants, else 0
-    trace: Trace | None  # None where `step` was not asked for it
+    trace: Any  # a Trace; None from a `step` that was not asked for it
 
 
 def init(ik: FootIK, rig: Rig) -> State:

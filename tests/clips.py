@@ -163,12 +163,10 @@ def make_rig(seed: int = 0, legs: int = 2) -> reference.Rig:
 def planes(*tilts: tuple[float, float, float]) -> PlainTerrain:
     """Three planes, each given by how steeply it rises forward and left, and its height, m.
 
-    The last stands for those that are missing, each 100 m further down: where two planes are one,
-    which of them has the slope is a matter of rounding. Rays meet the highest below their start.
+    Those that are missing are the last, each 100 m further down: of two planes that are one, which
+    has the slope is a matter of rounding. Rays meet the highest below their start.
     """
-    forward, left, height = tilts[-1]
-    deep = [(forward, left, height - 100.0 * count) for count in (1, 2)]
-    listed = (*tilts, *deep)[:3]
+    listed = (*tilts, *((*tilts[-1][:2], tilts[-1][2] - deep) for deep in (100.0, 200.0)))[:3]
     return PlainTerrain(
         maths.Y,
         planes=[
