@@ -354,3 +354,14 @@ def test_slopes_are_finite_where_a_swing_or_a_knee_has_no_single_answer():
     for hip, ankle, hinge in ((X, -X, Y), (X, X, Y), (X, Y, X), (0 * X, Y, Z), (X, Y, Z)):
         for reach in (0.0, 1.0, 2.0, 3.0):
             finite_slopes(limb.hinge_turn, hip, ankle, hinge, reach)
+
+
+@few
+@given(limbs(numbers(0.1, 3.0)))
+def test_a_limb_straight_to_within_rounding_has_no_slope_by_its_reach(drawn):
+    to_hip, to_ankle, hinge = drawn[:3]
+    whole = np.linalg.norm(to_hip) + np.linalg.norm(to_ankle)
+    for reach in (whole, np.nextafter(whole, 0.0), np.nextafter(whole, 9.0)):
+        given_as = [jnp.asarray(x) for x in (to_hip, to_ankle, hinge, reach)]
+        slopes = jax.jacfwd(limb.hinge_turn, argnums=3)(*given_as)
+        np.testing.assert_array_equal(slopes, 0.0)
