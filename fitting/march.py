@@ -13,7 +13,6 @@ from .slopes import Model, with_slopes
 
 TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
 CALM = 2  # such steps in a row that end a march
-STALLS = 12  # rejected steps in a row that end it: each shrinks the step to a quarter
 SOLVER = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
 # Slopes as an array: linearised programs in the solver's state would compile anew in each call.
 COMMON = {"options": {"jac": "bwd"}, "tags": frozenset()}
@@ -29,10 +28,9 @@ class Position(eqx.Module):
     steps: Array
     solver: Any  # optimistix's own state: slopes, step size and where it looks next
 
-    @property
-    def done(self) -> Array:
-        """Whether further steps are not worth it: next to nothing gained, or none accepted."""
-        return (self.calm >= CALM) | (self.stalls >= STALLS)
+    def done(self, stalls: int) -> Array:
+        """Whether steps are not worth it: next to nothing gained, or so many rejected in a row."""
+        return (self.calm >= CALM) | (self.stalls >= stalls)
 
     @property
     def slopes(self) -> Array:

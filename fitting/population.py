@@ -1,6 +1,7 @@
 """Many candidates at once: what they cost, and where they would go."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 
 import equinox as eqx
 import jax
@@ -12,7 +13,9 @@ from .problem import Problem
 from .space import EDGE, Space
 
 POPULATION = 64  # candidates in one vmapped call
-SWEEP = 14  # values of one parameter, spread over its range
+SWEEP = 6  # values of one parameter, spread over its range
+TRIES = 2  # sweeps in a row that find nothing and end a search
+GOLDEN = (5**0.5 - 1) / 2
 
 
 class Population(eqx.Module):
@@ -21,11 +24,6 @@ class Population(eqx.Module):
     cost: Float[np.ndarray, " population"]  # hard; infinite where a row is not finite
     moved: Float[np.ndarray, "population free"]  # after one Gauss-Newton step of smooth columns
     promised: Float[np.ndarray, " population"]  # cost there if the given slopes held
-
-
-def count_rows(problem: Problem) -> int:
-    """How many rows a problem has; nothing is computed."""
-    return len(jax.eval_shape(lambda u: problem.rows(u), problem.space.u0))
 
 
 def from_values(
@@ -58,13 +56,9 @@ def _in_parts(
 
 
 @eqx.filter_jit
-def _evaluate(
-    problem: Problem, candidates: Array, slopes: Array, moving: Array
-) -> tuple[Array, Array]:
+def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
     rows = jax.vmap(problem.rows)(candidates)
-    still = jnp.zeros_like(candidates)
-    pulls = jax.lax.cond(moving, lambda: rows @ slopes, lambda: still)
-    return 0.5 * jnp.sum(rows**2, axis=1), pulls
+    return 0.5 * jnp.sum(rows**2, axis=1), rows
 
 
 def evaluate(
@@ -78,24 +72,25 @@ def evaluate(
     slopes nothing moves.
     """
     dtype = problem.space.u0.dtype
-    shape = (count_rows(problem), problem.space.size)
-    given = jnp.zeros(shape, dtype) if slopes is None else jnp.asarray(slopes, dtype)
-    moving = jnp.asarray(slopes is not None)
-    parts = []
+    costs, pulls = [], []
     for first in range(0, len(candidates), POPULATION):
         some = candidates[first : first + POPULATION]
         filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), dtype)
-        part = _evaluate(problem, filled, given, moving)
-        parts.append([np.asarray(one)[: len(some)] for one in part])
-    cost, pulls = (np.concatenate(one) for one in zip(*parts, strict=True))
+        cost, rows = _evaluate(problem, filled)
+        costs.append(np.asarray(cost)[: len(some)])
+        if slopes is not None:
+            with np.errstate(invalid="ignore"):  # such a candidate's cost is infinite
+                pulls.append(np.asarray(rows)[: len(some)] @ slopes)
+    cost = np.concatenate(costs)
     finite = np.isfinite(cost)
     cost = np.where(finite, cost, np.inf)
     if slopes is None:
         return Population(cost, candidates, cost)
     gram = slopes.T @ slopes
     empty = np.diag(gram) == 0  # such a column does not move
-    steps = -np.linalg.solve(gram + np.diag(empty), pulls.T).T
-    moved, promised = candidates + steps, cost + 0.5 * np.sum(pulls * steps, axis=1)
+    pull = np.concatenate(pulls)
+    steps = -np.linalg.solve(gram + np.diag(empty), pull.T).T
+    moved, promised = candidates + steps, cost + 0.5 * np.sum(pull * steps, axis=1)
     return Population(
         cost,
         np.where(np.isfinite(moved), moved, candidates),
@@ -125,23 +120,47 @@ def vary(
     return from_values(space, values)
 
 
-def sweep(problem: Problem, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, float]:
-    """The best `u`, and its cost, with some parameters carried elsewhere in their range.
+def offsets() -> Iterator[float]:
+    """Where the values of sweeps lie, one sweep's between all those of the sweeps before it."""
+    return ((0.5 + GOLDEN * number) % 1.0 for number in itertools.count())
 
-    Each parameter in turn takes SWEEP values, the others keeping theirs; then the best of each are
-    taken over together, as many of them, the best first, as make the lowest cost.
+
+def sweep(
+    problem: Problem,
+    u: Float[np.ndarray, " free"],
+    cost: float,
+    gain: float,
+    places: Iterator[float],
+) -> tuple[np.ndarray, float] | None:
+    """A `u`, and its cost, with some parameters carried elsewhere in their range.
+
+    The first of TRIES sweeps that lowers the cost by `gain` of itself; None where none does.
+    """
+    for offset in itertools.islice(places, TRIES):
+        carried, lower = _swept(problem, u, (np.arange(SWEEP) + offset) / SWEEP)
+        if lower <= cost * (1 - gain):
+            return carried, lower
+    return None
+
+
+def _swept(
+    problem: Problem, u: Float[np.ndarray, " free"], shares: Float[np.ndarray, " values"]
+) -> tuple[np.ndarray, float]:
+    """The best `u`, and its cost, that these shares of the parameters' ranges make.
+
+    Each parameter in turn takes all the values, the others keeping theirs; then the best of each
+    are taken over together, as many of them, the best first, as make the lowest cost.
     """
     space = problem.space
     size = space.size
-    shares = (np.arange(SWEEP) + 0.5) / SWEEP
     odds = np.tile(np.log(shares / (1 - shares))[:, None], size)
     at, *grid = _in_parts(_values_of, space, np.concatenate([u[None], odds]))
     grid = np.asarray(grid)
-    alone = np.tile(at, (size, SWEEP, 1))
+    alone = np.tile(at, (size, len(shares), 1))
     for i in range(size):
         alone[i, :, i] = grid[:, i]
     candidates = from_values(space, alone.reshape(-1, size))
-    costs = evaluate(problem, candidates).cost.reshape(size, SWEEP)
+    costs = evaluate(problem, candidates).cost.reshape(size, -1)
 
     together = np.tile(at, (size, 1))
     for rank, i in enumerate(np.argsort(costs.min(axis=1), kind="stable")):

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .problem import Problem
@@ -24,6 +25,11 @@ def hard(u: Array, problem: Problem, pivot: Array, below: Array) -> tuple[Array,
     rows, slopes = problem.rows_and_jacobian(jnp.where(frozen, pivot, u), below)
     rows = jnp.concatenate([rows, jnp.where(frozen, u - pivot, 0)])
     return rows, jnp.concatenate([jnp.where(frozen, 0, slopes), jnp.diag(frozen.astype(u.dtype))])
+
+
+def rows_of_problem(slopes: Array) -> Float[np.ndarray, "rows free"]:
+    """Of the slopes of `hard`, those of the problem's own rows."""
+    return np.asarray(slopes)[: -slopes.shape[1]]
 
 
 def ensemble(u: Array, problem: Problem, shifts: Array, _: Array) -> tuple[Array, Array]:

@@ -25,12 +25,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .march import TOLERANCE, Position, evaluated, step
-from .population import POPULATION, count_rows, evaluate, sweep, vary
+from .population import POPULATION, evaluate, offsets, sweep, vary
 from .problem import Problem
-from .slopes import ensemble, hard
+from .slopes import ensemble, hard, rows_of_problem
 from .solution import Progress, Solution
 
 MARCH = 8  # steps of Levenberg–Marquardt between two turns of the population
+STALLS = 5  # rejected steps in a row that end a march: each shrinks the step to a quarter
+LAST_STALLS = 12  # that end the last one
 ROUNDING = 1e-9  # relative: two programs do not sum a cost alike
 AGREED = 1e-3  # relative: two ways that end further apart call for a third go
 ROUNDS = 5  # of blocks
@@ -58,7 +60,7 @@ class _Fit:
         self.progress = progress
         self.began = time.perf_counter()
         self.thresholds = np.asarray(problem.space.thresholds)
-        self.rows = count_rows(problem)
+        self.offsets = offsets()  # of sweeps
         self.cost_before = np.inf  # of the base's values
         self.start = 0
         self.steps = 0  # of this start
@@ -84,26 +86,29 @@ class _Fit:
     def descend(self, stage: str, u: np.ndarray, limit: int, shifts: Array | None = None) -> Any:
         """Levenberg–Marquardt from `u`: the point it came to, the cost and the slopes there.
 
-        Without shifts the thresholds are frozen and the rows are the hard ones.
+        Without shifts the thresholds are frozen and the rows are the hard ones; only these slopes
+        are the problem's.
         """
         here = jnp.asarray(u, self.problem.space.u0.dtype)
         model, second = (hard, here) if shifts is None else (ensemble, shifts)
         args = (self.problem, second)
         known = shifts is None and np.array_equal(here, self.first.u)
         at = self.first if known else evaluated(model, here, args)
-        while not at.done and int(at.steps) < limit:
+        last = stage == "polish"
+        stalls = LAST_STALLS if last else STALLS
+        while not at.done(stalls) and int(at.steps) < limit:
             if self.steps >= self.max_steps:
                 raise _Spent
             at = step(model, at, args)
             self.steps += 1
             self.total += 1
             if shifts is None:
-                settled = stage == "polish" and bool(at.done)
+                settled = last and bool(at.done(stalls))
                 self.keep(stage, np.asarray(at.u), float(at.cost), settled)
             else:
                 self.report(stage, float(at.cost))
         cost = float(at.cost) if jnp.isfinite(at.cost) else float("inf")
-        return np.asarray(at.u), cost, np.asarray(at.slopes)[: self.rows]
+        return np.asarray(at.u), cost, rows_of_problem(at.slopes)
 
     def breed(self, u: np.ndarray, cost: float, slopes: Any, spread: float) -> Any:
         """The best of some generations bred from `u`.
@@ -150,7 +155,7 @@ class _Fit:
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """Slopes of the problem's rows at `u`."""
         here = jnp.asarray(u, self.problem.space.u0.dtype)
-        return np.asarray(evaluated(hard, here, (self.problem, here)).slopes)[: self.rows]
+        return rows_of_problem(evaluated(hard, here, (self.problem, here)).slopes)
 
     def blur(self, u: np.ndarray) -> Any:
         """Levenberg–Marquardt on the mean residual over shifts that shrink."""
@@ -181,11 +186,10 @@ class _Fit:
     def sweep(self, u: np.ndarray, cost: float, rounds: int) -> Any:
         """Out of the valleys of single parameters: a clamp never reached has no slope to follow."""
         for _ in range(rounds):
-            carried, lower = sweep(self.problem, u)
-            if lower > cost * (1 - WORTH):
+            if (found := sweep(self.problem, u, cost, WORTH, self.offsets)) is None:
                 break
-            self.keep("sweep", carried, lower)
-            u, cost, _ = self.descend("sweep", carried, MARCH)
+            self.keep("sweep", *found)
+            u, cost, _ = self.descend("sweep", found[0], MARCH)
         return u, cost
 
     def starting_points(self, given: int | np.ndarray) -> list[tuple[np.ndarray, float]]:

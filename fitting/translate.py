@@ -39,7 +39,7 @@ from .base import load_base
 from .clips import edit
 from .compare import solve
 from .experiment import ClipEntry, Experiment
-from .population import evaluate, sweep
+from .population import evaluate, offsets, sweep
 from .problem import Problem
 from .space import free
 
@@ -233,11 +233,11 @@ def approach(problem: Problem) -> np.ndarray:
     """
     u = np.asarray(problem.space.pack({}))
     cost = float(evaluate(problem, u[None]).cost[0])
+    places = offsets()
     for _ in range(SWEEPS):
-        carried, lower = sweep(problem, u)
-        if not lower < cost * (1 - GAIN):
+        if (found := sweep(problem, u, cost, GAIN, places)) is None:
             break
-        u, cost = carried, lower
+        u, cost = found
     return u[None]
 
 
