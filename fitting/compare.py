@@ -14,7 +14,7 @@ import jaxik
 from jaxik import rule, vec
 from jaxik.terrain import Terrain, cast
 
-from . import compare_plots, files, frames, measures, panels, settings, tables
+from . import compare_plots, files, frames, measures, panels, programs, settings, tables
 from .checks import located
 from .clips.clip import Clip
 from .experiment import check_shapes
@@ -85,7 +85,7 @@ def solve(
     Raises:
         ValueError: for poses that are not finite.
     """
-    result = jaxik.run(ik, clip.rig, ground, motion)
+    result = programs.run(ik, clip.rig, ground, motion)
     solved = frames.solved_clip(clip, result, floor=floor)
     if not np.isfinite(solved.positions_ws).all():
         raise ValueError("these parameters give poses that are not finite; nothing was written")

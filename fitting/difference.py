@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 import jaxik
 from jaxik.skeleton import Transform
 
+from . import programs
 from .residuals import Scene, legs_ws, pelvis_ws, turn_between
 from .tables import Table, number, share
 
@@ -53,7 +54,7 @@ class Difference:
 
 def measure(ik: jaxik.FootIK, scene: Scene) -> Difference:
     """How far this system is from the scene's reference in each frame, and how far it had to go."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    result = programs.run(ik, scene.rig, scene.terrain, scene.frames)
     present = np.asarray(scene.rig.present)
     dt = np.asarray(scene.frames.dt)
     return Difference(

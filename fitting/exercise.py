@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Array, Float
 import jaxik
 from jaxik import rule
 
+from . import programs
 from .identify import NUDGE
 from .problem import Problem
 from .residuals import Scene
@@ -36,7 +36,7 @@ class Exercise:
 
 def exercise(ik: jaxik.FootIK, scene: Scene) -> Exercise:
     """What the scene's clip asks of this system."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    result = programs.run(ik, scene.rig, scene.terrain, scene.frames)
     present = np.asarray(scene.rig.present)
     locked = np.asarray(result.trace.advanced.held.locked)[:, present] > 0.5
     turns = np.diff(locked.astype(int), axis=0)
@@ -97,7 +97,7 @@ def flipped_decisions(
         ik = space.unpack(space.pack(values | moved))
         return np.concatenate(
             [
-                _decisions(jaxik.run(ik, scene.rig, scene.terrain, scene.frames))
+                _decisions(programs.run(ik, scene.rig, scene.terrain, scene.frames))
                 for scene in problem.data
             ]
         )
@@ -125,7 +125,7 @@ def _decisions(result: jaxik.Result) -> np.ndarray:
     return np.stack([np.asarray(one) > 0.5 for one in every], axis=-1).ravel()
 
 
-@eqx.filter_jit
+@programs.kept
 def _step_each(ik: jaxik.FootIK, scene: Scene, before: jaxik.State) -> tuple[Array, ...]:
     """Body and legs of every frame, each stepped from its own memory."""
 

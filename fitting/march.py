@@ -9,6 +9,7 @@ import optimistix as optx
 from jaxtyping import Array
 
 from .problem import Problem
+from .programs import kept
 from .slopes import Model, with_slopes
 
 TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
@@ -38,7 +39,7 @@ class Position(eqx.Module):
         return self.solver.aux
 
 
-@eqx.filter_jit
+@kept
 def begin(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
     """A march that has not evaluated anything yet."""
     rows, zero, endless = with_slopes(model), jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
@@ -50,7 +51,7 @@ def begin(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
     return Position(u, endless, zero, zero, zero, state)
 
 
-@eqx.filter_jit
+@kept
 def step(model: Model, at: Position, args: tuple[Problem, Array]) -> Position:
     """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
     before = at.solver

@@ -15,6 +15,7 @@ from jaxik import frame, vec
 from jaxik.skeleton import Transform
 from jaxik.terrain import cast
 
+from .programs import kept
 from .residuals import Scene, errors_of, legs_ws, pelvis_ws, rows_by_kind
 
 ABOVE, REACH = 1.0, 3.0  # m, where the rays that look for the ground start, and their length
@@ -99,12 +100,12 @@ class Playback(eqx.Module):
 
 def play(ik: jaxik.FootIK, scene: Scene) -> Playback:
     """The scene's clip under these parameters, as NumPy arrays."""
+    return jax.tree.map(np.asarray, _watch(ik, scene))
+
+
+@kept
+def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
     result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
-    return jax.tree.map(np.asarray, _watch(scene, result))
-
-
-@eqx.filter_jit
-def _watch(scene: Scene, result: jaxik.Result) -> Playback:
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
     animated, solved = scene.frames.pose.moved(_per_leg(world)), legs_ws(scene, result)
     base, carried = world @ scene.pelvis, pelvis_ws(scene, result)

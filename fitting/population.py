@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .problem import Problem
+from .programs import kept
 from .space import EDGE, Space
 
 POPULATION = 64  # candidates in one vmapped call
@@ -33,12 +34,12 @@ def from_values(
     return _in_parts(_from_values, space, values)
 
 
-@eqx.filter_jit
+@kept
 def _from_values(space: Space, values: Array) -> Array:
     return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(values)
 
 
-@eqx.filter_jit
+@kept
 def _values_of(space: Space, candidates: Array) -> Array:
     return jax.vmap(space.values)(candidates)
 
@@ -55,7 +56,7 @@ def _in_parts(
     return np.concatenate(parts)
 
 
-@eqx.filter_jit
+@kept
 def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
     rows = jax.vmap(problem.rows)(candidates)
     return 0.5 * jnp.sum(rows**2, axis=1), rows

@@ -1,19 +1,13 @@
-"""The posterior of a fit, sampled with emcee through the hard program.
-
-The moves are differential evolution, nine steps in ten at its usual scale and one with the whole
-difference, which jumps between modes (ter Braak 2006). Never emcee 3.1.6's snooker move: its
-acceptance is wrong, and in 20 dimensions it shrinks a unit variance to 0.81.
-"""
+"""The posterior of a fit, sampled with emcee through the hard program."""
 
 import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import emcee
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,10 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import diagnostics
-from .chain import Chain, Identity, Last
+from .chain import Chain, Identity
 from .problem import Problem
-
-DRAWS = 100  # rounds of start walkers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +106,10 @@ def sample_problem(
         ValueError: for shapes, counts or widths that cannot be, a start where too few walkers find
             a finite log-probability, or a file that holds another run's chain.
     """
+    from . import (
+        sampler,
+    )  # emcee takes scipy.stats with it: half a second, which a fit need not wait
+
     began = time.monotonic()
     size = problem.space.size
     start_u, start_sd = np.asarray(start_u, float), np.asarray(start_sd, float)
@@ -132,7 +128,7 @@ def sample_problem(
     with Chain(identity, path) as chain:
         every = math.ceil(check_every / thin_by)
         limit = max(max_steps // thin_by, len(chain))
-        steps = _steps(problem, chain, start_u, start_sd, limit)
+        steps = sampler.steps(problem, chain, start_u, start_sd, limit)
         try:
             for length in diagnostics.check_lengths(len(chain), every, limit):
                 while len(chain) < length:
@@ -171,92 +167,9 @@ def digest(problem: Problem) -> str:
     return hashed.hexdigest()
 
 
-def moves() -> list[tuple[emcee.moves.Move, float]]:
-    """Proposals and how often each is made."""
-    return [(emcee.moves.DEMove(), 0.9), (emcee.moves.DEMove(gamma0=1.0), 0.1)]
-
-
-class _Recorder(emcee.backends.Backend):
-    """Hands emcee's steps on to a chain."""
-
-    def __init__(self, chain: Chain):
-        super().__init__()
-        self.record = chain.append
-
-    def grow(self, ngrow: int, blobs: Any) -> None:
-        """The chain grows by itself."""
-
-    def save_step(self, state: Any, accepted: np.ndarray) -> None:
-        self.record(state.coords, state.log_prob, accepted, state.random_state)
-
-
-@jax.jit
-def _log_probabilities(
-    problem: Problem, u: Float[Array, "walkers free"]
-) -> Float[Array, " walkers"]:
-    found = jax.vmap(problem.log_probability)(u)
-    return jnp.where(jnp.isfinite(found), found, -jnp.inf)  # emcee raises on NaN
-
-
 @jax.jit
 def _values(problem: Problem, u: Float[Array, "samples free"]) -> Float[Array, "samples free"]:
     return jax.vmap(problem.space.values)(u)
-
-
-def _steps(
-    problem: Problem, chain: Chain, start_u: np.ndarray, start_sd: np.ndarray, limit: int
-) -> Iterator[emcee.State]:
-    """Runs the sampler on from the chain's last step, one stored step at a time."""
-    identity = chain.identity
-    dtype = problem.space.u0.dtype
-
-    def evaluate(u: np.ndarray) -> np.ndarray:
-        """Half of the walkers at a time, as the moves ask for them: one program."""
-        halves = np.asarray(u, dtype).reshape(-1, identity.walkers // 2, u.shape[1])
-        return np.concatenate(
-            [np.asarray(_log_probabilities(problem, half), float) for half in halves]
-        )
-
-    last = chain.last or _start(identity, evaluate, start_u, start_sd)
-    sampler = emcee.EnsembleSampler(
-        identity.walkers,
-        problem.space.size,
-        evaluate,
-        moves=moves(),
-        backend=_Recorder(chain),
-        vectorize=True,
-    )
-    sampler.log_prob_fn = evaluate  # type: ignore[assignment]  # emcee's wrapper prints all walkers when interrupted
-    yield from sampler.sample(
-        emcee.State(last.u, log_prob=last.log_probability, random_state=last.random_state),
-        iterations=limit - len(chain),
-        thin_by=identity.thin_by,
-        skip_initial_state_check=True,
-    )
-
-
-def _start(
-    identity: Identity,
-    evaluate: Callable[[np.ndarray], np.ndarray],
-    start_u: np.ndarray,
-    start_sd: np.ndarray,
-) -> Last:
-    """Walkers around the start, each drawn until its log-probability is finite."""
-    random = np.random.RandomState(identity.seed)  # emcee goes on with this generator's state
-    u = np.empty((identity.walkers, start_u.size))
-    log_probability = np.full(identity.walkers, -np.inf)
-    for _ in range(DRAWS):
-        missing = np.isneginf(log_probability)
-        drawn = start_u + start_sd * random.standard_normal(u.shape)
-        u[missing] = drawn[missing]
-        log_probability[missing] = evaluate(drawn)[missing]
-        if np.isfinite(log_probability).all():
-            return Last(u, log_probability, tuple(random.get_state()))
-    found = int(np.isfinite(log_probability).sum())
-    raise ValueError(
-        f"only {found} of {identity.walkers} walkers found a finite log-probability in {DRAWS}"
-        " draws around start_u; start from a fit, with a smaller start_sd"
-    )
 
 
 def _check_start(size: int, start_u: np.ndarray, start_sd: np.ndarray) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ import jaxik
 from jaxik import rule
 
 from .population import POPULATION, from_values
+from .programs import kept
 from .residuals import Scene, rows_of_scenes
 from .space import PRIOR_SD, Space, free, make_space
 
@@ -83,6 +83,6 @@ def _rows(space: Space, scenes: tuple[Scene, ...], some: np.ndarray) -> np.ndarr
     return np.asarray(_rows_of_all(space, scenes, filled))[: len(some)]
 
 
-@eqx.filter_jit
+@kept
 def _rows_of_all(space: Space, scenes: tuple[Scene, ...], candidates: Array) -> Array:
     return jax.vmap(lambda u: rows_of_scenes(space.unpack(u), scenes))(candidates)

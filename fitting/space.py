@@ -27,6 +27,8 @@ from jaxtyping import Array, Float
 
 from jaxik import rule
 
+from .programs import kept
+
 PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
 CENTRE_LIMIT = 3.0  # of u: a prior centred at a bound would hide the rest of the range
 EDGE = 1e-6  # share of the range that `pack` keeps from a bound, where u is infinite
@@ -188,6 +190,7 @@ class Space(eqx.Module):
         """The system with these free parameters."""
         return rule.replace(self.base, self._write(u)[0])  # type: ignore[type-var]
 
+    @eqx.filter_jit
     def values(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
         """The free parameters in their own units."""
         return self._write(u)[1]
@@ -201,10 +204,14 @@ class Space(eqx.Module):
         Raises:
             ValueError: for a name that is not free.
         """
-        named = given if isinstance(given, Mapping) else {}
+        named = dict(given) if isinstance(given, Mapping) else {}
         if unknown := sorted(set(named) - set(self.names)):
             raise ValueError(f"not free: {unknown}; free are {list(self.names)}")
         tree = self.base if isinstance(given, Mapping) else given
+        return self._pack(tree, {name: jnp.asarray(value) for name, value in named.items()})
+
+    @kept  # apart, every line would be a program
+    def _pack(self, tree: Any, named: dict[str, Array]) -> Array:
         leaves = self._leaves(tree)
         u = [jnp.zeros(())] * self.size
         for i in self.order:

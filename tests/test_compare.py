@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from experiments import ROOT
 
-import jaxik
-from fitting import cli, clips, compare, compare_plots, measures, panels
+from fitting import cli, clips, compare, compare_plots, measures, panels, programs
 from fitting.base import load_base
 from fitting.clips import edit
 from fitting.measures import COLUMNS, Measures
@@ -197,7 +196,7 @@ def test_an_interrupt_leaves_nothing(folder, tmp_path, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(jaxik, "run", interrupt)
+    monkeypatch.setattr(programs, "run", interrupt)
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
     assert cli.main([*map(str, words), "-o", str(tmp_path / "out")]) == cli.INTERRUPTED
     assert capsys.readouterr().err == "record ... stopped\n\njaxik compare: interrupted\n"

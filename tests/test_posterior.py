@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from fitting import diagnostics, posterior
+from fitting import diagnostics, posterior, sampler
 from fitting.chain import Chain, Identity, journal_path
 from fitting.posterior import sample_problem
 from fitting.problem import Problem
@@ -111,7 +111,7 @@ def test_a_known_normal_is_found_with_its_variances(size, stop_at):
 
 
 def test_the_moves_are_differential_evolution_only():
-    kinds = [(type(one).__name__, vars(one)["gamma0"], share) for one, share in posterior.moves()]
+    kinds = [(type(one).__name__, vars(one)["gamma0"], share) for one, share in sampler.moves()]
     assert kinds == [("DEMove", None, 0.9), ("DEMove", 1.0, 0.1)]
 
 
@@ -153,7 +153,7 @@ def test_a_threshold_is_sampled_as_integrated_on_a_grid():
 
     axis = jnp.linspace(-7, 7, 281)
     grid = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    weight = np.exp(np.asarray(posterior._log_probabilities(problem, grid)))
+    weight = np.exp(np.asarray(sampler._log_probabilities(problem, grid)))
     values = np.asarray(posterior._values(problem, grid))
     mean = np.average(values, axis=0, weights=weight)
     sd = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
@@ -279,7 +279,7 @@ def test_an_interrupt_before_the_first_step_is_passed_on_quietly(monkeypatch, ca
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(posterior, "_log_probabilities", interrupted)
+    monkeypatch.setattr(sampler, "_log_probabilities", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sample_problem(normal(2)[0], np.zeros(2), np.ones(2))
     assert capfd.readouterr().out == ""
@@ -516,14 +516,14 @@ def test_the_digest_follows_the_data_the_prior_and_the_loss():
 
 def test_a_walker_on_an_island_is_named_and_left_out(monkeypatch):
     problem = toy(6, two_islands, jnp.asarray(20.0))
-    begin = posterior._start
+    begin = sampler._start
 
     def with_a_castaway(identity, evaluate, start_u, start_sd):
         last = begin(identity, evaluate, start_u, start_sd)
         last.u[3] = 8.0 + 0.1 * last.u[3]
         return last._replace(log_probability=evaluate(last.u))
 
-    monkeypatch.setattr(posterior, "_start", with_a_castaway)
+    monkeypatch.setattr(sampler, "_start", with_a_castaway)
     found = sample_problem(problem, np.zeros(6), np.ones(6))
     assert found.apart == [3] and 3 in found.stuck
     assert "left out: 1 of 24 walkers" in found.message

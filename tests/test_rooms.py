@@ -14,7 +14,7 @@ ORDER = (
     "target lean lock pelvis effector leg foot pipeline presets record"
 ).split()
 LIBRARIES = {"jax", "equinox", "jaxtyping", "numpy"}
-ONE_ROOM_EACH = {"trimesh": "scenes", "optimistix": "march", "emcee": "posterior"}
+ONE_ROOM_EACH = {"trimesh": "scenes", "optimistix": "march", "emcee": "sampler"}
 
 JAXIK = sorted((ROOT / "jaxik").rglob("*.py"))
 FITTING = sorted((ROOT / "fitting").rglob("*.py"))
