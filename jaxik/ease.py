@@ -9,6 +9,8 @@ weight that moves at one pace (`towards`) closes its gap in steps.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from . import vec
+
 LN2 = 0.6931471805599453
 JUMP_GAP = 1e-4  # m: gaps below it are closed at once by the clamped speed
 
@@ -18,6 +20,7 @@ def approach(value: Array, goal: Array, share: Array) -> Array:
     return value + share * (goal - value)
 
 
+@vec.recomputed
 def share_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
     """Share of the gap that a gain per tick of 1/`tick_hz` s closes in `dt` s; gain 1 jumps.
 
@@ -27,6 +30,7 @@ def share_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
     return jnp.where(damped, -jnp.expm1(dt * tick_hz * jnp.log1p(-jnp.where(damped, gain, 0))), 1.0)
 
 
+@vec.recomputed
 def share_of_half_life(half_life: Array, dt: Array) -> Array:
     """Share of the gap closed in `dt` s when half of it takes `half_life` s; 0 or less jumps."""
     damped = half_life > 0
@@ -75,6 +79,7 @@ def spring(
     return _sprung(value, velocity, goal, share_of_half_life(half_life, dt), dt)
 
 
+@vec.recomputed
 def follow(
     value: Array, velocity: Array, goal: Array, share: Array, dt: Array, springy: Array
 ) -> tuple[Array, Array]:

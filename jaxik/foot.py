@@ -263,7 +263,8 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
 def joint_angle(axis: Array, shin: Array) -> Array:
     """Angle, rad, by which `axis` of the foot rises from the plane at right angles to the shin."""
     along = vec.dot(axis, shin)
-    return vec.safe_arctan2(-along, vec.length(axis - vec.scale(shin, along)))
+    along, across = vec.once(along, vec.length(axis - vec.scale(shin, along)))
+    return vec.safe_arctan2(-along, across)
 
 
 def limited(tilt: Array, joint: Array, low: Array, high: Array, gate: AbstractGate) -> Array:

@@ -5,12 +5,15 @@ answer with a weight 0..1, so that `a * b` is "and" and `1 - a` is "not" for eit
 its `band`: the width over which a decision turns, in the unit of what is compared.
 """
 
+import functools
 from abc import abstractmethod
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from . import vec
 
 
 class AbstractGate(eqx.Module):
@@ -58,9 +61,12 @@ class Hard(AbstractGate):
         return jnp.where(capped < low, low, capped)
 
     def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        # Not jnp.min: its slope picks the branch by bitwise equality after fusion.
+        # Not jnp.min: its slope picks the branch by bitwise equality after fusion. Nor what argmin
+        # points at: in reverse mode that is a loop over the batch. NaN is passed on.
         del band
-        return jnp.take_along_axis(x, jnp.argmin(x, axis=-1, keepdims=True), axis=-1)[..., 0]
+        return functools.reduce(
+            lambda a, b: jnp.where((b < a) | jnp.isnan(b), b, a), vec.numbers(x)
+        )
 
 
 class Smooth(AbstractGate):

@@ -123,12 +123,7 @@ class SlopeLean(AbstractLean):
         lean_forward = forward * ease.approach(self.forward_rate, self.forward_rate_slide, sliding)
         lean_side = side * ease.approach(self.side_rate, self.side_rate_slide, sliding)
         turn = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
-        normal = (
-            up_ws
-            - vec.scale(slope.forward_ws, jnp.tan(forward))
-            - vec.scale(slope.right_ws, jnp.tan(side))
-        )
-        lean = Lean(quat.from_rotvec(turn), vec.unit(normal, up_ws))
+        lean = Lean(quat.from_rotvec(turn), _normal(slope, up_ws, forward, side))
         return LeanState(forward, side, sliding, forward_speed, side_speed), lean
 
 
@@ -155,3 +150,11 @@ class NoLean(AbstractLean):
         gate: AbstractGate,
     ) -> tuple[None, Lean]:
         return None, Lean(quat.identity(up_ws.dtype), up_ws)
+
+
+@vec.recomputed
+def _normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
+    """Unit normal of ground that rises by these angles, rad, ahead and to the right."""
+    ahead = vec.scale(slope.forward_ws, jnp.tan(forward))
+    aside = vec.scale(slope.right_ws, jnp.tan(side))
+    return vec.unit(up_ws - ahead - aside, up_ws)

@@ -99,16 +99,18 @@ class TwoBone(AbstractLeg):
         self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate
     ) -> tuple[Array, Array]:
         """Distance from hip to ankle that the limits allow, m, and 1 where that is the target's."""
+        animated, distance = vec.length(to_ankle - to_hip), vec.length(to_target)
         thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
+        thigh2, shin2, animated, distance = vec.once(thigh2, shin2, animated, distance)
         product = vec.safe_sqrt(thigh2 * shin2)
-        longest = opposite_side(thigh2, shin2, product, jnp.cos(self.max_knee_angle))
-        shortest = opposite_side(thigh2, shin2, product, jnp.cos(self.min_knee_angle))
-        animated = vec.length(to_ankle - to_hip)
+        # Once, or each leg's loop would call the C library for them.
+        cos_max, cos_min = vec.once(jnp.cos(self.max_knee_angle), jnp.cos(self.min_knee_angle))
+        longest = opposite_side(thigh2, shin2, product, cos_max)
+        shortest = opposite_side(thigh2, shin2, product, cos_min)
         free = self.soften * longest
         longest = jnp.where(self.as_animated & (animated > longest), animated, longest)
         free = jnp.where(self.as_animated & (animated > free), animated, free)
         shortest = jnp.where(self.as_animated & (animated < shortest), animated, shortest)
-        distance = vec.length(to_target)
         allowed = gate.clip(
             soft_limit(distance, free, longest), shortest, longest, band=LENGTH_BAND
         )

@@ -58,7 +58,7 @@ def hinge_turn(to_hip: Array, to_ankle: Array, hinge: Array, reach: Array) -> tu
     a2, b2 = vec.dot(thigh, thigh), vec.dot(shin, shin)
     across2 = reach * reach - (along_thigh - along_shin) ** 2
     cos_now, sin_now = vec.dot(thigh, shin), vec.dot(hinge, vec.cross(thigh, shin))
-    return _opening(a2, b2, across2, cos_now, sin_now)
+    return _opening(*vec.once(a2, b2, across2, cos_now, sin_now))
 
 
 def _opening(

@@ -202,7 +202,7 @@ def pose(
     effector = advanced.effector
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
-        carried = frame.pose.moved(body)
+        carried = frame.pose.moved(body.copies(rig.side.size))
         bend = ik.leg.pose(rig, frame, sensed, carried, target_ms, effector.weight, gate)
     with jax.named_scope("foot"):
         planted = ik.foot.pose(rig, frame, sensed, effector, bend, gate)

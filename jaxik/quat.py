@@ -130,6 +130,7 @@ def from_axis_angle(axis: Float[Array, "*a 3"], angle: Float[Array, "*b"]) -> Fl
     return from_half(axis, *half_cos_sin(angle))
 
 
+@vec.recomputed
 def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     """Turn about `v` by its length, rad; smooth through zero (Taylor series there)."""
     square = vec.dot(v, v)

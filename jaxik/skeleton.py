@@ -26,6 +26,13 @@ class Transform(eqx.Module):
         back = quat.conjugate(self.rot)
         return Transform(-quat.rotate(back, self.pos), back)
 
+    def copies(self, count: int) -> "Transform":
+        """So many of it, on a last axis such as that of legs.
+
+        Broadcast instead, each of its uses would sum its slopes over the legs in reverse mode.
+        """
+        return Transform(vec.copies(self.pos, count), vec.copies(self.rot, count))
+
     def __matmul__(self, other: "Transform") -> "Transform":
         """`a_from_b @ b_from_c` is `a_from_c`."""
         return Transform(self.apply(other.pos), self.turn(other.rot))

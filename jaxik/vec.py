@@ -7,6 +7,7 @@ the time that tracing the pipeline takes.
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,19 @@ def fence(x: Array) -> Array:
 def once(*values: Array) -> tuple[Array, ...]:
     """Numbers, broadcast against each other, stacked behind a fence: angles, cosines, lengths."""
     return numbers(fence(jnp.stack(jnp.broadcast_arrays(*values), axis=-1)))
+
+
+def recomputed(function: Callable) -> Callable:
+    """The function, of which reverse mode keeps the arguments and computes the rest again.
+
+    For what is cheap and called in a scan, where each number kept is one more array to write.
+    """
+    return jax.checkpoint(function, prevent_cse=False)
+
+
+def copies(v: Float[Array, "*b n"], count: int) -> Float[Array, "*b count n"]:
+    """`v` so many times, on an axis before its own."""
+    return fence(jnp.stack([v] * count, axis=-2))
 
 
 @jax.jit

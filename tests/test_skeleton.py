@@ -200,6 +200,16 @@ def test_a_pose_carried_along_keeps_its_bones(by):
     assert_allclose(moved.ankle.rot, np.tile(by.rot, (2, 1)), atol=1e-15)
 
 
+def test_copies_of_a_transform_are_it_and_add_up_their_slopes():
+    one = Transform(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([0.5, 0.5, -0.5, 0.5]))
+    several = one.copies(3)
+    assert_allclose(several.pos, np.tile(one.pos, (3, 1)), atol=0)
+    assert_allclose(several.rot, np.tile(one.rot, (3, 1)), atol=0)
+    weights = jnp.asarray([[1.0], [10.0], [100.0]])
+    slope = jax.grad(lambda one: jnp.sum(weights * one.copies(3).pos))(one)
+    assert_allclose(slope.pos, [111.0] * 3, atol=0)
+
+
 def test_a_rig_is_data_but_for_its_names_and_joints():
     rig = Rig(
         knee_axis_ls=jnp.asarray([[1.0, 0.0, 0.0]] * 2),
