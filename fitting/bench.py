@@ -23,8 +23,7 @@ from .bench_limits import Work, least, work
 FAILURES = (MemoryError, jax.errors.JaxRuntimeError, subprocess.CalledProcessError)
 
 CEILINGS = "machine"  # the row against which the others are held
-LONG = 1.0  # s of a warm-up from which on it tells how long a call is
-SAMPLE = 0.02  # s that one sample lasts at least: what is quicker is called several times in it
+SAMPLE = 0.2  # s that one sample lasts at least: what is quicker is called several times in it
 STATUS = Path("/proc/self/status")
 Tell = Callable[[str], None]
 
@@ -141,9 +140,8 @@ class Row:
         counts = dict.fromkeys(calls, 1)
         for name, call in () if warm else calls.items():
             self.tell(f"{self.name}: warming up {name}")
+            clocked(call, 1)  # may compile
             took, _ = clocked(call, 1)
-            if took < LONG:  # else it needs no second look, nor several calls a sample
-                took, _ = clocked(call, 1)
             counts[name] = max(1, round(SAMPLE / max(took, 1e-9)))
         order = np.random.default_rng(0)
         drawn: dict[str, list[float]] = {name: [] for name in calls}
