@@ -61,6 +61,7 @@ class Sizes:
     frames: int = 600  # of a clip; 10 s
     derived: int = 512  # of them, whose gradient is taken
     chunk: int = 64  # characters at once
+    derived_chunk: int = 16  # whose reverse run a cache of 32 MB holds
     crowd_repeats: int = 3
     cells: int = 500  # along a side of the field; 2 cells² triangles
     rays: int = 1_000_000

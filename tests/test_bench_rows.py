@@ -27,9 +27,9 @@ from fitting.space import free, make_space
 from jaxik import presets
 
 SMALL = Sizes(
-    repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2, crowd_repeats=1,
-    cells=8, rays=40, read=1 << 12, side=8, fits=1, walkers=40, steps=2, batches=(2, 8),
-    lengths=(10, 20), grids=(3, 6), parameters=(2, 3), legs_each=(2, 3),
+    repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2, derived_chunk=2,
+    crowd_repeats=1, cells=8, rays=40, read=1 << 12, side=8, fits=1, walkers=40, steps=2,
+    batches=(2, 8), lengths=(10, 20), grids=(3, 6), parameters=(2, 3), legs_each=(2, 3),
 )  # fmt: skip
 
 
