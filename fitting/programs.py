@@ -37,7 +37,7 @@ UNSTABLE = tuple(
     for letter in "sd"
     for routine in ("geqrf", "ormqr", "orgqr", "trsm", "gesdd", "syevd", "getrf", "potrf")
 )
-TRACING = threading.Lock()  # two threads would take turns anyway, and trace twice what they share
+TRACING = threading.RLock()  # two threads would take turns anyway, and trace twice what they share
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")

@@ -146,6 +146,17 @@ def test_inside_another_program_it_is_part_of_that(folder):
     assert not folder.exists()
 
 
+def test_one_within_another_that_knows_all_its_arguments_waits_for_nobody(folder, monkeypatch):
+    inner, known = again(), points()
+
+    def outer(p):
+        return p + inner(2.0, known)["longer"]  # nothing of the inner call is traced
+
+    monkeypatch.setattr(outer, "__module__", "fitting.somewhere")
+    found = programs.kept(outer)(points())
+    np.testing.assert_allclose(found, points() + stretch(2.0, points())["longer"])
+
+
 @pytest.mark.parametrize("left", [b"", b"damaged", b"\x80\x04N."])
 def test_a_damaged_file_is_made_anew(folder, left):
     wanted = again()(2.0, points())
