@@ -3,13 +3,8 @@
 import os
 
 # Before JAX is imported. XLA's fusion emitters take three times as long to compile a pipeline on a
-# CPU and do not run faster, and a program in more parts than there are cores takes a tenth longer;
-# the flags do nothing on a GPU.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false "
-    f"--xla_cpu_parallel_codegen_split_count={os.cpu_count() or 1}",
-)
+# CPU and do not run faster; the flag does nothing on a GPU.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import argparse
 import math
