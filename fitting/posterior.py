@@ -106,9 +106,8 @@ def sample_problem(
         ValueError: for shapes, counts or widths that cannot be, a start where too few walkers find
             a finite log-probability, or a file that holds another run's chain.
     """
-    from . import (
-        sampler,
-    )  # emcee takes scipy.stats with it: half a second, which a fit need not wait
+    # Here, for emcee imports scipy.stats: half a second, for which a fit need not wait.
+    from . import sampler
 
     began = time.monotonic()
     size = problem.space.size

@@ -20,6 +20,7 @@ from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import export
 from jax.core import Tracer
 
@@ -35,14 +36,14 @@ FOLDER = "traced"  # in that of JAX's cache
 UNSTABLE = tuple(
     export.DisabledSafetyCheck.custom_call(f"lapack_{letter}{routine}_ffi")
     for letter in "sd"
-    for routine in ("geqrf", "ormqr", "orgqr", "trsm", "gesdd", "syevd", "getrf", "potrf")
+    for routine in ("geqrf", "ormqr", "orgqr", "gesdd")  # of a step's and an ensemble's equations
 )
 TRACING = threading.RLock()  # two threads would take turns anyway, and trace twice what they share
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
-# Its text, what it makes with 0 for each array, and what of that is static.
-Program: TypeAlias = tuple[bytes, Any, Any]
+# Itself, what it makes with 0 for each array, and what of that is static.
+Program: TypeAlias = tuple[export.Exported, Any, Any]
 
 
 class _Unknown(Exception):
@@ -61,9 +62,8 @@ def kept(function: Callable[Given, Made]) -> Callable[Given, Made]:
         given = (args, named)
         if (program := _program(function, given)) is None:
             return function(*args, **named)
-        text, blank, constants = program
-        leaves = jax.tree.leaves(eqx.filter(given, eqx.is_array))
-        made = export.deserialize(bytearray(text)).call(*leaves)
+        exported, blank, constants = program
+        made = exported.call(*jax.tree.leaves(eqx.filter(given, eqx.is_array)))
         return eqx.combine(jax.tree.unflatten(jax.tree.structure(blank), made), constants)
 
     inside = eqx.filter_jit(function)
@@ -152,27 +152,30 @@ def _trace(function: Callable, given: Any) -> Program:
         args, named = eqx.combine(jax.tree.unflatten(structure, leaves), static)
         arrays, constants = eqx.partition(function(*args, **named), eqx.is_array)
         made[:] = [jax.tree.map(lambda _: 0, arrays), constants]
-        return jax.tree.leaves(arrays)
+        # Of the very type it has when read again, or the next program's name would differ.
+        return [jnp.asarray(leaf, leaf.dtype) for leaf in jax.tree.leaves(arrays)]
 
     with TRACING:
         exported = export.export(jax.jit(flat), disabled_checks=UNSTABLE)(*kinds)
-    blank, constants = made
-    return bytes(exported.serialize()), blank, constants
+    return exported, *made
 
 
 def _read(path: Path) -> Program | None:
     """What was kept in a file; None where there is none, or a damaged one."""
     try:
-        return pickle.loads(path.read_bytes())
+        text, blank, constants = pickle.loads(path.read_bytes())
+        return export.deserialize(text), blank, constants
     except Exception:  # whatever is wrong with it, it can be made anew
         return None
 
 
 def _write(path: Path, program: Program) -> None:
     """Keeps a program, where the folder may be written."""
+    exported, *made = program
+    kept_as = pickle.dumps((exported.serialize(), *made))
     with contextlib.suppress(OSError, ValueError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write(path, lambda temporary: temporary.write_bytes(pickle.dumps(program)))
+        files.write(path, lambda temporary: temporary.write_bytes(kept_as))
 
 
 run = kept(jaxik.run)

@@ -118,6 +118,11 @@ def test_the_hard_gate_gives_the_whole_slope_to_one_operand_where_several_are_eq
         assert_allclose(finite_slopes(clip, HARD, x, -1.0, 1.0), [[1, 0, 0]], atol=0)
 
 
+@pytest.mark.parametrize("at", range(3))
+def test_the_least_of_numbers_of_which_one_is_none_is_none(at):
+    assert np.isnan(least(HARD, jnp.asarray([1.0, -1.0, 0.0]).at[at].set(np.nan)))
+
+
 def test_the_hard_program_contains_no_sigmoid():
     for function, args in FUNCTIONS.values():
         program = str(jax.make_jaxpr(function)(HARD, *map(jnp.asarray, args)))

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -157,7 +158,9 @@ def test_one_within_another_that_knows_all_its_arguments_waits_for_nobody(folder
     np.testing.assert_allclose(found, points() + stretch(2.0, points())["longer"])
 
 
-@pytest.mark.parametrize("left", [b"", b"damaged", b"\x80\x04N."])
+@pytest.mark.parametrize(
+    "left", [b"", b"damaged", pickle.dumps(None), pickle.dumps((b"no program", 0, None))]
+)
 def test_a_damaged_file_is_made_anew(folder, left):
     wanted = again()(2.0, points())
     (file,) = folder.iterdir()

@@ -1,6 +1,7 @@
 """The fit finds known parameters, says how it ended, and compiles once."""
 
 import functools
+import itertools
 
 import equinox as eqx
 import jax
@@ -259,3 +260,14 @@ def test_a_fit_keeps_the_type_of_its_numbers():
 def test_no_start_and_no_step_are_refused(options):
     with pytest.raises(ValueError, match="wanted at least 1 of each"):
         solve.solve(curve_problem(), **options)
+
+
+def test_each_sweep_looks_in_the_widest_gap_that_the_sweeps_before_have_left():
+    seen: list[float] = []
+    for place in itertools.islice(population.offsets(), 40):
+        assert 0 <= place < 1
+        if seen:
+            ends = np.sort([*seen, min(seen) + 1])  # once around
+            fallen_into = np.searchsorted(ends, place + (place < ends[0])) - 1
+            assert np.diff(ends)[fallen_into] > np.diff(ends).max() - 1e-9
+        seen.append(place)
