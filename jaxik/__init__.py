@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .gate import HARD as HARD
     from .gate import Hard as Hard
     from .gate import Smooth as Smooth
+    from .many import lanes as lanes
     from .pipeline import FootIK as FootIK
     from .pipeline import Result as Result
     from .pipeline import State as State
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "frame": ("Frame",),
     "gate": ("HARD", "Hard", "Smooth"),
+    "many": ("lanes",),
     "pipeline": ("FootIK", "Result", "State", "init", "resume", "run", "step"),
     "skeleton": ("LegPose", "Rig", "Transform"),
 }

@@ -1,0 +1,188 @@
+"""`lanes` gives what `jax.vmap` gives, with the axis of many last in all that it computes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import jaxprs_in_params
+
+import jaxik
+from fitting import bench_setup as setup
+from jaxik import Smooth, lanes, presets, quat, vec
+from jaxik.terrain import plane
+
+MANY = 5
+
+
+def numbers(*shape, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape))
+
+
+def same(found, wanted, tolerance=1e-12):
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance)
+
+
+@jax.custom_jvp
+def bent(x, y):
+    return jnp.abs(x) * y
+
+
+@bent.defjvp
+def _(primals, tangents):
+    (x, y), (dx, dy) = primals, tangents
+    return bent(x, y), 7.0 * dx + x * dy  # not the slope that JAX would find
+
+
+def carried(x):
+    """A carry that starts the same for all, and one that stays so."""
+
+    def turn(carry, now):
+        place, count = carry
+        return (place + x * now, count + 1), place[0] * count
+
+    return lax.scan(turn, (jnp.zeros(3), 0), jnp.arange(4.0))
+
+
+CASES = {
+    "vectors": lambda x: (vec.cross(x, x[::-1]), vec.unit(x, jnp.ones(3)), vec.total(x)),
+    "rotations": lambda x: quat.rotate(vec_to_quat(x), x),
+    "a number beside an array": lambda x: jnp.where(x[0] > 0, x, 2.0) + jnp.maximum(x, 0.1),
+    "a bound for all": lambda x: lax.clamp(x[0], x, x[0] + 1.0),
+    "shapes": lambda x: jnp.tile(x.reshape(3, 1), (2, 2)).T[1:, ::2].ravel(),
+    "padding": lambda x: jnp.pad(x, (1, 2)),
+    "sums and extremes": lambda x: (x.sum(), x.max(), x.argmin(), jnp.cumsum(x), jnp.any(x > 0)),
+    "sorting": lambda x: jnp.sort(x),
+    "products": lambda x: jnp.arange(12.0).reshape(4, 3) @ x,
+    "what is looked up": lambda x: jnp.arange(10.0)[jnp.argmax(x)] + x[jnp.argmax(x)],
+    "a loop of its own length": lambda x: lax.while_loop(
+        lambda s: s[0] < jnp.abs(x[0]) * 5, lambda s: (s[0] + 1.0, s[1] * x), (0.0, x)
+    ),
+    "a choice": lambda x: lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
+    "a scan": carried,
+    "a scan backwards": lambda x: lax.scan(
+        lambda c, i: (c * x + i, c), x, jnp.arange(3.0), reverse=True
+    ),
+    "one scan in another": lambda x: lax.scan(
+        lambda c, _: (carried(c)[0][0], None), x, None, length=2
+    )[0],
+    "what is computed again": lambda x: jax.checkpoint(jnp.tanh)(x) * 2.0,
+    "slopes told by hand": lambda x: bent(x, x[::-1]),
+    "slopes": lambda x: jax.grad(lambda x: bent(vec.unit(x, x), x[::-1]).sum())(x),
+    "a jitted function": lambda x: jax.jit(vec.dot)(x, 2 * x) + vec.dot(jnp.ones(3), jnp.ones(3)),
+    "what all share": lambda x: (jnp.arange(3), carried(jnp.ones(3)), x),
+    "one within another": lambda x: lanes(lambda y: vec.cross(x, y))(jnp.eye(3)),
+    "vmap within": lambda x: jax.vmap(lambda y: vec.cross(x, y))(jnp.eye(3)),
+    "whole numbers": lambda x: jnp.right_shift((100 * x).astype(int), 1) % 7,
+}
+
+
+def vec_to_quat(x):
+    return vec.once(*vec.components(x), jnp.ones(()))[3] * jnp.asarray([*[0.5] * 4])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_many_compute_is_what_each_computes(name):
+    x = numbers(MANY, 3)
+    wanted = jax.vmap(CASES[name])(x)
+    same(lanes(CASES[name])(x), wanted)
+    same(jax.jit(lanes(CASES[name]))(x), wanted)
+    behind = lanes(CASES[name], in_axes=-1, out_axes=-1)(x.T)
+    same(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), behind), wanted)
+
+
+@pytest.mark.parametrize("name", sorted(set(CASES) - {"a loop of its own length", "whole numbers"}))
+def test_it_is_differentiated_as_vmap_is(name):
+    x, along = numbers(MANY, 3), numbers(MANY, 3, seed=1)
+
+    def total(batched):
+        leaves = lambda x: jax.tree.leaves(batched(CASES[name])(x))  # noqa: E731
+        floats = lambda x: [y for y in leaves(x) if jnp.issubdtype(y.dtype, jnp.floating)]  # noqa: E731
+        return lambda x: sum(jnp.sum(jnp.sin(leaf)) for leaf in floats(x))
+
+    same(jax.grad(total(lanes))(x), jax.grad(total(jax.vmap))(x), 1e-10)
+    same(jax.jvp(total(lanes), (x,), (along,)), jax.jvp(total(jax.vmap), (x,), (along,)), 1e-10)
+
+
+def test_axes_are_told_as_vmap_is_told():
+    def function(shared, tree, z):
+        return {"sum": shared + tree["a"] * z, "b": tree["b"]}
+
+    tree = {"a": numbers(3, MANY), "b": numbers(2)}
+    args = (numbers(3), tree, numbers(MANY))
+    axes = {"in_axes": (None, {"a": 1, "b": None}, 0), "out_axes": {"sum": 1, "b": None}}
+    same(lanes(function, **axes)(*args), jax.vmap(function, **axes)(*args))
+    same(
+        lanes(function, (None, {"a": -1, "b": None}, 0))(*args)["b"], jnp.tile(tree["b"], (MANY, 1))
+    )
+
+
+def test_it_batches_and_scans_itself():
+    x = numbers(4, MANY, 3)
+    same(jax.vmap(lanes(CASES["vectors"]))(x), jax.vmap(jax.vmap(CASES["vectors"]))(x))
+    scanned = lax.scan(lambda c, x: (c, lanes(CASES["vectors"])(x)), 0, x)[1]
+    same(scanned, jax.vmap(jax.vmap(CASES["vectors"]))(x))
+
+
+def test_single_numbers_stay_single():
+    x = numbers(MANY, 3).astype(jnp.float32)
+    same(lanes(lambda x: x * 2.0 + 1)(x), x * 2.0 + 1)
+    assert lanes(lambda x: x + jnp.float64(1))(x).dtype == jnp.float64
+
+
+def test_the_axis_of_many_is_last_in_all_that_is_computed():
+    program = jax.make_jaxpr(lanes(CASES["vectors"], in_axes=-1, out_axes=-1))(numbers(3, MANY))
+
+    def shapes(jaxpr):
+        for equation in jaxpr.eqns:
+            for inner in jaxprs_in_params(equation.params):
+                yield from shapes(inner)
+            yield from (v.aval.shape for v in equation.outvars)
+
+    found = list(shapes(program.jaxpr))
+    assert len(found) > 20
+    assert all(MANY not in shape[:-1] for shape in found)
+
+
+@pytest.mark.parametrize(
+    ("axes", "args", "told"),
+    [
+        (0, (numbers(3), numbers(4)), r"arguments of \[3, 4\], wanted equally many"),
+        (None, (numbers(3), numbers(3)), "no argument with an axis of them"),
+        ((0, 1), (numbers(3), numbers(3)), r"shape \(3,\), wanted one with axis 1"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(axes, args, told):
+    with pytest.raises(ValueError, match=told):
+        lanes(jnp.add, in_axes=axes)(*args)
+
+
+def test_a_result_that_differs_cannot_be_the_same_for_all():
+    with pytest.raises(ValueError, match=r"shape \(3,\) differs, wanted the same for all"):
+        lanes(lambda x: x, out_axes=None)(numbers(MANY, 3))
+
+
+@pytest.mark.parametrize(
+    ("preset", "ground", "gate"),
+    [
+        ("record", "mesh", jaxik.HARD),
+        ("unreal", "plane", jaxik.HARD),
+        ("mec", "plane", setup.single(Smooth(0.1))),
+    ],
+)
+def test_a_crowd_does_what_its_members_do(preset, ground, gate):
+    crowd = dataclasses.replace(setup.crowd(3, 8), drawn={})
+    flat = setup.single(plane(normal=(0.1, 1.0, 0.05)))
+    under = flat if ground == "plane" else setup.ground(setup.field(30))
+    ik = setup.single(getattr(presets, preset)())
+
+    def of_one(given):
+        return jaxik.run(ik, crowd.rig, under, crowd.member(given)[1], gate, block=4)
+
+    found, wanted = jax.jit(lanes(of_one))(crowd.rows), jax.jit(jax.vmap(of_one))(crowd.rows)
+    same(found, wanted, 2e-5)
