@@ -1,19 +1,16 @@
 """The command `jaxik`."""
 
-import os
-
-# Before JAX is imported. XLA's fusion emitters take three times as long to compile a pipeline on a
-# CPU and do not run faster; the flag does nothing on a GPU.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
-
 import argparse
 import math
+import os
 import sys
 import textwrap
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from . import flags
 
 MISTAKE, INTERRUPTED = 2, 130  # exit status
 
@@ -40,6 +37,7 @@ interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and gives its exit status; a user's mistake makes one line on stderr."""
     options = parser().parse_args(arguments)
+    flags.use()
     try:
         from . import commands  # imports JAX: `--help` need not wait for it
 

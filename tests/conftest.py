@@ -1,15 +1,13 @@
 """Shared fixtures: 64-bit floats, and the reference material beside the project."""
 
-import os
 from pathlib import Path
 
-# Before jax is imported: the tests compile more than they compute, and XLA's older way of emitting
-# fused loops on a CPU compiles a pipeline in about half the time.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+import jax
+import pytest
 
-import jax  # noqa: E402
-import pytest  # noqa: E402
+from fitting import flags
 
+flags.use()  # as the commands do
 jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(__file__).resolve().parents[1]
