@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jaxik import lanes
+
 from .robust import Loss, robustify
 from .space import Space
 
@@ -58,7 +60,7 @@ class Problem(eqx.Module):
         rounding = 1.0 + 64 * jnp.finfo(rows.dtype).eps
         return rows, jax.lax.cond(
             0.5 * jnp.sum(rows**2) <= below * rounding,
-            lambda: jax.vmap(slope, out_axes=-1)(basis),
+            lambda: lanes(slope, out_axes=-1)(basis),
             lambda: jnp.zeros((rows.size, u.size), rows.dtype),
         )
 
