@@ -16,19 +16,24 @@ from . import bench_setup as setup
 from .bench import Row, cores, peak_mb, reset_peak
 from .bench_setup import Sizes
 
+BLOCK = 60  # frames at once: what a chunk computes of them stays in a core's cache
+
 
 def outcome(crowd: setup.Crowd, ground: Terrain, given: tuple) -> tuple:
     """What a game takes over of one character: corrections, the body's move, what was reached."""
     ik, frames = crowd.member(given)
-    result = jaxik.run(ik, crowd.rig, ground, frames)
+    return _taken(ik, crowd, ground, frames)
+
+
+def _taken(ik: jaxik.FootIK, crowd: setup.Crowd, ground: Terrain, frames: jaxik.Frame) -> tuple:
+    result = jaxik.run(ik, crowd.rig, ground, frames, block=BLOCK)
     return result.corrections, result.body, result.reached
 
 
 def _loss(ik: jaxik.FootIK, crowd: setup.Crowd, ground: Terrain, frames: jaxik.Frame) -> jax.Array:
     """A number that depends on all of a character's outcome."""
-    result = jaxik.run(ik, crowd.rig, ground, frames)
-    parts = (result.corrections, result.body, result.reached)
-    return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(parts))  # type: ignore[return-value]
+    parts = jax.tree.leaves(_taken(ik, crowd, ground, frames))
+    return sum(jnp.sum(leaf**2) for leaf in parts)  # type: ignore[return-value]
 
 
 def slopes(crowd: setup.Crowd, ground: Terrain, given: tuple) -> tuple:
@@ -54,7 +59,7 @@ def chunked(
     )
 
     def of_chunk(shared: setup.Crowd, ground: Terrain, part: tuple) -> Any:
-        return jax.vmap(lambda given: of_one(shared, ground, given))(part)
+        return jaxik.lanes(lambda given: of_one(shared, ground, given), out_axes=-1)(part)
 
     program = row.program(name, of_chunk, shared, ground, parts[0], sparse=ground)
     row.work[name] = row.work[name] * len(parts)
@@ -94,7 +99,7 @@ def gradient(row: Row, sizes: Sizes) -> None:
     ground = setup.single(plane())
     calls = {
         "forward": chunked(row, "forward", outcome, people, ground, sizes.chunk),
-        "reverse": chunked(row, "reverse", slopes, people, ground, sizes.derived_chunk),
+        "reverse": chunked(row, "reverse", slopes, people, ground, sizes.chunk),
     }
     reset_peak()
     row.race(calls, sizes.crowd_repeats)

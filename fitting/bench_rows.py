@@ -96,12 +96,24 @@ def _bend(batch: setup.Batch) -> Bend:
     )
 
 
+def side_by_side(of_one: Callable[[setup.Batch], Any]) -> Callable[[jaxik.FootIK, tuple], Any]:
+    """What is computed of one leg, for a batch's `in_lanes`."""
+
+    def of_many(ik: jaxik.FootIK, parts: tuple) -> Any:
+        one = lambda parts: of_one(setup.Batch(ik, *parts))  # noqa: E731
+        return jaxik.lanes(one, in_axes=-1, out_axes=-1)(parts)
+
+    return of_many
+
+
+@side_by_side
 def corrections(batch: setup.Batch) -> tuple[jax.Array, jax.Array]:
     """Local rotations of hips and knees."""
     bend = _bend(batch)
     return bend.hip, bend.knee
 
 
+@side_by_side
 def planted(batch: setup.Batch) -> tuple:
     """Legs and feet: the solved pose and all corrections."""
     bend, frame, sensed = _bend(batch), batch.frame, batch.sensed
@@ -125,7 +137,7 @@ def _per_leg(row: Row, count: int, **reach: Any) -> None:
 def legs(row: Row, sizes: Sizes) -> None:
     """Two-bone legs against plain NumPy."""
     batch = setup.batch(sizes.legs)
-    ours = row.compiled("ours", corrections, batch)
+    ours = row.compiled("ours", corrections, *batch.in_lanes())
     plain = plain_legs(batch)
     row.race({"ours": ours, "NumPy": lambda: peers.two_bone(*plain)})
     _per_leg(row, batch.legs, at_most=30.0)
@@ -147,7 +159,7 @@ def plain_legs(batch: setup.Batch) -> tuple[peers.Legs, float, float, float]:
 def feet(row: Row, sizes: Sizes) -> None:
     """Two-bone legs, ankles and all transforms of the solved legs."""
     batch = setup.batch(sizes.feet)
-    row.race({"ours": row.compiled("ours", planted, batch)})
+    row.race({"ours": row.compiled("ours", planted, *batch.in_lanes())})
     _per_leg(row, batch.legs, at_most=80.0)
 
 

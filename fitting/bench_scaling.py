@@ -30,7 +30,8 @@ def scaling(row: Row, sizes: Sizes) -> None:
     ik, flat = setup.single(jaxik.presets.record()), setup.single(plane())
 
     def batch(legs: int) -> dict[str, float]:
-        call = row.compiled(f"{legs} legs", rows.corrections, setup.batch(legs))
+        given = setup.batch(legs).in_lanes()
+        call = row.compiled(f"{legs} legs", rows.corrections, *given)
         return {"two-bone legs": _median(row, f"{legs} legs", call)}
 
     def length(frames: int) -> dict[str, float]:

@@ -61,7 +61,6 @@ class Sizes:
     frames: int = 600  # of a clip; 10 s
     derived: int = 512  # of them, whose gradient is taken
     chunk: int = 64  # characters at once
-    derived_chunk: int = 16  # whose reverse run a cache of 32 MB holds
     crowd_repeats: int = 3
     cells: int = 500  # along a side of the field; 2 cells² triangles
     rays: int = 1_000_000
@@ -166,6 +165,11 @@ class Batch(eqx.Module):
     def legs(self) -> int:
         """How many legs there are in all."""
         return len(self.target_ms)
+
+    def in_lanes(self) -> tuple[jaxik.FootIK, tuple]:
+        """The system, and batches of one leg side by side on the last axis."""
+        parts = (self.rig, self.frame, self.sensed, self.target_ms)
+        return self.ik, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], parts)
 
 
 @jax.jit

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from clips import assert_close
@@ -27,7 +28,7 @@ from fitting.space import free, make_space
 from jaxik import presets
 
 SMALL = Sizes(
-    repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2, derived_chunk=2,
+    repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2,
     crowd_repeats=1, cells=8, rays=40, read=1 << 12, side=8, fits=1, walkers=40, steps=2,
     batches=(2, 8), lengths=(10, 20), grids=(3, 6), parameters=(2, 3), legs_each=(2, 3),
 )  # fmt: skip
@@ -89,7 +90,7 @@ def test_legs_and_feet_are_held_against_what_is_to_be_reached():
 def test_numpys_leg_is_ours():
     with jax.enable_x64(True):
         batch = bench_setup.batch(200)
-        ours = [np.asarray(x).reshape(-1, 4) for x in bench_rows.corrections(batch)]
+        ours = [np.asarray(x)[0].T for x in bench_rows.corrections(*batch.in_lanes())]
         theirs = bench_peers.two_bone(*bench_rows.plain_legs(batch))
     for our, their in zip(ours, theirs, strict=True):
         assert_close(np.abs(np.sum(our * their, axis=-1)), np.ones(200), 1e-4)
@@ -117,6 +118,7 @@ def test_a_crowd_in_chunks_is_the_crowd_whole():
         flat = bench_setup.single(bench_rows.plane())
         row = bench.Row("crowd", "crowd", 1)
         parts = bench_crowd.chunked(row, "plane", places, people, flat, 2)()
+        parts = [jnp.moveaxis(part, -1, 0) for part in parts]  # members are last
         whole = jax.vmap(lambda given: places(people, flat, given))(people.rows)
     first, second, last = parts
     assert_close([first, second, last], [whole[:2], whole[2:4], whole[3:]], 1e-5)
