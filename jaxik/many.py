@@ -33,7 +33,9 @@ ALONG = frozenset(
 )
 
 
-def lanes(function: Callable, in_axes: Any = 0, out_axes: Any = 0) -> Callable:
+def lanes(
+    function: Callable, in_axes: Any = 0, out_axes: Any = 0, *, block: int | None = None
+) -> Callable:
     """`jax.vmap`, with the axis it adds behind all others in what is computed.
 
     The results are those of `jax.vmap` but for rounding, and transform in the same ways. On a CPU
@@ -45,11 +47,16 @@ def lanes(function: Callable, in_axes: Any = 0, out_axes: Any = 0) -> Callable:
         in_axes: the axis of the many in each argument, None where all share it; as `jax.vmap` has
             it, one for all or a tree whose leaves stand for what is below them.
         out_axes: where it is to be in each result; None where a result is the same for all.
+        block: so many at a time, in a loop. Besides arguments and results a block is all that
+            memory holds, in reverse mode too; one that a core's cache holds is quicker than all.
 
     Raises:
-        ValueError: no argument has such an axis, arguments are of unequally many, or a result that
-            differs was to be the same for all.
+        ValueError: no argument has such an axis, arguments are of unequally many, a result that
+            differs was to be the same for all, or a block of none.
     """
+
+    if block is not None and block < 1:
+        raise ValueError(f"block is {block}, wanted 1 or more, or None for all at once")
 
     @functools.wraps(function)
     def of_many(*args: Any) -> Any:
@@ -64,12 +71,39 @@ def lanes(function: Callable, in_axes: Any = 0, out_axes: Any = 0) -> Callable:
             (x, False) if axis is None else (jnp.moveaxis(x, axis, -1), True)
             for x, axis in zip(given, axes, strict=True)
         ]
-        made = _Many(size).evaluate(traced.jaxpr, traced.consts, values)
+        made = _in_blocks(traced, values, size, size if block is None else min(block, size))
         places = _leaves(out_axes, shapes)
         results = [_placed(*one, size, place) for one, place in zip(made, places, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return of_many
+
+
+def _in_blocks(traced: ClosedJaxpr, values: list[Value], size: int, block: int) -> list[Value]:
+    """The results of a trace, a block at a time. The last one reaches back, to be as long."""
+    call, told = _Many(block).called(traced.jaxpr, traced.consts, [many for _, many in values])
+    if block == size:
+        return list(zip(call(*(x for x, _ in values)), told, strict=True))
+
+    def of_block(first: Array) -> list[Array]:
+        cut = functools.partial(lax.dynamic_slice_in_dim, slice_size=block, axis=-1)
+        return call(*(cut(x, first) if many else x for x, many in values))
+
+    blocks = -(-size // block)
+    firsts = jnp.minimum(block * jnp.arange(blocks), size - block)
+    made = lax.map(jax.checkpoint(of_block), firsts)
+    rest = size - (blocks - 1) * block
+    side_by_side = [
+        jnp.concatenate([_joined(x[:-1]), x[-1, ..., block - rest :]], -1) if many else x[0]
+        for x, many in zip(made, told, strict=True)
+    ]
+    return list(zip(side_by_side, told, strict=True))
+
+
+def _joined(x: Array) -> Array:
+    """Blocks that lead, on the last axis."""
+    moved = jnp.moveaxis(x, 0, -2)
+    return moved.reshape(*moved.shape[:-2], -1)
 
 
 def _leaves(axes: Any, tree: Any) -> list[int | None]:
@@ -178,7 +212,7 @@ class _Many:
         made = jax.vmap(_alone(equation), in_axes=axes, out_axes=-1)(*(x for x, _ in given))
         return [(x, True) for x in made]
 
-    def _called(
+    def called(
         self, jaxpr: Jaxpr, consts: Sequence[Any], many: Sequence[bool]
     ) -> tuple[Callable[..., list[Any]], list[bool]]:
         """A trace as a function, and, once that is traced, which of its results are of many."""
@@ -194,7 +228,7 @@ class _Many:
     def _jit(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
         closed, many = equation.params["jaxpr"], tuple(many for _, many in given)
         if (id(closed), many) not in self.jitted:
-            call, told = self._called(closed.jaxpr, closed.consts, many)
+            call, told = self.called(closed.jaxpr, closed.consts, many)
             call.__name__ = equation.params["name"]
             self.jitted[id(closed), many] = jax.jit(call), told, closed  # which keeps its id
         call, told, _ = self.jitted[id(closed), many]
@@ -202,7 +236,7 @@ class _Many:
 
     def _checkpoint(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
         params = equation.params
-        call, told = self._called(params["jaxpr"], (), [many for _, many in given])
+        call, told = self.called(params["jaxpr"], (), [many for _, many in given])
         again = jax.checkpoint(call, prevent_cse=params["prevent_cse"], policy=params["policy"])
         return list(zip(again(*(x for x, _ in given)), told, strict=True))
 

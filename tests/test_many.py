@@ -109,6 +109,46 @@ def test_it_is_differentiated_as_vmap_is(name):
     same(jax.jvp(total(lanes), (x,), (along,)), jax.jvp(total(jax.vmap), (x,), (along,)), 1e-10)
 
 
+@pytest.mark.parametrize("block", [1, 2, 3, 5, 9])
+@pytest.mark.parametrize("name", ["vectors", "a scan", "what all share"])
+def test_blocks_give_what_all_at_once_give(name, block):
+    x = numbers(MANY, 3)
+    wanted = jax.vmap(CASES[name])(x)
+    same(lanes(CASES[name], block=block)(x), wanted)
+    behind = lanes(CASES[name], in_axes=-1, out_axes=-1, block=block)(x.T)
+    same(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), behind), wanted)
+
+
+def test_blocks_keep_what_is_the_same_for_all():
+    found = lanes(lambda x: (x[0], jnp.arange(3)), out_axes=(0, None), block=2)(numbers(MANY, 3))
+    assert found[0].shape == (MANY,) and found[1].tolist() == [0, 1, 2]
+
+
+def test_reverse_mode_holds_one_block():
+    def waves(x):
+        for _ in range(40):  # each of which reverse mode keeps
+            x = jnp.sin(jnp.cumsum(x))
+        return x
+
+    def loss(x, block):
+        return jnp.sum(lanes(waves, block=block)(x) ** 2)
+
+    x = numbers(20_000, 3)
+    rooms = {}
+    for block in (None, 100):
+        compiled = jax.jit(jax.grad(loss), static_argnums=1).lower(x, block).compile()
+        rooms[block] = compiled.memory_analysis().temp_size_in_bytes
+        same(compiled(x), jax.grad(loss)(x, None), 1e-10)
+    assert rooms[None] > 20 * x.nbytes
+    assert rooms[100] < 5 * x.nbytes  # arguments, results and their slopes turned
+
+
+@pytest.mark.parametrize("block", [0, -1])
+def test_a_block_of_none_is_refused(block):
+    with pytest.raises(ValueError, match=f"block is {block}, wanted 1 or more"):
+        lanes(jnp.sin, block=block)
+
+
 def test_axes_are_told_as_vmap_is_told():
     def function(shared, tree, z):
         return {"sum": shared + tree["a"] * z, "b": tree["b"]}
