@@ -1,8 +1,8 @@
 """Rows of `jaxik bench` of a crowd: the whole pipeline a chunk at a time, and its gradient."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +13,7 @@ import jaxik
 from jaxik.terrain import Terrain, plane
 
 from . import bench_setup as setup
-from .bench import Row, cores, peak_mb, reset_peak
+from .bench import Row, cores, on_all_cores, peak_mb, reset_peak
 from .bench_setup import Sizes
 
 BLOCK = 60  # frames at once: what a chunk computes of them stays in a core's cache
@@ -63,13 +63,8 @@ def chunked(
 
     program = row.program(name, of_chunk, shared, ground, parts[0], sparse=ground)
     row.work[name] = row.work[name] * len(parts)
-
-    def call() -> list:
-        with ThreadPoolExecutor(cores()) as pool:
-            one = lambda part: jax.block_until_ready(program(shared, ground, part))  # noqa: E731
-            return list(pool.map(one, parts))
-
-    return call
+    calls = [functools.partial(program, shared, ground, part) for part in parts]
+    return functools.partial(on_all_cores, calls)
 
 
 def crowd(row: Row, sizes: Sizes) -> None:

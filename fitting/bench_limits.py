@@ -30,13 +30,10 @@ class Work:
     operations: float = 0.0  # on floats
     moved: float = 0.0  # bytes of arguments and results
     workspace: float = 0.0  # bytes beside them
-    compiled: float = 0.0  # operations as XLA counts its fused program; of each loop one turn
 
     def __mul__(self, times: int | float) -> "Work":
         """As many runs of it; they take the same room again."""
-        return Work(
-            times * self.operations, times * self.moved, self.workspace, times * self.compiled
-        )
+        return Work(times * self.operations, times * self.moved, self.workspace)
 
 
 def work(traced: Any, compiled: Any, sparse: Any = ()) -> Work:
@@ -58,8 +55,7 @@ def work(traced: Any, compiled: Any, sparse: Any = ()) -> Work:
     written = [_bytes(one.aval) for one in live.outvars]
     told = compiled.memory_analysis()  # some devices do not say
     workspace = float(told.temp_size_in_bytes) if told else math.nan
-    fused = (compiled.cost_analysis() or {}).get("flops", math.nan)
-    return Work(operations(live), sum(read) + sum(written), workspace, float(fused))
+    return Work(operations(live), sum(read) + sum(written), workspace)
 
 
 def operations(jaxpr: Jaxpr) -> float:
