@@ -1,7 +1,7 @@
 """Foot IK as sense, advance, pose: one frame with `step`, a clip with `run`.
 
 What has no memory is computed for all frames at once (`sense`, `pose`); only a few numbers per leg
-go through the scan (`advance`). Everything is for one character: batch with `jax.vmap`.
+go through the scan (`advance`). Everything is for one character: batch with `lanes` or `jax.vmap`.
 """
 
 import dataclasses

@@ -1,0 +1,30 @@
+"""The flags of XLA: set where none are, and they do what they are there for."""
+
+import os
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from fitting import flags
+
+
+def test_flags_are_set_where_none_are(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    flags.use()
+    assert os.environ["XLA_FLAGS"] == flags.XLA
+
+
+def test_flags_of_the_user_stay(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    flags.use()
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
+
+
+@pytest.mark.skipif(os.environ.get("XLA_FLAGS") != flags.XLA, reason="XLA has other flags")
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is no such loop on a GPU")
+@pytest.mark.parametrize(("numbers", "one"), [(64, True), (1_000_000, False)])
+def test_a_loop_that_moves_little_is_one_function(numbers, one):
+    turns = jax.jit(lambda x: jax.lax.scan(lambda c, x: (c + jnp.sin(x), c * x), x[0], x))
+    program = turns.lower(jnp.ones((3, numbers))).compile().as_text()
+    assert ("xla_cpu_small_call" in program) == one
