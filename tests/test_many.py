@@ -211,7 +211,6 @@ def test_a_result_that_differs_cannot_be_the_same_for_all():
     ("preset", "ground", "gate"),
     [
         ("record", "mesh", jaxik.HARD),
-        ("unreal", "plane", jaxik.HARD),
         ("mec", "plane", setup.single(Smooth(0.1))),
     ],
 )
