@@ -176,7 +176,8 @@ class _Many:
 
     def evaluate(self, jaxpr: Jaxpr, consts: Sequence[Any], values: Sequence[Value]) -> list[Value]:
         """The results of a trace, for these arguments."""
-        known: dict[Any, Value] = {v: (c, False) for v, c in zip(jaxpr.constvars, consts)}  # noqa: B905
+        shared = [(const, False) for const in consts]
+        known: dict[Any, Value] = dict(zip(jaxpr.constvars, shared, strict=True))
         known |= zip(jaxpr.invars, values, strict=True)
 
         def read(atom: Any) -> Value:
@@ -198,8 +199,8 @@ class _Many:
             return [(SHAPED[name](xs, equation.params, self.size), True)]
         if name in ONE_BY_ONE | ALONG:
             if name in ONE_BY_ONE:  # one number may stand beside arrays, for each of theirs
-                shape = (*equation.outvars[0].aval.shape, self.size)
-                xs = [jnp.broadcast_to(x, shape) for x in xs]
+                made: Any = equation.outvars[0].aval
+                xs = [jnp.broadcast_to(x, (*made.shape, self.size)) for x in xs]
             return [(x, True) for x in _alone(equation)(*xs)]
         return self._vmapped(equation, given)
 
@@ -242,7 +243,8 @@ class _Many:
 
     def _custom_jvp(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
         """With the slopes that the function tells of itself."""
-        ones = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
+        avals: list[Any] = [atom.aval for atom in equation.invars]
+        ones = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
         if not all(jnp.issubdtype(one.dtype, jnp.inexact) for one in ones):
             return self._vmapped(equation, given)
         closed = equation.params["call_jaxpr"]
@@ -284,7 +286,8 @@ class _Many:
         while True:  # what a turn makes differ is of many from the start
             each = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in xs]
             jax.eval_shape(turn, [x for x, _ in carry], each)
-            grown = [new and not old for new, (_, old) in zip(told, carry)]  # noqa: B905
+            old = [many for _, many in carry]
+            grown = [new and not old for new, old in zip(told[:carried], old, strict=True)]
             if not any(grown):
                 break
             carry = [
