@@ -93,8 +93,8 @@ def gradient(row: Row, sizes: Sizes) -> None:
     count = sizes.derived * sizes.frames * people.rig.side.size
     ground = setup.single(plane())
     calls = {
-        "forward": chunked(row, "forward", outcome, people, ground, sizes.chunk),
-        "reverse": chunked(row, "reverse", slopes, people, ground, sizes.chunk),
+        name: chunked(row, name, of_one, people, ground, sizes.chunk)
+        for name, of_one in (("forward", outcome), ("reverse", slopes))
     }
     reset_peak()
     row.race(calls, sizes.crowd_repeats)
