@@ -85,25 +85,24 @@ def _in_blocks(traced: ClosedJaxpr, values: list[Value], size: int, block: int) 
     if block == size:
         return list(zip(call(*(x for x, _ in values)), told, strict=True))
 
+    @jax.checkpoint
     def of_block(first: Array) -> list[Array]:
         cut = functools.partial(lax.dynamic_slice_in_dim, slice_size=block, axis=-1)
         return call(*(cut(x, first) if many else x for x, many in values))
 
-    blocks = -(-size // block)
-    firsts = jnp.minimum(block * jnp.arange(blocks), size - block)
-    made = lax.map(jax.checkpoint(of_block), firsts)
-    rest = size - (blocks - 1) * block
-    side_by_side = [
-        jnp.concatenate([_joined(x[:-1]), x[-1, ..., block - rest :]], -1) if many else x[0]
-        for x, many in zip(made, told, strict=True)
+    def turn(whole: list[Array], first: Array) -> tuple[list[Array], None]:
+        return [
+            lax.dynamic_update_slice_in_dim(x, part, first, axis=-1) if many else part
+            for x, part, many in zip(whole, of_block(first), told, strict=True)
+        ], None
+
+    firsts = jnp.minimum(block * jnp.arange(-(-size // block)), size - block)
+    # Written in place: blocks that are stacked have to be put side by side in the end.
+    whole = [
+        jnp.zeros((*x.shape[:-1], size) if many else x.shape, x.dtype)
+        for x, many in zip(jax.eval_shape(of_block, firsts[0]), told, strict=True)
     ]
-    return list(zip(side_by_side, told, strict=True))
-
-
-def _joined(x: Array) -> Array:
-    """Blocks that lead, on the last axis."""
-    moved = jnp.moveaxis(x, 0, -2)
-    return moved.reshape(*moved.shape[:-2], -1)
+    return list(zip(lax.scan(turn, whole, firsts)[0], told, strict=True))
 
 
 def _leaves(axes: Any, tree: Any) -> list[int | None]:
@@ -154,6 +153,10 @@ def _spread(x: Any, many: bool, size: int) -> Array:
         return x
     shape = jnp.shape(x)
     return lax.broadcast_in_dim(x, (*shape, size), tuple(range(len(shape))))
+
+
+def _is_bool(x: Any) -> bool:
+    return jax.typeof(x).dtype == bool
 
 
 def _alone(equation: JaxprEqn) -> Callable[..., list[Any]]:
@@ -235,6 +238,10 @@ class _Many:
         call, told, _ = self.jitted[id(closed), many]
         return list(zip(call(*(x for x, _ in given)), told, strict=True))
 
+    def _inlined(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
+        closed = equation.params["call_jaxpr"]
+        return self.evaluate(closed.jaxpr, closed.consts, given)
+
     def _checkpoint(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
         params = equation.params
         call, told = self.called(params["jaxpr"], (), [many for _, many in given])
@@ -267,6 +274,8 @@ class _Many:
     def _scan(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
         params = equation.params
         closed, consts, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
+        # A condition that all share is a branch, one number at a time; an array of them is a mask.
+        given = [(self._spread([one])[0], True) if _is_bool(one[0]) else one for one in given]
         first, after = given[:consts], given[consts + carried :]
         carry = given[consts : consts + carried]
         xs = [x for x, _ in after]
@@ -302,6 +311,7 @@ class _Many:
 
 RULES = {
     "jit": _Many._jit,
+    "closed_call": _Many._inlined,  # a turn of a scan that reverse mode computes again
     "remat2": _Many._checkpoint,
     "custom_jvp_call": _Many._custom_jvp,
     "scan": _Many._scan,

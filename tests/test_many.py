@@ -49,6 +49,16 @@ def carried(x):
     return lax.scan(turn, (jnp.zeros(3), 0), jnp.arange(4.0))
 
 
+def started(x):
+    """A condition that is the same for all, and one that all are told."""
+
+    def turn(carry, now):
+        begun, place = carry
+        return (jnp.ones_like(begun), jnp.where(begun & now, 0.5 * place, place + x)), begun
+
+    return lax.scan(turn, (jnp.zeros((), bool), x), jnp.arange(4) % 2 == 0)
+
+
 CASES = {
     "vectors": lambda x: (vec.cross(x, x[::-1]), vec.unit(x, jnp.ones(3)), vec.total(x)),
     "rotations": lambda x: quat.rotate(vec_to_quat(x), x),
@@ -67,6 +77,10 @@ CASES = {
     "a scan": carried,
     "a scan backwards": lambda x: lax.scan(
         lambda c, i: (c * x + i, c), x, jnp.arange(3.0), reverse=True
+    ),
+    "a scan with a condition": started,
+    "slopes of a scan computed again": jax.grad(
+        lambda x: jax.checkpoint(lambda x: carried(jnp.sin(x))[0][0])(x).sum()
     ),
     "one scan in another": lambda x: lax.scan(
         lambda c, _: (carried(c)[0][0], None), x, None, length=2
@@ -175,8 +189,9 @@ def test_single_numbers_stay_single():
     assert lanes(lambda x: x + jnp.float64(1))(x).dtype == jnp.float64
 
 
-def test_the_axis_of_many_is_last_in_all_that_is_computed():
-    program = jax.make_jaxpr(lanes(CASES["vectors"], in_axes=-1, out_axes=-1))(numbers(3, MANY))
+@pytest.mark.parametrize("name", ["vectors", "slopes of a scan computed again"])
+def test_the_axis_of_many_is_last_in_all_that_is_computed(name):
+    program = jax.make_jaxpr(lanes(CASES[name], in_axes=-1, out_axes=-1))(numbers(3, MANY))
 
     def shapes(jaxpr):
         for equation in jaxpr.eqns:
