@@ -252,6 +252,7 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
     facing, rising = vec.dot(ankle.normal, up), -vec.dot(ankle.normal, ahead)
     two = (toe.found * ankle.found > 0) & (run > SHORTEST_SOLE)
     rise, run = jnp.where(two, vec.dot(across, up), rising), jnp.where(two, run, facing)
+    rise, run, facing, rising = vec.once(rise, run, facing, rising)
     pitch = vec.safe_arctan2(rise, run)
     # Of the normal, the part along the up of a foot so pitched.
     upward = vec.safe_divide(run * facing + rise * rising, vec.safe_sqrt(run * run + rise * rise))

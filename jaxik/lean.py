@@ -155,6 +155,7 @@ class NoLean(AbstractLean):
 @vec.recomputed
 def _normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
     """Unit normal of ground that rises by these angles, rad, ahead and to the right."""
-    ahead = vec.scale(slope.forward_ws, jnp.tan(forward))
-    aside = vec.scale(slope.right_ws, jnp.tan(side))
-    return vec.unit(up_ws - ahead - aside, up_ws)
+    (level, rising), (across, tilted) = vec.cos_sin(forward), vec.cos_sin(side)
+    ahead = vec.scale(slope.forward_ws, rising * across)
+    aside = vec.scale(slope.right_ws, level * tilted)
+    return vec.unit(vec.scale(up_ws, level * across) - ahead - aside, up_ws)

@@ -213,16 +213,16 @@ def bend_leg(
     turn = quat.from_half(hinge, half_cos, half_sin)
     swing = quat.part(swing, weight)
 
-    knee_pos = pose.hip.pos - quat.rotate(swing, to_hip)
+    knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -to_hip))
     whole = quat.multiply(swing, turn)
-    ankle_pos = knee_pos + quat.rotate(whole, to_ankle)
+    ankle_pos = vec.add(knee_pos, quat.rotate(whole, to_ankle))
     ankle = Transform(ankle_pos, quat.multiply(whole, pose.ankle.rot))
     solved = LegPose(
         Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
         Transform(knee_pos, quat.multiply(whole, pose.knee.rot)),
         ankle,
         Transform(
-            ankle_pos + quat.rotate(whole, pose.toe.pos - pose.ankle.pos),
+            vec.add(ankle_pos, quat.rotate(whole, pose.toe.pos - pose.ankle.pos)),
             quat.multiply(whole, pose.toe.rot),
         ),
     )

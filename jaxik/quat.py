@@ -18,7 +18,7 @@ def components(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array, Array]:
 
 def stack(w: Array, x: Array, y: Array, z: Array) -> Float[Array, "*b 4"]:
     """The quaternion with these components, which are broadcast against each other."""
-    return jnp.stack(jnp.broadcast_arrays(w, x, y, z), axis=-1)
+    return vec.joined(w, x, y, z)
 
 
 def identity(dtype=None) -> Float[Array, "4"]:
@@ -106,7 +106,7 @@ def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array,
 
 def half_cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
     """Cosine and sine of half an angle, rad."""
-    cos, sin = vec.once(jnp.cos(0.5 * angle), jnp.sin(0.5 * angle))
+    cos, sin = vec.once(*vec.cos_sin(0.5 * angle))
     return cos, sin
 
 
@@ -136,8 +136,9 @@ def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     square = vec.dot(v, v)
     large = square > jnp.finfo(v.dtype).eps ** 0.5
     angle = jnp.sqrt(jnp.where(large, square, 1.0))
-    half_sinc = jnp.where(large, jnp.sin(0.5 * angle) / angle, 0.5 - square / 48.0)
-    cos = jnp.where(large, jnp.cos(0.5 * angle), 1.0 - square / 8.0)
+    cos, sin = vec.cos_sin(0.5 * angle)
+    half_sinc = jnp.where(large, sin / angle, 0.5 - square / 48.0)
+    cos = jnp.where(large, cos, 1.0 - square / 8.0)
     x, y, z = vec.components(v)
     return stack(cos, x * half_sinc, y * half_sinc, z * half_sinc)
 

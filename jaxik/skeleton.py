@@ -15,7 +15,7 @@ class Transform(eqx.Module):
 
     def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*c 3"]:
         """Points of space b, m, in space a."""
-        return self.pos + quat.rotate(self.rot, points)
+        return vec.add(self.pos, quat.rotate(self.rot, points))
 
     def turn(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*c 4"]:
         """Rotations of space b in space a."""

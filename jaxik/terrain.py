@@ -197,10 +197,13 @@ def _nearest(
         drop, facing, seen = surface.meet(origins_ws, terrain.up_ws, mask)
         nearer = seen & (drop <= distance)
         distance = jnp.where(nearer, drop, distance)
-        normal = jnp.where(nearer[..., None], facing, normal)
+        pairs = zip(vec.components(facing), vec.components(normal), strict=True)
+        normal = vec.fence(vec.stack(*(jnp.where(nearer, new, old) for new, old in pairs)))
         found |= nearer
+    # Of all that follows much asks for a hit, and would work it out anew.
+    distance, found = vec.once(distance, found.astype(distance.dtype))
     point = origins_ws - vec.scale(terrain.up_ws, distance)
-    return Hit(point, normal, distance, found.astype(distance.dtype))
+    return Hit(point, normal, distance, found)
 
 
 def layer_mask(*layers: int) -> int:

@@ -7,11 +7,14 @@ the time that tracing the pipeline takes.
 """
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+from numpy.polynomial import chebyshev
 
 
 def numbers(v: Float[Array, "*b n"]) -> tuple[Array, ...]:
@@ -40,9 +43,18 @@ def total_of(v: Float[Array, "*b n 3"]) -> Float[Array, "*b 3"]:
     return stack(*map(total, components(v)))
 
 
+def joined(*values: Array) -> Float[Array, "*b n"]:
+    """Numbers on a last axis, broadcast against each other; the inverse of `numbers`."""
+    # Not `jnp.stack`: mapped over single numbers it puts the mapped axis last, and what is mapped
+    # lies one way here and another there.
+    values = jnp.broadcast_arrays(*values)
+    last = values[0].ndim
+    return jax.lax.concatenate([jax.lax.expand_dims(x, (last,)) for x in values], last)
+
+
 def stack(x: Array, y: Array, z: Array) -> Float[Array, "*b 3"]:
     """The vector with these components, which are broadcast against each other."""
-    return jnp.stack(jnp.broadcast_arrays(x, y, z), axis=-1)
+    return joined(x, y, z)
 
 
 def fence(x: Array) -> Array:
@@ -58,7 +70,7 @@ def fence(x: Array) -> Array:
 
 def once(*values: Array) -> tuple[Array, ...]:
     """Numbers, broadcast against each other, stacked behind a fence: angles, cosines, lengths."""
-    return numbers(fence(jnp.stack(jnp.broadcast_arrays(*values), axis=-1)))
+    return numbers(fence(joined(*values)))
 
 
 def recomputed(function: Callable) -> Callable:
@@ -71,7 +83,8 @@ def recomputed(function: Callable) -> Callable:
 
 def copies(v: Float[Array, "*b n"], count: int) -> Float[Array, "*b count n"]:
     """`v` so many times, on an axis before its own."""
-    return fence(jnp.stack([v] * count, axis=-2))
+    axis = v.ndim - 1
+    return fence(jax.lax.concatenate([jax.lax.expand_dims(v, (axis,))] * count, axis))
 
 
 @jax.jit
@@ -90,9 +103,16 @@ def cross(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 
 
 
 @jax.jit
+def add(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
+    """Sum of a place and what was turned, kept: `+` turns anew for each that needs the sum."""
+    return fence(stack(*(x + y for x, y in zip(components(a), components(b), strict=True))))
+
+
+@jax.jit
 def scale(v: Float[Array, "*b 3"], factor: Array) -> Float[Array, "*c 3"]:
     """`v` times one number per vector."""
-    return v * jnp.asarray(factor)[..., None]
+    # By components: a factor that is broadcast is summed by a library in reverse mode.
+    return fence(stack(*(part * factor for part in components(v))))
 
 
 def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -114,22 +134,61 @@ def safe_arctan2(y: Float[Array, "*a"], x: Float[Array, "*b"]) -> Array:
     return _angle(*jnp.broadcast_arrays(y, x))
 
 
+def _tangent_series(last: int) -> list[float]:
+    """Coefficients of the odd powers, up to the last, of the arctangent on -1..1.
+
+    Its Chebyshev series, 2 sum (-1)^k q^(2k + 1) / (2k + 1) T_(2k + 1) with q the tangent of 22.5
+    degrees, as a polynomial: nearest where it is furthest from Taylor's.
+    """
+    odd = np.arange(1, last + 1, 2)
+    series = np.zeros(last + 1)
+    series[1::2] = 2.0 * (-1.0) ** (odd // 2) * (np.sqrt(2.0) - 1.0) ** odd / odd
+    return chebyshev.cheb2poly(series)[1::2].tolist()
+
+
+# By the bytes of a float; the first term left out is half of its rounding.
+TANGENT_SERIES = {4: _tangent_series(17), 8: _tangent_series(37)}
+
+
+def _polynomial(x: Array, coefficients: Sequence[float]) -> Array:
+    """The polynomial with these coefficients, that of the lowest power first."""
+    return functools.reduce(lambda high, low: high * x + low, reversed(coefficients))  # type: ignore[return-value]
+
+
+def _arctangent_series(last: int) -> list[float]:
+    """Coefficients of the odd powers, up to the last, of the arctangent on -1..1.
+
+    Its Chebyshev series, 2 sum (-1)^k q^(2k + 1) / (2k + 1) T_(2k + 1) with q the tangent of an
+    eighth of a half-turn, as a polynomial: Taylor's hardly converges at 1.
+    """
+    odd = np.arange(1, last + 1, 2)
+    series = np.zeros(last + 1)
+    series[odd] = 2.0 * (-1.0) ** (odd // 2) * (np.sqrt(2.0) - 1.0) ** odd / odd
+    return chebyshev.cheb2poly(series)[odd].tolist()
+
+
+# By the bytes of a float.
+ARCTANGENT = {4: _arctangent_series(17), 8: _arctangent_series(41)}
+
+
+def _polynomial(x: Array, coefficients: Sequence[float]) -> Array:
+    """The polynomial with these coefficients, that of the lowest power first."""
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = total * x + coefficient
+    return total
+
+
 @jax.custom_jvp
 def _angle(y: Array, x: Array) -> Array:
-    # A CPU calls the C library for each arctangent: 28 ns, against 3 to 5 ns in float32 for this.
-    # Three halvings of the angle to the x axis leave a tangent under 0.2, whose series is short.
-    largest = jnp.maximum(jnp.abs(x), jnp.abs(y))
-    scale = 1.0 / jnp.where(largest > 0, largest, 1.0)
-    rise, run = y * scale, jnp.abs(x) * scale
-    tangent = rise / jnp.where(largest > 0, run + jnp.sqrt(rise * rise + run * run), 1.0)
-    for _ in range(2):
-        tangent = tangent / (1.0 + jnp.sqrt(1.0 + tangent * tangent))
-    square = -tangent * tangent
-    series = jnp.zeros_like(square)
-    for odd in range(23 if x.dtype.itemsize > 4 else 11, 0, -2):
-        series = series * square + 1.0 / odd
-    angle = 8.0 * tangent * series
-    return jnp.where(x < 0, jnp.copysign(jnp.pi, y) - angle, angle)
+    # A CPU calls the C library for each arctangent: 28 ns, against 1 to 2 in float32 for this.
+    rise, run = jnp.abs(y), jnp.abs(x)
+    steep = rise > run
+    small, large = jnp.where(steep, run, rise), jnp.where(steep, rise, run)
+    tangent = small / jnp.where(large > 0, large, 1.0)
+    angle = tangent * _polynomial(tangent * tangent, ARCTANGENT[x.dtype.itemsize])
+    angle = jnp.where(steep, 0.5 * jnp.pi - angle, angle)
+    return jnp.copysign(jnp.where(x < 0, jnp.pi - angle, angle), y)
 
 
 @_angle.defjvp
@@ -139,6 +198,27 @@ def _angle_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     known = square > 0
     inverse = jnp.where(known, 1.0 / jnp.where(known, square, 1.0), 0.0)
     return _angle(y, x), x * inverse * y_slope - y * inverse * x_slope
+
+
+@jax.custom_jvp
+def cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
+    """Cosine and sine of an angle, rad; their error is a rounding of 1, or of a large angle.
+
+    A CPU calls the C library for each, number by number; this is Taylor's series.
+    """
+    halves = jnp.round(angle / jnp.pi)
+    rest = angle - jnp.pi * halves  # within a quarter turn
+    sign = 1.0 - 2.0 * jnp.abs(halves - 2.0 * jnp.round(0.5 * halves))
+    terms = [1.0 / math.factorial(power) for power in range(14 if rest.dtype.itemsize < 8 else 24)]
+    square = -rest * rest
+    cos, sin = _polynomial(square, terms[::2]), rest * _polynomial(square, terms[1::2])
+    return sign * cos, sign * sin
+
+
+@cos_sin.defjvp
+def _cos_sin_slope(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    (cos, sin), (slope,) = cos_sin(*primals), tangents
+    return (cos, sin), (-sin * slope, cos * slope)
 
 
 def length(v: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
@@ -157,7 +237,9 @@ def unit(v: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]) -> Float[Array
     """`v` at length one; `fallback`, flat in `v`, where `v` is too short to have a direction."""
     known = has_direction(v)
     inverse = 1.0 / jnp.sqrt(jnp.where(known, dot(v, v), 1.0))
-    return jnp.where(known[..., None], scale(v, inverse), fallback)
+    # Stacked and fenced, or each who needs it would take the length again.
+    pairs = zip(components(v), components(fallback), strict=True)
+    return fence(stack(*(jnp.where(known, part * inverse, other) for part, other in pairs)))
 
 
 @unit.defjvp

@@ -28,6 +28,8 @@ FUNCTIONS = {
     "safe_sqrt": (vec.safe_sqrt, (X**2,)),
     "safe_divide": (vec.safe_divide, (X, Y)),
     "safe_arctan2": (vec.safe_arctan2, (X, Y)),
+    "cos_sin": (vec.cos_sin, (X,)),
+    "add": (vec.add, (A, B)),
     "length": (vec.length, (A,)),
     "unit": (vec.unit, (A, B)),
     "reject": (vec.reject, (A, B)),
@@ -87,6 +89,7 @@ def test_products_are_those_of_numpy(a, b):
     ja, jb = jnp.asarray(a), jnp.asarray(b)
     assert_allclose(vec.dot(ja, jb), np.dot(a, b), rtol=1e-12, atol=1e-15)
     assert_allclose(vec.cross(ja, jb), np.cross(a, b), rtol=1e-12, atol=1e-15)
+    assert_allclose(vec.add(ja, jb), a + b, atol=0)
     assert_allclose(vec.length(ja), np.linalg.norm(a), rtol=1e-12)
     assert_allclose(vec.stack(*vec.components(ja)), a, atol=0)
     assert_allclose(vec.fence(ja), a, atol=0)
@@ -142,6 +145,19 @@ def test_an_angle_is_told_to_the_last_digits_all_around_and_at_every_size():
         assert_allclose(answer, exact, rtol=6 * np.finfo(dtype).eps)
 
 
+def test_cosines_and_sines_are_told_to_the_last_digits_all_around():
+    angle = np.linspace(-20.0, 20.0, 4001)
+    for dtype in (np.float32, np.float64):
+        given = angle.astype(dtype)
+        cos, sin = vec.cos_sin(jnp.asarray(given))
+        assert cos.dtype == sin.dtype == dtype
+        exact = given.astype(np.float64)
+        # One rounding of the result, and that of an angle which holds several turns.
+        allowed = np.finfo(dtype).eps * (2.0 + 0.5 * np.abs(exact))
+        assert np.all(np.abs(np.asarray(cos, np.float64) - np.cos(exact)) <= allowed)
+        assert np.all(np.abs(np.asarray(sin, np.float64) - np.sin(exact)) <= allowed)
+
+
 def test_safe_functions_are_flat_at_their_limits():
     assert vec.safe_sqrt(jnp.asarray(0.0)) == vec.safe_sqrt(jnp.asarray(-1.0)) == 0
     assert vec.safe_arctan2(jnp.asarray(0.0), jnp.asarray(0.0)) == 0
@@ -171,6 +187,7 @@ def test_slopes_of_safe_functions_are_those_of_differences(x, y, size, sign):
     assert_slopes_agree(vec.safe_sqrt, size * x)
     assert_slopes_agree(vec.safe_divide, x, sign * size * y)
     assert_slopes_agree(vec.safe_arctan2, size * x, sign * y)
+    assert_slopes_agree(vec.cos_sin, sign * x)
 
 
 def test_slopes_stay_finite_in_single_precision_however_short_the_vector():
