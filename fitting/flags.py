@@ -7,7 +7,7 @@ import os
 # its hundred small kernels in each turn: a clip's residuals take a third of the time.
 XLA = (
     "--xla_cpu_use_fusion_emitters=false"
-    " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
+    " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
 )
 
 

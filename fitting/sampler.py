@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import emcee
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from jaxik import lanes
 
 from .chain import Chain, Identity, Last
 from .problem import Problem
@@ -44,7 +45,7 @@ class _Recorder(emcee.backends.Backend):
 def _log_probabilities(
     problem: Problem, u: Float[Array, "walkers free"]
 ) -> Float[Array, " walkers"]:
-    found = jax.vmap(problem.log_probability)(u)
+    found = lanes(problem.log_probability)(u)
     return jnp.where(jnp.isfinite(found), found, -jnp.inf)  # emcee raises on NaN
 
 
