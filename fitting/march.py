@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .problem import Problem
 from .programs import kept
-from .slopes import Model, with_slopes
+from .slopes import Model, turned
 
 TOLERANCE = 1e-6  # relative fall of the cost below which a step counts as none
 CALM = 2  # such steps in a row that end a march
@@ -42,10 +42,11 @@ class Position(eqx.Module):
 @kept
 def begin(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
     """A march that has not evaluated anything yet."""
-    rows, zero, endless = with_slopes(model), jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
-    all_args = (*args, endless)
-    shape, aux_shape = jax.eval_shape(rows, u, all_args)
-    state = SOLVER.init(rows, u, all_args, f_struct=shape, aux_struct=aux_shape, **COMMON)
+    zero, endless = jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
+    shapes = eqx.filter_eval_shape(turned, model, u, *args, endless)
+    empty = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+    shape, aux_shape = jax.eval_shape(empty.rows_at, u, None)
+    state = SOLVER.init(empty.rows_at, u, None, f_struct=shape, aux_struct=aux_shape, **COMMON)
     whole = jnp.ones((), u.dtype)  # optimistix's own is of JAX's default type
     state = eqx.tree_at(lambda state: state.search_state.step_size, state, whole)
     return Position(u, endless, zero, zero, zero, state)
@@ -56,8 +57,8 @@ def step(model: Model, at: Position, args: tuple[Problem, Array]) -> Position:
     """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
     before = at.solver
     # A trial that lowers no cost is rejected, whatever its slopes, and need not have any.
-    below = (*args, at.cost)
-    u, state, _ = SOLVER.step(with_slopes(model), at.u, below, state=before, **COMMON)
+    here = turned(model, before.y_eval, *args, at.cost)
+    u, state, _ = SOLVER.step(here.rows_at, at.u, None, state=before, **COMMON)
     first = before.first_step
     accepted = state.num_accepted_steps > before.num_accepted_steps
     cost = state.f_info.as_min()

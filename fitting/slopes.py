@@ -46,33 +46,43 @@ def ensemble(u: Array, problem: Problem, shifts: Array, _: Array) -> tuple[Array
     return mean, jnp.where(decides, regressed, slopes)
 
 
-def with_slopes(model: Model) -> Callable[[Array, Any], tuple[Array, Array]]:
-    """A model as optimistix wants it: as few rows as there are parameters, and their derivative.
+class Turned(eqx.Module):
+    """Rows and slopes at one point, turned into one row more than there are parameters.
 
     For a step and its cost all that counts of rows and slopes is the triangle that an orthogonal
-    turn makes of them: |J du + r| stays for every du. The slopes themselves come beside it. The
-    Jacobian is made once per step, and the derivative of the turned rows is what was turned.
+    turn makes of them: |J du + r| stays for every du. The slopes themselves are beside it.
     """
 
-    @eqx.filter_custom_jvp
-    def rows(u: Array, *, args: Any) -> tuple[Array, Array]:
-        turned, _, slopes = _turned(model, u, args)
-        return turned, slopes
+    rows: Float[Array, " turned"]
+    steepness: Float[Array, "turned free"]
+    slopes: Float[Array, "rows free"]
 
-    @rows.def_jvp
-    def _(primals: Any, tangents: Any, *, args: Any) -> Any:
-        (u,), (move,) = primals, tangents
-        turned, steepness, slopes = _turned(model, u, args)
-        return (turned, slopes), (steepness @ move, jnp.zeros_like(slopes))
+    def rows_at(self, u: Array, _: Any) -> tuple[Array, Array]:
+        """Rows as optimistix wants them, a function with a derivative, for this one point.
 
-    return lambda u, args: rows(u, args=args)
+        It knows its derivative, so that only a handful of products are differentiated and not the
+        pipeline, which would be traced once more.
+        """
+        return _known(u, self.rows, self.steepness, self.slopes)
+
+
+@jax.custom_jvp
+def _known(u: Array, rows: Array, steepness: Array, slopes: Array) -> tuple[Array, Array]:
+    return rows, slopes
+
+
+@_known.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    _, rows, steepness, slopes = primals
+    return (rows, slopes), (steepness @ tangents[0], jnp.zeros_like(slopes))
 
 
 @eqx.filter_jit  # traced once for all programs around it
-def _turned(model: Model, u: Array, args: Any) -> tuple[Array, Array, Array]:
-    rows, slopes = model(u, *args)
+def turned(model: Model, u: Array, problem: Problem, second: Array, below: Array) -> Turned:
+    """What a model's rows and slopes at `u` come to."""
+    rows, slopes = model(u, problem, second, below)
     both = triangle(jnp.concatenate([slopes, rows[:, None]], axis=1))
-    return both[:, -1], both[:, :-1], slopes
+    return Turned(both[:, -1], both[:, :-1], slopes)
 
 
 def triangle(tall: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
