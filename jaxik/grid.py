@@ -75,17 +75,23 @@ class Grid(eqx.Module):
         functions are taken with an allowance above their rounding. A needle that this rounding
         turns over is left out: where it lies, its neighbours lie too.
         """
-        return _first_met(*jax.lax.stop_gradient((self, origins_ws)), mask)
+        grid, origins = jax.lax.stop_gradient((self, origins_ws))
+        offset = origins - grid.centre_ws
+        place = vec.once(*(vec.dot(offset, grid.axes_ws[axis]) for axis in range(3)))
+        return _first_met(grid, *place, mask)
 
 
 @jax.custom_batching.custom_vmap
 def _first_met(
-    grid: Grid, origins: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]
+    grid: Grid,
+    x: Float[Array, "*#b"],
+    y: Float[Array, "*#b"],
+    z: Float[Array, "*#b"],
+    mask: UInt[Array, "*#b"],
 ) -> Int[Array, "*b"]:
-    """See `Grid.search`."""
-    x, y, z = vec.once(
-        *(vec.dot(origins - grid.centre_ws, grid.axes_ws[axis]) for axis in range(3))
-    )
+    """See `Grid.search`; places in the grid's frame, numbers that are treated one by one."""
+    shape = jnp.broadcast_shapes(*(number.shape for number in (x, y, z, mask)))
+    x, y, z = (jnp.broadcast_to(number, shape) for number in (x, y, z))
     start, count = grid._look_up(x, z)
     slack = 4 * jnp.finfo(x.dtype).eps
     top = y + slack * jnp.abs(y)  # a ray that starts on a triangle meets it
@@ -133,9 +139,7 @@ def _first_met(
 
 
 @_first_met.def_vmap
-def _first_met_by_many(
-    size: int, batched: list, grid: Grid, origins: Array, mask: Array
-) -> tuple[Array, bool]:
+def _first_met_by_many(size: int, batched: list, grid: Grid, *numbers: Array) -> tuple[Array, bool]:
     """Rays of one grid are one batch, however many maps they come through.
 
     They share one loop; a mapped loop would choose anew for each batch, step by step, whether it
@@ -143,12 +147,16 @@ def _first_met_by_many(
     """
     if any(jax.tree.leaves(batched[0])):
         axes = jax.tree.map(lambda mapped: 0 if mapped else None, tuple(batched))
-        return jax.vmap(_first_met.fun, in_axes=axes)(grid, origins, mask), True
-    if not batched[1]:
-        origins = jnp.broadcast_to(origins, (size, *origins.shape))
-    if batched[2]:
-        mask = jnp.expand_dims(mask, tuple(range(1, origins.ndim - mask.ndim)))
-    return _first_met(grid, origins, mask), True
+        return jax.vmap(_first_met.fun, in_axes=axes)(grid, *numbers), True
+    rank = max(x.ndim - mapped for x, mapped in zip(numbers, batched[1:], strict=True))
+    deep = [
+        jnp.expand_dims(x, tuple(range(1, 2 + rank - x.ndim))) if mapped else x
+        for x, mapped in zip(numbers, batched[1:], strict=True)
+    ]
+    return _first_met(grid, *deep), True
+
+
+_first_met_by_many.one_by_one = _first_met  # for `lanes`, which needs no axis moved
 
 
 def build(

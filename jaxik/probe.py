@@ -1,8 +1,10 @@
 """Stage 3: rays that look for ground under each foot."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -56,8 +58,7 @@ class FootProbe(AbstractProbe):
         above = vec.scale(terrain.leg_up_ws, self.ray_up)
         ankle_ws = animated(frame).pos
         toe_ws = frame.world_from_model.apply(toe_point(rig, frame, self.toe_ls))
-        ankle = cast(terrain, ankle_ws + above, reach, self.layers)
-        toe = cast(terrain, toe_ws + above, reach, self.layers)
+        ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
         toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
         rays = rays_of(ankle, self.ray_up, self.ray_down, self.layers)
         return Ground(ankle, toe, unseen(ankle), rays)
@@ -127,11 +128,13 @@ class CornerProbe(AbstractProbe):
         below = foot_height + self._extra(frame, foot.pos, up, gate)
         reach = self.ray_up + below
 
-        def look(points_ws: Array) -> Hit:
-            hit = cast(terrain, points_ws + vec.scale(up, self.ray_up), reach + MARGIN, self.layers)
-            return seen_if(hit, hit.found * gate.below(hit.distance, reach, band=HEIGHT_BAND))
+        def look(*points_ws: Array) -> list[Hit]:
+            starts = [place + vec.scale(up, self.ray_up) for place in points_ws]
+            hits = cast_each(terrain, starts, reach + MARGIN, self.layers)
+            seen = (gate.below(hit.distance, reach, band=HEIGHT_BAND) for hit in hits)
+            return [seen_if(hit, hit.found * near) for hit, near in zip(hits, seen, strict=True)]
 
-        ankle = look(foot.pos)
+        (ankle,) = look(foot.pos)
         ankle = seen_if(ankle, jnp.where(self.active, ankle.found, 0.0))
         sole = gate.choose(
             ankle.found[..., None], ankle.point, foot.pos - vec.scale(up, foot_height)
@@ -140,9 +143,10 @@ class CornerProbe(AbstractProbe):
         over = sole + vec.scale(up, foot_height)
         level_toe = vec.scale(ahead, self.foot_length)
         level_corner = vec.scale(right, self.half_width)
+        sides = (level_toe, level_corner)
         toe, corner = (
-            on_level(look(over + aside), ankle.found, sole + aside, gate)
-            for aside in (level_toe, level_corner)
+            on_level(hit, ankle.found, sole + aside, gate)
+            for hit, aside in zip(look(*(over + aside for aside in sides)), sides, strict=True)
         )
         rays = rays_of(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
         return Ground(ankle, toe, corner, rays)
@@ -155,6 +159,14 @@ class CornerProbe(AbstractProbe):
         stable = jnp.where(self.by_height, low, 1.0) * jnp.where(self.by_speed, slow, 1.0)
         chosen = gate.choose(stable, self.extra_max, self.extra_min)
         return jnp.where(self.by_height | self.by_speed, chosen, self.extra)
+
+
+def cast_each(
+    terrain: Terrain | LegTerrains, starts_ws: Sequence[Array], reach: Array, mask: Array
+) -> list[Hit]:
+    """What rays from several places of each leg meet; one search, which is much of a program."""
+    hits = cast(terrain, jnp.stack(starts_ws), reach, mask)
+    return [jax.tree.map(lambda x: x[i], hits) for i in range(len(starts_ws))]  # noqa: B023
 
 
 def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:

@@ -39,6 +39,20 @@ def _(primals, tangents):
     return bent(x, y), 7.0 * dx + x * dy  # not the slope that JAX would find
 
 
+@jax.custom_batching.custom_vmap
+def ruled(x, y):
+    return x * y
+
+
+@ruled.def_vmap
+def _(size, batched, x, y):
+    x, y = (
+        one if mapped else jnp.broadcast_to(one, (size, *one.shape))
+        for one, mapped in zip((x, y), batched, strict=True)
+    )
+    return jax.vmap(jnp.multiply)(x, y), True
+
+
 def carried(x):
     """A carry that starts the same for all, and one that stays so."""
 
@@ -70,6 +84,11 @@ CASES = {
     "sorting": lambda x: jnp.sort(x),
     "products": lambda x: jnp.arange(12.0).reshape(4, 3) @ x,
     "what is looked up": lambda x: jnp.arange(10.0)[jnp.argmax(x)] + x[jnp.argmax(x)],
+    "rows that are looked up": lambda x: jnp.arange(20.0).reshape(10, 2)[(9 * x).astype(int) % 10],
+    "what is looked up and not there": lambda x: (
+        jnp.arange(4.0).at[(3 * x).astype(int)].get(mode="fill", fill_value=-1.0) * x
+    ),
+    "a batch with a rule of its own": lambda x: ruled(x, x[0]),
     "a loop of its own length": lambda x: lax.while_loop(
         lambda s: s[0] < jnp.abs(x[0]) * 5, lambda s: (s[0] + 1.0, s[1] * x), (0.0, x)
     ),
@@ -121,6 +140,32 @@ def test_it_is_differentiated_as_vmap_is(name):
 
     same(jax.grad(total(lanes))(x), jax.grad(total(jax.vmap))(x), 1e-10)
     same(jax.jvp(total(lanes), (x,), (along,)), jax.jvp(total(jax.vmap), (x,), (along,)), 1e-10)
+
+
+def test_a_function_that_goes_number_by_number_gets_all_of_them_as_they_are():
+    seen = []
+
+    @jax.custom_batching.custom_vmap
+    def weighted(table, x, y):
+        seen.append((table.shape, jnp.shape(x), jnp.shape(y)))
+        return table[0] * x + y
+
+    @weighted.def_vmap
+    def by_many(size, batched, *given):
+        return jax.vmap(weighted.fun, in_axes=[0 if mapped else None for mapped in batched])(
+            *given
+        ), True
+
+    by_many.one_by_one = weighted
+    x, table = numbers(MANY, 3), numbers(2)
+    for of_one in (lambda x: weighted(table, x, x[0]), lambda x: weighted(table, x, 2.0)):
+        seen.clear()
+        found = lanes(of_one)(x)
+        wide = seen[-1]
+        same(found, jax.vmap(of_one)(x))
+        assert wide[:2] == ((2,), (3, MANY)) and wide[2] in {(MANY,), (1,)}
+    # What all were to share is of many: then it goes by its rule.
+    same(*(batched(lambda x: weighted(x, x, x[0]))(x) for batched in (lanes, jax.vmap)))
 
 
 @pytest.mark.parametrize("block", [1, 2, 3, 5, 9])

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 350  # lines
 ORDER = (
-    "many vec quat gate ease rule skeleton limb aim cells grid terrain frame contact root probe "
+    "equations many vec quat gate ease rule skeleton limb aim cells grid terrain frame contact root probe "
     "stride target lean lock pelvis effector leg foot pipeline presets record"
 ).split()
 LIBRARIES = {"jax", "equinox", "jaxtyping", "numpy"}
