@@ -16,7 +16,7 @@ from . import bench_setup as setup
 from .bench import Row, cores, on_all_cores, peak_mb, reset_peak
 from .bench_setup import Sizes
 
-BLOCK = 10  # frames at once: small enough for XLA to make one function of all of them
+BLOCK = 20  # frames at once, whose arrays a core's cache holds
 
 
 def outcome(crowd: setup.Crowd, ground: Terrain, given: tuple) -> tuple:

@@ -127,19 +127,22 @@ def planted(batch: setup.Batch) -> tuple:
     return feet.pose, bend.hip, bend.knee, feet.ankle
 
 
-def _shared_out(row: Row, of_many: Callable, batch: setup.Batch) -> Callable[[], Any]:
-    """A call in which each core computes its share of the legs: one program, of a share."""
-    ik, parts = batch.in_lanes()
-    share = -(-batch.legs // cores())
+def _shared_out(
+    row: Row, of_many: Callable, shared: Any, many: Any, axis: int = -1, sparse: Any = ()
+) -> Callable[[], Any]:
+    """A call in which each core computes its share of the many: one program, of a share."""
+    count = jax.tree.leaves(many)[0].shape[axis]
+    share = -(-count // cores())
 
-    def from_leg(first: int) -> tuple:
-        first = min(first, batch.legs - share)  # the last reaches back, to be as long
-        return jax.tree.map(lambda leaf: leaf[..., first : first + share], parts)
+    def from_number(first: int) -> Any:
+        first = min(first, count - share)  # the last reaches back, to be as long
+        cut = functools.partial(jax.lax.slice_in_dim, axis=axis)
+        return jax.tree.map(lambda leaf: cut(leaf, first, first + share), many)
 
-    shares = [from_leg(first) for first in range(0, batch.legs, share)]
-    program = row.program("ours", of_many, ik, shares[0])
+    shares = [from_number(first) for first in range(0, count, share)]
+    program = row.program("ours", of_many, shared, shares[0], sparse=sparse)
     row.work["ours"] = row.work["ours"] * len(shares)
-    calls = [functools.partial(program, ik, one) for one in shares]
+    calls = [functools.partial(program, shared, one) for one in shares]
     return functools.partial(on_all_cores, calls)
 
 
@@ -154,7 +157,7 @@ def _per_leg(row: Row, count: int, **reach: Any) -> None:
 def legs(row: Row, sizes: Sizes) -> None:
     """Two-bone legs against plain NumPy."""
     batch = setup.batch(sizes.legs)
-    ours = _shared_out(row, corrections, batch)
+    ours = _shared_out(row, corrections, *batch.in_lanes())
     plain = plain_legs(batch)
     row.race({"ours": ours, "NumPy": lambda: peers.two_bone(*plain)})
     _per_leg(row, batch.legs, at_most=30.0)
@@ -176,7 +179,7 @@ def plain_legs(batch: setup.Batch) -> tuple[peers.Legs, float, float, float]:
 def feet(row: Row, sizes: Sizes) -> None:
     """Two-bone legs, ankles and all transforms of the solved legs."""
     batch = setup.batch(sizes.feet)
-    row.race({"ours": _shared_out(row, planted, batch)})
+    row.race({"ours": _shared_out(row, planted, *batch.in_lanes())})
     _per_leg(row, batch.legs, at_most=80.0)
 
 
@@ -188,8 +191,10 @@ def rays(row: Row, sizes: Sizes) -> None:
     note = "with the small programs that its shape needs"
     row.add("build the grid", time.perf_counter() - began, "s", note=note)
     origins = setup.ray_origins(sizes.rays)
-    ours = row.compiled("ours", met, ground, jnp.asarray(origins), sparse=ground)
-    calls: dict[str, Callable[[], Any]] = {"ours": ours}
+    given = jnp.asarray(origins)
+    calls: dict[str, Callable[[], Any]] = {
+        "ours": _shared_out(row, met, ground, given, axis=0, sparse=ground)
+    }
     tracer = scenes.embree(mesh.vertices, mesh.faces)
     down = np.tile([0.0, -1.0, 0.0], (len(origins), 1))
     wide = origins.astype(np.float64)
@@ -208,7 +213,8 @@ def rays(row: Row, sizes: Sizes) -> None:
             f"{name}: its time in ours", name, "ours", note="Embree on one core", at_least=3.0
         )
         row.timed(f"{name}: rays a second", name, "M", 1e-6 * len(origins), rate=True)
-    row.notes.append(_agreement(ours(), tracer.intersects_location(wide, down, False)))
+    hits = jax.jit(met)(ground, given)
+    row.notes.append(_agreement(hits, tracer.intersects_location(wide, down, False)))
 
 
 def met(ground: Terrain, origins: jax.Array) -> Any:

@@ -139,7 +139,10 @@ def test_the_crowd_is_measured_on_a_plane_and_on_a_mesh(flat):
     assert found["peak of memory"].value > 50.0
 
 
-def test_the_gradient_is_counted_in_forward_runs():
+def test_the_gradient_is_counted_in_forward_runs(monkeypatch):
+    # In place of the pipeline, whose slopes are shown elsewhere and take a minute to compile.
+    easy = lambda ik, crowd, ground, frames: (ik.leg.soften * frames.pose.ankle.pos,)  # noqa: E731
+    monkeypatch.setattr(bench_crowd, "_taken", easy)
     row = measured("gradient")
     ratio = row.samples["reverse"][0] / row.samples["forward"][0]
     assert named(row)["reverse in forward runs"].value == pytest.approx(ratio)
