@@ -11,7 +11,6 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -237,19 +236,6 @@ def peak_mb() -> float:
         return float("nan")
     lines = STATUS.read_text(encoding="ascii").splitlines()
     return next(float(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM"))
-
-
-def cores() -> int:
-    """Cores that programs share: all that this process may use; one where a GPU computes."""
-    if jax.default_backend() != "cpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def on_all_cores(calls: Sequence[Callable[[], Any]]) -> list:
-    """What these calls give, made as many at once as there are cores."""
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda one: jax.block_until_ready(one()), calls))
 
 
 def load() -> float:

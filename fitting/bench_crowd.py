@@ -13,8 +13,9 @@ import jaxik
 from jaxik.terrain import Terrain, plane
 
 from . import bench_setup as setup
-from .bench import Row, cores, on_all_cores, peak_mb, reset_peak
+from .bench import Row, peak_mb, reset_peak
 from .bench_setup import Sizes
+from .cores import cores, on_all_cores
 
 BLOCK = 20  # frames at once, whose arrays a core's cache holds
 

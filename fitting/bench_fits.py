@@ -22,9 +22,10 @@ import numpy as np
 
 from . import bench_peers as peers
 from . import bench_setup as setup
-from .bench import Row, clocked, cores
+from .bench import Row, clocked
 from .bench_setup import Sizes
 from .clips import load_clip, save_clip
+from .cores import cores
 from .posterior import sample_problem
 from .problem import Problem
 from .scenes import load_terrain, save_mesh

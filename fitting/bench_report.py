@@ -11,7 +11,8 @@ from typing import Any
 import jax
 
 from . import bench_plots, files, panels, tables
-from .bench import Figure, Report, Row, cores, load, medians
+from .bench import Figure, Report, Row, load, medians
+from .cores import cores
 
 MEMORY = Path("/proc/meminfo")
 CPU = Path("/proc/cpuinfo")

@@ -19,8 +19,9 @@ from jaxik.terrain import Terrain, cast, plane
 from . import bench_peers as peers
 from . import bench_setup as setup
 from . import scenes
-from .bench import Row, cores, on_all_cores
+from .bench import Row
 from .bench_setup import Sizes
+from .cores import cores, on_all_cores
 from .frames import frames_of
 
 BLOCK = 400  # legs at once on a CPU: under a core's cache, and a loop that `flags` makes one kernel
