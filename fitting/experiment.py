@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxik
@@ -238,23 +237,27 @@ def make_scene(
         rig=base.rig,
         terrain=ground,
         frames=animation,
-        pelvis=animation.world_from_model.inverse() @ pelvis,
+        pelvis=_seen_from(animation.world_from_model, pelvis),
         reference=Reference(
             pelvis=_joint_ws(reference, reference.rig.pelvis),
             knee_ws=legs.knee.pos,
             ankle=legs.ankle,
-            contact=jnp.asarray(labels),
-            seen=jnp.asarray(seen),
+            contact=jax.device_put(labels),
+            seen=jax.device_put(seen),
             label=label,
         ),
-        sigmas=Sigmas(**{name: jnp.asarray(value, float) for name, value in given.items()}),
+        sigmas=Sigmas(**{name: jax.device_put(np.float64(value)) for name, value in given.items()}),
     )
 
 
 def _joint_ws(clip: clips.Clip, joint: int) -> Transform:
-    return Transform(
-        jnp.asarray(clip.positions_ws[:, joint]), jnp.asarray(clip.rotations_ws[:, joint])
-    )
+    places = clip.positions_ws[:, joint], clip.rotations_ws[:, joint]
+    return Transform(*jax.device_put(places))
+
+
+@jax.jit  # outside jit one program, not twelve
+def _seen_from(world: Transform, joint: Transform) -> Transform:
+    return world.inverse() @ joint
 
 
 def make_problem(experiment: Experiment) -> Problem:

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from jaxik import quat
 from jaxik.frame import UP, Stride
 
 from .clips import contacts
@@ -38,20 +37,22 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
         for places in (np.asarray(world.pos), clip.joints_ws(2), clip.joints_ws(3))
     )
     slide = np.zeros(clip.frames) if clip.slide is None else clip.slide
-    still = jaxik.Transform(
-        jnp.zeros_like(world.pos), jnp.broadcast_to(quat.identity(world.rot.dtype), world.rot.shape)
-    )
+
+    def told(numbers: np.ndarray) -> Array:
+        return jax.device_put(numbers.astype(dtype))  # in JAX the conversion would be a program
+
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (clip.frames, 1))
     return jaxik.Frame(
         world_from_model=world,
         pose=pose,
-        weight=jnp.ones((clip.frames, legs), dtype),
-        slide=jnp.asarray(slide, dtype),
-        velocity_ws=jnp.asarray(velocity, dtype),
-        foot_speed=jnp.asarray(np.linalg.norm(foot, axis=-1), dtype),
-        toe_speed=jnp.asarray(np.linalg.norm(toe, axis=-1), dtype),
-        stride=_stride(clip, dtype),
-        dt=jnp.full(clip.frames, 1.0 / clip.fps, dtype),
-        platform=still,
+        weight=told(np.ones((clip.frames, legs))),
+        slide=told(slide),
+        velocity_ws=told(velocity),
+        foot_speed=told(np.linalg.norm(foot, axis=-1)),
+        toe_speed=told(np.linalg.norm(toe, axis=-1)),
+        stride=Stride(*map(told, _stride(clip))),
+        dt=told(np.full(clip.frames, 1.0 / clip.fps)),
+        platform=jaxik.Transform(told(np.zeros(world.pos.shape)), told(upright)),
     )
 
 
@@ -77,8 +78,8 @@ def _velocity(places: np.ndarray, fps: float) -> np.ndarray:
     return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(places.shape)
 
 
-def _stride(clip: Clip, dtype: np.dtype) -> Stride:
-    """Where each foot stood last and will stand next; a foot that never stands does not know."""
+def _stride(clip: Clip) -> tuple[np.ndarray, ...]:
+    """A `Stride`: where each foot stood last and will stand next, if it ever stands."""
     stance, balls = clip.standing(), clip.joints_ws(3)
     known = np.broadcast_to(stance.any(axis=0), stance.shape)
     last_ws, next_ws, share = np.zeros(balls.shape), np.zeros(balls.shape), np.zeros(stance.shape)
@@ -86,7 +87,7 @@ def _stride(clip: Clip, dtype: np.dtype) -> Stride:
         falls = contacts.footfalls(balls[:, leg], stance[:, leg])
         last_ws[:, leg], next_ws[:, leg] = falls.places_ws[falls.last], falls.places_ws[falls.next]
         share[:, leg] = falls.share
-    return Stride(*(jnp.asarray(x, dtype) for x in (stance, last_ws, next_ws, share, known)))
+    return stance, last_ws, next_ws, share, known
 
 
 def solved_clip(

@@ -29,9 +29,9 @@ class Position(eqx.Module):
     steps: Array
     solver: Any  # optimistix's own state: slopes, step size and where it looks next
 
-    def done(self, stalls: int) -> Array:
+    def done(self, stalls: int) -> bool:
         """Whether steps are not worth it: next to nothing gained, or so many rejected in a row."""
-        return (self.calm >= CALM) | (self.stalls >= stalls)
+        return int(self.calm) >= CALM or int(self.stalls) >= stalls
 
     @property
     def slopes(self) -> Array:

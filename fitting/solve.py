@@ -103,11 +103,11 @@ class _Fit:
             self.steps += 1
             self.total += 1
             if shifts is None:
-                settled = last and bool(at.done(stalls))
+                settled = last and at.done(stalls)
                 self.keep(stage, np.asarray(at.u), float(at.cost), settled)
             else:
                 self.report(stage, float(at.cost))
-        cost = float(at.cost) if jnp.isfinite(at.cost) else float("inf")
+        cost = float(at.cost) if np.isfinite(at.cost) else float("inf")
         return np.asarray(at.u), cost, rows_of_problem(at.slopes)
 
     def breed(self, u: np.ndarray, cost: float, slopes: Any, spread: float) -> Any:

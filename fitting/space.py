@@ -23,6 +23,7 @@ from typing import Any, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxik import rule
@@ -100,7 +101,7 @@ def free(ik: eqx.Module, name: str, **overrides: Any) -> Free:
         name=name,
         low=low,
         high=high,
-        prior_mean=float(overrides.get("prior_mean", min(max(float(value.mean()), low), high))),
+        prior_mean=float(overrides.get("prior_mean", min(max(float(np.asarray(value).mean()), low), high))),
         prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
         kind=_one_of(name, "kind", overrides.get("kind", declaration.kind), rule.Kind),
         scale=_one_of(name, "scale", overrides.get("scale", declaration.scale), rule.Scale),
@@ -292,15 +293,16 @@ def make_space(ik: eqx.Module, frees: Sequence[Free]) -> Space:
     dtype = rule.get(ik, frees[0].leaf).dtype
     space = Space(
         base=ik,
-        u0=jnp.zeros(len(frees), dtype),
-        prior_sd=jnp.asarray([one.prior_sd for one in frees], dtype),
-        low=jnp.asarray([one.low for one in frees], dtype),
-        high=jnp.asarray([one.high for one in frees], dtype),
+        u0=jax.device_put(np.zeros(len(frees), dtype)),
+        prior_sd=jax.device_put(np.asarray([one.prior_sd for one in frees], dtype)),
+        low=jax.device_put(np.asarray([one.low for one in frees], dtype)),
+        high=jax.device_put(np.asarray([one.high for one in frees], dtype)),
         frees=tuple(frees),
         order=_order(frees),
     )
-    centre = space.pack({one.name: one.prior_mean for one in frees})
-    return eqx.tree_at(lambda s: s.u0, space, jnp.clip(centre, -CENTRE_LIMIT, CENTRE_LIMIT))
+    centre = np.asarray(space.pack({one.name: one.prior_mean for one in frees}))
+    middle = jax.device_put(np.clip(centre, -CENTRE_LIMIT, CENTRE_LIMIT))
+    return eqx.tree_at(lambda s: s.u0, space, middle)
 
 
 def _order(frees: Sequence[Free]) -> tuple[int, ...]:

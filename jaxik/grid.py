@@ -6,6 +6,8 @@ triangles; those still crowded are split four by four, again and again while tha
 that an uneven mesh costs neither long lists nor a fine grid everywhere.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -176,7 +178,7 @@ def build(
         slack: m, how far a vertex may later move sideways and its triangles still be found.
     """
     used = np.asarray(vertices_ws)[np.asarray(triangles).reshape(-1)]
-    centre_ws = jnp.asarray((used.min(axis=0) + used.max(axis=0)) / 2)
+    centre_ws = jnp.asarray((used.min(axis=0) + used.max(axis=0)) / 2, used.dtype)
     axes_ws = _axes(up_ws)
     corners, wall = _corners(vertices_ws, triangles, centre_ws, axes_ws)
     plan = np.asarray(corners).reshape(-1, 3, 3)[..., :2]
@@ -190,15 +192,20 @@ def build(
         centre_ws=centre_ws,
         axes_ws=axes_ws,
         corners=corners,
-        visible=jnp.where(wall, jnp.zeros_like(layers), layers),
-        corner=jnp.asarray(lists.corner, plan.dtype),
-        pitch=jnp.asarray(lists.pitch, plan.dtype),
-        first=jnp.asarray(lists.first, jnp.int32),
-        children=jnp.asarray(lists.children, jnp.int32),
-        members=jnp.asarray(lists.members, jnp.int32),
+        visible=_array(np.where(wall, 0, layers), np.uint32),
+        corner=_array(lists.corner, plan.dtype),
+        pitch=_array(lists.pitch, plan.dtype),
+        first=_array(lists.first, np.int32),
+        children=_array(lists.children, np.int32),
+        members=_array(lists.members, np.int32),
         shape=lists.shape,
         depth=lists.depth,
     )
+
+
+def _array(numbers: np.ndarray | float, dtype: Any) -> Array:
+    """Converted by NumPy: in JAX the conversion would be a program."""
+    return jnp.asarray(np.asarray(numbers, dtype), dtype)
 
 
 @jax.jit  # outside jit one program, not thirty

@@ -260,9 +260,9 @@ def mesh(
     _check(places, corners)
     up_ws = _direction(up, "up", dtype)
     surface = (
-        jnp.asarray(places, dtype),
-        jnp.asarray(corners, jnp.int32),
-        jnp.asarray(np.broadcast_to(_bits(layer), len(corners))),
+        jnp.asarray(places.astype(dtype), dtype),  # else the conversion would be a program
+        jnp.asarray(corners.astype(np.int32), np.int32),
+        jnp.asarray(np.broadcast_to(_bits(layer), len(corners)), np.uint32),
     )
     return Terrain(up_ws, (Mesh(*surface, grid.build(*surface, up_ws, slack)),))
 
@@ -303,8 +303,13 @@ def _dtype(*given: ArrayLike | tuple[float, ...]) -> jnp.dtype:
 def _direction(given: ArrayLike | tuple[float, ...], name: str, dtype) -> Float[Array, "3"]:
     direction = jnp.asarray(given, dtype)
     if not isinstance(direction, Tracer):
-        if direction.shape != (3,) or not 0 < float(vec.dot(direction, direction)) < np.inf:
+        if direction.shape != (3,) or not 0 < np.sum(np.square(direction)) < np.inf:
             raise ValueError(f"{name} is a direction, three numbers with a length; got {given}")
+    return _normalised(direction)
+
+
+@jax.jit  # outside jit one program, not six
+def _normalised(direction: Float[Array, "3"]) -> Float[Array, "3"]:
     return vec.scale(direction, 1.0 / vec.length(direction))
 
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
@@ -67,12 +66,12 @@ class Clip:
         if self.measured is None:
             find_roles(self.joint_names, self.parents)  # says what is missing
             raise ValueError(f"{self.source} was loaded without legs; load it with joints=...")
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), self.measured)
+        return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), self.measured)
 
     @property
     def skeleton(self) -> Skeleton:
         """The tree of joints with its rest offsets, in JAX's default precision."""
-        return Skeleton(jnp.asarray(self.offsets_ls), self.joint_names, self.parents)
+        return Skeleton(jax.device_put(self.offsets_ls), self.joint_names, self.parents)
 
     def joints_ws(self, role: int) -> Float64[np.ndarray, "frames legs 3"]:
         """Where a joint of each leg is: `role` 0 hip, 1 knee, 2 ankle, 3 toe."""
@@ -90,8 +89,8 @@ class Clip:
         return LegPose(
             *(
                 Transform(
-                    jnp.asarray(self.positions_ws[:, column]),
-                    jnp.asarray(self.rotations_ws[:, column]),
+                    jax.device_put(self.positions_ws[:, column]),
+                    jax.device_put(self.rotations_ws[:, column]),
                 )
                 for column in joints.T
             )
@@ -123,7 +122,7 @@ class Clip:
         zero = np.zeros_like(yaw)
         rot = np.stack([np.cos(yaw / 2), zero, np.sin(yaw / 2), zero], axis=-1)
         turned = upright.inv() * Rotation.from_quat(rot, scalar_first=True)
-        return Transform(jnp.asarray(pos), jnp.asarray(turned.as_quat(scalar_first=True)))
+        return Transform(*jax.device_put((pos, turned.as_quat(scalar_first=True))))
 
     def _heading(self, upright: Rotation) -> Float64[np.ndarray, " frames"]:
         """Yaw of the character, rad, without jumps; 0 looks along +z, pi/2 along +x (left)."""

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -103,7 +102,7 @@ def _own(path: Path, content: dict[str, np.ndarray]) -> Clip:
     if "rig_names" in content:
         with jax.enable_x64(True):
             rig = Rig(
-                **{name: jnp.asarray(content[f"rig_{name}"]) for name in RIG_ARRAYS},
+                **{name: jax.device_put(content[f"rig_{name}"]) for name in RIG_ARRAYS},
                 names=tuple(map(str, content["rig_names"])),
                 joints=tuple(
                     (int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"]
