@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import QUICK
 from clips import assert_close
 
 import jaxik
@@ -57,7 +58,7 @@ def test_reverse_mode_goes_through_blocks_and_holds_one_in_memory():
     short, long = (
         jax.jit(lambda height, frames: jax.grad(summed)(height, frames, 32))
         .lower(0.02, repeated(count))
-        .compile()
+        .compile(QUICK)
         for count in (128, 1024)
     )
     beside = jax.jit(summed)
