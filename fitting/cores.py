@@ -23,5 +23,5 @@ def on_all_cores(calls: Sequence[Callable[[], Any]]) -> list:
 
 @functools.cache
 def _threads(count: int) -> ThreadPoolExecutor:
-    """Kept, for it takes 0.5 ms to start one."""
+    """Kept, for it takes 0.4 ms to start one."""
     return ThreadPoolExecutor(count)

@@ -104,7 +104,7 @@ class Many:
         return [spread(x, many, self.size) for x, many in given]
 
     def _vmapped(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
-        """By JAX's own rule, for what has none here: loops of unknown length, gathers, products."""
+        """By JAX's own rule, for what has none here: loops of unknown length, products, sorting."""
         axes = tuple(-1 if many else None for _, many in given)
         made = jax.vmap(_alone(equation), in_axes=axes, out_axes=-1)(*(x for x, _ in given))
         return [(x, True) for x in made]
@@ -165,7 +165,7 @@ class Many:
         return [(x, True) for x in told(*self._spread(given))]
 
     def _custom_vmap(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
-        """A function that says it treats all but its first argument number by number, as it is."""
+        """By its rule; as it is, if that has it as `one_by_one`: all but what comes first is numbers."""
         params = equation.params
         function = getattr(params["rule"], "one_by_one", None)
         _, (first, *numbers) = jax.tree.unflatten(params["in_tree"], given)

@@ -150,6 +150,7 @@ def _first_met_by_many(size: int, batched: list, grid: Grid, *numbers: Array) ->
     if any(jax.tree.leaves(batched[0])):
         axes = jax.tree.map(lambda mapped: 0 if mapped else None, tuple(batched))
         return jax.vmap(_first_met.fun, in_axes=axes)(grid, *numbers), True
+    # What is mapped lies before all other axes; those are counted from the last one.
     rank = max(x.ndim - mapped for x, mapped in zip(numbers, batched[1:], strict=True))
     deep = [
         jnp.expand_dims(x, tuple(range(1, 2 + rank - x.ndim))) if mapped else x
