@@ -101,7 +101,9 @@ def free(ik: eqx.Module, name: str, **overrides: Any) -> Free:
         name=name,
         low=low,
         high=high,
-        prior_mean=float(overrides.get("prior_mean", min(max(float(np.asarray(value).mean()), low), high))),
+        prior_mean=float(
+            overrides.get("prior_mean", min(max(float(np.asarray(value).mean()), low), high))
+        ),
         prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
         kind=_one_of(name, "kind", overrides.get("kind", declaration.kind), rule.Kind),
         scale=_one_of(name, "scale", overrides.get("scale", declaration.scale), rule.Scale),

@@ -165,7 +165,7 @@ class Many:
         return [(x, True) for x in told(*self._spread(given))]
 
     def _custom_vmap(self, equation: JaxprEqn, given: list[Value]) -> list[Value]:
-        """By its rule; as it is, if that has it as `one_by_one`: all but what comes first is numbers."""
+        """By its rule; or as it is, if that has it as `one_by_one`: numbers, but for the first."""
         params = equation.params
         function = getattr(params["rule"], "one_by_one", None)
         _, (first, *numbers) = jax.tree.unflatten(params["in_tree"], given)
