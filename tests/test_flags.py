@@ -1,4 +1,4 @@
-"""The flags of XLA: set where none are, and they do what they are there for."""
+"""Flags of XLA and JAX: set where none are, and they do what they are there for."""
 
 import os
 
@@ -19,6 +19,21 @@ def test_flags_of_the_user_stay(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     flags.use()
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
+
+
+@pytest.mark.parametrize("user", [None, "true"])
+def test_programs_run_where_they_are_called_unless_the_user_has_said(monkeypatch, user):
+    monkeypatch.delenv(flags.ASYNC, raising=False)
+    if user is not None:
+        monkeypatch.setenv(flags.ASYNC, user)
+    name = flags.ASYNC.lower()
+    before = jax.config.values[name]
+    jax.config.update(name, True)
+    try:
+        flags.use()
+        assert jax.config.values[name] == (user is not None)
+    finally:
+        jax.config.update(name, before)
 
 
 @pytest.mark.skipif(os.environ.get("XLA_FLAGS") != flags.XLA, reason="XLA has other flags")
