@@ -176,8 +176,8 @@ class HintLeg(AbstractLeg):
 
 def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
     """From the knee to the hip and to the ankle, m, and the knee's unit hinge; model space."""
-    to_hip = pose.hip.pos - pose.knee.pos
-    to_ankle = pose.ankle.pos - pose.knee.pos
+    to_hip = vec.subtract(pose.hip.pos, pose.knee.pos)
+    to_ankle = vec.subtract(pose.ankle.pos, pose.knee.pos)
     return to_hip, to_ankle, quat.rotate(pose.knee.rot, rig.knee_axis_ls)
 
 

@@ -109,6 +109,12 @@ def add(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 3"
 
 
 @jax.jit
+def subtract(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
+    """The vector from one place to another, kept: `-` is taken anew for each that needs it."""
+    return fence(stack(*(x - y for x, y in zip(components(a), components(b), strict=True))))
+
+
+@jax.jit
 def scale(v: Float[Array, "*b 3"], factor: Array) -> Float[Array, "*c 3"]:
     """`v` times one number per vector."""
     # By components: a factor that is broadcast is summed by a library in reverse mode.
