@@ -24,7 +24,7 @@ from .bench_setup import Sizes
 from .cores import cores, on_all_cores
 from .frames import frames_of
 
-BLOCK = 400  # legs at once on a CPU: under a core's cache, and a loop that `flags` makes one kernel
+BLOCK = 256  # legs at once on a CPU: under a core's cache, and a loop that `flags` makes one kernel
 
 
 def machine(row: Row, sizes: Sizes) -> None:

@@ -87,7 +87,7 @@ class TwoBone(AbstractLeg):
     ) -> Bend:
         """The leg by itself: `pose` with its ankle at `target_ms`, m, model space."""
         to_hip, to_ankle, hinge = bones(rig, pose)
-        to_target = target_ms - pose.hip.pos
+        to_target = vec.subtract(target_ms, pose.hip.pos)
         reach, reached = vec.once(*self._reach(to_hip, to_ankle, to_target, gate))
         half_cos, half_sin = hinge_turn(to_hip, to_ankle, hinge, reach)
         turn = quat.from_half(hinge, half_cos, half_sin)
