@@ -12,6 +12,7 @@ from .frame import Contact, Frame
 from .gate import AbstractGate
 from .rule import parameter
 from .skeleton import Rig
+from .struct import struct
 
 HEIGHT_BAND = 0.01  # m over which a softened height decision turns
 SPEED_BAND = 0.05  # m/s, likewise
@@ -99,7 +100,8 @@ class LabelContact(AbstractInstantContact):
         return Contact(lift, standing, standing, 1.0 - standing)
 
 
-class SpeedState(eqx.Module):
+@struct
+class SpeedState:
     """Which feet stand."""
 
     standing: Float[Array, " legs"]  # 0 or 1

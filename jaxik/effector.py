@@ -14,12 +14,14 @@ from .lock import Held
 from .pelvis import PelvisState, asked_heights
 from .rule import parameter, switch
 from .skeleton import Rig
+from .struct import struct
 
 HEIGHT_BAND = 0.01  # m
 ANGLE_BAND = 0.035  # rad, 2 degrees
 
 
-class Effector(eqx.Module):
+@struct
+class Effector:
     """What the legs are solved for."""
 
     target_ws: Float[Array, "legs 3"]  # m, of the ankles
@@ -154,7 +156,8 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
     return jnp.where(helps, turned + phase, 0.0)
 
 
-class BodyState(eqx.Module):
+@struct
+class BodyState:
     """Feet relative to the body."""
 
     height: Float[Array, " legs"]  # m, of the ankles over the moved body's animation
@@ -213,7 +216,8 @@ class BodyEffector(AbstractEffector):
         return gate.least(standing, band=0.1)
 
 
-class FadeState(eqx.Module):
+@struct
+class FadeState:
     """How far each leg has come, and what its last ground asked of it."""
 
     share: Float[Array, " legs"]  # 0..1

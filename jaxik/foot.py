@@ -16,6 +16,7 @@ from .limb import turn_about
 from .probe import foot_heading
 from .rule import parameter, switch
 from .skeleton import LegPose, Rig, Transform
+from .struct import struct
 from .terrain import Hit
 
 ANGLE_BAND = 0.035  # rad, 2 degrees
@@ -26,7 +27,8 @@ SHORTEST_SOLE = 0.01  # m, horizontal distance under which two hits give no pitc
 LEFT = (1.0, 0.0, 0.0)  # foot axes
 
 
-class Planted(eqx.Module):
+@struct
+class Planted:
     """A leg with its foot turned."""
 
     pose: LegPose  # legs, model space

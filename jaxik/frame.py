@@ -1,18 +1,21 @@
 """What goes into the pipeline, and what its stages hand on. One character, one frame."""
 
-import equinox as eqx
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt
 
 from . import quat, vec
 from .skeleton import LegPose, Transform
+from .struct import struct
 from .terrain import Hit
 
 FORWARD = (0.0, 0.0, 1.0)  # model space
 UP = (0.0, 1.0, 0.0)  # model space
 
 
-class Stride(eqx.Module):
+@struct
+class Stride:
     """Where each foot of the animation stood last and where it will stand next.
 
     Places are those of the ball; how high they lie does not count. While a foot stands, its last
@@ -32,7 +35,8 @@ class Stride(eqx.Module):
         return cls(jnp.ones_like(like), nowhere, nowhere, zero, zero)
 
 
-class Frame(eqx.Module):
+@struct
+class Frame:
     """The animation's frame, before foot IK."""
 
     world_from_model: Transform
@@ -51,8 +55,14 @@ class Frame(eqx.Module):
         """Of the character, m/s."""
         return vec.length(self.velocity_ws)
 
+    def moved(self, offset_ws: Float[Array, "*b 3"]) -> "Frame":
+        """The frame with the whole character moved, m."""
+        world = Transform(self.world_from_model.pos + offset_ws, self.world_from_model.rot)
+        return dataclasses.replace(self, world_from_model=world)
 
-class Rays(eqx.Module):
+
+@struct
+class Rays:
     """How far over and under a foothold the probe looks, and at what."""
 
     above: Float[Array, " legs"]  # m
@@ -60,7 +70,8 @@ class Rays(eqx.Module):
     layers: UInt[Array, "*legs"]
 
 
-class Ground(eqx.Module):
+@struct
+class Ground:
     """What the rays of each leg saw."""
 
     ankle: Hit  # legs
@@ -69,7 +80,8 @@ class Ground(eqx.Module):
     rays: Rays  # for a stage that looks under a place of its own
 
 
-class Contact(eqx.Module):
+@struct
+class Contact:
     """How far each foot stands."""
 
     lift: Float[Array, " legs"]  # m, animated ankle over the animation's own ground
@@ -78,7 +90,8 @@ class Contact(eqx.Module):
     lifted: Float[Array, " legs"]  # decision: high enough to have left
 
 
-class Foothold(eqx.Module):
+@struct
+class Foothold:
     """Where each foot would stand; the ankle is `lift` above it along up."""
 
     point_ws: Float[Array, "legs 3"]  # m
@@ -89,7 +102,8 @@ class Foothold(eqx.Module):
     found: Float[Array, " legs"]  # 0..1
 
 
-class Slope(eqx.Module):
+@struct
+class Slope:
     """Slope of the ground under the feet, positive where it rises ahead and to the right."""
 
     forward: Float[Array, ""]  # rad
@@ -98,7 +112,8 @@ class Slope(eqx.Module):
     right_ws: Float[Array, "3"]  # unit
 
 
-class Sensed(eqx.Module):
+@struct
+class Sensed:
     """All that one frame shows without memory."""
 
     up_ws: Float[Array, "3"]  # of the body

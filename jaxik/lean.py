@@ -11,9 +11,11 @@ from . import ease, quat, vec
 from .frame import Contact, Frame, Ground, Slope, heading
 from .gate import AbstractGate
 from .rule import constant, parameter, switch
+from .struct import struct
 
 
-class Lean(eqx.Module):
+@struct
+class Lean:
     """What the slope does to the body."""
 
     turn_ws: Float[Array, "4"]  # rotation of the body about its pivot, world axes
@@ -47,7 +49,8 @@ class AbstractLean(eqx.Module):
         """The lean after memory."""
 
 
-class LeanState(eqx.Module):
+@struct
+class LeanState:
     """Smoothed slope and slide weight."""
 
     forward: Float[Array, ""]  # rad

@@ -20,9 +20,11 @@ from .limb import (
 )
 from .rule import parameter, switch
 from .skeleton import LegPose, Rig, Transform
+from .struct import struct
 
 
-class Bend(eqx.Module):
+@struct
+class Bend:
     """A solved leg."""
 
     pose: LegPose  # legs, model space; ankle and toe carried along

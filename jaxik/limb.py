@@ -1,12 +1,12 @@
 """Solving a two-bone limb: the triangle, the turn of the knee, the swing of the hip."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import quat, vec
 from .gate import AbstractGate
+from .struct import struct
 
 LENGTH_BAND = 0.005  # m
 DOWN = (0.0, -1.0, 0.0)
@@ -221,7 +221,8 @@ def bounded_cosine(x: Array) -> Array:
     return jnp.where(x < -1, -1.0, jnp.where(x > 1, 1.0, x))
 
 
-class PoleBend(eqx.Module):
+@struct
+class PoleBend:
     """A limb that bends towards a pole."""
 
     swing: Float[Array, "*b 4"]  # of the hip, on the left of its rotation

@@ -12,6 +12,7 @@ from .frame import Sensed
 from .gate import AbstractGate
 from .rule import parameter, switch
 from .skeleton import Rig
+from .struct import struct
 from .terrain import LegTerrains, Terrain, cast
 
 DISTANCE_BAND = 0.01  # m
@@ -20,7 +21,8 @@ SPEED_BAND = 0.05  # m/s
 FACTOR_BAND = 0.05
 
 
-class Held(eqx.Module):
+@struct
+class Held:
     """What locks make of the footholds."""
 
     offset_ws: Float[Array, "legs 3"]  # m, kept from the foothold
@@ -69,7 +71,8 @@ class NoLock(AbstractLock):
         return None, Held(free, sensed.rot_ws, jnp.zeros_like(sensed.foothold.found))
 
 
-class LockState(eqx.Module):
+@struct
+class LockState:
     """Which feet are locked, and how far from the animation that holds them."""
 
     locked: Float[Array, " legs"]  # 0 or 1
@@ -209,7 +212,8 @@ class OffsetLock(AbstractLock):
         return along * gate.below(speed, self.release_speed, band=SPEED_BAND)
 
 
-class PlantState(eqx.Module):
+@struct
+class PlantState:
     """Where planted feet stand."""
 
     locked: Float[Array, " legs"]  # 0 or 1

@@ -1,5 +1,6 @@
 """Stage 7: how far the body sinks or rises so that the legs can reach."""
 
+import dataclasses
 from abc import abstractmethod
 from typing import Any
 
@@ -13,12 +14,14 @@ from .frame import Sensed
 from .gate import AbstractGate
 from .lean import Lean
 from .rule import constant, parameter, switch
+from .struct import struct
 
 HEIGHT_BAND = 0.01  # m
 FAR = 1e6  # m, beyond any leg
 
 
-class PelvisState(eqx.Module):
+@struct
+class PelvisState:
     """The body's offset."""
 
     height: Float[Array, ""]  # m
@@ -141,7 +144,7 @@ class CapsulePelvis(AbstractPelvis):
         height = follow(state.height, goal)
         half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
         level = PelvisState.at(height, goal, sensed.up_ws)
-        return eqx.tree_at(lambda state: state.half_height, level, half_height)
+        return dataclasses.replace(level, half_height=half_height)
 
 
 class LegLengthPelvis(AbstractPelvis):
@@ -219,7 +222,7 @@ class AbstractFollowingPelvis(AbstractPelvis):
         )
         height = ease.approach(state.height, height, awake)
         after = PelvisState.at(height, goal, sensed.up_ws)
-        return eqx.tree_at(lambda state: state.velocity, after, awake * velocity)
+        return dataclasses.replace(after, velocity=awake * velocity)
 
 
 class SupportPelvis(AbstractFollowingPelvis):

@@ -26,6 +26,7 @@ from .pelvis import AbstractPelvis
 from .probe import AbstractProbe, foot_heading
 from .root import AbstractRoot
 from .skeleton import LegPose, Rig, Transform, bone_lengths
+from .struct import struct
 from .target import AbstractTarget
 from .terrain import LegTerrains, Terrain
 
@@ -45,7 +46,8 @@ class FootIK(eqx.Module):
     foot: AbstractFoot
 
 
-class State(eqx.Module):
+@struct
+class State:
     """All that the pipeline remembers between frames."""
 
     started: Bool[Array, "*b"]  # False before the first frame, on which memory jumps to its goals
@@ -57,7 +59,8 @@ class State(eqx.Module):
     effector: Any
 
 
-class Advanced(eqx.Module):
+@struct
+class Advanced:
     """What memory makes of a frame."""
 
     foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, before the lock
@@ -67,7 +70,8 @@ class Advanced(eqx.Module):
     state: State  # after the frame
 
 
-class Corrections(eqx.Module):
+@struct
+class Corrections:
     """Local rotations that turn the animated pose into the solved one, right-multiplied."""
 
     hip: Float[Array, "*b legs 4"]
@@ -75,14 +79,16 @@ class Corrections(eqx.Module):
     ankle: Float[Array, "*b legs 4"]
 
 
-class Trace(eqx.Module):
+@struct
+class Trace:
     """Every stage's output."""
 
     sensed: Sensed
     advanced: Advanced
 
 
-class Result(eqx.Module):
+@struct
+class Result:
     """The frame after foot IK."""
 
     pose: LegPose  # legs, model space
@@ -120,7 +126,7 @@ def sense(
     weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
     with jax.named_scope("root"):
         root_ws = vec.scale(terrain.up_ws, ik.root.sense(terrain, frame))
-        frame = moved(frame, root_ws)
+        frame = frame.moved(root_ws)
     with jax.named_scope("probe"):
         ground = ik.probe.sense(rig, terrain, frame, contact, ik.target.foot_height, gate)
     with jax.named_scope("target"):
@@ -228,12 +234,6 @@ def contacts_of(
             return (after, jnp.ones_like(memory[1])), (after, contact)
 
         return jax.lax.scan(scanned, (state.contact, state.started), (seen, frames.dt))[1]
-
-
-def moved(frame: Frame, offset_ws: Array) -> Frame:
-    """The frame with the whole character moved, m."""
-    world = Transform(frame.world_from_model.pos + offset_ws, frame.world_from_model.rot)
-    return eqx.tree_at(lambda frame: frame.world_from_model, frame, world)
 
 
 def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform:

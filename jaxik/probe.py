@@ -1,5 +1,6 @@
 """Stage 3: rays that look for ground under each foot."""
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Sequence
 
@@ -192,7 +193,7 @@ def foot_heading(rig: Rig, frame: Frame, up_ws: Array) -> tuple[Array, Array]:
 
 def seen_if(hit: Hit, found: Array) -> Hit:
     """The hit with another weight."""
-    return eqx.tree_at(lambda hit: hit.found, hit, found)
+    return dataclasses.replace(hit, found=found)
 
 
 def unseen(like: Hit) -> Hit:

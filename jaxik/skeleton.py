@@ -5,9 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from . import quat, vec
+from .struct import struct
 
 
-class Transform(eqx.Module):
+@struct
+class Transform:
     """Rigid transform; named `a_from_b`, it takes points of space b to space a."""
 
     pos: Float[Array, "*b 3"]  # m
@@ -89,7 +91,8 @@ def forward_kinematics(
     )
 
 
-class LegPose(eqx.Module):
+@struct
+class LegPose:
     """The four joints of each leg; `toe` is the ball of the foot."""
 
     hip: Transform  # legs, model space
@@ -102,7 +105,8 @@ class LegPose(eqx.Module):
         return LegPose(by @ self.hip, by @ self.knee, by @ self.ankle, by @ self.toe)
 
 
-class Rig(eqx.Module):
+@struct
+class Rig:
     """What a leg is, apart from its pose. Legs of one character may differ in everything."""
 
     knee_axis_ls: Float[Array, "*b legs 3"]  # unit, knee space; a positive turn opens the knee

@@ -1,6 +1,5 @@
 """Stage 3 with foresight: the ground as a stride will meet it."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,6 +9,7 @@ from .gate import AbstractGate
 from .probe import AbstractProbe, rays_of, unseen
 from .rule import parameter
 from .skeleton import Rig
+from .struct import struct
 from .terrain import Hit, LegTerrains, Terrain, cast
 
 HEIGHT_BAND = 0.01  # m
@@ -166,7 +166,8 @@ class StrideProbe(AbstractProbe):
         return most * smooth_share(stride.share / ENDS) * smooth_share((1.0 - stride.share) / ENDS)
 
 
-class Level(eqx.Module):
+@struct
+class Level:
     """The level of a character's root, at right angles to each leg's up."""
 
     origin_ws: Float[Array, "3"]  # m

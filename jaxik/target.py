@@ -12,6 +12,7 @@ from .frame import Contact, Foothold, Frame, Ground, animated, foothold
 from .gate import AbstractGate
 from .rule import parameter, switch
 from .skeleton import Rig
+from .struct import struct
 
 HEIGHT_BAND = 0.01  # m
 
@@ -50,7 +51,8 @@ class AbstractInstantTarget(AbstractTarget):
         return None, jnp.zeros_like(foothold.height)
 
 
-class TargetState(eqx.Module):
+@struct
+class TargetState:
     """Smoothed height of the ground under each foot."""
 
     height: Float[Array, " legs"]  # m, along up

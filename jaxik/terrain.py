@@ -16,13 +16,15 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from . import grid, vec
+from .struct import struct
 
 ALL_LAYERS = 0xFFFFFFFF  # a mask that sees every layer
 LAYERS = 32
 HORIZON = 1e4  # m; a longer ray, an endless one too, ends here
 
 
-class Hit(eqx.Module):
+@struct
+class Hit:
     """What a ray met; a miss has `found` 0, the ray's end as its point and up as its normal."""
 
     point: Float[Array, "*b 3"]  # m, world
@@ -107,7 +109,8 @@ class Mesh(AbstractSurface):
         return distance, vec.stack(x, y, z), seen
 
 
-class Terrain(eqx.Module):
+@struct
+class Terrain:
     """Surfaces under one up direction."""
 
     up_ws: Float[Array, "*t 3"]  # unit; rays run along its opposite
@@ -133,7 +136,8 @@ class Terrain(eqx.Module):
         )
 
 
-class LegTerrains(eqx.Module):
+@struct
+class LegTerrains:
     """The same world as each leg meets it: rays of leg i run along the opposite of its own up.
 
     For feet on walls and hands on ladders. A mesh is gridded for one up, so that each up that

@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 350  # lines
 ORDER = (
-    "equations many vec quat gate ease rule skeleton limb aim cells grid terrain frame contact "
-    "root probe stride target lean lock pelvis effector leg foot pipeline presets record"
+    "struct equations many vec quat gate ease rule skeleton limb aim cells grid terrain frame "
+    "contact root probe stride target lean lock pelvis effector leg foot pipeline presets record"
 ).split()
 LIBRARIES = {"jax", "equinox", "jaxtyping", "numpy"}
 ONE_ROOM_EACH = {"trimesh": "scenes", "optimistix": "march", "emcee": "sampler"}
