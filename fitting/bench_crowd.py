@@ -17,7 +17,7 @@ from .bench import Row, peak_mb, reset_peak
 from .bench_setup import Sizes
 from .cores import cores, on_all_cores
 
-BLOCK = 20  # frames at once, whose arrays a core's cache holds
+BLOCK = 3  # frames at once, whose arrays a core's nearest cache holds
 
 
 def outcome(crowd: setup.Crowd, ground: Terrain, given: tuple) -> tuple:
