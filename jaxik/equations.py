@@ -4,6 +4,7 @@ What is of many has them on its last axis. What all share stays as it is, and a 
 no rule here goes through that of `jax.vmap`.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -16,6 +17,8 @@ from jaxtyping import Array
 # A value, and whether it is of many: then they are on its last axis.
 Value: TypeAlias = tuple[Any, bool]
 
+FEW = 8  # numbers that are added one by one
+
 # Primitives that treat numbers one by one.
 ONE_BY_ONE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil"
@@ -27,7 +30,7 @@ ONE_BY_ONE = frozenset(
 # Those along axes that are told, counted from the first: one more at the end does not matter.
 ALONG = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum optimization_barrier reduce_and"
-    " reduce_max reduce_min reduce_or reduce_prod reduce_sum rev split stack unstack".split()
+    " reduce_max reduce_min reduce_or reduce_prod rev split stack unstack".split()
 )
 
 
@@ -228,6 +231,21 @@ class Many:
         return [*zip(last, wide, strict=True), *zip(made, told[carried:], strict=True)]
 
 
+def _sum(x: Array, axes: Sequence[int]) -> Array:
+    """The sum over some axes; few numbers are added one by one.
+
+    A CPU's loop that computes what it sums takes the many one at a time.
+    """
+    for axis in sorted(axes, reverse=True):
+        count = x.shape[axis]
+        if 0 < count <= FEW:
+            parts = lax.split(x, (1,) * count, axis)
+            x = lax.squeeze(functools.reduce(lax.add, parts), (axis,))
+        else:
+            x = lax.reduce_sum(x, (axis,))
+    return x
+
+
 RULES = {
     "jit": Many._jit,
     "closed_call": Many._inlined,  # a turn of a scan that reverse mode computes again
@@ -243,6 +261,7 @@ SHAPED: dict[str, Callable[[list[Array], dict[str, Any], int], Array]] = {
         xs[0], (*told["shape"], size), (*told["broadcast_dimensions"], len(told["shape"]))
     ),
     "concatenate": lambda xs, told, size: lax.concatenate(xs, told["dimension"]),
+    "reduce_sum": lambda xs, told, size: _sum(xs[0], told["axes"]),
     "reshape": lambda xs, told, size: lax.reshape(xs[0], (*told["new_sizes"], size)),
     "slice": lambda xs, told, size: lax.slice(
         xs[0],

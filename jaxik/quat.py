@@ -171,8 +171,10 @@ def nlerp(
     a: Float[Array, "*a 4"], b: Float[Array, "*b 4"], weight: Float[Array, "*w"]
 ) -> Float[Array, "*c 4"]:
     """`a` at weight 0, `b` at weight 1, between them the normalised line along the shorter way."""
-    near = jnp.where((dot(a, b) < 0)[..., None], -b, b)
-    return unit(a + (near - a) * jnp.asarray(weight)[..., None])
+    opposed = dot(a, b) < 0
+    # By components: a weight that is broadcast is summed number by number in reverse mode.
+    pairs = zip(components(a), components(b), strict=True)
+    return unit(stack(*(x + (jnp.where(opposed, -y, y) - x) * weight for x, y in pairs)))
 
 
 def part(q: Float[Array, "*a 4"], weight: Float[Array, "*w"]) -> Float[Array, "*c 4"]:

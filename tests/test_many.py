@@ -83,6 +83,13 @@ CASES = {
     "shapes": lambda x: jnp.tile(x.reshape(3, 1), (2, 2)).T[1:, ::2].ravel(),
     "padding": lambda x: jnp.pad(x, (1, 2)),
     "sums and extremes": lambda x: (x.sum(), x.max(), x.argmin(), jnp.cumsum(x), jnp.any(x > 0)),
+    "sums of few and of many": lambda x: (
+        (cube := jnp.sin(jnp.arange(90.0).reshape(2, 15, 3) * x)).sum((0, 2)),
+        cube.sum((1,)),
+        cube.sum((0, 1)),
+        cube[:0].sum(0),
+        cube.astype(int).sum(0),
+    ),
     "sorting": lambda x: jnp.sort(x),
     "products": lambda x: jnp.arange(12.0).reshape(4, 3) @ x,
     "what is looked up": lambda x: jnp.arange(10.0)[jnp.argmax(x)] + x[jnp.argmax(x)],
