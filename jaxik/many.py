@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
@@ -81,7 +82,7 @@ def _in_blocks(traced: ClosedJaxpr, values: list[Value], size: int, block: int) 
             for x, part, many in zip(whole, of_block(first), told, strict=True)
         ], None
 
-    firsts = jnp.minimum(block * jnp.arange(-(-size // block)), size - block)
+    firsts = np.minimum(block * np.arange(-(-size // block)), size - block).astype(np.int32)
     # Written in place: blocks that are stacked have to be put side by side in the end.
     whole = [
         jnp.zeros((*x.shape[:-1], size) if many else x.shape, x.dtype)
