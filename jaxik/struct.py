@@ -25,7 +25,7 @@ def struct(cls: type[Data]) -> type[Data]:
     static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(made)}
     leaves = tuple(name for name in static if not static[name])
     rest = tuple(name for name in static if static[name])
-    leaves_of, rest_of = _values(leaves), _values(rest)
+    names, leaves_of, rest_of = (*leaves, *rest), _values(leaves), _values(rest)
     keys = [jax.tree_util.GetAttrKey(name) for name in leaves]
 
     def flat(value: Any) -> tuple[tuple, tuple]:
@@ -36,8 +36,7 @@ def struct(cls: type[Data]) -> type[Data]:
 
     def whole(rest_values: tuple, leaf_values: Any) -> Any:
         value = object.__new__(made)
-        value.__dict__.update(zip(leaves, leaf_values, strict=True))
-        value.__dict__.update(zip(rest, rest_values, strict=True))
+        value.__dict__.update(zip(names, (*leaf_values, *rest_values), strict=True))
         return value
 
     jax.tree_util.register_pytree_with_keys(made, flat_with_keys, whole, flat)
@@ -47,5 +46,5 @@ def struct(cls: type[Data]) -> type[Data]:
 def _values(names: tuple[str, ...]) -> Callable[[Any], tuple]:
     """What tells the values of these fields."""
     if len(names) > 1:
-        return attrgetter(*names)
-    return lambda value: tuple(getattr(value, name) for name in names)
+        return attrgetter(*names)  # of one alone it would tell no tuple
+    return (lambda value: (getattr(value, names[0]),)) if names else (lambda value: ())
