@@ -142,15 +142,20 @@ def _shared_out(
     count = jax.tree.leaves(many)[0].shape[axis]
     share = -(-count // cores())
 
-    def from_number(first: int) -> Any:
+    def from_number(first: int) -> list[jax.Array]:
         first = min(first, count - share)  # the last reaches back, to be as long
         cut = functools.partial(jax.lax.slice_in_dim, axis=axis)
-        return jax.tree.map(lambda leaf: cut(leaf, first, first + share), many)
+        part = jax.tree.map(lambda leaf: cut(leaf, first, first + share), many)
+        return jax.tree.leaves((shared, part))
 
+    def of_share(leaves: list) -> Any:
+        return of_many(*jax.tree.unflatten(jax.tree.structure((shared, many)), leaves))
+
+    # Leaves, taken apart beforehand: while Python does that, no other thread can begin.
     shares = [from_number(first) for first in range(0, count, share)]
-    program = row.program("ours", of_many, shared, shares[0], sparse=sparse)
+    program = row.program("ours", of_share, shares[0], sparse=sparse)
     row.work["ours"] = row.work["ours"] * len(shares)
-    calls = [functools.partial(program, shared, one) for one in shares]
+    calls = [functools.partial(program, one) for one in shares]
     return functools.partial(on_all_cores, calls)
 
 
