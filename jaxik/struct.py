@@ -15,10 +15,10 @@ Data = TypeVar("Data")
 def struct(cls: type[Data]) -> type[Data]:
     """A class of fields as a frozen dataclass that JAX takes apart in half a module's time.
 
-    To take modules apart and put them together took as long as the program of one frame of one
-    character. Fields with `static=True` are part of the structure. JAX puts one together past its
-    constructor, as it does a module (but no dataclass registered by JAX's own decorator): what JAX
-    puts in a field while it transforms need not be what the field is declared to hold.
+    To take modules apart and put them together took two thirds as long as the program of one frame
+    of one character. Fields with `static=True` are part of the structure. JAX puts one together
+    past its constructor, as it does a module (but no dataclass registered by JAX's own decorator):
+    what JAX puts in a field while it transforms need not be what the field is declared to hold.
     """
     made: Any = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
     made.__repr__ = eqx.tree_pformat
