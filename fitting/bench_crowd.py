@@ -15,7 +15,7 @@ from jaxik.terrain import Terrain, plane
 from . import bench_setup as setup
 from .bench import Row, peak_mb, reset_peak
 from .bench_setup import Sizes
-from .cores import cores, on_all_cores
+from .cores import at_once, cores, on_all_cores
 
 BLOCK = 3  # frames at once, whose arrays a core's nearest cache holds
 
@@ -27,7 +27,7 @@ def outcome(crowd: setup.Crowd, ground: Terrain, given: tuple) -> tuple:
 
 
 def _taken(ik: jaxik.FootIK, crowd: setup.Crowd, ground: Terrain, frames: jaxik.Frame) -> tuple:
-    result = jaxik.run(ik, crowd.rig, ground, frames, block=BLOCK)
+    result = jaxik.run(ik, crowd.rig, ground, frames, block=at_once(BLOCK))
     return result.corrections, result.body, result.reached
 
 

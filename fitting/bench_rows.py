@@ -22,7 +22,7 @@ from . import bench_setup as setup
 from . import scenes
 from .bench import Row
 from .bench_setup import Sizes
-from .cores import cores, on_all_cores
+from .cores import at_once, cores, on_all_cores
 from .frames import frames_of
 
 BLOCK = 256  # legs at once on a CPU: under a core's cache, and a loop that `flags` makes one kernel
@@ -112,8 +112,7 @@ def side_by_side(of_one: Callable[[setup.Batch], Any]) -> Callable[[jaxik.FootIK
 
     def of_many(ik: jaxik.FootIK, parts: tuple) -> Any:
         one = lambda parts: of_one(setup.Batch(ik, *parts))  # noqa: E731
-        block = BLOCK if jax.default_backend() == "cpu" else None
-        return jaxik.lanes(one, in_axes=-1, out_axes=-1, block=block)(parts)
+        return jaxik.lanes(one, in_axes=-1, out_axes=-1, block=at_once(BLOCK))(parts)
 
     return of_many
 

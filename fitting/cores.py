@@ -17,6 +17,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def at_once(count: int) -> int | None:
+    """So many at a time on a CPU, whose cache is to hold them; all where a GPU computes."""
+    return count if jax.default_backend() == "cpu" else None
+
+
 def on_all_cores(calls: Sequence[Callable[[], Any]]) -> list:
     """What these calls give, made as many at once as there are cores.
 
