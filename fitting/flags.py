@@ -21,7 +21,7 @@ ASYNC = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
 
 
 def use() -> None:
-    """Sets what the user has not set; to be called before JAX computes anything.
+    """Sets what the environment has not; to be called before JAX computes anything.
 
     Besides XLA's flags: a program runs in the thread that calls it. To wake another one for it, as
     JAX does by itself, takes as long as one frame of one character.

@@ -37,6 +37,14 @@ def test_programs_run_where_they_are_called_unless_the_user_has_said(monkeypatch
 
 
 @pytest.mark.skipif(os.environ.get("XLA_FLAGS") != flags.XLA, reason="XLA has other flags")
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is no such library on a GPU")
+def test_sums_are_no_calls_of_a_library():
+    told = jax.ShapeDtypeStruct((2048, 2048), jnp.float32)
+    program = jax.jit(lambda x: jnp.sum(x, 0)).lower(told).compile().as_text()
+    assert "ynn_fusion" not in program
+
+
+@pytest.mark.skipif(os.environ.get("XLA_FLAGS") != flags.XLA, reason="XLA has other flags")
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is no such loop on a GPU")
 @pytest.mark.parametrize(("numbers", "one"), [(64, True), (100_000_000, False)])
 def test_a_loop_that_moves_little_is_one_function(numbers, one):
