@@ -28,11 +28,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting import course, crawlers, experiment, frames, scenes, walker
-from fitting.clips import Clip, save_clip
-from fitting.pace import Slide, Slip, Stop
-from jaxik import rule
-from jaxik.terrain import Terrain
+from fitting.datasets import frames
+from fitting.datasets.clips import Clip, save_clip
+from fitting.datasets.synthetic import course, crawlers, walker
+from fitting.datasets.synthetic.speed_profile import Slide, Slip, Stop
+from fitting.datasets.terrain import mesh_files
+from fitting.experiments import experiment
+from jaxik.maths import parameter_tree
+from jaxik.world.terrain import Terrain
 
 HERE = Path(__file__).resolve().parent
 TERRAINS = {
@@ -162,7 +165,7 @@ def base(name: str) -> Clip:
 
 def reference(made: Made, flat: Clip, terrain: Terrain) -> Clip:
     """The flat base as the pipeline with the true parameters has it, without noise."""
-    ik = rule.replace(experiment.name_preset(made.preset), made.truth)
+    ik = parameter_tree.replace(experiment.name_preset(made.preset), made.truth)
     result = jaxik.run(ik, flat.rig, terrain, frames.frames_of(flat))
     return dataclasses.replace(frames.solved_clip(flat, result), source=made.name.replace("_", " "))
 
@@ -214,12 +217,12 @@ def make(folder: Path) -> None:
     terrains.mkdir(parents=True, exist_ok=True)
     clips.mkdir(parents=True, exist_ok=True)
     for name, mesh in TERRAINS.items():
-        scenes.save_mesh(terrains / f"{name}.ply", *mesh())
+        mesh_files.save_mesh(terrains / f"{name}.ply", *mesh())
     bases = {name: base(name) for name in BASES}
     for name, flat in bases.items():
         save_clip(clips / f"{name}_base.npz", flat)
     for made in MADE:
-        terrain = scenes.load_terrain(terrains / f"{made.base}.ply")
+        terrain = mesh_files.load_terrain(terrains / f"{made.base}.ply")
         solved = reference(made, bases[made.base], terrain)
         save_clip(clips / f"{made.name}.npz", kept(noisy(solved, made.seed)))
         truth = clips / f"{made.name}_truth.toml"

@@ -13,22 +13,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from . import quat, vec
-from .contact import AbstractContact
-from .effector import AbstractEffector, Effector
-from .foot import AbstractFoot
-from .frame import Contact, Frame, Sensed, animated
-from .gate import HARD, AbstractGate
-from .lean import AbstractLean, Lean
-from .leg import AbstractLeg
-from .lock import AbstractLock, Held
-from .pelvis import AbstractPelvis
-from .probe import AbstractProbe, foot_heading
-from .root import AbstractRoot
-from .skeleton import LegPose, Rig, Transform, bone_lengths
-from .struct import struct
-from .target import AbstractTarget
-from .terrain import LegTerrains, Terrain
+from jaxik.maths import quat, vec
+from jaxik.maths.gate import HARD, AbstractGate
+from jaxik.maths.struct import struct
+from jaxik.stages.contact import AbstractContact
+from jaxik.stages.effector import AbstractEffector, Effector
+from jaxik.stages.foot import AbstractFoot
+from jaxik.stages.lean import AbstractLean, Lean
+from jaxik.stages.leg import AbstractLeg
+from jaxik.stages.lock import AbstractLock, Held
+from jaxik.stages.pelvis import AbstractPelvis
+from jaxik.stages.probe import AbstractProbe, foot_heading
+from jaxik.stages.root import AbstractRoot
+from jaxik.stages.target import AbstractTarget
+from jaxik.world.frame import Contact, Frame, Sensed, animated
+from jaxik.world.skeleton import LegPose, Rig, Transform, bone_lengths
+from jaxik.world.terrain import LegTerrains, Terrain
 
 
 class FootIK(eqx.Module):

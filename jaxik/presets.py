@@ -2,18 +2,24 @@
 
 import math
 
-from .contact import HeightContact, IdleContact, LabelContact, StandingContact
-from .effector import BodyEffector, DirectEffector, FadeEffector, FoundEffector, HeelEffector
-from .foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
-from .lean import NoLean, SlopeLean
-from .leg import HintLeg, PoleLeg, TwoBone
-from .lock import NoLock, OffsetLock, PlantLock
-from .pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
-from .pipeline import FootIK
-from .probe import CornerProbe, FootProbe, RootProbe
-from .root import GroundRoot, KeepRoot
-from .stride import StrideProbe
-from .target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
+from jaxik.pipeline import FootIK
+from jaxik.stages.contact import HeightContact, IdleContact, LabelContact, StandingContact
+from jaxik.stages.effector import (
+    BodyEffector,
+    DirectEffector,
+    FadeEffector,
+    FoundEffector,
+    HeelEffector,
+)
+from jaxik.stages.foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
+from jaxik.stages.lean import NoLean, SlopeLean
+from jaxik.stages.leg import HintLeg, PoleLeg, TwoBone
+from jaxik.stages.lock import NoLock, OffsetLock, PlantLock
+from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
+from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe
+from jaxik.stages.root import GroundRoot, KeepRoot
+from jaxik.stages.stride_probe import StrideProbe
+from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
 
 
 def record() -> FootIK:

@@ -18,9 +18,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from . import presets, rule
-from .pipeline import FootIK
-from .skeleton import Rig
+from jaxik import presets
+from jaxik.maths import parameter_tree
+from jaxik.pipeline import FootIK
+from jaxik.world.skeleton import Rig
 
 SIZE = 0x80
 FLAGS = (  # bit at 0x1, name in the record, our name
@@ -154,7 +155,9 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
     toe = [values.pop(f"probe.toe_ls[{axis}]") for axis in range(3)]
     switches = {ours: record.flag(name) for _, name, ours in FLAGS}
     ticks = {name: reading.tick_hz for name in ("lean.tick_hz", "pelvis.tick_hz")}
-    return rule.replace(presets.record(), values | {"probe.toe_ls": toe} | switches | ticks)
+    return parameter_tree.replace(
+        presets.record(), values | {"probe.toe_ls": toe} | switches | ticks
+    )
 
 
 def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = None) -> Record:
@@ -301,7 +304,7 @@ def _fields(reading: Reading) -> list[tuple[str, str, str]]:
 def _leaf(ik: FootIK, name: str) -> float:
     """A number that all legs share."""
     leaf, _, index = name.rstrip("]").partition("[")
-    values = np.asarray(rule.get(ik, leaf))
+    values = np.asarray(parameter_tree.get(ik, leaf))
     values = np.unique(values[..., int(index)] if index else values)
     if len(values) > 1:
         raise ValueError(f"{name} is {values.tolist()}; the record has one value for all legs")

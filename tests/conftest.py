@@ -5,9 +5,9 @@ from pathlib import Path
 import jax
 import pytest
 
-from fitting import flags
+from fitting.runtime import xla
 
-flags.use()  # as the commands do
+xla.use()  # as the commands do
 jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(__file__).resolve().parents[1]

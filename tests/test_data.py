@@ -11,9 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting import course, experiment, frames, scenes
-from fitting.clips import contacts, load_clip, save_clip
-from jaxik import rule, terrain
+from fitting.datasets import frames
+from fitting.datasets.clips import contacts, load_clip, save_clip
+from fitting.datasets.synthetic import course
+from fitting.datasets.terrain import mesh_files
+from fitting.experiments import experiment
+from jaxik.maths import parameter_tree
+from jaxik.world import terrain
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 SAME = 1e-6  # m, and of quaternions, on another machine
@@ -104,7 +108,9 @@ def test_a_reference_differs_from_the_truth_by_the_noise_that_the_file_tells(mak
     assert truth["preset"] == one.preset and values == one.truth
     base = load_clip(DATA / "clips" / f"{one.base}_base.npz")
     seen = load_clip(DATA / "clips" / f"{one.name}.npz")
-    clean = make.reference(one, base, scenes.load_terrain(DATA / "terrains" / f"{one.base}.ply"))
+    clean = make.reference(
+        one, base, mesh_files.load_terrain(DATA / "terrains" / f"{one.base}.ply")
+    )
     error = seen.positions_ws - clean.positions_ws
     assert np.std(error) == pytest.approx(noise["position"], rel=0.02)
     assert np.abs(np.corrcoef(error[1:].reshape(-1), error[:-1].reshape(-1))[0, 1]) < 0.03
@@ -117,17 +123,19 @@ def test_a_reference_differs_from_the_truth_by_the_noise_that_the_file_tells(mak
 
 def test_a_truth_is_within_bounds_and_far_from_its_preset(one):
     ik = experiment.name_preset(one.preset)
-    declared = rule.declarations(ik)
+    declared = parameter_tree.declarations(ik)
     numbers = {name: value for name, value in one.truth.items() if not isinstance(value, bool)}
     assert len(numbers) >= 5
     for name, value in numbers.items():
         low, high = declared[name].low, declared[name].high
         assert low < value < high, name
-        assert abs(value - float(rule.get(ik, name))) >= 0.05 * (high - low) * (1 - 1e-6), name
+        assert abs(value - float(parameter_tree.get(ik, name))) >= 0.05 * (high - low) * (
+            1 - 1e-6
+        ), name
 
 
 def test_the_truth_of_the_uneven_walk_has_thresholds_in_order(make):
-    declared = rule.declarations(jaxik.presets.record())
+    declared = parameter_tree.declarations(jaxik.presets.record())
     thresholds = [name for name in make.RECORD if declared[name].kind == "threshold"]
     assert len(make.RECORD) >= 14 and len(thresholds) >= 3
     assert make.RECORD["contact.planted_height"] < make.RECORD["contact.raised_height"]
@@ -156,7 +164,7 @@ def test_the_base_is_ten_seconds_or_more_on_a_flat_floor_and_slides():
 
 def test_the_course_is_under_every_foot_within_reach_of_the_rays():
     base = load_clip(DATA / "clips" / "uneven_walk_base.npz")
-    ground = scenes.load_terrain(DATA / "terrains" / "uneven_walk.ply")
+    ground = mesh_files.load_terrain(DATA / "terrains" / "uneven_walk.ply")
     for role in (2, 3):
         hit = under(ground, base.joints_ws(role).reshape(-1, 3))
         assert hit.found.min() == 1.0
@@ -167,7 +175,7 @@ def test_the_course_is_under_every_foot_within_reach_of_the_rays():
 
 def test_the_walk_that_stops_stands_still_on_three_uneven_places():
     base = load_clip(DATA / "clips" / "stop_and_go_base.npz")
-    ground = scenes.load_terrain(DATA / "terrains" / "stop_and_go.ply")
+    ground = mesh_files.load_terrain(DATA / "terrains" / "stop_and_go.ply")
     still = np.asarray(frames.frames_of(base).speed) == 0.0
     stands = contacts.runs(still)
     assert base.fps == 30.0 and len(stands) == 3
@@ -189,7 +197,7 @@ def test_the_walk_that_stops_stands_still_on_three_uneven_places():
 def test_terrain_is_under_every_foot(walk, mesh):
     base = load_clip(DATA / "clips" / f"{walk}_base.npz")
     up = course.WALL_UP if mesh == "wall" else (0.0, 1.0, 0.0)
-    ground = scenes.load_terrain(DATA / "terrains" / f"{mesh}.ply", up=up)
+    ground = mesh_files.load_terrain(DATA / "terrains" / f"{mesh}.ply", up=up)
     for role in (2, 3):
         points = base.joints_ws(role).reshape(-1, 3) + 0.5 * np.array(up)
         hit = jax.jit(terrain.cast)(ground, points, 4.0)
@@ -208,8 +216,8 @@ def test_the_wall_has_holds_of_two_to_six_centimetres():
 @pytest.mark.parametrize("name", ["slope", "steps", "stones", "uneven", "stop_and_go", "meadow"])
 def test_a_course_has_no_hole_and_faces_up(tmp_path, name):
     mesh = getattr(course, name)()
-    scenes.save_mesh(tmp_path / "ground.ply", *mesh)
-    ground = scenes.load_terrain(tmp_path / "ground.ply")
+    mesh_files.save_mesh(tmp_path / "ground.ply", *mesh)
+    ground = mesh_files.load_terrain(tmp_path / "ground.ply")
     rng = np.random.default_rng(0)
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     points = rng.uniform(low, high, (2000, 3)) * [0.99, 0.0, 1.0]
@@ -219,14 +227,14 @@ def test_a_course_has_no_hole_and_faces_up(tmp_path, name):
 
 
 def test_steps_are_as_high_as_they_say_and_the_slope_as_steep(tmp_path):
-    scenes.save_mesh(tmp_path / "steps.ply", *course.steps())
-    ground = scenes.load_terrain(tmp_path / "steps.ply")
+    mesh_files.save_mesh(tmp_path / "steps.ply", *course.steps())
+    ground = mesh_files.load_terrain(tmp_path / "steps.ply")
     middles = 1.0 + course.TREAD * (np.arange(-1, len(course.STEP_HEIGHTS)) + 0.5)
     points = np.stack([0 * middles, 0 * middles, middles], axis=-1)
     rises = np.diff(np.array(under(ground, points).point[:, 1], np.float64))
     np.testing.assert_allclose(rises, course.STEP_HEIGHTS, rtol=0, atol=1e-4)
-    scenes.save_mesh(tmp_path / "slope.ply", *course.slope())
-    ground = scenes.load_terrain(tmp_path / "slope.ply")
+    mesh_files.save_mesh(tmp_path / "slope.ply", *course.slope())
+    ground = mesh_files.load_terrain(tmp_path / "slope.ply")
     normal = np.asarray(under(ground, np.array([[0.0, 0.0, 2.3]])).normal[0])
     assert np.degrees(np.arctan2(-normal[2], normal[1])) == pytest.approx(12.0, abs=0.1)
     assert -normal[0] / normal[1] == pytest.approx(0.1, abs=1e-3)

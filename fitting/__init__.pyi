@@ -1,0 +1,9 @@
+from .datasets.clips import Clip as Clip
+from .datasets.clips import load_clip as load_clip
+from .datasets.clips import save_clip as save_clip
+from .datasets.terrain.mesh_files import load_terrain as load_terrain
+from .experiments.experiment import Experiment as Experiment
+from .experiments.experiment import load_experiment as load_experiment
+from .studies.study import Fit as Fit
+from .studies.study import fit as fit
+from .studies.study import sample as sample

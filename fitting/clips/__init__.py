@@ -1,5 +1,0 @@
-"""Animation files in: what they say, how they are understood, what may be cut from them."""
-
-from .clip import Clip as Clip
-from .load import load_clip as load_clip
-from .npz import save_clip as save_clip

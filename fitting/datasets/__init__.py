@@ -1,0 +1,1 @@
+"""Clips and terrain, read from files or synthesised."""

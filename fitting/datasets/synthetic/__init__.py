@@ -1,0 +1,1 @@
+"""Synthetic walkers, crawlers and the ground they walk on."""

@@ -1,0 +1,1 @@
+"""Terrain from mesh files and from the stances of a captured clip."""

@@ -1,0 +1,68 @@
+"""Files that hold the game's record: bytes, CSV, and parameters in TOML."""
+
+import csv
+from pathlib import Path
+
+from fitting.runtime import validation
+from jaxik import record
+from jaxik.maths import parameter_tree
+
+from . import parameter_files, systems
+
+
+def read_bytes(path: Path) -> record.Record:
+    """The record in a binary file; ValueError for none."""
+    if not path.is_file():
+        raise ValueError(f"{path}: {validation.missing(path)}, wanted a record")
+    with validation.located(path):
+        return record.from_bytes(path.read_bytes())
+
+
+def read(path: Path, reading: record.Reading, base: record.Record | None) -> list[record.Record]:
+    """The records of a file, binary, CSV or TOML.
+
+    Args:
+        path: of the file.
+        reading: how the record's fields are meant.
+        base: completes a record that is made from parameters.
+
+    Raises:
+        ValueError: what is not there or cannot be read, parameters of another preset than `record`
+            or of other rules, a base for a record that is whole.
+    """
+    kind = path.suffix.lower()
+    if kind == ".toml":
+        ik, preset = parameter_files.from_toml(path)
+        if preset != "record":
+            raise ValueError(f"{path}: parameters of {preset!r}; only those of 'record' make one")
+        if other := systems.exchanged(ik, systems.name_preset(preset)):
+            raise ValueError(f"{path}: rules {other}; only those of 'record' make one")
+        return [record.from_ik(ik, base, reading)]
+    if base is not None:
+        raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
+    if kind != ".csv" or not path.is_file():
+        return [read_bytes(path)]
+    try:
+        rows = record.from_csv(path.read_text(encoding="utf-8"))
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not rows:
+        raise ValueError(f"{path}: the CSV has no row")
+    return rows
+
+
+def shown(one: record.Record, reading: record.Reading) -> str:
+    """A record under its own names and ours, a line a field."""
+    ik = record.to_ik(one, reading)
+    declared = parameter_tree.declarations(ik)
+    axis = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")[one.knee_axis_type]
+    lines = [f"{'kneeAxisType':30} {one.knee_axis_type} ({axis})"]
+    for _, name, ours in record.FLAGS:
+        lines.append(f"{name:30} {'on' if one.flag(name) else 'off':>12}   {ours}")
+    for name, ours, _ in record.FLOATS:
+        leaf, _, index = ours.partition("[")
+        value = parameter_tree.get(ik, leaf)
+        value = float(value[int(index[:-1])] if index else value)
+        meaning = f"{ours} = {value:.6g} {declared[leaf].unit}"
+        lines.append(f"{name:30} {one.value(name):12.6g}   {meaning}")
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""The best fit, its posterior, and what the data determine."""

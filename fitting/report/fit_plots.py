@@ -1,0 +1,292 @@
+"""Pictures of a fit, to be read without explanation; each function makes one figure."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogFormatter
+
+from fitting.analysis.playback import Motion, Playback
+from fitting.inference.optimisation.solution import Progress
+
+from .style import (
+    AFTER,
+    BEFORE,
+    CAPTURED,
+    EARTH,
+    GROUND,
+    LOCKED,
+    SLIDING,
+    STAGES,
+    STANDING,
+    earth,
+    legend,
+    spans,
+    stretch,
+    styled,
+    whole_and_part,
+)
+from .style import STYLE as STYLE
+
+STRIDE = 0.3  # m, between two drawn legs
+WORDS = {
+    "ankle": ("Ankle position", "cm", 100.0),
+    "knee": ("Knee position", "cm", 100.0),
+    "pelvis": ("Pelvis position", "cm", 100.0),
+    "foot": ("Foot orientation", "degrees", 180 / np.pi),
+    "body": ("Pelvis orientation", "degrees", 180 / np.pi),
+    "contact": ("Contact weight", "of 1", 1.0),
+    "smooth": ("Ankle acceleration", "m/s²", 1.0),
+}
+SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
+
+
+@styled
+def motion(play: Playback, legs: Sequence[str], title: str) -> Figure:
+    """Heights of ankles and pelvis over time, the ground below them; whole clip and a stretch."""
+    figure, columns = _whole_and_part(play, len(legs) + 1, title)
+    ground = 100 * play.ground_height()
+    for shown in columns:
+        for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
+            _three(axes, play, lambda one, leg=leg: 100 * play.height(one.ankle[:, leg]))
+            earth(axes, play.time, ground[:, leg])
+            axes.set_title(f"{name.capitalize()} ankle, over the ground under it ({play.label})")
+        _three(shown[-1], play, lambda one: 100 * play.height(one.pelvis))
+        earth(shown[-1], play.time, ground.mean(axis=1))
+        shown[-1].set_title("Pelvis, over the mean of the ground under the feet")
+    for axes in columns[0]:
+        axes.set_ylabel("height, cm")
+    legend(figure, *_lines(play), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
+    return figure
+
+
+@styled
+def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
+    """Legs from the side over the ground, in the stretch of the clip that climbs most."""
+    start, end = stretch(play.time, play.height(play.captured.pelvis))
+    inside = slice(start, end + 1)
+    way = play.travelled[inside]
+    apart = max(STRIDE, (np.max(way) - np.min(way)) / 20)
+    chosen = start + np.unique(np.floor((way - way[0]) / apart), return_index=True)[1]
+    tall = np.clip(16.0 * 1.35 / (np.ptp(way) + 1.6), 2.2, 6.5)
+    figure = Figure(figsize=(17, (tall + 0.7) * len(legs) + 1.4), layout="constrained")
+    figure.suptitle(f"{title}, seen from the right, {_seconds(play, start, end)}")
+    rows = figure.subplots(len(legs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for leg, (axes, name) in enumerate(zip(rows, legs, strict=True)):
+        for colour, one in _motions(play):
+            joints = np.stack([one.hip, one.knee, one.ankle, one.toe], axis=-2)[:, leg]
+            across, height = play.along(joints)[chosen], play.height(joints)[chosen]
+            axes.plot(across.T, height.T, color=colour, linewidth=2.0, solid_capstyle="round")
+            axes.plot(across[:, 1:3].T, height[:, 1:3].T, "o", color=colour, markersize=4)
+            pelvis = play.along(one.pelvis)[inside], play.height(one.pelvis)[inside]
+            axes.plot(*pelvis, color=colour, linewidth=2.6)
+        along = play.along(play.ground_ws)[inside, leg]
+        order = np.argsort(along, kind="stable")
+        earth(axes, along[order], play.ground_height()[inside, leg][order])
+        axes.set_aspect("equal")
+        axes.set_title(f"{name.capitalize()} leg every {100 * apart:.0f} cm, and the pelvis' way")
+        axes.set_ylabel("height, m")
+    rows[-1].set_xlabel("distance travelled, m")
+    ground = Patch(facecolor=EARTH, edgecolor=GROUND, label="ground under this foot's track")
+    legend(figure, *_lines(play), ground)
+    return figure
+
+
+@styled
+def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
+    """Knee angles over time with the fitted limits; whole clip and a stretch."""
+    figure, columns = _whole_and_part(play, len(legs), title)
+    lines = _lines(play)
+    for shown in columns:
+        for leg, (axes, name) in enumerate(zip(shown, legs, strict=True)):
+            _three(axes, play, lambda one, leg=leg: np.degrees(one.knee_angle[:, leg]))
+            axes.set_title(f"{name.capitalize()} knee (180° is straight)")
+            low, high = axes.get_ylim()
+            for limit in limits:
+                axes.axhline(np.degrees(limit), **SIGMA)
+            axes.set_ylim(low, max(high, 183.0))
+    for axes in columns[0]:
+        axes.set_ylabel("knee angle, degrees")
+    if limits:
+        lines.append(Line2D([], [], **SIGMA, label="limits"))
+    legend(figure, *lines)
+    return figure
+
+
+@styled
+def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
+    """Errors of each kind over time, and how they spread against the sigma that was assumed."""
+    kinds = fitted.used
+    figure = Figure(figsize=(17, 3.0 * len(kinds) + 1.8), layout="constrained")
+    figure.suptitle(title)
+    grid = figure.subplots(len(kinds), 2, squeeze=False, width_ratios=[2.4, 1])
+    for (axes, side), kind in zip(grid, kinds, strict=True):
+        words, unit, factor = WORDS[kind]
+        for play, colour in ((first, BEFORE), (fitted, AFTER)):
+            size = factor * _size(play, kind)
+            axes.plot(_times(play, size), size, color=colour, linewidth=1.2)
+        axes.axhline(factor * float(fitted.sigmas[kind]), **SIGMA)
+        of_legs = "" if kind in ("pelvis", "body") else " (of the legs' the larger)"
+        axes.set_title(f"{words}: size of the error{of_legs}")
+        axes.set_ylabel(unit)
+        axes.set_xlim(fitted.time[0], fitted.time[-1])
+        axes.set_ylim(bottom=0)
+        _spread(side, np.asarray(first.rows[kind]), np.asarray(fitted.rows[kind]))
+        side.set_title(f"{words}: spread of the residuals")
+    grid[-1, 0].set_xlabel("time, s")
+    grid[-1, 1].set_xlabel("residual as the fit sees it, in sigmas")
+    legend(
+        figure,
+        Line2D([], [], color=BEFORE, linewidth=3, label="with the preset's parameters"),
+        Line2D([], [], color=AFTER, linewidth=3, label="with the fitted parameters"),
+        Line2D([], [], **SIGMA, label="assumed sigma; right: its normal curve"),
+    )
+    return figure
+
+
+@styled
+def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
+    """When each foot stands and locks, as lanes; the whole clip and a stretch."""
+    labelled, locking = bool(np.any(play.stance)), bool(np.any(play.locked))
+    lanes: list[tuple[str, str, np.ndarray]] = []
+    for leg, name in enumerate(legs):
+        lanes.append((f"{name} contact weight", STANDING, np.asarray(play.contact)[:, leg]))
+        if locking:
+            lanes.append((f"{name} foot locked", LOCKED, np.asarray(play.locked)[:, leg]))
+        if labelled:
+            lanes.append(
+                (f"{name} stance, {play.label}", CAPTURED, np.asarray(play.stance)[:, leg])
+            )
+    if np.any(play.slide):
+        lanes.append(("sliding", SLIDING, np.asarray(play.slide)))
+    parts = spans(play.time, play.height(play.captured.pelvis))
+    tall = (0.55 * len(lanes) + 1.3) * len(parts) + 1.3
+    figure = Figure(figsize=(17, tall), layout="constrained")
+    figure.suptitle(title if locking else f"{title} (no foot ever locks)")
+    rows = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
+    for axes, (start, end) in zip(rows, parts, strict=True):
+        _draw_lanes(axes, play.time, lanes)
+        axes.set_xlim(play.time[start], play.time[end])
+        whole = (start, end) == parts[0]
+        axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(play, start, end)}")
+        axes.set_xlabel("time, s")
+    released = Line2D([], [], color="black", marker="v", linestyle="", label="released")
+    shown = [
+        (True, Patch(color=STANDING, label="contact weight, 0 to 1")),
+        (locking, Patch(color=LOCKED, label="foot locked")),
+        (locking, released),
+        (labelled, Patch(color=CAPTURED, label=f"stance, {play.label}")),
+        (bool(np.any(play.slide)), Patch(color=SLIDING, label="sliding")),
+    ]
+    legend(figure, *(entry for there, entry in shown if there))
+    return figure
+
+
+@styled
+def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
+    """Cost of the fit over its time, by stage, and the best so far."""
+    figure = Figure(figsize=(13, 6.5), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots()
+    for i, stage in enumerate(dict.fromkeys(one.stage for one in history)):
+        those = [one for one in history if one.stage == stage and np.isfinite(one.cost)]
+        axes.plot(
+            [one.seconds for one in those],
+            [one.cost for one in those],
+            "o",
+            markersize=7,
+            color=STAGES[i % len(STAGES)],
+            label=f"stage: {stage}",
+        )
+    best = [(one.seconds, one.best) for one in history if np.isfinite(one.best)]
+    if best:
+        axes.step(*zip(*best, strict=True), where="post", color="black", label="best so far")
+    axes.axhline(cost_before, color=BEFORE, linestyle="--", label="before the fit (the preset)")
+    axes.set_yscale("log")
+    for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
+    axes.set_xlabel("time since the fit began, compilation included, s")
+    axes.set_ylabel("cost: half the sum of squared residuals")
+    legend(figure, *axes.get_legend_handles_labels()[0])
+    return figure
+
+
+def _lines(play: Playback) -> list[Line2D]:
+    """What the colours of the three motions mean."""
+    shown = (
+        (BEFORE, "before: animation on a flat floor"),
+        (AFTER, "after fitted foot IK"),
+        (CAPTURED, play.label),
+    )
+    return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in shown]
+
+
+def _whole_and_part(play: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
+    figure = Figure(figsize=(17, 3.4 * rows + 1.6), layout="constrained")
+    figure.suptitle(title)
+    return figure, whole_and_part(figure, play.time, play.height(play.captured.pelvis), rows)
+
+
+def _motions(play: Playback) -> list[tuple[str, Motion]]:
+    """In the order in which they are drawn, with their colours."""
+    return [(BEFORE, play.before), (CAPTURED, play.captured), (AFTER, play.after)]
+
+
+def _three(axes: Axes, play: Playback, of: Callable[[Motion], np.ndarray]) -> None:
+    """One number of the animation, the capture and the result, over time."""
+    for colour, one in _motions(play):
+        axes.plot(play.time, of(one), color=colour, linewidth=1.2 if colour == BEFORE else 1.7)
+
+
+def _size(play: Playback, kind: str) -> np.ndarray:
+    """Length of the error of a kind in every frame, the larger of the legs; NaN where not seen."""
+    error = np.abs(np.asarray(play.errors[kind]))
+    if kind != "contact":
+        error = np.linalg.norm(error, axis=-1)
+    if error.ndim > 1:
+        error = error.max(axis=1)
+    seen = play.seen if len(error) == len(play.seen) else play.seen[1:-1]
+    return np.where(seen, error, np.nan)
+
+
+def _times(play: Playback, series: np.ndarray) -> np.ndarray:
+    return play.time if len(series) == len(play.time) else play.time[1:-1]
+
+
+def _spread(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
+    """Histograms of residuals in sigmas with the normal curve; what lies beyond 5 is put at 5."""
+    edges = np.linspace(-5.0, 5.0, 41)
+    for rows, colour, fill in ((first, BEFORE, True), (fitted, AFTER, False)):
+        values = np.clip(rows[rows != 0], -5.0, 5.0)  # rows not seen are 0
+        if values.size:
+            density = np.histogram(values, edges, density=True)[0]
+            axes.stairs(density, edges, fill=fill, color=colour, alpha=0.45 if fill else 1.0)
+    curve = np.linspace(-5.0, 5.0, 201)
+    axes.plot(
+        curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black", linewidth=1.4
+    )
+    axes.set_xlim(-5.6, 5.6)
+    axes.set_xticks([-5, -2.5, 0, 2.5, 5], ["≤−5", "−2.5", "0", "2.5", "≥5"])
+    axes.set_ylabel("density")
+
+
+def _draw_lanes(axes: Axes, time: np.ndarray, lanes: Sequence[tuple[str, str, np.ndarray]]) -> None:
+    """Series of 0..1 one above the other; a mark where a locked foot is released."""
+    for row, (_, colour, series) in enumerate(reversed(lanes)):
+        axes.fill_between(time, row, row + 0.75 * series, step="post", color=colour, linewidth=0)
+        axes.axhline(row, color="#bbbbbb", linewidth=0.7)
+        if colour == LOCKED:
+            ends = time[1:][np.diff(series) < -0.5]
+            axes.plot(ends, np.full(len(ends), row + 0.4), "v", color="black", markersize=5)
+    axes.set_ylim(-0.05, len(lanes))
+    axes.set_yticks(np.arange(len(lanes)) + 0.4, [name for name, _, _ in reversed(lanes)])
+    axes.tick_params(axis="y", length=0)
+    axes.grid(False, axis="y")
+
+
+def _seconds(play: Playback, start: int, end: int) -> str:
+    return f"{play.time[start]:.1f} s to {play.time[end]:.1f} s"

@@ -1,0 +1,100 @@
+"""What figures have in common: colours, letters, ground, columns in time, the way to a file."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+
+from fitting.runtime import files
+
+# Okabe and Ito's colours, told apart by colour-blind readers too.
+BEFORE, AFTER, CAPTURED = "#8c8c8c", "#0072B2", "#D55E00"
+STANDING, LOCKED, SLIDING = "#56B4E9", "#009E73", "#CC79A7"
+STAGES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
+GROUND, EARTH = "#5f5236", "#ece5d6"
+SPAN = 5.0  # s, of the stretch that is also shown enlarged
+LONG = 8.0  # s; shorter clips need no enlargement
+STYLE: Any = {
+    "font.size": 13,
+    "axes.titlesize": 14,
+    "axes.labelsize": 13,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "figure.titlesize": 18,
+    "legend.frameon": False,
+    "legend.fontsize": 13,
+    "lines.linewidth": 1.6,
+    "savefig.dpi": 100,
+}
+styled = matplotlib.rc_context(STYLE)
+
+
+def stretch(time: np.ndarray, pelvis: np.ndarray) -> tuple[int, int]:
+    """First and last frame of the seconds in which the pelvis climbs and sinks most.
+
+    Args:
+        time: of each frame, s.
+        pelvis: its height, m.
+    """
+    if time[-1] <= LONG:
+        return 0, len(time) - 1
+    frames = int(np.searchsorted(time, SPAN))
+    steps = np.abs(np.diff(pelvis))
+    sums = np.concatenate([[0.0], np.cumsum(steps)])
+    start = int(np.argmax(sums[frames:] - sums[:-frames]))
+    return start, start + frames
+
+
+def spans(time: np.ndarray, pelvis: np.ndarray) -> list[tuple[int, int]]:
+    """First and last frames of what is shown: the whole clip and, of a long one, a stretch."""
+    whole = 0, len(time) - 1
+    return list(dict.fromkeys([whole, stretch(time, pelvis)]))
+
+
+def whole_and_part(
+    figure: FigureBase, time: np.ndarray, pelvis: np.ndarray, rows: int
+) -> list[list[Axes]]:
+    """Axes in a column for the whole clip and, for a long clip, in one for a stretch of it.
+
+    Args:
+        figure: to be drawn into.
+        time: of each frame, s.
+        pelvis: its height, m, which tells the stretch.
+        rows: of axes.
+    """
+    parts = spans(time, pelvis)
+    ratios = [1.6, 1.0][: len(parts)]
+    grid = figure.subplots(rows, len(parts), squeeze=False, sharey="row", width_ratios=ratios)
+    for column, (start, end) in zip(grid.T, parts, strict=True):
+        for axes in column:
+            axes.set_xlim(time[start], time[end])
+        enlarged = "" if (start, end) == parts[0] else ", enlarged"
+        column[-1].set_xlabel(f"time, s{enlarged}")
+    return [list(column) for column in grid.T]
+
+
+def earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
+    """Ground as an area with an edge, down to the end of what the axes show by now."""
+    axes.plot(across, height, color=GROUND, linewidth=1.4)
+    low, high = axes.get_ylim()
+    axes.fill_between(across, height, low, where=np.isfinite(height), color=EARTH, linewidth=0)
+    axes.set_ylim(low, high)
+
+
+def legend(figure: Figure, *entries: Any, columns: int = 4) -> None:
+    """What the colours of a figure mean, below it."""
+    figure.legend(handles=entries, loc="outside lower center", ncols=min(columns, len(entries)))
+
+
+def save(path: Path, figure: Figure) -> None:
+    """Writes a figure; never half a file."""
+    look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
+    files.write(path, lambda temporary: figure.savefig(temporary, **look))

@@ -1,0 +1,75 @@
+"""The picture of the two seconds in which the fit is worst."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from fitting.analysis.playback import Motion, Playback
+from fitting.analysis.worst_window import Worst
+
+from .style import AFTER, CAPTURED, EARTH, GROUND, STANDING, earth, legend, styled
+
+STANCE, UNSEEN = 0.22, "#dddddd"
+
+
+@styled
+def worst(play: Playback, legs: Sequence[str], found: Worst, title: str) -> Figure:
+    """Heights of feet and pelvis, and knee angles, captured and fitted, in the worst window."""
+    inside = slice(found.start, found.end + 1)
+    time = play.time[inside]
+    rows = 2 * len(legs) + 1
+    figure = Figure(figsize=(17, 3.1 * rows + 1.6), layout="constrained")
+    figure.suptitle(title)
+    panels = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    ground = 100 * play.ground_height()[inside]
+
+    def draw(axes: Axes, of: Callable[[Motion], np.ndarray]) -> None:
+        for colour, motion in ((CAPTURED, play.captured), (AFTER, play.after)):
+            axes.plot(time, of(motion)[inside], color=colour, linewidth=2.2)
+
+    for leg, name in enumerate(legs):
+        foot, knee = panels[leg], panels[len(legs) + 1 + leg]
+        draw(foot, lambda one, leg=leg: 100 * play.height(one.ankle[:, leg]))
+        earth(foot, time, ground[:, leg])
+        foot.set_title(f"{name.capitalize()} ankle, over the ground under it ({play.label})")
+        draw(knee, lambda one, leg=leg: np.degrees(one.knee_angle[:, leg]))
+        knee.set_title(f"{name.capitalize()} knee (180° is straight)")
+        knee.set_ylabel("knee angle, degrees")
+        for axes in (foot, knee):
+            _shade(axes, time, np.asarray(play.stance)[inside, leg] > 0.5, STANDING, STANCE)
+    middle = panels[len(legs)]
+    draw(middle, lambda one: 100 * play.height(one.pelvis))
+    middle.set_title("Pelvis")
+    for axes in panels[: len(legs) + 1]:
+        axes.set_ylabel("height, cm")
+    for axes in panels:
+        _shade(axes, time, ~np.asarray(play.seen)[inside], UNSEEN, 1.0)
+        axes.axvline(play.time[found.frame], color="black", linestyle=":", linewidth=1.6)
+    panels[-1].set_xlabel("time, s")
+    panels[-1].set_xlim(time[0], time[-1])
+    entries = [
+        Line2D([], [], color=CAPTURED, linewidth=3, label=play.label),
+        Line2D([], [], color=AFTER, linewidth=3, label="after fitted foot IK"),
+        Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"),
+        Patch(color=STANDING, alpha=STANCE, label="the foot stands, as captured"),
+        Line2D([], [], color="black", linestyle=":", label="the largest error"),
+    ]
+    if not np.all(np.asarray(play.seen)[inside]):
+        entries.append(Patch(color=UNSEEN, label="not seen by the fit"))
+    legend(figure, *entries, columns=6)
+    return figure
+
+
+def _shade(axes: Axes, time: np.ndarray, where: np.ndarray, colour: str, alpha: float) -> None:
+    """Colours the whole height of the axes at these frames."""
+    half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    edges = np.flatnonzero(np.diff(where.astype(int), prepend=0, append=0))
+    for start, end in edges.reshape(-1, 2):
+        axes.axvspan(
+            float(time[start]) - half, float(time[end - 1]) + half,
+            color=colour, alpha=alpha, linewidth=0, zorder=0,
+        )  # fmt: skip

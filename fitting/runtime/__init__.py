@@ -1,0 +1,1 @@
+"""How programs run here: XLA settings, threads, kept programs, files written whole."""

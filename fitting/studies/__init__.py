@@ -1,0 +1,1 @@
+"""The jobs and the folder of a run."""

@@ -1,0 +1,2 @@
+from . import lanes as lanes
+from . import primitives as primitives

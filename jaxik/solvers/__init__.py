@@ -1,0 +1,5 @@
+"""Closed-form limb and aim solvers, free of any game's rules."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

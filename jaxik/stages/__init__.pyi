@@ -1,0 +1,11 @@
+from . import contact as contact
+from . import effector as effector
+from . import foot as foot
+from . import lean as lean
+from . import leg as leg
+from . import lock as lock
+from . import pelvis as pelvis
+from . import probe as probe
+from . import root as root
+from . import stride_probe as stride_probe
+from . import target as target

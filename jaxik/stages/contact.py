@@ -1,0 +1,159 @@
+"""Stage 1: how far each foot of the animation stands."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxik.maths import smoothing, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.parameter_tree import parameter
+from jaxik.maths.struct import struct
+from jaxik.world.frame import Contact, Frame
+from jaxik.world.skeleton import Rig
+
+HEIGHT_BAND = 0.01  # m over which a softened height decision turns
+SPEED_BAND = 0.05  # m/s, likewise
+
+
+class AbstractContact(eqx.Module):
+    """Reads contact from the animation."""
+
+    @abstractmethod
+    def init(self, rig: Rig, dtype: Any) -> Any:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        """Lift and contact of each foot as this frame alone shows them."""
+
+    @abstractmethod
+    def advance(
+        self, contact: Contact, dt: Array, state: Any, started: Array, gate: AbstractGate
+    ) -> tuple[Any, Contact]:
+        """Memory after this frame, and the contact with it."""
+
+
+class AbstractInstantContact(AbstractContact):
+    """Reads contact from the present frame alone."""
+
+    def init(self, rig: Rig, dtype: Any) -> None:
+        return None
+
+    def advance(
+        self, contact: Contact, dt: Array, state: None, started: Array, gate: AbstractGate
+    ) -> tuple[None, Contact]:
+        return None, contact
+
+
+class HeightContact(AbstractInstantContact):
+    """By the ankle's height: 1 below `planted_height`, 0 above `raised_height`, linear between."""
+
+    ground_height: Array = parameter(0.0, unit="m", low=-0.5, high=0.5)
+    planted_height: Array = parameter(0.10, unit="m", low=0.0, high=0.4, kind="threshold")
+    raised_height: Array = parameter(
+        0.16, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
+    )
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        lift = frame.pose.ankle.pos[..., 1] - self.ground_height
+        planted = gate.below(lift, self.planted_height, band=HEIGHT_BAND)
+        lifted = gate.above(lift, self.raised_height, band=HEIGHT_BAND)
+        span = self.raised_height - self.planted_height
+        share = vec.safe_divide(self.raised_height - lift, span)
+        zero, one = jnp.zeros_like(lift), jnp.ones_like(lift)
+        ramp = gate.clip(share, zero, one, band=0.1)
+        return Contact(lift, jnp.where(span > 0, ramp, planted), planted, lifted)
+
+
+class StandingContact(AbstractInstantContact):
+    """Every foot always stands: where there is ground, foot IK works (ozz and Mec)."""
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        lift = frame.pose.ankle.pos[..., 1]
+        one, zero = jnp.ones_like(lift), jnp.zeros_like(lift)
+        return Contact(lift, one, one, zero)
+
+
+class IdleContact(AbstractInstantContact):
+    """All feet stand while the character does, none while it moves (Unreal, seed 001)."""
+
+    idle_speed: Array = parameter(0.0, unit="m/s", low=0.0, high=3.0, kind="threshold")
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        lift = frame.pose.ankle.pos[..., 1]
+        idle = gate.below(frame.speed, self.idle_speed, band=SPEED_BAND)
+        idle = jnp.broadcast_to(idle, lift.shape)
+        return Contact(lift, idle, idle, 1.0 - idle)
+
+
+class LabelContact(AbstractInstantContact):
+    """As the animation is labelled (`Stride.standing`): what its author or a capture says."""
+
+    ground_height: Array = parameter(0.0, unit="m", low=-0.5, high=0.5)
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        standing = frame.stride.standing
+        lift = frame.pose.ankle.pos[..., 1] - self.ground_height
+        return Contact(lift, standing, standing, 1.0 - standing)
+
+
+@struct
+class SpeedState:
+    """Which feet stand."""
+
+    standing: Float[Array, " legs"]  # 0 or 1
+    weight: Float[Array, " legs"]  # 0..1, follows it
+
+
+class SpeedContact(AbstractContact):
+    """By speed and height of the ball, with hysteresis.
+
+    A foot begins to stand once its ball is both low and slow, and stops once it is either high or
+    fast, by thresholds of their own: a foot on the border does not flicker. Gait labs find contact
+    so (foot velocity algorithms; O'Connor et al. 2007 take the foot's centre). A standing foot's
+    ball is slower than 0.25 m/s, a swinging one's hardly ever.
+    """
+
+    ground_height: Array = parameter(0.0, unit="m", low=-0.5, high=0.5)
+    planted_height: Array = parameter(0.075, unit="m", low=0.0, high=0.4, kind="threshold")
+    raised_height: Array = parameter(
+        0.10, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
+    )
+    planted_speed: Array = parameter(0.25, unit="m/s", low=0.0, high=1.5, kind="threshold")
+    raised_speed: Array = parameter(
+        0.50, unit="m/s", low=0.0, high=3.0, kind="threshold", above="planted_speed"
+    )
+    half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+
+    def init(self, rig: Rig, dtype: Any) -> SpeedState:
+        each = jnp.zeros(rig.side.shape, dtype)
+        return SpeedState(each, each)
+
+    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+        lift = frame.pose.ankle.pos[..., 1] - self.ground_height
+        height, speed = frame.pose.toe.pos[..., 1] - self.ground_height, frame.toe_speed
+        low = gate.below(height, self.planted_height, band=HEIGHT_BAND)
+        slow = gate.below(speed, self.planted_speed, band=SPEED_BAND)
+        lowish = gate.below(height, self.raised_height, band=HEIGHT_BAND)
+        slowish = gate.below(speed, self.raised_speed, band=SPEED_BAND)
+        planted = low * slow
+        return Contact(lift, planted, planted, 1.0 - lowish * slowish)
+
+    def advance(
+        self,
+        contact: Contact,
+        dt: Array,
+        state: SpeedState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[SpeedState, Contact]:
+        before = jnp.where(started, state.standing, contact.planted)
+        one, zero = jnp.ones_like(before), jnp.zeros_like(before)
+        standing = gate.choose(contact.planted, one, before)
+        standing = gate.choose(contact.lifted, zero, standing)
+        share = jnp.where(started, smoothing.share_of_half_life(self.half_life, dt), 1.0)
+        weight = smoothing.approach(state.weight, standing, share)
+        return SpeedState(standing, weight), Contact(contact.lift, weight, standing, 1.0 - standing)

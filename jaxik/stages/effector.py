@@ -1,0 +1,269 @@
+"""Stage 8: where each leg is sent once the body has moved, and how much of foot IK it gets."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.world.frame import Sensed
+from jaxik.world.skeleton import Rig
+
+from .lock import Held
+from .pelvis import PelvisState, asked_heights
+
+HEIGHT_BAND = 0.01  # m
+ANGLE_BAND = 0.035  # rad, 2 degrees
+
+
+@struct
+class Effector:
+    """What the legs are solved for."""
+
+    target_ws: Float[Array, "legs 3"]  # m, of the ankles
+    rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule takes it
+    weight: Float[Array, " legs"]  # 0..1, share of foot IK
+
+
+class AbstractEffector(eqx.Module):
+    """Follows the targets."""
+
+    @abstractmethod
+    def init(self, rig: Rig, dtype: Any) -> Any:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def awake(self, sensed: Sensed, state: Any, gate: AbstractGate) -> Float[Array, ""]:
+        """0 while the body shall stay as it is, else 1."""
+
+    @abstractmethod
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: Any,
+        started: Array,
+        gate: AbstractGate,
+    ) -> tuple[Any, Effector]:
+        """Memory after this frame, and where the legs go."""
+
+
+class AbstractInstantEffector(AbstractEffector):
+    """Follows by the present frame alone."""
+
+    def init(self, rig: Rig, dtype: Any) -> None:
+        return None
+
+    def awake(self, sensed: Sensed, state: None, gate: AbstractGate) -> Float[Array, ""]:
+        return jnp.ones_like(sensed.dt)
+
+
+class DirectEffector(AbstractInstantEffector):
+    """The targets as they are; a foot without ground goes where it was animated."""
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Effector]:
+        return None, Effector(target_ws, held.rot_ws, sensed.weight)
+
+
+class FoundEffector(AbstractInstantEffector):
+    """The targets of feet that found ground; other legs stay as the body carries them (ozz)."""
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Effector]:
+        return None, Effector(target_ws, held.rot_ws, sensed.weight * sensed.foothold.found)
+
+
+class HeelEffector(AbstractInstantEffector):
+    """Lifts a heel where its leg would otherwise be too long, as a walker's trailing foot does.
+
+    The foot turns about its ball, toes down, until the ankle is within `extension` of the leg's
+    length of the hip, or within the animated distance where that is longer, by `max_lift` at most
+    (as the heel lift of locomotion systems after Johansen, 2009).
+    """
+
+    extension: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
+    max_lift: Array = parameter(0.60, unit="rad", low=0.0, high=1.2)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Effector]:
+        turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        arm = quat.rotate(turn, sensed.ankle_ws - sensed.ball_ws)
+        ball = target_ws - arm
+        axis = vec.cross(sensed.ahead_ws, sensed.leg_up_ws)
+        spare = vec.length(sensed.ankle_ws - sensed.hip_ws)
+        longest = self.extension * (sensed.thigh + sensed.shin)
+        longest = jnp.where(spare > longest, spare, longest)
+        hip = sensed.hip_ws + pelvis.offset_ws
+        angle = heel_angle(ball - hip, arm, axis, longest)
+        level = jnp.zeros_like(angle)
+        angle = gate.clip(angle, level, level + self.max_lift, band=ANGLE_BAND)
+        lift = quat.from_axis_angle(axis, -angle)
+        rot_ws = quat.multiply(lift, held.rot_ws)
+        return None, Effector(ball + quat.rotate(lift, arm), rot_ws, sensed.weight)
+
+
+def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[Array, " legs"]:
+    """Turn of `arm`, rad, toes down about `axis`, after which `to_ball + arm` is `length` long.
+
+    Below 0 where it is shorter as it is; where it never gets so short, the turn that comes nearest;
+    0 where it would only get longer. The squared length is `c + P cos + Q sin` of the turn.
+    """
+    along = vec.scale(axis, vec.dot(arm, axis))
+    across = arm - along
+    start = to_ball + along
+    constant = vec.dot(start, start) + vec.dot(across, across)
+    cos_part = 2.0 * vec.dot(start, across)
+    sin_part = 2.0 * vec.dot(start, vec.cross(across, axis))
+    size = vec.safe_sqrt(cos_part**2 + sin_part**2)
+    helps = sin_part < 0
+    cosine = vec.safe_divide(length**2 - constant, size)
+    inside = (cosine > -1) & (cosine < 1)
+    edge = jnp.where(cosine < 0, jnp.pi, 0.0)
+    safe = jnp.where(inside, cosine, 0.0)
+    turned = jnp.where(inside, vec.safe_arctan2(vec.safe_sqrt(1.0 - safe**2), safe), edge)
+    phase = vec.safe_arctan2(jnp.where(helps, sin_part, -1.0), cos_part)
+    return jnp.where(helps, turned + phase, 0.0)
+
+
+@struct
+class BodyState:
+    """Feet relative to the body."""
+
+    height: Float[Array, " legs"]  # m, of the ankles over the moved body's animation
+    asleep: Float[Array, ""]  # 0 or 1
+
+
+class BodyEffector(AbstractEffector):
+    """Smooths each foot's height relative to the body, after the body has moved (Unreal, seed 001).
+
+    The height goes to the asked one less the pelvis' goal by the clamped-speed law, and the foot
+    moves with the pelvis. With `latch` on everything stops once all feet are within
+    `latch_distance` of their goals, until the character moves: a pelvis slower than the feet then
+    freezes short of its goal, which is the original's trap. Off is recommended.
+    """
+
+    speed: Array = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    latch: Array = switch(False)
+    latch_distance: Array = parameter(0.01, unit="m", low=0.0, high=0.05, kind="threshold")
+    mesh_scale: Array = parameter(1.0, unit="1", low=0.5, high=2.0)
+
+    def init(self, rig: Rig, dtype: Any) -> BodyState:
+        return BodyState(jnp.zeros(rig.side.shape, dtype), jnp.zeros((), dtype))
+
+    def awake(self, sensed: Sensed, state: BodyState, gate: AbstractGate) -> Float[Array, ""]:
+        return 1.0 - state.asleep * self._still(sensed, gate)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: BodyState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[BodyState, Effector]:
+        awake = self.awake(sensed, state, gate)
+        asked = asked_heights(sensed, target_ws)
+        goal = asked - pelvis.goal
+        share = smoothing.share_of_speed(self.speed, sensed.dt, goal - state.height)
+        share = awake * jnp.where(started, share, 1.0)
+        height = smoothing.approach(state.height, goal, share)
+
+        near = gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
+        arrived = jnp.prod(jnp.where(sensed.weight > 0, near, 1.0))
+        falls = jnp.where(self.latch, self._still(sensed, gate), 0.0)
+        asleep = falls * (1.0 - awake * (1.0 - arrived))
+
+        moved = vec.scale(sensed.leg_up_ws, height / self.mesh_scale - asked) + pelvis.offset_ws
+        effector = Effector(target_ws + moved, held.rot_ws, sensed.weight)
+        return BodyState(height, asleep), effector
+
+    def _still(self, sensed: Sensed, gate: AbstractGate) -> Float[Array, ""]:
+        """1 while all feet stand."""
+        standing = jnp.where(sensed.weight > 0, sensed.contact.planted, 1.0)
+        return gate.least(standing, band=0.1)
+
+
+@struct
+class FadeState:
+    """How far each leg has come, and what its last ground asked of it."""
+
+    share: Float[Array, " legs"]  # 0..1
+    offset_ws: Float[Array, "legs 3"]  # m, from the animated ankle to the target
+    turn_ws: Float[Array, "legs 4"]  # from the animated ankle's rotation to the wanted one
+
+
+class FadeEffector(AbstractEffector):
+    """Fades each leg in while it finds ground and out while it does not, at one pace (Mec).
+
+    On the way out the leg keeps what the last ground asked of it: the same offset from its
+    animation, and the same turn.
+    """
+
+    transition_time: Array = parameter(0.20, unit="s", low=0.0, high=1.0)
+
+    def init(self, rig: Rig, dtype: Any) -> FadeState:
+        upright = jnp.broadcast_to(quat.identity(dtype), (*rig.side.shape, 4))
+        return FadeState(
+            jnp.zeros(rig.side.shape, dtype), jnp.zeros((*rig.side.shape, 3), dtype), upright
+        )
+
+    def awake(self, sensed: Sensed, state: FadeState, gate: AbstractGate) -> Float[Array, ""]:
+        return jnp.ones_like(sensed.dt)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        held: Held,
+        pelvis: PelvisState,
+        state: FadeState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[FadeState, Effector]:
+        found = sensed.foothold.found
+        step = jnp.where(started, smoothing.step_of_time(self.transition_time, sensed.dt), 1.0)
+        share = smoothing.towards(state.share, found, step)
+        asked = target_ws - sensed.ankle_ws
+        offset_ws = gate.choose(found[..., None], asked, state.offset_ws)
+        turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        turn_ws = quat.nlerp(state.turn_ws, turn, found)
+        effector = Effector(
+            sensed.ankle_ws + offset_ws,
+            quat.multiply(turn_ws, sensed.ankle_rot_ws),
+            sensed.weight * share,
+        )
+        return FadeState(share, offset_ws, turn_ws), effector

@@ -1,0 +1,166 @@
+"""Stage 5: the body's lean against the slope under the feet (the record's "undulation")."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.parameter_tree import constant, parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.world.frame import Contact, Frame, Ground, Slope, heading
+
+
+@struct
+class Lean:
+    """What the slope does to the body."""
+
+    turn_ws: Float[Array, "4"]  # rotation of the body about its pivot, world axes
+    normal_ws: Float[Array, "3"]  # unit, the smoothed ground normal
+
+
+class AbstractLean(eqx.Module):
+    """Leans the body."""
+
+    @abstractmethod
+    def init(self, dtype: Any) -> Any:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def sense(
+        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+    ) -> Slope:
+        """The slope that this frame alone shows."""
+
+    @abstractmethod
+    def advance(
+        self,
+        slope: Slope,
+        up_ws: Array,
+        slide: Array,
+        dt: Array,
+        state: Any,
+        started: Array,
+        gate: AbstractGate,
+    ) -> tuple[Any, Lean]:
+        """The lean after memory."""
+
+
+@struct
+class LeanState:
+    """Smoothed slope and slide weight."""
+
+    forward: Float[Array, ""]  # rad
+    side: Float[Array, ""]  # rad
+    slide: Float[Array, ""]  # 0..1
+    forward_speed: Float[Array, ""]  # rad/s, of a spring
+    side_speed: Float[Array, ""]  # rad/s, likewise
+
+
+class SlopeLean(AbstractLean):
+    """Leans by a rate times the smoothed slope, with other rates and gains while sliding.
+
+    The slope comes from the normals under the feet that stand. Rate +1 lays the body's up on the
+    normal, a negative rate leans into the hill. The slope is smoothed before the rates are applied,
+    so that the smoothed normal exists by itself; with `spring` on critically damped, with the
+    half-lives of the same gains.
+    """
+
+    forward_rate: Array = parameter(-0.30, unit="1", low=-1.0, high=1.0)
+    side_rate: Array = parameter(-0.10, unit="1", low=-1.0, high=1.0)
+    forward_rate_slide: Array = parameter(0.80, unit="1", low=-1.0, high=1.0)
+    side_rate_slide: Array = parameter(0.60, unit="1", low=-1.0, high=1.0)
+    gain: Array = parameter(0.19, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    gain_slide: Array = parameter(0.294, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    slide_on_gain: Array = parameter(0.226, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    slide_off_gain: Array = parameter(0.135, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    spring: Array = switch(False)
+    tick_hz: Array = constant(30.0)
+
+    def init(self, dtype: Any) -> LeanState:
+        zero = jnp.zeros((), dtype)
+        return LeanState(zero, zero, zero, zero, zero)
+
+    def sense(
+        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+    ) -> Slope:
+        forward_ws, right_ws = heading(frame.world_from_model, up_ws)
+        share = contact.weight * ground.ankle.found * weight
+        normal = vec.total_of(vec.scale(ground.ankle.normal, share))
+        normal = jnp.where(vec.total(share) > 0, normal, up_ws)
+        up = vec.dot(normal, up_ws)
+        return Slope(
+            vec.safe_arctan2(-vec.dot(normal, forward_ws), up),
+            vec.safe_arctan2(-vec.dot(normal, right_ws), up),
+            forward_ws,
+            right_ws,
+        )
+
+    def advance(
+        self,
+        slope: Slope,
+        up_ws: Array,
+        slide: Array,
+        dt: Array,
+        state: LeanState,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[LeanState, Lean]:
+        entering = gate.above(slide - state.slide, jnp.zeros_like(slide), band=0.1)
+        slide_gain = gate.choose(entering, self.slide_on_gain, self.slide_off_gain)
+        slide_share = smoothing.share_of_gain(slide_gain, dt, self.tick_hz)
+        sliding = smoothing.approach(state.slide, slide, jnp.where(started, slide_share, 1.0))
+
+        gain = smoothing.approach(self.gain, self.gain_slide, sliding)
+        share = jnp.where(started, smoothing.share_of_gain(gain, dt, self.tick_hz), 1.0)
+        forward, forward_speed = smoothing.follow(
+            state.forward, state.forward_speed, slope.forward, share, dt, self.spring
+        )
+        side, side_speed = smoothing.follow(
+            state.side, state.side_speed, slope.side, share, dt, self.spring
+        )
+
+        lean_forward = forward * smoothing.approach(
+            self.forward_rate, self.forward_rate_slide, sliding
+        )
+        lean_side = side * smoothing.approach(self.side_rate, self.side_rate_slide, sliding)
+        turn = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
+        lean = Lean(quat.from_rotvec(turn), _normal(slope, up_ws, forward, side))
+        return LeanState(forward, side, sliding, forward_speed, side_speed), lean
+
+
+class NoLean(AbstractLean):
+    """The body stays as upright as it was animated."""
+
+    def init(self, dtype: Any) -> None:
+        return None
+
+    def sense(
+        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+    ) -> Slope:
+        level = jnp.zeros_like(frame.dt)
+        return Slope(level, level, *heading(frame.world_from_model, up_ws))
+
+    def advance(
+        self,
+        slope: Slope,
+        up_ws: Array,
+        slide: Array,
+        dt: Array,
+        state: None,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> tuple[None, Lean]:
+        return None, Lean(quat.identity(up_ws.dtype), up_ws)
+
+
+@vec.recomputed
+def _normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
+    """Unit normal of ground that rises by these angles, rad, ahead and to the right."""
+    (level, rising), (across, tilted) = vec.cos_sin(forward), vec.cos_sin(side)
+    ahead = vec.scale(slope.forward_ws, rising * across)
+    aside = vec.scale(slope.right_ws, level * tilted)
+    return vec.unit(vec.scale(up_ws, level * across) - ahead - aside, up_ws)

@@ -1,0 +1,236 @@
+"""Stage 9: two-bone legs that bring the ankles to their targets."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import quat, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.solvers.two_bone import (
+    LENGTH_BAND,
+    hinge_turn,
+    local,
+    opposite_side,
+    pole_bend,
+    soft_limit,
+    swing_turn,
+)
+from jaxik.world.frame import Frame, Sensed
+from jaxik.world.skeleton import LegPose, Rig, Transform
+
+
+@struct
+class Bend:
+    """A solved leg."""
+
+    pose: LegPose  # legs, model space; ankle and toe carried along
+    hip: Float[Array, "legs 4"]  # correction, on the right of the hip's rotation
+    knee: Float[Array, "legs 4"]  # correction, on the right of the knee's rotation
+    reached: Float[Array, " legs"]  # 1 where the ankle is at its target, else 0
+
+
+class AbstractLeg(eqx.Module):
+    """Solves legs."""
+
+    weight: eqx.AbstractVar[Array]  # 0..1, share of foot IK
+
+    @abstractmethod
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
+    ) -> Bend:
+        """The leg with its ankle at `target_ms`, m; `carried` is animated, on the moved body."""
+
+
+class TwoBone(AbstractLeg):
+    """Turns the knee about its hinge until the ankle is as far as the target, then swings the hip.
+
+    Exact for a hinge that is not square to the leg: distances are split along and across the hinge
+    axis, and the triangle is closed across it. Half-angle algebra throughout (systems.md, 0, after
+    ozz's two-bone job). Knee limits and softening act on the distance from hip to ankle, never on
+    the angle: from `soften` times the longest reach the leg approaches that reach exponentially.
+    With `as_animated` on, a leg that the animation holds straighter or more bent may stay so.
+
+    Beyond reach the leg points at the target; with the target on the hip it keeps its direction; a
+    leg with a zero bone, or lying along its hinge, does not bend.
+    """
+
+    max_knee_angle: Array = parameter(3.0000531803, unit="rad", low=2.0, high=3.1415926536)
+    min_knee_angle: Array = parameter(0.6982008392, unit="rad", low=0.0, high=1.8)
+    soften: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
+    as_animated: Array = switch(False)
+    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
+    ) -> Bend:
+        return self.solve(rig, carried, target_ms, weight, gate)
+
+    def solve(
+        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
+    ) -> Bend:
+        """The leg by itself: `pose` with its ankle at `target_ms`, m, model space."""
+        to_hip, to_ankle, hinge = bones(rig, pose)
+        to_target = vec.subtract(target_ms, pose.hip.pos)
+        reach, reached = vec.once(*self._reach(to_hip, to_ankle, to_target, gate))
+        half_cos, half_sin = hinge_turn(to_hip, to_ankle, hinge, reach)
+        turn = quat.from_half(hinge, half_cos, half_sin)
+        bent = quat.rotate(turn, to_ankle) - to_hip
+        swing = swing_turn(bent, to_target, hinge, self.twist)
+        return bend_leg(rig, pose, swing, half_cos, half_sin, reached, weight)
+
+    def _reach(
+        self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate
+    ) -> tuple[Array, Array]:
+        """Distance from hip to ankle that the limits allow, m, and 1 where that is the target's."""
+        animated, distance = vec.length(to_ankle - to_hip), vec.length(to_target)
+        thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
+        thigh2, shin2, animated, distance = vec.once(thigh2, shin2, animated, distance)
+        product = vec.safe_sqrt(thigh2 * shin2)
+        # Once, or each leg's loop would call the C library for them.
+        cos_max, cos_min = vec.once(jnp.cos(self.max_knee_angle), jnp.cos(self.min_knee_angle))
+        longest = opposite_side(thigh2, shin2, product, cos_max)
+        shortest = opposite_side(thigh2, shin2, product, cos_min)
+        free = self.soften * longest
+        longest = jnp.where(self.as_animated & (animated > longest), animated, longest)
+        free = jnp.where(self.as_animated & (animated > free), animated, free)
+        shortest = jnp.where(self.as_animated & (animated < shortest), animated, shortest)
+        allowed = gate.clip(
+            soft_limit(distance, free, longest), shortest, longest, band=LENGTH_BAND
+        )
+        inside = gate.above(distance, shortest, band=LENGTH_BAND)
+        return allowed, inside * gate.below(distance, free, band=LENGTH_BAND)
+
+
+class PoleLeg(AbstractLeg):
+    """ozz's two-bone job: the plane of the leg contains the pole, here the animated knee's own.
+
+    The pole is at right angles to hinge and shin: the knee's y axis of a rig whose x lies along the
+    bone and whose z is the hinge. With `enabled` off the leg stays as the body carries it.
+    """
+
+    enabled: Array = switch(True)
+    soften: Array = parameter(1.0, unit="1", low=0.1, high=1.0)
+    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
+    ) -> Bend:
+        _, to_ankle, hinge = bones(rig, carried)
+        pole = vec.cross(hinge, to_ankle)
+        weight = jnp.where(self.enabled, weight, 0.0)
+        return solve_to_pole(rig, carried, target_ms, pole, self.soften, self.twist, weight, gate)
+
+
+class HintLeg(AbstractLeg):
+    """The same with the pole from the hip to a hint: the detected toe and the calf (Mec).
+
+    The hint is the toe's place on the ground plus the animated vector from ankle to knee plus
+    `hint_offset`, in the character's axes (x left, y up, z forward).
+    """
+
+    hint_offset: Array = parameter((0.0, 0.0, 0.0), unit="m", low=-0.5, high=0.5)
+    soften: Array = parameter(1.0, unit="1", low=0.1, high=1.0)
+    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+
+    def pose(
+        self,
+        rig: Rig,
+        frame: Frame,
+        sensed: Sensed,
+        carried: LegPose,
+        target_ms: Array,
+        weight: Array,
+        gate: AbstractGate,
+    ) -> Bend:
+        toe = frame.world_from_model.inverse().apply(sensed.ground.toe.point)
+        calf = frame.pose.knee.pos - frame.pose.ankle.pos
+        pole = toe + calf + self.hint_offset - carried.hip.pos
+        return solve_to_pole(rig, carried, target_ms, pole, self.soften, self.twist, weight, gate)
+
+
+def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
+    """From the knee to the hip and to the ankle, m, and the knee's unit hinge; model space."""
+    to_hip = vec.subtract(pose.hip.pos, pose.knee.pos)
+    to_ankle = vec.subtract(pose.ankle.pos, pose.knee.pos)
+    return to_hip, to_ankle, quat.rotate(pose.knee.rot, rig.knee_axis_ls)
+
+
+def solve_to_pole(
+    rig: Rig,
+    carried: LegPose,
+    target_ms: Array,
+    pole_ms: Array,
+    soften: Array,
+    twist: Array,
+    weight: Array,
+    gate: AbstractGate,
+) -> Bend:
+    """The leg whose plane contains the direction `pole_ms`."""
+    to_hip, to_ankle, hinge = bones(rig, carried)
+    to_target = target_ms - carried.hip.pos
+    bend = pole_bend(to_hip, to_ankle, hinge, to_target, pole_ms, soften, twist, gate)
+    return bend_leg(rig, carried, bend.swing, bend.half_cos, bend.half_sin, bend.reached, weight)
+
+
+def bend_leg(
+    rig: Rig,
+    pose: LegPose,
+    swing: Array,
+    half_cos: Array,
+    half_sin: Array,
+    reached: Array,
+    weight: Array,
+) -> Bend:
+    """The leg with its knee turned about its hinge, then its hip, each by a share `weight`."""
+    to_hip, to_ankle, hinge = bones(rig, pose)
+    half_cos, half_sin = quat.half_part(half_cos, half_sin, weight)
+    turn = quat.from_half(hinge, half_cos, half_sin)
+    swing = quat.part(swing, weight)
+
+    knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -to_hip))
+    whole = quat.multiply(swing, turn)
+    ankle_pos = vec.add(knee_pos, quat.rotate(whole, to_ankle))
+    ankle = Transform(ankle_pos, quat.multiply(whole, pose.ankle.rot))
+    solved = LegPose(
+        Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
+        Transform(knee_pos, quat.multiply(whole, pose.knee.rot)),
+        ankle,
+        Transform(
+            vec.add(ankle_pos, quat.rotate(whole, pose.toe.pos - pose.ankle.pos)),
+            quat.multiply(whole, pose.toe.rot),
+        ),
+    )
+    return Bend(
+        solved,
+        local(pose.hip.rot, swing),
+        quat.from_half(rig.knee_axis_ls, half_cos, half_sin),
+        reached * jnp.where(weight >= 1, 1.0, 0.0),
+    )

@@ -1,0 +1,308 @@
+"""Stage 7: how far the body sinks or rises so that the legs can reach."""
+
+import dataclasses
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxik.maths import smoothing, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.parameter_tree import constant, parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.world.frame import Sensed
+
+from .lean import Lean
+
+HEIGHT_BAND = 0.01  # m
+FAR = 1e6  # m, beyond any leg
+
+
+@struct
+class PelvisState:
+    """The body's offset."""
+
+    height: Float[Array, ""]  # m
+    velocity: Float[Array, ""]  # m/s, of a spring; 0 where a rule has none
+    goal: Float[Array, ""]  # m, that the height follows
+    offset_ws: Float[Array, "3"]  # m
+    half_height: Float[Array, ""]  # m, of the character's capsule; 0 where a rule has none
+
+    @classmethod
+    def level(cls, dtype: Any) -> "PelvisState":
+        """Nothing moved."""
+        zero = jnp.zeros((), dtype)
+        return cls(zero, zero, zero, jnp.zeros(3, dtype), zero)
+
+    @classmethod
+    def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
+        """At a height along up, without memory of anything else."""
+        zero = jnp.zeros_like(height)
+        return cls(height, zero, goal, vec.scale(up_ws, height), zero)
+
+
+class AbstractPelvis(eqx.Module):
+    """Moves the body."""
+
+    def init(self, dtype: Any) -> PelvisState:
+        """Memory before the first frame."""
+        return PelvisState.level(dtype)
+
+    @abstractmethod
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Array,
+        gate: AbstractGate,
+    ) -> PelvisState:
+        """The offset after this frame; with `awake` 0 it stays as it is."""
+
+
+class LowestPelvis(AbstractPelvis):
+    """Follows the standing foot that asks for the lowest body (the record's "height offset").
+
+    Each foot asks for the height from its animated ankle to its target. A foot that does not stand
+    counts, by its contact weight, as the highest of those that take part; with no foot standing the
+    goal is 0. Without a limit and with gains of 1 it is ozz's pelvis correction.
+    """
+
+    enabled: Array = switch(True)
+    limit: Array = parameter(0.30, unit="m", low=0.0, high=0.6)
+    on_gain: Array = parameter(0.225, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    off_gain: Array = parameter(0.116, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    vertical_only: Array = switch(True)
+    tick_hz: Array = constant(30.0)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        asked = asked_heights(sensed, target_ws)
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
+        taking_part = sensed.weight > 0
+        top = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
+        asked = jnp.where(taking_part, smoothing.approach(top, asked, weight), top)
+        lowest = gate.least(asked, band=HEIGHT_BAND)
+        standing = gate.largest(weight, band=0.1)
+        goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, goal, 0.0)
+        share = smoothing.approach(
+            smoothing.share_of_gain(self.off_gain, sensed.dt, self.tick_hz),
+            smoothing.share_of_gain(self.on_gain, sensed.dt, self.tick_hz),
+            standing,
+        )
+        share = awake * jnp.where(started, share, 1.0)
+        height = smoothing.approach(state.height, goal, share)
+        along = jnp.where(self.vertical_only, sensed.up_ws, lean.normal_ws)
+        return PelvisState.at(height, goal, along)
+
+
+class CapsulePelvis(AbstractPelvis):
+    """Sinks to the lowest foot and never rises; the character's capsule shrinks (Unreal, seed 001).
+
+    The offset follows the lowest height that a foot asks for, or 0 if that is above it, and the
+    capsule's half-height goes to its full one less half of that depth, both by the clamped-speed
+    law. With `enabled` off both go back.
+    """
+
+    enabled: Array = switch(True)
+    speed: Array = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    half_height: Array = parameter(0.90, unit="m", low=0.3, high=2.0)
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target_ws), 0.0)
+        lowest = gate.least(asked, band=HEIGHT_BAND)
+        zero = jnp.zeros_like(lowest)
+        sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, sunk, 0.0)
+
+        def follow(value: Array, goal: Array) -> Array:
+            share = smoothing.share_of_speed(self.speed, sensed.dt, goal - value)
+            return smoothing.approach(value, goal, awake * jnp.where(started, share, 1.0))
+
+        height = follow(state.height, goal)
+        half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
+        level = PelvisState.at(height, goal, sensed.up_ws)
+        return dataclasses.replace(level, half_height=half_height)
+
+
+class LegLengthPelvis(AbstractPelvis):
+    """Keeps the distance from each hip to its foot's goal within what a leg has (Mec).
+
+    Of the heights that do so the one nearest to the animation; where one leg would have to be
+    longer and another shorter, none is over-stretched. A foot too far aside to be reached from any
+    height asks for the one that comes nearest. Damped, the offset follows by the clamped-speed law.
+    """
+
+    enabled: Array = switch(True)
+    min_length: Array = parameter(0.50, unit="m", low=0.0, high=1.0)
+    max_length: Array = parameter(0.88, unit="m", low=0.2, high=1.5, above="min_length")
+    damp: Array = switch(True)
+    speed: Array = parameter(10.0, unit="1/s", low=0.5, high=30.0, scale="log")
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        lowest = rise_to_length(sensed, target_ws, self.min_length)
+        highest = rise_to_length(sensed, target_ws, self.max_length)
+        asks = (sensed.foothold.found > 0) & (sensed.weight > 0)
+        zero = jnp.zeros_like(lowest[:1])
+        lifted = jnp.concatenate([jnp.where(asks, lowest, -FAR), zero])
+        lift = gate.largest(lifted, band=HEIGHT_BAND)
+        bounds = jnp.concatenate([jnp.where(asks, highest, FAR), lift[None]])
+        goal = jnp.where(self.enabled, gate.least(bounds, band=HEIGHT_BAND), 0.0)
+
+        share = smoothing.share_of_speed(self.speed, sensed.dt, goal - state.height)
+        share = awake * jnp.where(started & self.damp, share, 1.0)
+        height = smoothing.approach(state.height, goal, share)
+        return PelvisState.at(height, goal, sensed.up_ws)
+
+
+class AbstractFollowingPelvis(AbstractPelvis):
+    """Follows a goal by one half-life up and one down, as an exponential or a spring."""
+
+    rise_half_life: eqx.AbstractVar[Array]
+    fall_half_life: eqx.AbstractVar[Array]
+    spring: eqx.AbstractVar[Array]
+
+    @abstractmethod
+    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
+        """Height over the animation to go to, m; `otherwise` where no foot has a say."""
+
+    def advance(
+        self,
+        sensed: Sensed,
+        target_ws: Array,
+        lean: Lean,
+        state: PelvisState,
+        awake: Array,
+        started: Bool[Array, ""],
+        gate: AbstractGate,
+    ) -> PelvisState:
+        asked = asked_heights(sensed, target_ws)
+        otherwise = jnp.where(started, state.goal, mean_height(sensed, asked))
+        goal = self.goal(sensed, target_ws, otherwise, gate)
+        gap = goal - state.height
+        share = gate.choose(
+            gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
+            smoothing.share_of_half_life(self.rise_half_life, sensed.dt),
+            smoothing.share_of_half_life(self.fall_half_life, sensed.dt),
+        )
+        share = jnp.where(started, share, 1.0)
+        height, velocity = smoothing.follow(
+            state.height, state.velocity, goal, share, sensed.dt, self.spring
+        )
+        height = smoothing.approach(state.height, height, awake)
+        after = PelvisState.at(height, goal, sensed.up_ws)
+        return dataclasses.replace(after, velocity=awake * velocity)
+
+
+class SupportPelvis(AbstractFollowingPelvis):
+    """Follows the feet that stand, with a share of the lowest foot.
+
+    The goal is the mean of what the standing feet ask, by their contact weights, pulled by
+    `lowest_share` towards the lowest of all. With no foot standing it stays where it was. The
+    human pelvis rides on its support: of the pelvis rules of games this one was nearest to capture
+    before reach was thought of (the blocks benchmark's table).
+    """
+
+    lowest_share: Array = parameter(0.30, unit="1", low=0.0, high=1.0)
+    rise_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Array = switch(False)
+
+    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
+        asked = asked_heights(sensed, target_ws)
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
+        total = vec.total(weight)
+        taking_part = sensed.weight > 0
+        lowest = gate.least(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
+        support = vec.safe_divide(vec.total(weight * asked), total)
+        return jnp.where(
+            total > 0, smoothing.approach(support, lowest, self.lowest_share), otherwise
+        )
+
+
+class ReachPelvis(AbstractFollowingPelvis):
+    """Goes where the feet want it, as far as the legs reach: human pelvis height on uneven ground.
+
+    The feet want a mix of the mean and the highest of what they ask. No leg is to become longer
+    than `extension` times its length: of the wanted height and those at which each leg is that long
+    a soft least is taken, `-k log Σ exp(-x / k)` with `k = softness`. The same of the animation is
+    taken away, so that on the ground for which it was made nothing moves, whatever its legs do.
+    Found on the blocks benchmark, where reach explains most of a walker's pelvis height.
+    """
+
+    highest_share: Array = parameter(0.75, unit="1", low=0.0, high=1.2)
+    extension: Array = parameter(0.958, unit="1", low=0.85, high=1.0)
+    softness: Array = parameter(0.025, unit="m", low=0.002, high=0.1, scale="log")
+    rise_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Array = switch(False)
+
+    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
+        asked = asked_heights(sensed, target_ws)
+        taking_part = sensed.weight > 0
+        mean = mean_height(sensed, asked)
+        highest = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
+        highest = jnp.where(jnp.any(taking_part), highest, mean)
+        wanted = smoothing.approach(mean, highest, self.highest_share)
+        longest = self.extension * (sensed.thigh + sensed.shin)
+
+        def reachable(ankle_ws: Array, wanted: Array) -> Array:
+            rises = jnp.where(taking_part, rise_to_length(sensed, ankle_ws, longest), FAR)
+            rises = jnp.concatenate([rises, wanted[None]])
+            return -self.softness * jax.nn.logsumexp(-rises / self.softness)
+
+        animated = reachable(sensed.ankle_ws, jnp.zeros_like(wanted))
+        return reachable(target_ws, wanted) - animated
+
+
+def mean_height(sensed: Sensed, asked: Array) -> Float[Array, ""]:
+    """Mean of what legs ask for, m, by their share of foot IK; 0 where none takes part."""
+    return vec.safe_divide(vec.total(sensed.weight * asked), vec.total(sensed.weight))
+
+
+def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:
+    """How far the body would rise until each hip is `length`, m, from its ankle.
+
+    Where an ankle is further aside than that, the height at which it is nearest.
+    """
+    leg = ankle_ws - sensed.hip_ws
+    along = vec.dot(leg, sensed.up_ws)
+    across2 = vec.dot(leg, leg) - along**2
+    return along + vec.safe_sqrt(length**2 - across2)
+
+
+def asked_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+    """Height from each animated ankle to its target along the leg's up, m."""
+    return vec.dot(target_ws - sensed.ankle_ws, sensed.leg_up_ws)

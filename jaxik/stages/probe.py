@@ -1,0 +1,214 @@
+"""Stage 3: rays that look for ground under each foot."""
+
+import dataclasses
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxik.maths import parameter_tree, quat, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.world.frame import FORWARD, Contact, Frame, Ground, Rays, animated, heading
+from jaxik.world.skeleton import Rig
+from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
+
+HEIGHT_BAND = 0.01  # m
+SPEED_BAND = 0.05  # m/s
+MARGIN = 0.1  # m by which a ray is cast beyond its reach, so that a softened end has two sides
+
+
+class AbstractProbe(eqx.Module):
+    """Looks for ground."""
+
+    @abstractmethod
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        contact: Contact,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        """What the rays of each leg see in this frame; `foot_height`, m, is sole to ankle."""
+
+
+class FootProbe(AbstractProbe):
+    """A ray at the ankle and, if wanted, one at the toe (record: useFootEndRay; ozz without it)."""
+
+    ray_up: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_down: Array = parameter(0.80, unit="m", low=0.0, high=2.0, kind="threshold")
+    toe_ls: Array = parameter((0.0, -0.07, 0.20), unit="m", low=-0.4, high=0.4)
+    use_toe: Array = switch(True)
+    layers: Array = parameter_tree.layers()
+
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        contact: Contact,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        reach = self.ray_up + self.ray_down
+        above = vec.scale(terrain.leg_up_ws, self.ray_up)
+        ankle_ws = animated(frame).pos
+        toe_ws = frame.world_from_model.apply(toe_point(rig, frame, self.toe_ls))
+        ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
+        toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
+        rays = rays_of(ankle, self.ray_up, self.ray_down, self.layers)
+        return Ground(ankle, toe, unseen(ankle), rays)
+
+
+class RootProbe(AbstractProbe):
+    """A ray over each ankle's place on the ground plan, between two heights over the root.
+
+    Unreal's trace (seed 001): from the capsule's centre, `ray_up` (its half-height) over the root,
+    to `ray_down` (the trace distance) under it.
+    """
+
+    ray_up: Array = parameter(0.90, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_down: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    layers: Array = parameter_tree.layers()
+
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        contact: Contact,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        up, ankle_ws = terrain.leg_up_ws, animated(frame).pos
+        over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
+        start = ankle_ws + vec.scale(up, self.ray_up - over_root)
+        hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
+        rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
+        return Ground(hit, unseen(hit), unseen(hit), rays)
+
+
+class CornerProbe(AbstractProbe):
+    """Three rays: at the foot, ahead of it for the pitch, and to its right for the roll (Mec).
+
+    The toe's and the corner's rays start over the detected foot, along the animated foot's heading.
+    Rays end `foot_height` and an extra distance under the foot. That extra is fixed, or set by how
+    stable the foot is: the longer one while it is low, slow, or both, as the switches ask.
+    """
+
+    active: Array = switch(True)
+    ray_up: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    foot_length: Array = parameter(0.20, unit="m", low=0.02, high=0.5)
+    half_width: Array = parameter(0.05, unit="m", low=0.01, high=0.2)
+    extra: Array = parameter(0.20, unit="m", low=0.0, high=1.0, kind="threshold")
+    by_height: Array = switch(True)
+    by_speed: Array = switch(False)
+    extra_min: Array = parameter(0.0, unit="m", low=0.0, high=1.0, kind="threshold")
+    extra_max: Array = parameter(
+        0.30, unit="m", low=0.0, high=1.0, kind="threshold", above="extra_min"
+    )
+    stable_height: Array = parameter(0.12, unit="m", low=0.0, high=0.5, kind="threshold")
+    stable_speed: Array = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
+    layers: Array = parameter_tree.layers()
+
+    def sense(
+        self,
+        rig: Rig,
+        terrain: Terrain | LegTerrains,
+        frame: Frame,
+        contact: Contact,
+        foot_height: Array,
+        gate: AbstractGate,
+    ) -> Ground:
+        up, foot = terrain.leg_up_ws, animated(frame)
+        below = foot_height + self._extra(frame, foot.pos, up, gate)
+        reach = self.ray_up + below
+
+        def look(*points_ws: Array) -> list[Hit]:
+            starts = [place + vec.scale(up, self.ray_up) for place in points_ws]
+            hits = cast_each(terrain, starts, reach + MARGIN, self.layers)
+            seen = (gate.below(hit.distance, reach, band=HEIGHT_BAND) for hit in hits)
+            return [seen_if(hit, hit.found * near) for hit, near in zip(hits, seen, strict=True)]
+
+        (ankle,) = look(foot.pos)
+        ankle = seen_if(ankle, jnp.where(self.active, ankle.found, 0.0))
+        sole = gate.choose(
+            ankle.found[..., None], ankle.point, foot.pos - vec.scale(up, foot_height)
+        )
+        ahead, right = foot_heading(rig, frame, up)
+        over = sole + vec.scale(up, foot_height)
+        level_toe = vec.scale(ahead, self.foot_length)
+        level_corner = vec.scale(right, self.half_width)
+        sides = (level_toe, level_corner)
+        toe, corner = (
+            on_level(hit, ankle.found, sole + aside, gate)
+            for hit, aside in zip(look(*(over + aside for aside in sides)), sides, strict=True)
+        )
+        rays = rays_of(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
+        return Ground(ankle, toe, corner, rays)
+
+    def _extra(self, frame: Frame, foot_ws: Array, up_ws: Array, gate: AbstractGate) -> Array:
+        """How far under a standing sole each foot's rays end, m."""
+        height = vec.dot(foot_ws - frame.world_from_model.pos, up_ws)
+        low = gate.below(height, self.stable_height, band=HEIGHT_BAND)
+        slow = gate.below(frame.foot_speed, self.stable_speed, band=SPEED_BAND)
+        stable = jnp.where(self.by_height, low, 1.0) * jnp.where(self.by_speed, slow, 1.0)
+        chosen = gate.choose(stable, self.extra_max, self.extra_min)
+        return jnp.where(self.by_height | self.by_speed, chosen, self.extra)
+
+
+def cast_each(
+    terrain: Terrain | LegTerrains, starts_ws: Sequence[Array], reach: Array, mask: Array
+) -> list[Hit]:
+    """What rays from several places of each leg meet; one search, which is much of a program."""
+    hits = cast(terrain, jnp.stack(starts_ws), reach, mask)
+    return [jax.tree.map(lambda x: x[i], hits) for i in range(len(starts_ws))]  # noqa: B023
+
+
+def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
+    """The toe of each leg, m, model space, for a toe given in the foot's axes from the ankle.
+
+    Its sideways component is meant for a left foot and mirrors on a right one (A16).
+    """
+    x, y, z = vec.components(toe_ls)
+    foot = quat.multiply(frame.pose.ankle.rot, rig.ankle_from_foot)
+    return frame.pose.ankle.pos + quat.rotate(foot, vec.stack(rig.side * x, y, z))
+
+
+def foot_heading(rig: Rig, frame: Frame, up_ws: Array) -> tuple[Array, Array]:
+    """Forward and right of each animated foot, unit, at right angles to up, world space.
+
+    A foot that points along up has the character's.
+    """
+    foot = quat.multiply(animated(frame).rot, rig.ankle_from_foot)
+    sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
+    ahead = vec.unit(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
+    return ahead, vec.cross(ahead, up_ws)
+
+
+def seen_if(hit: Hit, found: Array) -> Hit:
+    """The hit with another weight."""
+    return dataclasses.replace(hit, found=found)
+
+
+def unseen(like: Hit) -> Hit:
+    """Hits of rays that were not cast."""
+    return seen_if(like, jnp.zeros_like(like.found))
+
+
+def on_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit:
+    """A hit beside a foot that was `found`; a miss lies on the level at that foot."""
+    seen = hit.found * found
+    point = gate.choose(seen[..., None], hit.point, level_ws)
+    return Hit(point, hit.normal, hit.distance, seen)
+
+
+def rays_of(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
+    """Rays as many as hits, all of the same reach, m."""
+    shape = like.found.shape
+    return Rays(jnp.broadcast_to(above, shape), jnp.broadcast_to(below, shape), layers)

@@ -1,0 +1,46 @@
+"""Stage 2: the character's height over the ground at its root."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import parameter_tree, vec
+from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.world.frame import Frame
+from jaxik.world.terrain import LegTerrains, Terrain, cast
+
+
+class AbstractRoot(eqx.Module):
+    """Moves the whole character before its legs look for ground."""
+
+    @abstractmethod
+    def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
+        """How far along up the character is moved in this frame, m."""
+
+
+class KeepRoot(AbstractRoot):
+    """The character stays where the game put it."""
+
+    def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
+        return jnp.zeros_like(frame.dt)
+
+
+class GroundRoot(AbstractRoot):
+    """The origin of the character goes to the ground below it (ozz: "auto character height").
+
+    Where no ground is found, or with `enabled` off, it stays.
+    """
+
+    enabled: Array = switch(True)
+    ray_up: Array = parameter(10.0, unit="m", low=0.0, high=20.0, kind="threshold")
+    ray_down: Array = parameter(float("inf"), unit="m", low=0.0, high=20.0, kind="threshold")
+    layers: Array = parameter_tree.layers()
+
+    def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
+        origin, up = frame.world_from_model.pos, terrain.up_ws
+        above = origin + vec.scale(up, self.ray_up)
+        hit = cast(terrain.body, above, self.ray_up + self.ray_down, self.layers)
+        height = vec.dot(hit.point - origin, up)
+        return jnp.where(self.enabled & (hit.found > 0), height, 0.0)

@@ -1,0 +1,5 @@
+"""What foot IK acts on: skeletons, terrain, rays, and the frame of animation."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,129 @@
+"""Transforms, joint trees with forward kinematics, rigs and leg poses."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxik.maths import quat, vec
+from jaxik.maths.struct import struct
+
+
+@struct
+class Transform:
+    """Rigid transform; named `a_from_b`, it takes points of space b to space a."""
+
+    pos: Float[Array, "*b 3"]  # m
+    rot: Float[Array, "*b 4"]  # wxyz
+
+    def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*c 3"]:
+        """Points of space b, m, in space a."""
+        return vec.add(self.pos, quat.rotate(self.rot, points))
+
+    def turn(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*c 4"]:
+        """Rotations of space b in space a."""
+        return quat.multiply(self.rot, rot)
+
+    def inverse(self) -> "Transform":
+        """`b_from_a`."""
+        back = quat.conjugate(self.rot)
+        return Transform(-quat.rotate(back, self.pos), back)
+
+    def copies(self, count: int) -> "Transform":
+        """So many of it, on a last axis such as that of legs.
+
+        Broadcast instead, each of its uses would sum its slopes over the legs in reverse mode.
+        """
+        return Transform(vec.copies(self.pos, count), vec.copies(self.rot, count))
+
+    def __matmul__(self, other: "Transform") -> "Transform":
+        """`a_from_b @ b_from_c` is `a_from_c`."""
+        return Transform(self.apply(other.pos), self.turn(other.rot))
+
+
+def still(dtype=None) -> Transform:
+    """The transform that moves nothing."""
+    return Transform(jnp.zeros(3, dtype), quat.identity(dtype))
+
+
+class Skeleton(eqx.Module):
+    """A tree of joints, parents before children."""
+
+    offsets: Float[Array, "joints 3"]  # m, in the parent's space
+    names: tuple[str, ...] = eqx.field(static=True)
+    parents: tuple[int, ...] = eqx.field(static=True)  # -1 at the root
+
+    def __check_init__(self) -> None:
+        if not len(self.names) == len(self.parents) == self.offsets.shape[0]:
+            raise ValueError(
+                f"a skeleton has one name, parent and offset a joint; got {len(self.names)} names, "
+                f"{len(self.parents)} parents, {self.offsets.shape[0]} offsets"
+            )
+        for joint, parent in enumerate(self.parents):
+            if not -1 <= parent < joint:
+                raise ValueError(
+                    f"parents come before children; joint {joint} ({self.names[joint]}) has parent "
+                    f"{parent}"
+                )
+
+
+def forward_kinematics(
+    skeleton: Skeleton,
+    rotations_ls: Float[Array, "*b joints 4"],
+    positions_ls: Float[Array, "*b joints 3"] | None = None,
+) -> Transform:
+    """World transforms of all joints, `*b joints`.
+
+    Args:
+        skeleton: the tree.
+        rotations_ls: each joint's rotation in its parent's space.
+        positions_ls: each joint's place in its parent's space, m, where it is not the offset (the
+            root's travel); None takes the offsets.
+    """
+    if positions_ls is None:
+        positions_ls = jnp.broadcast_to(skeleton.offsets, (*rotations_ls.shape[:-1], 3))
+    world: list[Transform] = []
+    for joint, parent in enumerate(skeleton.parents):
+        local = Transform(positions_ls[..., joint, :], rotations_ls[..., joint, :])
+        world.append(local if parent < 0 else world[parent] @ local)
+    return Transform(
+        jnp.stack([joint.pos for joint in world], axis=-2),
+        jnp.stack([joint.rot for joint in world], axis=-2),
+    )
+
+
+@struct
+class LegPose:
+    """The four joints of each leg; `toe` is the ball of the foot."""
+
+    hip: Transform  # legs, model space
+    knee: Transform
+    ankle: Transform
+    toe: Transform
+
+    def moved(self, by: Transform) -> "LegPose":
+        """The whole pose carried by one transform."""
+        return LegPose(by @ self.hip, by @ self.knee, by @ self.ankle, by @ self.toe)
+
+
+@struct
+class Rig:
+    """What a leg is, apart from its pose. Legs of one character may differ in everything."""
+
+    knee_axis_ls: Float[Array, "*b legs 3"]  # unit, knee space; a positive turn opens the knee
+    ankle_from_foot: Float[Array, "*b legs 4"]  # foot axes (x left, y up, z forward) in ankle space
+    thigh: Float[Array, "*b legs"]  # m, hip to knee
+    shin: Float[Array, "*b legs"]  # m, knee to ankle
+    foot: Float[Array, "*b legs"]  # m, ankle to ball
+    side: Float[Array, "*b legs"]  # +1 left, -1 right, 0 in the middle
+    present: Bool[Array, "*b legs"]  # False pads a batch of mixed leg counts
+    names: tuple[str, ...] = eqx.field(static=True)  # one a leg
+    joints: tuple[tuple[int, int, int, int], ...] = eqx.field(static=True)  # hip knee ankle toe
+    pelvis: int = eqx.field(static=True)  # joint index
+
+
+def bone_lengths(pose: LegPose) -> tuple[Array, Array]:
+    """Thigh and shin lengths of a pose, m, each of shape `legs`."""
+    return (
+        vec.length(pose.knee.pos - pose.hip.pos),
+        vec.length(pose.ankle.pos - pose.knee.pos),
+    )

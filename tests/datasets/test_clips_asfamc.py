@@ -1,0 +1,161 @@
+"""ASF and AMC: order, axes, limits over several lines, and what is refused."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fitting.datasets.clips import load_clip
+from fitting.datasets.clips.formats.asfamc import read_asfamc
+
+ASF = """# comment
+:version 1.10
+:units
+  length 0.45
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 1 0
+  orientation 0 0 0
+:bonedata
+  begin
+    id 1
+    name lfemur
+    direction 0 -1 0
+    length 7
+    axis 10 20 30 XYZ
+    dof rx ry rz
+    limits (-160.0 20.0)
+           (-70.0 70.0)
+           (-60.0 70.0)
+  end
+  begin
+    name ltibia
+    direction 0 -1 0
+    length 8
+    axis 0 0 20 XYZ
+    dof rx
+    limits (-10.0 170.0)
+  end
+  begin
+    name lfoot
+    direction 0 0 1
+    length 2
+    axis 0 0 0 XYZ
+  end
+:hierarchy
+  begin
+    root lfemur
+    ltibia lfoot
+    lfemur ltibia
+  end
+"""
+AMC = """#!OML:ASF somewhere
+:FULLY-SPECIFIED
+:DEGREES
+1
+root 1 2 3 10 20 30
+lfemur 5 6 7
+ltibia 40
+2
+root 1 2 4 10 20 30
+ltibia 50
+lfemur 5 6 8
+"""
+
+
+@pytest.fixture
+def pair(tmp_path):
+    def write(asf: str = ASF, amc: str = AMC):
+        (tmp_path / "a.asf").write_text(asf)
+        (tmp_path / "a_01.amc").write_text(amc)
+        return tmp_path / "a_01.amc", tmp_path / "a.asf"
+
+    return write
+
+
+def test_a_bone_turns_by_c_m_c_inverse_at_its_start(pair):
+    recording = read_asfamc(*pair())
+    assert recording.names == ("root", "lfemur", "ltibia", "lfoot", "lfoot_end")
+    assert recording.parents == (-1, 0, 1, 2, 3)
+    assert np.allclose(recording.positions_ls[:, 0], [[1, 3, 3], [1, 3, 4]])
+    assert np.allclose(
+        recording.positions_ls[0, 1:], [[0, 0, 0], [0, -7, 0], [0, -8, 0], [0, 0, 2]]
+    )
+    x, y, z = (Rotation.from_euler(axis, angle, degrees=True) for axis, angle in
+               (("x", 5), ("y", 6), ("z", 7)))  # fmt: skip
+    rest = Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
+    wanted = rest * (z * y * x) * rest.inv()
+    assert abs(recording.rotations_ls[0, 1] @ wanted.as_quat(scalar_first=True)) > 1 - 1e-14
+    knee = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.0])
+    wanted = Rotation.from_rotvec(np.radians(40) * knee)
+    assert abs(recording.rotations_ls[0, 2] @ wanted.as_quat(scalar_first=True)) > 1 - 1e-14
+    assert np.allclose(recording.rotations_ls[:, 3], [1, 0, 0, 0])  # no degrees of freedom
+    assert recording.metres_per_unit == pytest.approx(0.0254 / 0.45)
+
+
+def test_crlf_radians_and_a_missing_last_newline_change_nothing(pair):
+    plain = read_asfamc(*pair())
+    crlf = read_asfamc(*pair(ASF.replace("\n", "\r\n"), AMC.replace("\n", "\r\n").rstrip()))
+    assert np.array_equal(plain.rotations_ls, crlf.rotations_ls)
+    radians = AMC.replace(":DEGREES", ":RADIANS")
+    for degrees in ("10 20 30", "5 6 7", "5 6 8", "40", "50"):
+        radians = radians.replace(f" {degrees}\n", " " + " ".join(
+            str(np.radians(float(word))) for word in degrees.split()) + "\n")  # fmt: skip
+    assert np.allclose(plain.rotations_ls, read_asfamc(*pair(amc=radians)).rotations_ls)
+
+
+def test_the_skeleton_is_found_beside_the_motion_or_asked_for(pair, tmp_path):
+    amc, asf = pair()
+    one_leg = {"pelvis": "root", "hip_l": "lfemur", "knee_l": "ltibia", "ankle_l": "lfoot"}
+    assert load_clip(amc, joints=one_leg).rig.names == ("left",)
+    assert load_clip(amc, asf=asf).measured is None  # one leg is no pair
+    asf.rename(tmp_path / "b.asf")
+    assert load_clip(amc).frames == 2  # the only one there
+    (tmp_path / "c.asf").write_text(ASF)
+    with pytest.raises(ValueError, match=r"wanted a_01\.asf or a\.asf .*b\.asf.*c\.asf"):
+        load_clip(amc)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("direction 0 -1 0", "direction 0 -1", r"a\.asf:15: wanted 3 finite numbers of direction"),
+        ("length 7", "length long", r"a\.asf:16: wanted 1 numbers of length"),
+        ("length 0.45", "length 0", r"a\.asf:4: wanted a length unit above 0"),
+        ("dof rx ry rz", "dof rx ry l", r"a\.asf:18: wanted degrees of freedom"),
+        ("axis 10 20 30 XYZ", "axis 10 20 30 XXZ", r"a\.asf:17: wanted an axis order"),
+        ("name ltibia", "name lfemur", r"a\.asf:30: wanted a bone name that is not taken"),
+        ("root lfemur", "root rfemur", r"a\.asf:39: no bone named rfemur; there are"),
+        ("    lfemur ltibia\n", "", "bones without a way to the root.*ltibia"),
+        ("  begin\n    id 1", "    id 1", r"a\.asf:12: wanted begin"),
+    ],
+)  # fmt: skip
+def test_malformed_skeletons_are_answered_with_file_and_line(pair, old, new, said):
+    assert old in ASF
+    with pytest.raises(ValueError, match=said):
+        read_asfamc(*pair(ASF.replace(old, new, 1)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("lfemur 5 6 7", "lfemur 5 6", r"a_01\.amc:6: wanted 3 finite numbers of lfemur"),
+        ("lfemur 5 6 7", "lfemur 5 6 7x", r"a_01\.amc:6: wanted 3 numbers of lfemur"),
+        ("lfemur 5 6 7", "lfemur 5 6 nan", "wanted finite numbers; lfemur has others in frame 1"),
+        ("lfemur 5 6 7\n", "", r"a_01\.amc:4: wanted all bones in frame 1; without \['lfemur'\]"),
+        ("lfemur 5 6 8\n", "", r"a_01\.amc:8: wanted all bones in frame 2"),
+        ("lfemur 5 6 7", "lfemur 5 6 7\nlfemur 5 6 7", r"a_01\.amc:7: wanted lfemur once"),
+        ("lfemur 5 6 7", "rfemur 5 6 7", r"a_01\.amc:6: .*out of.*lfemur.*rfemur"),
+        ("1\nroot", "root", r"a_01\.amc:4: wanted a frame number"),
+    ],
+)  # fmt: skip
+def test_malformed_motions_are_answered_with_file_and_line(pair, old, new, said):
+    assert old in AMC
+    with pytest.raises(ValueError, match=said):
+        read_asfamc(*pair(amc=AMC.replace(old, new, 1)))
+
+
+def test_a_motion_without_frames_is_refused(pair):
+    with pytest.raises(ValueError, match="wanted frames"):
+        read_asfamc(*pair(amc=":DEGREES\n"))

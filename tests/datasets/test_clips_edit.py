@@ -1,0 +1,183 @@
+"""Edits of clips and what inspect says of them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fitting.datasets.clips import edit, load_clip
+from fitting.datasets.clips.contacts import standing
+from fitting.datasets.clips.inspect import describe, render, to_json
+from fitting.datasets.clips.joint_roles import find_roles
+from fitting.datasets.clips.rigs import measure_rig
+from support.clips_made import BVH, walker
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return walker()
+
+
+def bones(clip) -> np.ndarray:
+    joints = [joint for joint, parent in enumerate(clip.parents) if parent >= 0]
+    parents = [clip.parents[joint] for joint in joints]
+    return np.linalg.norm(clip.positions_ws[:, joints] - clip.positions_ws[:, parents], axis=-1)
+
+
+def test_the_same_rate_gives_the_same_clip(walk):
+    assert edit.resample(walk, walk.fps) is walk
+
+
+def test_half_the_rate_takes_every_second_frame(walk):
+    half = edit.resample(walk, 30.0)
+    assert half.fps == 30.0 and half.frames == (walk.frames + 1) // 2
+    assert np.allclose(half.positions_ws, walk.positions_ws[::2], atol=1e-12)
+    assert np.array_equal(half.standing(), walk.standing()[::2])
+
+
+@pytest.mark.parametrize("fps", [120.0, 50.0, 24.0, 144.0])
+def test_resampling_keeps_time_and_bones(walk, fps):
+    other = edit.resample(walk, fps)
+    assert 0 <= walk.seconds - other.seconds < 1 / fps
+    assert np.allclose(bones(other)[:, [1, 2, 5, 6]], bones(walk)[0, [1, 2, 5, 6]], atol=1e-12)
+    at = np.arange(other.frames) * walk.fps / fps
+    for axis in range(3):
+        wanted = np.interp(at, np.arange(walk.frames), walk.positions_ws[:, 4, axis])
+        assert np.abs(other.positions_ws[:, 4, axis] - wanted).max() < 2e-3
+
+
+def test_frames_made_from_a_masked_one_are_masked(walk):
+    mask = np.ones(walk.frames, bool)
+    mask[7] = False
+    fine = edit.resample(replace(walk, mask=mask), 120.0)
+    assert np.flatnonzero(fine.mask == 0).tolist() == [13, 14, 15]
+
+
+def test_rates_that_are_none_are_refused(walk):
+    with pytest.raises(ValueError, match="fps is 0"):
+        edit.resample(walk, 0.0)
+
+
+def test_trim_keeps_both_ends(walk):
+    cut = edit.trim(walk, 0.5, 1.0)
+    assert cut.frames == 31
+    assert np.array_equal(cut.positions_ws, walk.positions_ws[30:61])
+    assert np.array_equal(cut.standing(), walk.standing()[30:61])
+    assert edit.trim(walk).frames == walk.frames
+    for start, end in ((-0.1, 1.0), (1.0, 0.5), (0.0, 99.0)):
+        with pytest.raises(ValueError, match="wanted 0 <= start <= end <="):
+            edit.trim(walk, start, end)
+
+
+def with_t_pose(tmp_path, ramp: int):
+    """The small BVH, 40 frames of it, after a T-pose and `ramp` frames of the way out of it."""
+    head = BVH.split("Frames:")[0]
+    first = np.zeros(24)
+    first[1] = 87
+    rows = [first]
+    walk = [
+        first + np.eye(24)[7] * (5 * np.sin(f / 9) - 30) + np.eye(24)[9] * (60 + 5 * np.cos(f / 9))
+        for f in range(40)
+    ]
+    rows += [first + (walk[0] - first) * (step + 1) / (ramp + 1) for step in range(ramp)]
+    rows += [*walk, walk[-1], walk[-1]]
+    text = "\n".join(" ".join(map(str, row)) for row in rows)
+    path = tmp_path / "t.bvh"
+    path.write_text(f"{head}Frames: {len(rows)}\nFrame Time: 0.0083333\n{text}")
+    return load_clip(path)
+
+
+@pytest.mark.parametrize("ramp", [0, 4])
+def test_a_t_pose_its_ramp_and_repeated_last_frames_go(tmp_path, ramp):
+    clip = with_t_pose(tmp_path, ramp)
+    assert edit.motion_span(clip) == (1 + ramp, ramp + 40)
+    moving = edit.drop_t_pose(clip)
+    assert moving.frames == 40
+    assert edit.drop_t_pose(moving) is moving
+    told = describe(clip)
+    assert f"starts with a T-pose; the motion begins at frame {1 + ramp}" in told["warnings"]
+    assert "the last frame is repeated 2 times" in told["warnings"]
+
+
+def test_a_clip_without_t_pose_or_motion_is_left_alone(walk):
+    assert edit.drop_t_pose(walk) is walk
+    still = walk.at(np.zeros(5, int))
+    assert edit.drop_t_pose(still) is still
+
+
+def test_a_popped_marker_is_masked(walk):
+    positions = np.array(walk.positions_ws)
+    positions[50, 7] += [0.0, 0.3, 0.0]
+    popped = edit.mask_pops(walk.with_motion(positions, walk.rotations_ws))
+    assert np.flatnonzero(edit.pops(popped)).tolist() == [49, 50, 51]
+    assert np.flatnonzero(popped.mask == 0).tolist() == [49, 50, 51]
+    assert not edit.pops(walk).any()
+    again = edit.mask_pops(replace(walk, mask=popped.mask))
+    assert again.mask is not None and (again.mask == popped.mask).all()
+    assert any("markers pop in 3 frames" in told for told in describe(popped)["warnings"])
+
+
+def test_a_clip_mirrored_twice_is_the_clip(walk):
+    uneven = replace(
+        walk, measured=replace(walk.measured, thigh=walk.measured.thigh + np.array([0.0, 0.1]))
+    )
+    once = edit.mirror(uneven)
+    assert np.allclose(once.joints_ws(2)[:, 0], uneven.joints_ws(2)[:, 1] * [-1, 1, 1])
+    assert np.allclose(once.rig.thigh, uneven.rig.thigh[::-1])
+    assert np.array_equal(once.standing(), uneven.standing()[:, ::-1])
+    assert once.rig.side.tolist() == [1, -1]
+    twice = edit.mirror(once)
+    assert np.array_equal(twice.positions_ws, uneven.positions_ws)
+    assert np.array_equal(twice.rotations_ws, uneven.rotations_ws)
+    assert np.array_equal(twice.rig.thigh, uneven.rig.thigh)
+
+
+def test_a_mirrored_clip_measures_as_its_mirrored_rig(mocap):
+    clip = load_clip(mocap / "clips/cmu_asfamc/02_03.amc")
+    once = edit.mirror(clip)
+    roles = find_roles(once.joint_names, once.parents)
+    positions, rotations = np.array(once.positions_ws), np.array(once.rotations_ws)
+    again = measure_rig(roles, positions, rotations, standing(once.joints_ws(3), once.fps))
+    for name in ("knee_axis_ls", "thigh", "shin", "foot"):
+        assert np.allclose(getattr(again, name), getattr(once.rig, name), atol=1e-6)
+    gap = np.abs(np.sum(np.asarray(again.ankle_from_foot * once.rig.ankle_from_foot), axis=-1))
+    assert gap.min() > 1 - 1e-9
+
+
+def test_a_one_sided_body_has_no_mirror(walk):
+    names = tuple(name.replace("right_knee", "peg") for name in walk.joint_names)
+    parents = list(walk.parents)
+    parents[names.index("peg")] = 0
+    with pytest.raises(ValueError, match="no mirror.*peg"):
+        edit.mirror(replace(walk, joint_names=names, parents=tuple(parents)))
+
+
+def test_marker_pops_and_t_poses_of_the_reference_files(mocap):
+    pops = edit.pops(load_clip(mocap / "blocks/03_03.npz"))
+    assert pops.sum() == 52  # as facts.json counts them
+    spans = {
+        "cmu_bvh_mb/cmu_12_01_walk.bvh": (1, 523),
+        "cmu_bvh_poser/03_01.bvh": (7, 432),
+        "cmu_bvh_max/scaled_131_01.bvh": (0, 993),
+        "cmu_asfamc/02_01.amc": (0, 342),
+    }
+    for file, span in spans.items():
+        assert edit.motion_span(load_clip(mocap / "clips" / file)) == span
+
+
+def test_a_clip_is_described_as_data_and_text(walk):
+    told = describe(walk)
+    assert json.loads(to_json(told)) == told
+    assert told["joint_map"]["knee_left"] == "left_knee"
+    assert told["legs"]["left"]["contacts"] == 3 and told["legs"]["left"]["contacts_from"] == "file"
+    assert told["legs"]["right"]["thigh"] == pytest.approx(0.5)
+    text = render(told)
+    for part in ("walker: 162 frames", "60 Hz", "y up", "hip left_hip", "stands 3 times"):
+        assert part in text
+
+
+def test_a_clip_without_legs_is_described_too(walk):
+    text = render(describe(replace(walk, measured=None, remarks=("no legs recognised",))))
+    assert "no legs recognised" in text and "hip" in text
+    assert describe(replace(walk, measured=None))["legs"] == {}

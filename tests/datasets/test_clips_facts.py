@@ -1,0 +1,119 @@
+"""Every reference file against an independent reading of it."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fitting.datasets.clips import Clip, load_clip
+from fitting.datasets.clips.recording import UP_FROM_Z_UP
+
+TOLERANCE = 1e-4  # of body height, and of a rotation matrix
+FILES = [
+    *(f"cmu_asfamc/{name}.amc" for name in ("01_01", "02_01", "02_03", "03_01", "03_03")),
+    "cmu_bvh_max/131_01.bvh",
+    "cmu_bvh_max/scaled_131_01.bvh",
+    "cmu_bvh_mb/cmu_12_01_walk.bvh",
+    "cmu_bvh_poser/03_01.bvh",
+    "mit/pybvh_test1_zup.bvh",
+    "mit/full_precision_frame_time.bvh",
+]
+
+
+@pytest.fixture(scope="module")
+def facts(mocap) -> dict[str, dict]:
+    return {fact["file"]: fact for fact in json.loads((mocap / "clips/facts.json").read_text())}
+
+
+@pytest.fixture(scope="module", params=FILES)
+def case(request, mocap, facts) -> tuple[Clip, dict]:
+    path, fact = mocap / "clips" / request.param, facts[request.param]
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == fact["sha256"]
+    return load_clip(path), fact
+
+
+def test_no_reference_file_is_left_out(facts):
+    assert sorted(facts) == sorted(FILES)
+
+
+def test_positions_and_rotations_are_those_of_the_reference(case):
+    clip, fact = case
+    axes = UP_FROM_Z_UP if fact["up_axis"] == "z" else np.eye(3)
+    worst = 0.0
+    for key, suffix in (("positions", ""), ("bone_start_positions", ""),
+                        ("bone_end_positions", "_end")):  # fmt: skip
+        for frame, joints in fact.get(key, {}).items():
+            for name, wanted in joints.items():
+                if name + suffix in clip.joint_names:
+                    joint = clip.joint_names.index(name + suffix)
+                    gap = clip.positions_ws[int(frame), joint] - clip.scale * axes @ wanted
+                    worst = max(worst, float(np.abs(gap).max()))
+                else:
+                    assert suffix, f"{name} is missing"
+    assert worst <= TOLERANCE * clip.body_height
+    for frame, joints in fact["world_rotations"].items():
+        for name, wanted in joints.items():
+            rot = clip.rotations_ws[int(frame), clip.joint_names.index(name)]
+            matrix = Rotation.from_quat(rot, scalar_first=True).as_matrix()
+            assert np.abs(matrix - axes @ np.array(wanted) @ axes.T).max() < TOLERANCE
+
+
+def test_frames_rate_scale_and_up_axis_are_recognised(case):
+    clip, fact = case
+    assert clip.frames == fact["n_frames"]
+    assert clip.fps == fact.get("fps", fact.get("fps_nominal"))
+    assert clip.raw_frame_time == pytest.approx(fact.get("frame_time", 1 / 120), rel=1e-12)
+    assert clip.up_axis == fact["up_axis"]
+    if fact["scale_to_m"] is not None:
+        assert clip.scale == pytest.approx(fact["scale_to_m"])
+
+
+def test_legs_are_recognised_and_measured(case):
+    clip, fact = case
+    if fact["joint_map"] is None:
+        with pytest.raises(ValueError, match="no pair of legs.*Hips.*Head_end"):
+            _ = clip.rig
+        return
+    rig = clip.rig
+    assert clip.joint_names[rig.pelvis] == fact["joint_map"]["pelvis"]
+    for joints, letter in zip(rig.joints, "lr", strict=True):
+        for joint, part in zip(joints, ("hip", "knee", "ankle", "ball"), strict=True):
+            wanted = fact["joint_map"][f"{part}_{letter}"]
+            if wanted is None:  # no toe joint: the foot's end site
+                wanted = fact["joint_map"][f"tip_{letter}"].replace("/End Site", "_end")
+            assert clip.joint_names[joint] == wanted
+    for name in ("thigh", "shin", "foot") if "bone_lengths_m" in fact else ():
+        wanted = [fact["bone_lengths_m"][f"{name}_{letter}"] for letter in "lr"]
+        assert np.allclose(getattr(rig, name), wanted, atol=1e-6)
+
+
+def test_knees_open_about_their_measured_axis(case):
+    clip, fact = case
+    if fact["joint_map"] is None:
+        return
+    rig = clip.rig
+    for leg, (hip, knee, ankle, _) in enumerate(rig.joints):
+        turn = Rotation.from_quat(clip.rotations_ws[:, knee], scalar_first=True)
+        axis_ws = turn.apply(np.array(rig.knee_axis_ls[leg]))
+        p = clip.positions_ws
+        flexing = np.cross(p[:, knee] - p[:, hip], p[:, ankle] - p[:, knee])
+        bent = np.linalg.norm(flexing, axis=-1) > 0.05 * np.median(np.linalg.norm(flexing, axis=-1))
+        assert np.mean(np.sum(flexing[bent] * axis_ws[bent], axis=-1) < 0) > 0.98
+    if fact["format"] == "ASF/AMC":  # hinges about x of a frame turned by 20 degrees about z
+        turned = [[-np.cos(np.radians(20)), sign * np.sin(np.radians(20)), 0] for sign in (-1, 1)]
+        assert np.allclose(rig.knee_axis_ls, turned, atol=1e-6)
+
+
+def test_foot_axes_of_a_standing_foot_are_level_and_point_ahead(case):
+    clip, fact = case
+    if fact["joint_map"] is None or "poser" in fact["file"]:  # whose feet slide
+        return
+    rig = clip.rig
+    ahead = np.cross(clip.left_ws(), [0.0, 1.0, 0.0])
+    for leg, (_, _, ankle, _) in enumerate(rig.joints):
+        foot = Rotation.from_quat(np.asarray(rig.ankle_from_foot[leg]), scalar_first=True)
+        turn = Rotation.from_quat(clip.rotations_ws[:, ankle], scalar_first=True) * foot
+        assert np.median(turn.apply([0.0, 1.0, 0.0])[:, 1]) > 0.8
+        assert np.median(np.sum(turn.apply([0.0, 0.0, 1.0]) * ahead, axis=-1)) > 0.75

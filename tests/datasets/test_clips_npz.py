@@ -1,0 +1,142 @@
+"""NumPy archives: our own, and the blocks benchmark."""
+
+from dataclasses import fields, replace
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fitting.datasets.clips import load_clip, save_clip
+from fitting.datasets.clips.edit import mask_pops
+from support.clips_made import walker
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return replace(mask_pops(walker()), remarks=("one", "two"))
+
+
+def assert_same(one, other):
+    for field in fields(one):
+        first, second = getattr(one, field.name), getattr(other, field.name)
+        if field.name == "measured":
+            assert jax.tree.structure(first) == jax.tree.structure(second)
+            for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+                assert a.dtype == b.dtype and np.array_equal(a, b)
+        elif isinstance(first, np.ndarray):
+            assert first.dtype == second.dtype and np.array_equal(first, second)
+        else:
+            assert type(first) is type(second) and first == second
+
+
+def test_a_saved_clip_comes_back_exactly(walk, tmp_path):
+    save_clip(tmp_path / "clip.npz", walk)
+    assert_same(load_clip(tmp_path / "clip.npz"), walk)
+    bare = replace(walk, measured=None, stance=None, mask=None, dialect=None, remarks=())
+    save_clip(tmp_path / "clip.npz", bare)
+    assert_same(load_clip(tmp_path / "clip.npz"), bare)
+
+
+def test_a_save_that_fails_leaves_the_old_file_and_nothing_else(walk, tmp_path, monkeypatch):
+    save_clip(tmp_path / "clip.npz", walk)
+    before = (tmp_path / "clip.npz").read_bytes()
+
+    def fail(file, **content):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_clip(tmp_path / "clip.npz", walk)
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.npz"]
+    assert (tmp_path / "clip.npz").read_bytes() == before
+
+
+def test_arrays_of_a_clip_cannot_be_written_to(walk):
+    for array in (walk.positions_ws, walk.rotations_ws, walk.stance, walk.mask):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+def test_archives_that_are_no_clips_are_refused(walk, tmp_path):
+    path = tmp_path / "clip.npz"
+    path.write_bytes(b"not an archive")
+    with pytest.raises(ValueError, match="wanted a NumPy archive"):
+        load_clip(path)
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(ValueError, match=r"wanted a clip saved by save_clip.*\['a'\]"):
+        load_clip(path)
+    save_clip(path, walk)
+    content = dict(np.load(path))
+    for change, said in (
+        ({"format": np.array("jaxik clip 9")}, "wanted the format"),
+        ({"fps": None}, r"without the arrays \['fps'\]"),
+        (
+            {"positions_ws": content["positions_ws"] * np.nan},
+            "positions_ws has numbers that are not",
+        ),
+    ):
+        changed = {key: value for key, value in (content | change).items() if value is not None}
+        np.savez(path, **changed)  # pyright: ignore[reportArgumentType]
+        with pytest.raises(ValueError, match=said):
+            load_clip(path)
+    save_clip(path, walk)
+    with pytest.raises(ValueError, match="only blocks files have the variant 'base'"):
+        load_clip(path, variant="base")
+    with pytest.raises(ValueError, match=r"\['fps'\] do not apply"):
+        load_clip(path, fps=30.0)
+
+
+def write_blocks(path, walk, **change):
+    """The walker as a blocks file, the base being the same motion 10 cm lower."""
+    content = {"fps": np.array(walk.fps), "stance": walk.stance, "leg_lengths": np.ones((2, 2))}
+    content["pelvis_rot"] = walk.rotations_ws[:, 0].astype(np.float32)
+    content["foot_rot"] = walk.rotations_ws[:, [3, 7]].astype(np.float32)
+    for prefix, lower in (("", 0.0), ("base_", 0.1)):
+        content[f"{prefix}pelvis"] = walk.positions_ws[:, 0] - [0, lower, 0]
+        for role, name in enumerate(("hip", "knee", "ankle", "ball")):
+            content[prefix + name] = walk.joints_ws(role) - [0, lower, 0]
+    np.savez(path, **{key: value for key, value in (content | change).items() if value is not None})
+
+
+def test_blocks_files_load_captured_and_base(walk, tmp_path):
+    path = tmp_path / "blocks.npz"
+    write_blocks(path, walk)
+    for variant, lower in (("captured", 0.0), ("base", 0.1)):
+        clip = load_clip(path, variant=variant)
+        assert np.allclose(clip.positions_ws, walk.positions_ws - [0, lower, 0], atol=1e-12)
+        assert np.abs(np.sum(clip.rotations_ws * walk.rotations_ws, axis=-1)).min() > 1 - 1e-12
+        assert np.array_equal(clip.standing(), walk.standing())
+        assert np.allclose(clip.rig.knee_axis_ls, [-1, 0, 0], atol=1e-9)
+
+
+def test_blocks_files_with_wrong_arrays_are_refused(walk, tmp_path):
+    path = tmp_path / "blocks.npz"
+    write_blocks(path, walk)
+    with pytest.raises(ValueError, match=r"no variant 'flat'; there are \['captured', 'base'\]"):
+        load_clip(path, variant="flat")
+    for change, said in (
+        ({"knee": walk.joints_ws(1)[:5]}, r"knee is \(5, 2, 3\); wanted"),
+        ({"foot_rot": None}, r"without the arrays \['foot_rot'\]"),
+    ):
+        write_blocks(path, walk, **change)
+        with pytest.raises(ValueError, match=said):
+            load_clip(path)
+
+
+def test_the_blocks_benchmark_loads_as_it_is(mocap):
+    raw = np.load(mocap / "blocks/03_03.npz")
+    for variant, prefix in (("captured", ""), ("base", "base_")):
+        clip = load_clip(mocap / "blocks/03_03.npz", variant=variant)
+        assert np.array_equal(clip.positions_ws[:, 0], raw[f"{prefix}pelvis"])
+        for role, name in enumerate(("hip", "knee", "ankle", "ball")):
+            assert np.array_equal(clip.joints_ws(role), raw[prefix + name])
+        assert np.allclose(clip.rig.thigh, raw["leg_lengths"][:, 0], atol=1e-6)
+        assert np.allclose(clip.rig.shin, raw["leg_lengths"][:, 1], atol=1e-6)
+        assert np.allclose(clip.rig.knee_axis_ls, [-1, 0, 0], atol=0.01)
+        for leg, joints in enumerate(clip.rig.joints):  # bones lie along -y of their joints
+            turn = Rotation.from_quat(clip.rotations_ws[:, joints[0]], scalar_first=True)
+            bone = np.array(clip.joints_ws(1)[:, leg] - clip.joints_ws(0)[:, leg])
+            along = turn.inv().apply(bone)
+            assert np.abs(along[:, [0, 2]]).max() < 1e-6 and along[:, 1].max() < 0

@@ -1,0 +1,234 @@
+"""Joints recognised, rigs measured, and clips as poses of legs."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fitting.datasets.clips import load_clip
+from fitting.datasets.clips.contacts import runs, standing
+from fitting.datasets.clips.formats.bvh import read_bvh
+from fitting.datasets.clips.joint_roles import find_roles, partners
+from fitting.datasets.clips.recording import localise, place
+from fitting.datasets.clips.rigs import knee_axis
+from jaxik.maths import quat
+from jaxik.world.skeleton import Transform, forward_kinematics
+from support.clips_made import BVH, walker
+
+PARTS = ("pelvis", "hip", "knee", "ankle", "toe")
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return walker()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "root lfemur ltibia lfoot ltoes rfemur rtibia rfoot rtoes",
+        "Hips LeftHip LeftKnee LeftAnkle LeftToe RightHip RightKnee RightAnkle RightToe",
+        "Hips LeftUpLeg LeftLeg LeftFoot LeftToeBase RightUpLeg RightLeg RightFoot RightToeBase",
+        "m:Hips mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase "
+        "mixamorigRightUpLeg mixamorig:RightLeg mixamorig9:RightFoot mixamorig:RightToeBase",
+        "hip lThigh lShin lFoot lToe rThigh rShin rFoot rToe",
+        "Hips UpperLeg_L LowerLeg_L Foot_L Toes_L UpperLeg_R LowerLeg_R Foot_R Toes_R",
+        "pelvis thigh_l calf_l foot_l ball_l thigh_r calf_r foot_r ball_r",
+        "Pelvis L_Hip L_Knee L_Ankle L_Foot R_Hip R_Knee R_Ankle R_Foot",
+    ],
+)  # fmt: skip
+def test_a_dialect_is_recognised_by_its_names(names):
+    roles = find_roles(tuple(names.split()), (-1, 0, 1, 2, 3, 0, 5, 6, 7))
+    assert roles.pelvis == 0
+    assert [(leg.name, leg.side, leg.joints) for leg in roles.legs] == [
+        ("left", 1.0, (1, 2, 3, 4)),
+        ("right", -1.0, (5, 6, 7, 8)),
+    ]
+
+
+def test_a_leg_that_is_not_found_is_answered_with_the_joints():
+    with pytest.raises(ValueError, match=r"no pair of legs.*\['Hips', 'Tail'\].*MotionBuilder"):
+        find_roles(("Hips", "Tail"), (-1, 0))
+    feet = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot")
+    with pytest.raises(ValueError, match="neither toe nor end site: nothing hangs on LeftFoot"):
+        find_roles(feet, (-1, 0, 1, 2))
+
+
+def test_any_number_of_legs_is_given_by_hand():
+    names, parents, joints = ["body"], [-1], {"pelvis": "body"}
+    for leg in ("fl", "fr", "hl", "hr", "tail"):
+        for index, part in enumerate(PARTS[1:]):
+            names.append(f"{part}{leg}")
+            parents.append(len(names) - 2 if index else 0)
+            joints[f"{part}_{leg}"] = names[-1]
+    roles = find_roles(tuple(names), tuple(parents), joints)
+    assert [leg.side for leg in roles.legs] == [1, -1, 1, -1, 1]
+    assert roles.legs[2].joints == (9, 10, 11, 12)
+
+
+def test_sides_by_hand_are_told_by_the_end_of_the_suffix():
+    suffixes = ("fore_left", "fore_right", "left", "r", "weft", "light")
+    names, parents, joints = ["body"], [-1], {"pelvis": "body"}
+    for leg in suffixes:
+        for index, part in enumerate(PARTS[1:]):
+            names.append(f"{part}{leg}")
+            parents.append(len(names) - 2 if index else 0)
+            joints[f"{part}_{leg}"] = names[-1]
+    roles = find_roles(tuple(names), tuple(parents), joints)
+    assert [leg.side for leg in roles.legs] == [1, -1, 1, -1, 0, 0]
+    assert [leg.name for leg in roles.legs[:2]] == ["fore_left", "fore_right"]
+
+
+@pytest.mark.parametrize(
+    ("joints", "said"),
+    [
+        ({"pelvis": "Hips"}, "wanted pelvis and for each leg"),
+        ({"pelvis": "Hips", "hip_l": "LeftUpLeg", "knee_l": "LeftLeg"}, "wanted pelvis and"),
+        ({"pelvis": "Hips", "hip_l": "a", "knee_l": "b", "ankle_l": "c", "paw_l": "d"}, "paw_l"),
+        ({"pelvis": "Hips", "hip_l": "Thigh", "knee_l": "LeftLeg", "ankle_l": "LeftFoot"},
+         r"no joints named \['Thigh'\]; there are .*LeftUpLeg"),
+    ],
+)  # fmt: skip
+def test_a_wrong_map_is_answered_with_what_is_wanted(tmp_path, joints, said):
+    (tmp_path / "a.bvh").write_text(BVH)
+    with pytest.raises(ValueError, match=said):
+        load_clip(tmp_path / "a.bvh", joints=joints)
+
+
+def test_partners_are_the_other_sides():
+    names = (
+        "lfemur", "rfemur", "lowerback", "root", "LeftLeg", "RightLeg", "Foot_L", "Foot_R",
+             "LThumb", "RThumb", "left_hip", "right_hip", "head", "rig:l_hand", "rig:r_hand",
+    )  # fmt: skip
+    assert partners(names) == (1, 0, 2, 3, 5, 4, 7, 6, 9, 8, 11, 10, 12, 14, 13)
+
+
+def test_placing_agrees_with_the_jax_kinematics_and_localising_undoes_it(tmp_path):
+    (tmp_path / "a.bvh").write_text(BVH)
+    recording = read_bvh(tmp_path / "a.bvh")
+    positions_ws, rotations_ws = place(
+        recording.parents, recording.positions_ls, recording.rotations_ls
+    )
+    clip = load_clip(tmp_path / "a.bvh", scale=1.0)
+    world = forward_kinematics(
+        clip.skeleton, jnp.asarray(recording.rotations_ls), jnp.asarray(recording.positions_ls)
+    )
+    assert np.abs(world.pos - positions_ws).max() < 1e-12
+    assert np.abs(quat.angle(world.rot, jnp.asarray(rotations_ws))).max() < 1e-7
+    assert np.array_equal(clip.positions_ws, positions_ws)
+    back_pos, back_rot = localise(recording.parents, positions_ws, rotations_ws)
+    assert np.abs(back_pos - recording.positions_ls).max() < 1e-12
+    assert np.abs(np.abs(np.sum(back_rot * recording.rotations_ls, axis=-1)) - 1).max() < 1e-14
+
+
+def test_a_hinge_is_found_in_any_knee_axes_and_a_still_one_from_geometry():
+    rng = np.random.default_rng(3)
+    left = np.array([1.0, 0.0, 0.0])
+    bend = np.linspace(0.3, 1.2, 40)
+    for turns in (bend, np.full(40, 0.6)):
+        for skew in Rotation.random(5, rng):
+            thigh = Rotation.from_rotvec(rng.normal(size=(40, 3)) * 0.3)
+            shin = thigh * Rotation.from_rotvec(turns[:, None] * left)
+            hip = np.zeros((40, 3))
+            knee = thigh.apply([0.0, -0.4, 0.0])
+            ankle = knee + shin.apply([0.0, -0.4, 0.0])
+            axis = knee_axis(hip, knee, ankle, thigh, shin * skew, thigh.apply(left))
+            assert np.allclose(axis, skew.inv().apply(-left), atol=1e-6)
+
+
+def test_the_rig_of_a_made_walker_is_the_one_it_was_made_with(walk):
+    rig = walk.rig
+    assert np.allclose(rig.knee_axis_ls, [[-1, 0, 0], [-1, 0, 0]], atol=1e-9)
+    assert np.allclose(rig.ankle_from_foot, [[1, 0, 0, 0]] * 2, atol=1e-9)
+    assert np.allclose(rig.thigh, 0.5) and np.allclose(rig.shin, 0.48)
+    assert np.allclose(rig.foot, np.hypot(0.1, 0.05))
+    assert rig.side.tolist() == [1, -1] and rig.names == ("left", "right")
+    assert rig.thigh.dtype == np.float64
+
+
+def test_turning_about_the_knee_axis_opens_the_knee(walk):
+    pose, rig = walk.leg_pose_ws(), walk.rig
+    opened = quat.multiply(pose.knee.rot, quat.from_axis_angle(rig.knee_axis_ls, jnp.array(0.1)))
+    moved = pose.knee.pos + quat.rotate(
+        opened, quat.unrotate(pose.knee.rot, pose.ankle.pos - pose.knee.pos)
+    )
+    reach = jnp.linalg.norm(moved - pose.hip.pos, axis=-1)
+    before = jnp.linalg.norm(pose.ankle.pos - pose.hip.pos, axis=-1)
+    assert (reach > before)[before < 0.95].all()
+
+
+def test_leg_poses_have_the_session_precision(walk):
+    assert walk.leg_pose_ws().knee.pos.shape == (walk.frames, 2, 3)
+    assert walk.leg_pose_ws().knee.pos.dtype == jnp.float64
+    with jax.enable_x64(False):
+        assert walk.leg_pose_ws().knee.rot.dtype == jnp.float32
+        assert walk.rig.thigh.dtype == jnp.float32
+        assert walk.world_from_model().pos.dtype == jnp.float32
+
+
+def test_the_model_root_is_on_the_floor_under_the_pelvis_and_faces_ahead(walk):
+    root = walk.world_from_model(floor=0.25)
+    assert np.allclose(root.pos[:, 1], 0.25)
+    assert np.allclose(root.pos[:, [0, 2]], walk.positions_ws[:, 0][:, [0, 2]])
+    assert np.allclose(root.rot, [1, 0, 0, 0], atol=1e-12)
+
+
+def test_the_heading_turns_on_smoothly_past_half_a_turn(walk):
+    yaw = np.linspace(0.0, 3 * np.pi, walk.frames)
+    spin = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
+    positions = np.stack(
+        [spin.apply(np.array(walk.positions_ws[:, joint])) for joint in range(9)], axis=1
+    )
+    turned = walk.with_motion(positions, walk.rotations_ws).world_from_model()
+    assert isinstance(turned, Transform)
+    assert np.sum(turned.rot[1:] * turned.rot[:-1], axis=-1).min() > 0.99
+    assert np.allclose(turned.rot[:, 0], np.cos(yaw / 2), atol=1e-9)
+
+
+def test_a_lying_character_keeps_its_last_heading(walk):
+    positions = np.array(walk.positions_ws)
+    positions[100:110, [1, 5]] = positions[100:110, [0]] + [[0, 0.1, 0], [0, -0.1, 0]]
+    root = walk.with_motion(positions, walk.rotations_ws).world_from_model()
+    assert np.allclose(root.rot, [1, 0, 0, 0], atol=1e-9)
+
+
+def test_contacts_of_a_made_walker_are_its_stances(walk):
+    found = standing(walk.joints_ws(3), walk.fps)
+    assert (found == walk.stance).mean() > 0.9
+    assert len(runs(found[:, 0])) == len(runs(walk.stance[:, 0]))
+
+
+def test_a_foot_hanging_still_in_the_air_does_not_stand():
+    height = np.interp(np.arange(120), [0, 40, 50, 70, 80, 120], [0, 0, 0.3, 0.3, 0, 0])
+    ball = np.stack([0 * height, height, 0 * height], axis=-1)[:, None]
+    found = standing(ball, 60.0)[:, 0]
+    assert found[:35].all() and found[85:].all() and not found[42:78].any()
+
+
+def test_contacts_agree_with_the_labels_of_the_blocks(mocap):
+    clip = load_clip(mocap / "blocks/03_03.npz")
+    rows = np.genfromtxt(
+        mocap / "blocks/stances_03_03.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
+    )
+    labels = np.zeros((clip.frames, 2), bool)
+    for row in rows:
+        labels[row["first_frame"] : row["last_frame"] + 1, "lr".index(row["side"])] = True
+    assert np.array_equal(labels, clip.standing())
+    found = standing(clip.joints_ws(3), clip.fps)
+    assert (found == labels).mean() > 0.99  # 0.9954 when written
+    assert [len(runs(found[:, leg])) for leg in (0, 1)] == [28, 26]
+
+
+def test_a_character_that_always_lies_on_its_side_looks_along_z(walk):
+    positions = np.array(walk.positions_ws)
+    positions[:, [1, 5]] = positions[:, [0]] + [[0, 0.1, 0], [0, -0.1, 0]]
+    root = walk.with_motion(positions, walk.rotations_ws).world_from_model()
+    assert np.array_equal(root.rot, np.tile([1.0, 0.0, 0.0, 0.0], (walk.frames, 1)))
+
+
+def test_a_clip_made_without_legs_says_so(walk):
+    with pytest.raises(ValueError, match="walker was loaded without legs"):
+        _ = replace(walk, measured=None).rig

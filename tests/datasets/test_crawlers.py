@@ -1,0 +1,170 @@
+"""Made motion on many limbs: feet that stand still, bones that keep their lengths, usual speeds."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.datasets import frames
+from fitting.datasets.clips import contacts, load_clip, save_clip
+from fitting.datasets.clips.recording import localise
+from fitting.datasets.synthetic import course, crawlers
+from fitting.datasets.terrain import mesh_files
+
+EXACT = 1e-9  # m
+WALL = course.WALL_FROM_FLOOR.as_matrix()  # columns: a floor's left, up and ahead, on the wall
+BODIES = {"quadruped": crawlers.QUADRUPED, "climber": crawlers.CLIMBER}
+
+
+@pytest.fixture(scope="module", params=["quadruped", "climber"])
+def name(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def clip(name):
+    made = {"quadruped": crawlers.crawl(crawlers.QUADRUPED, 5.0, 60.0, 1)}
+    return made[name] if name in made else crawlers.climb(6.0, 60.0, 1)
+
+
+@pytest.fixture(scope="module")
+def on_floor(name, clip):
+    """Joints, m, over a floor with y up and z ahead, also of the climber."""
+    return clip.positions_ws @ WALL if name == "climber" else clip.positions_ws
+
+
+def test_the_ball_of_a_standing_foot_lies_on_the_ground_and_does_not_move(name, clip, on_floor):
+    for leg, (_, _, ankle, toe) in enumerate(clip.rig.joints):
+        spells = contacts.runs(clip.stance[:, leg])
+        assert len(spells) >= 2
+        for first, last in spells:
+            for joint, height in (
+                (toe, BODIES[name].sole),
+                (ankle, BODIES[name].sole + BODIES[name].foot[0]),
+            ):
+                place = on_floor[first : last + 1, joint]
+                assert np.ptp(place, axis=0).max() < EXACT
+                np.testing.assert_allclose(place[:, 1], height, rtol=0, atol=EXACT)
+
+
+def test_no_foot_sinks_into_the_ground_and_no_knee_comes_near_it(name, clip, on_floor):
+    for _, knee, ankle, toe in clip.rig.joints:
+        assert on_floor[:, toe, 1].min() > BODIES[name].sole - EXACT
+        assert on_floor[:, [knee, ankle], 1].min() > 0.06
+
+
+def test_bones_keep_their_lengths_and_limbs_hang_rigidly_on_the_trunk(name, clip):
+    for limb, joints in zip(BODIES[name].limbs, clip.rig.joints, strict=True):
+        places = [clip.positions_ws[:, joint] for joint in joints]
+        wanted = (*limb.bones, np.hypot(*BODIES[name].foot))
+        for a, b, length in zip(places, places[1:], wanted, strict=False):
+            distance = np.linalg.norm(b - a, axis=-1)
+            np.testing.assert_allclose(distance, length, rtol=0, atol=EXACT)
+    positions_ls, _ = localise(clip.parents, clip.positions_ws, clip.rotations_ws)
+    assert np.ptp(positions_ls[:, 1:], axis=0).max() < EXACT
+
+
+def test_the_legs_are_named_by_limb_with_sides_flat_feet_and_hinges_that_flex(name, clip):
+    rig = clip.rig
+    assert rig.names == tuple(limb.name for limb in BODIES[name].limbs)
+    np.testing.assert_array_equal(rig.side, [1.0, -1.0, 1.0, -1.0])
+    np.testing.assert_allclose(rig.knee_axis_ls, [[-1.0, 0.0, 0.0]] * 4, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(rig.ankle_from_foot, [[1.0, 0.0, 0.0, 0.0]] * 4, rtol=0, atol=0.03)
+
+
+def test_limbs_stay_bent_the_way_that_they_bend(name, clip, on_floor):
+    for limb, (hip, knee, ankle, _) in zip(BODIES[name].limbs, clip.rig.joints, strict=True):
+        a, b, c = (on_floor[:, joint] for joint in (hip, knee, ankle))
+        stretch = np.linalg.norm(c - a, axis=-1) / sum(limb.bones)
+        assert 0.3 < stretch.min() and stretch.max() < 0.96
+        along = (c - a) / np.linalg.norm(c - a, axis=-1, keepdims=True)
+        out = b - a - along * np.sum((b - a) * along, axis=-1, keepdims=True)
+        assert (out @ np.array(limb.pole)).min() > 0.0
+
+
+def test_the_quadruped_walks_in_lateral_sequence_with_two_feet_or_more_down():
+    clip = crawlers.crawl(crawlers.QUADRUPED, 5.0, 60.0, 1)
+    assert clip.stance is not None
+    landings = {
+        name: [first for first, _ in contacts.runs(clip.stance[:, leg]) if first > 0]
+        for leg, name in enumerate(clip.rig.names)
+    }
+    order = sorted((frame, name) for name, those in landings.items() for frame in those)
+    names = [name for _, name in order]
+    start = names.index("hind_left")
+    wanted = ["hind_left", "fore_left", "hind_right", "fore_right"] * 5
+    assert names[start : start + 12] == wanted[:12]
+    assert clip.stance.sum(axis=1).min() >= 2
+    speed = np.linalg.norm(np.diff(clip.positions_ws[:, 0], axis=0), axis=-1) * 60.0
+    assert 0.8 < speed.min() and speed.max() < 1.3
+    assert np.linalg.norm(np.diff(clip.positions_ws, axis=0), axis=-1).max() * 60.0 < 5.5
+
+
+def test_the_climber_moves_one_limb_at_a_time_and_goes_straight_up_the_wall():
+    clip = crawlers.climb(6.0, 60.0, 1)
+    assert clip.stance is not None
+    assert clip.stance.sum(axis=1).min() == 3
+    moved = clip.positions_ws[-1, 0] - clip.positions_ws[0, 0]
+    np.testing.assert_allclose(moved[[0, 2]], 0.0, rtol=0, atol=EXACT)
+    assert 0.5 < moved[1] < 1.2
+    assert clip.positions_ws[..., 2].max() < 0.0  # in front of the wall z = 0
+    assert np.linalg.norm(np.diff(clip.positions_ws, axis=0), axis=-1).max() * 60.0 < 2.0
+
+
+def test_on_a_wall_the_root_lies_on_it_with_the_normal_as_its_up():
+    clip = crawlers.climb(2.0, 30.0)
+    made = frames.frames_of(clip, up_ws=course.WALL_UP)
+    root = made.world_from_model
+    trunk = clip.positions_ws[:, 0]
+    np.testing.assert_allclose(root.pos, trunk * [1.0, 1.0, 0.0], rtol=0, atol=1e-12)
+    for axis, wanted in ((0, (1, 0, 0)), (1, course.WALL_UP), (2, (0, 1, 0))):
+        ends = root.apply(jnp.eye(3)[axis]) - root.pos
+        np.testing.assert_allclose(ends, np.tile(wanted, (60, 1)), rtol=0, atol=1e-12)
+    speed = crawlers.CLIMBER.stride / crawlers.CLIMBER.period
+    np.testing.assert_allclose(made.speed, speed, rtol=1e-9)
+
+
+def test_an_animal_may_start_elsewhere_and_a_seed_gives_the_same_steps():
+    first, same, other = (crawlers.crawl(crawlers.QUADRUPED, 2.0, 30.0, s) for s in (4, 4, 5))
+    np.testing.assert_array_equal(first.positions_ws, same.positions_ws)
+    assert np.abs(first.positions_ws - other.positions_ws).max() > 0.005
+    ahead = crawlers.crawl(crawlers.QUADRUPED, 2.0, 30.0, 4, start=3.0)
+    assert ahead.positions_ws[0, 0, 2] == pytest.approx(3.0)
+
+
+def test_a_clip_of_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
+    save_clip(tmp_path / "clip.npz", clip)
+    loaded = load_clip(tmp_path / "clip.npz")
+    np.testing.assert_array_equal(loaded.positions_ws, clip.positions_ws)
+    assert loaded.rig.names == clip.rig.names and loaded.rig.joints == clip.rig.joints
+
+
+@pytest.mark.parametrize(("animal", "mesh"), [("quadruped", "meadow"), ("climber", "wall")])
+def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh):
+    up = course.WALL_UP if animal == "climber" else (0.0, 1.0, 0.0)
+    clip = {"quadruped": crawlers.crawl(crawlers.QUADRUPED, 1.0), "climber": crawlers.climb(1.0)}
+    clip = clip[animal]
+    mesh_files.save_mesh(tmp_path / "ground.ply", *getattr(course, mesh)())
+    ground = mesh_files.load_terrain(tmp_path / "ground.ply", up=up)
+    made = frames.frames_of(clip, up_ws=up)
+    result = jaxik.run(jaxik.presets.record(), clip.rig, ground, made)
+    assert np.asarray(result.trace.sensed.ground.ankle.found).min() == 1.0
+    assert np.asarray(result.reached).mean() > 0.95
+    solved = frames.solved_clip(clip, result, up_ws=up)
+    assert np.isfinite(solved.positions_ws).all()
+    raised = (solved.positions_ws - clip.positions_ws) @ np.array(up)
+    assert 0.01 < np.abs(raised).max() < 0.25
+
+
+@pytest.mark.parametrize(
+    "body, seconds, said",
+    [
+        (crawlers.QUADRUPED, 0.0, "above 0, got 0.0 s"),
+        (replace(crawlers.QUADRUPED, stride=3.0), 2.0, "fore_left limb of the quadruped does not"),
+    ],
+)
+def test_impossible_crawls_are_refused(body, seconds, said):
+    with pytest.raises(ValueError, match=said):
+        crawlers.crawl(body, seconds)

@@ -1,0 +1,83 @@
+"""Parameters of a system as TOML."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.experiments import parameter_files
+from fitting.experiments.systems import leaf_names
+from jaxik.maths import parameter_tree
+from support.clips import ODD
+
+
+def written(folder, text):
+    path = folder / "parameters.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_every_parameter_convention_and_switch_comes_back_exactly(tmp_path):
+    per_leg = {"foot.max_roll": jnp.array([0.1, 0.2]), "pelvis.tick_hz": jnp.array(60.0)}
+    ik = parameter_tree.replace(parameter_tree.replace(jaxik.presets.record(), ODD), per_leg)
+    ik = parameter_tree.replace(ik, {"leg.soften": jnp.nextafter(jnp.array(0.9), jnp.array(1.0))})
+    back, preset = parameter_files.from_toml(written(tmp_path, parameter_files.to_toml(ik)))
+    assert preset == "record"
+    for name in leaf_names(ik):
+        np.testing.assert_array_equal(
+            parameter_tree.get(back, name), parameter_tree.get(ik, name), err_msg=name
+        )
+
+
+def test_what_a_file_leaves_out_is_the_preset_s(tmp_path):
+    ik, preset = parameter_files.from_toml(
+        written(tmp_path, "lock.enabled = false\nleg.soften = 1\n")
+    )
+    assert preset == "record"
+    changed = {"lock.enabled": False, "leg.soften": 1.0}
+    expected = parameter_tree.replace(jaxik.presets.record(), changed)
+    for name in leaf_names(ik):
+        np.testing.assert_array_equal(
+            parameter_tree.get(ik, name), parameter_tree.get(expected, name), err_msg=name
+        )
+
+
+def test_one_value_a_leg_is_taken(tmp_path):
+    ik, _ = parameter_files.from_toml(written(tmp_path, "[foot]\nmax_pitch = [0.3, 0.4]\n"))
+    np.testing.assert_array_equal(parameter_tree.get(ik, "foot.max_pitch"), [0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("lock = [[", "not TOML"),
+        ("preset = 'recrod'", r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
+        ("preset = 3", "no preset named 3"),
+        ("[lok]\nenabled = true", "unknown key 'lok'; nearest is 'lock' of"),
+        ("[lock]\nspeed = 1.0", "unknown key 'lock.speed'; nearest is 'lock.max_speed'"),
+        ("lock = 3", "unknown key 'lock'; nearest is 'lock.enabled'"),
+        ("[lock]", "unknown key 'lock'; nearest is 'lock.enabled'"),
+        ("[lock]\nmax_speed = 'fast'", "lock.max_speed is 'fast'; wanted a number"),
+        ("[lock]\nmax_speed = true", "lock.max_speed is True; wanted a number"),
+        ("[lock]\nmax_speed = nan", "lock.max_speed is nan; wanted a number"),
+        ("[lock]\nmax_speed = 1979-05-27", "lock.max_speed is .*; wanted a number"),
+        ("[lock]\nmax_speed = [[1], [1, 2]]", "lock.max_speed is .*; wanted a number"),
+        ("[lock]\nmax_speed = []", r"lock.max_speed has shape \(0,\); wanted \(\)"),
+        ("[lock]\nmax_speed = [[1.0]]", r"lock.max_speed has shape \(1, 1\); wanted \(\)"),
+        ("[lock]\nenabled = 1", "lock.enabled is 1; wanted true or false"),
+        ("[probe]\ntoe_ls = [0.1, 0.2]", r"probe.toe_ls has shape \(2,\); wanted \(3,\)"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_what_came_and_what_was_wanted(tmp_path, text, said):
+    with pytest.raises(ValueError, match=said):
+        parameter_files.from_toml(written(tmp_path, text))
+
+
+def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no.toml: no such file, wanted a parameter file"):
+        parameter_files.from_toml(tmp_path / "no.toml")
+    with pytest.raises(ValueError, match="a folder, wanted a parameter file"):
+        parameter_files.from_toml(tmp_path)
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match="binary.toml: not TOML"):
+        parameter_files.from_toml(tmp_path / "binary.toml")

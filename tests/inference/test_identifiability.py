@@ -1,0 +1,125 @@
+"""What a fit says of itself: determined, undetermined, at a bound, correlated, not at a minimum."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fitting.inference import identifiability
+from fitting.inference.optimisation import population, search
+from fitting.problem import space
+from fitting.problem.problem import Problem
+from support import toy
+
+SEED = 5  # a toy clip that determines every threshold
+BLUNT = 2  # one in which the foot is always lifted before it is fast
+TRUTH = np.asarray([toy.TRUTH.get(name, np.nan) for name in toy.NAMES])
+
+
+def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, search.Solution]:
+    """A solution found in a few steps, as it starts where it should end."""
+    problem = toy.make_problem(seed, truth=truth)
+    start = np.clip(np.asarray(problem.space.pack(truth)), -5, 5)
+    return problem, search.solve(problem, starts=start[None], max_steps=24)
+
+
+@pytest.fixture(scope="module")
+def report() -> identifiability.Identification:
+    return identifiability.identify(*toy.solved(SEED))
+
+
+def test_a_parameter_that_does_nothing_is_named_undetermined(report):
+    assert report.undetermined == ("foot.idle",)
+    idle = report.names.index("foot.idle")
+    assert report.contraction[idle] == pytest.approx(0, abs=1e-9)
+    assert report.sd[idle] == pytest.approx(space.PRIOR_SD)
+    assert report.eigenvalues[0] == pytest.approx(0, abs=1e-6)
+    assert report.weakest == ("foot.idle",)
+
+
+def test_intervals_hold_the_truth_of_nearly_all_parameters(report):
+    known = np.isfinite(TRUTH)
+    covered = (report.interval[:, 0] <= TRUTH) & (TRUTH <= report.interval[:, 1])
+    assert covered[known].sum() >= known.sum() - 1
+    assert (report.interval[:, 0] <= report.interval[:, 1]).all()
+
+
+def test_a_threshold_has_an_interval_of_its_profile_and_no_standard_deviation(report):
+    problem, solution = toy.solved(SEED)
+    thresholds = np.asarray(problem.space.thresholds)
+    np.testing.assert_array_equal(np.isnan(report.sd), thresholds)
+    for name, profile in report.profiles.items():
+        i = report.names.index(name)
+        assert tuple(report.interval[i]) == profile.interval
+        assert profile.interval[0] <= solution.values[i] <= profile.interval[1]
+        width = profile.interval[1] - profile.interval[0]
+        assert 0 < width < 0.2 * float(problem.space.high[i] - problem.space.low[i])
+        assert (np.diff(profile.values) > 0).all()
+        outside = (profile.values < profile.interval[0]) | (profile.values > profile.interval[1])
+        assert (profile.rises[outside] > identifiability.RISE).all()
+        assert min(profile.nudged) > identifiability.RISE
+
+
+def test_the_laplace_sd_of_a_linear_parameter_is_the_least_squares_one(report):
+    problem, solution = toy.solved(SEED)
+    smooth = np.asarray(problem.space.smooth)
+    slopes = solution.jacobian[:, smooth]
+    expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    np.testing.assert_allclose(report.sd[smooth], expected, rtol=1e-6)
+
+
+def test_a_threshold_that_the_clip_never_reaches_has_a_wide_interval():
+    i = toy.NAMES.index("lock.speed_off")
+    profile = identifiability.profile(*from_the_truth(BLUNT, toy.TRUTH), "lock.speed_off")
+    low, high = profile.interval
+    assert high - low > 0.5 * 2.3
+    assert low <= TRUTH[i] <= high
+
+
+def test_a_fit_at_its_minimum_is_not_improved_by_its_profiles(report):
+    assert report.improvement < 0.5
+
+
+def test_a_fit_off_its_minimum_is_told_by_how_much():
+    problem, solution = toy.solved(SEED)
+    values = dict(zip(toy.NAMES, solution.values, strict=True)) | {"lock.height_on": 0.06}
+    u = np.asarray(problem.space.pack(values))
+    cost = float(population.evaluate(problem, u[None]).cost[0])
+    moved = dataclasses.replace(
+        solution, u=u, values=np.asarray(problem.space.values(jnp.asarray(u))), cost=cost
+    )
+    assert identifiability.identify(problem, moved).improvement > 0.9 * (cost - solution.cost)
+
+
+def test_a_value_at_its_bound_is_flagged():
+    assert set(identifiability.identify(*toy.solved(SEED)).at_bound) == {""}
+    truth = toy.TRUTH | {"body.rise": 0.0, "foot.limit[1]": 0.1}
+    flags = identifiability.identify(*from_the_truth(SEED, truth)).at_bound
+    named = {name: flag for name, flag in zip(toy.NAMES, flags, strict=True) if flag}
+    assert named == {"body.rise": "low", "foot.limit[1]": "low"}
+
+
+def test_parameters_that_do_the_same_are_named_as_a_pair(report):
+    assert report.correlated == ()
+    problem, solution = toy.solved(SEED)
+    one, other = (toy.NAMES.index(name) for name in ("foot.idle", "body.drop"))
+    slopes = solution.jacobian.copy()
+    data = slice(0, -problem.space.size)
+    slopes[data, one] = slopes[data, other]
+    twin = identifiability.identify(problem, dataclasses.replace(solution, jacobian=slopes))
+    ((first, second, correlation),) = twin.correlated
+    assert {first, second} == {"foot.idle", "body.drop"}
+    assert correlation == pytest.approx(-1, abs=1e-3)
+
+
+def test_slopes_that_are_not_finite_are_refused():
+    problem, solution = toy.solved(SEED)
+    broken = dataclasses.replace(solution, jacobian=solution.jacobian * np.nan)
+    with pytest.raises(ValueError, match="nothing can be said where the slopes are not finite"):
+        identifiability.identify(problem, broken)
+
+
+def test_a_profile_of_a_name_that_is_not_free_is_refused():
+    with pytest.raises(ValueError, match="not free: 'lock.speed'; free are"):
+        identifiability.profile(*toy.solved(SEED), "lock.speed")

@@ -1,0 +1,296 @@
+"""Quaternions: held against SciPy's rotations, at their limits, and their slopes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxik.maths import quat, vec
+from support.slopes import (
+    TINY,
+    angles,
+    assert_slopes_agree,
+    directions,
+    finite_slopes,
+    numbers,
+    quaternions,
+    vectors,
+)
+
+few = settings(max_examples=15, derandomize=True, deadline=None)
+HALF_TURN = np.array([0.0, 0.6, 0.0, 0.8])
+
+RNG = np.random.default_rng(1)
+P, Q = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in RNG.normal(size=(2, 4, 4)))
+A, B, AXIS = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in RNG.normal(size=(3, 4, 3)))
+ANGLE = RNG.uniform(-3, 3, size=4)
+COS, SIN = np.cos(ANGLE), np.sin(ANGLE)
+FUNCTIONS = {
+    "components": (quat.components, (Q,)),
+    "stack": (quat.stack, (COS, SIN, COS, SIN)),
+    "multiply": (quat.multiply, (P, Q)),
+    "conjugate": (quat.conjugate, (Q,)),
+    "rotate": (quat.rotate, (Q, A)),
+    "axes": (quat.axes, (Q,)),
+    "unrotate": (quat.unrotate, (Q, A)),
+    "dot": (quat.dot, (P, Q)),
+    "unit": (quat.unit, (3.0 * Q,)),
+    "half_angle": (quat.half_angle, (COS, SIN)),
+    "half_cos_sin": (quat.half_cos_sin, (ANGLE,)),
+    "from_half": (quat.from_half, (AXIS, COS, SIN)),
+    "from_cos_sin": (quat.from_cos_sin, (AXIS, COS, SIN)),
+    "from_axis_angle": (quat.from_axis_angle, (AXIS, ANGLE)),
+    "from_rotvec": (quat.from_rotvec, (A,)),
+    "arc": (quat.arc, (A, B, AXIS)),
+    "nlerp": (quat.nlerp, (P, Q, ANGLE)),
+    "part": (quat.part, (Q, ANGLE)),
+    "half_part": (quat.half_part, (np.abs(COS), SIN, ANGLE)),
+    "angle": (quat.angle, (P, Q)),
+}
+
+
+def turned(p, q, v):
+    """Several answers in one program: most of a test's time goes into compiling."""
+    products = quat.multiply(p, q), quat.rotate(q, v), quat.unrotate(q, v)
+    return *products, quat.unit(q), quat.from_rotvec(v)
+
+
+def turns_about(axis, angle, cos, sin):
+    return quat.from_axis_angle(axis, angle), quat.from_cos_sin(axis, cos, sin)
+
+
+def arc_between(a, b, axis):
+    """The arc between the directions of two vectors: its slopes stay on the unit sphere."""
+    return quat.arc(vec.unit(a, axis), vec.unit(b, axis), axis)
+
+
+def scipy(q) -> Rotation:
+    return Rotation.from_quat(np.asarray(q), scalar_first=True)
+
+
+def assert_same_turn(q, expected: Rotation, tolerance: float = 1e-12) -> None:
+    """`q` is of length one, and as good as `expected` or its negative."""
+    assert_allclose(np.linalg.norm(q), 1.0, atol=tolerance)
+    wanted = expected.as_quat(scalar_first=True)
+    assert_allclose(q * np.sign(np.dot(q, wanted)), wanted, atol=tolerance)
+
+
+def everything(args):
+    return {name: function(*args[name]) for name, (function, _) in FUNCTIONS.items()}
+
+
+def test_precision_follows_the_inputs():
+    for dtype in (jnp.float32, jnp.float64):
+        args = {
+            name: [jnp.asarray(x, dtype) for x in args] for name, (_, args) in FUNCTIONS.items()
+        }
+        for name, answer in jax.eval_shape(everything, args).items():
+            assert {leaf.dtype for leaf in jax.tree.leaves(answer)} == {jnp.dtype(dtype)}, name
+
+
+def test_a_compiled_batch_is_many_singles():
+    args = {name: [jnp.asarray(x) for x in args] for name, (_, args) in FUNCTIONS.items()}
+    batch, singles = jax.jit(everything)(args), jax.jit(jax.vmap(everything))(args)
+    for name in FUNCTIONS:
+        for one, other in zip(*map(jax.tree.leaves, (batch[name], singles[name])), strict=True):
+            assert_allclose(one, other, 1e-14, 1e-14, err_msg=name)
+
+
+def test_the_identity_turns_nothing_in_either_precision():
+    for dtype in (jnp.float32, jnp.float64):
+        one = quat.identity(dtype)
+        assert one.dtype == dtype
+        assert_allclose(quat.rotate(one, jnp.asarray(A, dtype)), jnp.asarray(A, dtype), atol=0)
+
+
+def test_one_turn_broadcasts_against_many_vectors():
+    answer = quat.rotate(jnp.asarray(Q[0]), jnp.asarray(A))
+    assert_allclose(answer, scipy(Q[0]).apply(A), atol=1e-14)
+    assert quat.multiply(jnp.asarray(Q)[:, None], jnp.asarray(P)).shape == (4, 4, 4)
+
+
+@few
+@given(quaternions(), quaternions(), vectors((1.0, TINY, 0.0)))
+def test_products_inverses_and_turned_vectors_are_those_of_scipy(p, q, v):
+    jp, jq, jv = map(jnp.asarray, (p, q, v))
+    assert_same_turn(quat.multiply(jp, jq), scipy(p) * scipy(q))
+    assert_same_turn(quat.conjugate(jq), scipy(q).inv())
+    assert_allclose(quat.rotate(jq, jv), scipy(q).apply(v), atol=1e-14)
+    assert_allclose(quat.unrotate(jq, jv), scipy(q).inv().apply(v), atol=1e-14)
+    assert_allclose(quat.angle(jp, jq), (scipy(p).inv() * scipy(q)).magnitude(), atol=1e-12)
+    assert_allclose(quat.stack(*quat.components(jq)), q, atol=0)
+
+
+@few
+@given(quaternions(), quaternions(), quaternions(), vectors())
+def test_turns_form_a_group_that_acts_on_vectors(p, q, r, v):
+    p, q, r, v = map(jnp.asarray, (p, q, r, v))
+    assert_allclose(
+        quat.multiply(quat.multiply(p, q), r), quat.multiply(p, quat.multiply(q, r)), atol=1e-14
+    )
+    assert_allclose(quat.multiply(q, quat.conjugate(q)), quat.identity(), atol=1e-14)
+    assert_allclose(quat.multiply(q, quat.identity(q.dtype)), q, atol=0)
+    assert_allclose(
+        quat.rotate(quat.multiply(p, q), v), quat.rotate(p, quat.rotate(q, v)), atol=1e-14
+    )
+    assert_allclose(quat.rotate(q, v), quat.rotate(-q, v), atol=0)
+    assert_allclose(quat.unrotate(q, quat.rotate(q, v)), v, atol=1e-14)
+
+
+@few
+@given(directions(), angles(1e-9))
+def test_every_way_of_writing_a_turn_about_an_axis_is_that_of_scipy(pair, angle):
+    axis, turn = pair[0], jnp.asarray(angle)
+    expected = Rotation.from_rotvec(angle * axis)
+    assert_same_turn(quat.from_axis_angle(jnp.asarray(axis), turn), expected)
+    assert_same_turn(quat.from_rotvec(jnp.asarray(angle * axis)), expected)
+    cos, sin = jnp.cos(turn), jnp.sin(turn)
+    assert_same_turn(quat.from_cos_sin(jnp.asarray(axis), cos, sin), expected)
+
+
+@few
+@given(angles(1e-9))
+def test_half_an_angle_has_a_cosine_above_zero_and_is_exact(angle):
+    half_cos, half_sin = quat.half_angle(jnp.cos(angle), jnp.sin(angle))
+    assert half_cos >= 0
+    assert_allclose(half_cos, np.cos(angle / 2), atol=1e-15)
+    assert_allclose(half_sin, np.sin(angle / 2), atol=1e-15)
+
+
+def test_half_of_half_a_turn_is_a_right_angle_upwards():
+    half_cos, half_sin = quat.half_angle(jnp.asarray(-1.0), jnp.asarray(0.0))
+    assert (half_cos, half_sin) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-200, 1e-12, 1e-6, 1.2e-4, 1.3e-4, 1e-2])
+def test_small_rotation_vectors_do_not_see_where_the_series_ends(size):
+    v = size * np.array([0.6, 0.0, 0.8])
+    assert_allclose(
+        quat.from_rotvec(jnp.asarray(v)), [np.cos(size / 2), *(v * np.sinc(size / 2 / np.pi) / 2)],
+        rtol=1e-14,
+    )  # fmt: skip
+    assert jnp.isfinite(jnp.asarray(finite_slopes(quat.from_rotvec, v))).all()
+
+
+@few
+@given(directions(1e-9))
+def test_an_arc_carries_one_direction_to_the_other_by_the_shortest_way(pair):
+    a, b, axis = map(jnp.asarray, pair)
+    q = quat.arc(a, b, axis)
+    assert_allclose(jnp.linalg.norm(q), 1.0, atol=1e-12)
+    assert_allclose(quat.rotate(q, a), b, atol=1e-7)
+    assert_allclose(quat.dot(q, jnp.asarray([0.0, *np.add(a, b)])), 0, atol=1e-12)  # no twist
+    assert_allclose(
+        quat.angle(q, quat.identity()), np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b), atol=1e-7
+    )
+
+
+def test_an_arc_between_opposed_directions_is_half_a_turn_about_the_fallback_and_flat():
+    a, axis = np.eye(3)[0], np.eye(3)[1]
+    assert_allclose(quat.arc(*map(jnp.asarray, (a, -a, axis))), [0, *axis], atol=0)
+    assert_allclose(finite_slopes(quat.arc, a, -a, axis)[:, :6], 0, atol=0)
+
+
+@few
+@given(directions(1e-4))
+def test_an_arc_in_single_precision_is_of_length_one_and_good_to_a_millimetre_a_metre(pair):
+    a, b, axis = (jnp.asarray(v, jnp.float32) for v in pair)
+    q = quat.arc(a, b, axis)
+    assert_allclose(jnp.linalg.norm(q), 1.0, atol=1e-6)
+    assert_allclose(quat.rotate(q, a), b, atol=1e-3)
+
+
+@few
+@given(quaternions(), st.sampled_from([1e-9, 1e-3, 1.0, 1e6]))
+def test_a_unit_quaternion_is_the_same_turn_at_length_one(q, size):
+    assert_allclose(quat.unit(jnp.asarray(size * q)), q, atol=1e-14)
+
+
+def test_a_quaternion_without_direction_becomes_the_identity_and_is_flat():
+    assert_allclose(quat.unit(jnp.zeros((2, 4))), [[1, 0, 0, 0]] * 2, atol=0)
+    assert_allclose(finite_slopes(quat.unit, np.zeros(4)), 0, atol=0)
+
+
+@few
+@given(quaternions(), quaternions())
+def test_blending_starts_at_one_turn_stops_at_the_other_and_halves_the_way(p, q):
+    jp, jq = jnp.asarray(p), jnp.asarray(q)
+    assert_same_turn(quat.nlerp(jp, jq, jnp.asarray(0.0)), scipy(p))
+    assert_same_turn(quat.nlerp(jp, jq, jnp.asarray(1.0)), scipy(q))
+    if abs(np.dot(p, q)) > 1e-6:  # half a turn apart, two ways are as short
+        middle = Slerp([0, 1], Rotation.concatenate([scipy(p), scipy(q)]))(0.5)
+        assert_same_turn(quat.nlerp(jp, jq, jnp.asarray(0.5)), middle, 1e-8)
+
+
+@few
+@given(quaternions(), directions(), numbers(-3, 3), numbers(0, 1))
+def test_a_part_of_a_turn_is_the_blend_from_no_turn(q, pair, angle, weight):
+    axis, weight = jnp.asarray(pair[0]), jnp.asarray(weight)
+    still = quat.identity()
+    assert_allclose(
+        quat.part(jnp.asarray(q), weight), quat.nlerp(still, jnp.asarray(q), weight), atol=1e-14
+    )
+    half = quat.half_cos_sin(jnp.asarray(angle))
+    assert_allclose(
+        quat.from_half(axis, *quat.half_part(*half, weight)),
+        quat.part(quat.from_half(axis, *half), weight),
+        atol=1e-14,
+    )
+
+
+@few
+@given(quaternions())
+def test_the_axes_of_a_turn_are_the_turned_axes(q):
+    assert_allclose(np.stack(quat.axes(jnp.asarray(q)), axis=-1), scipy(q).as_matrix(), atol=1e-14)
+
+
+@few
+@given(quaternions(), quaternions(), vectors((1.0, TINY, 0.0)))
+def test_slopes_of_products_and_turned_vectors_are_those_of_differences(p, q, v):
+    assert_slopes_agree(turned, p, q, v)
+
+
+@few
+@given(directions(), numbers(-2.9, 2.9))
+def test_slopes_of_turns_about_an_axis_are_those_of_differences(pair, angle):
+    assert_slopes_agree(turns_about, pair[0], angle, np.cos(angle), np.sin(angle))
+
+
+@few
+@given(directions(opposed=False))
+def test_slopes_of_arcs_are_those_of_differences(pair):
+    assert_slopes_agree(arc_between, *pair, tolerance=1e-5)
+
+
+@few
+@given(directions(), numbers(-3, 3))
+def test_slopes_of_the_angle_between_turns_are_those_of_differences(pair, angle):
+    q = np.asarray(quat.from_axis_angle(jnp.asarray(pair[0]), jnp.asarray(angle)))
+    assert_slopes_agree(quat.angle, np.array([1.0, 0, 0, 0]), q)
+
+
+@few
+@given(quaternions(), quaternions().filter(lambda q: abs(q[0]) > 1e-3), numbers(0, 1))
+def test_slopes_of_blends_are_those_of_differences(p, turn, weight):
+    q = np.asarray(quat.multiply(jnp.asarray(p), jnp.asarray(turn)))
+    assert_slopes_agree(quat.nlerp, p, q, weight)
+
+
+@pytest.mark.parametrize("q", [np.array([1.0, 0, 0, 0]), HALF_TURN])
+def test_no_turn_and_half_a_turn_have_finite_slopes_everywhere(q):
+    one = np.array([1.0, 0, 0, 0])
+    assert_allclose(quat.angle(jnp.asarray(one), jnp.asarray(q)), 0 if q[0] else np.pi)
+    finite_slopes(quat.angle, one, q)
+    finite_slopes(quat.nlerp, one, q, 0.5)
+    finite_slopes(quat.from_cos_sin, q[1:], 2 * q[0] ** 2 - 1, 0.0)
+
+
+def test_the_angle_between_equal_turns_is_zero_and_flat():
+    for q in (Q[0], -Q[0]):
+        assert_allclose(quat.angle(jnp.asarray(Q[0]), jnp.asarray(q)), 0, atol=1e-15)
+    one = np.array([1.0, 0, 0, 0])
+    assert_allclose(finite_slopes(quat.angle, one, -one), 0, atol=0)

@@ -1,0 +1,200 @@
+"""Vectors: their axioms, their limits and their slopes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from jaxik.maths import vec
+from support.slopes import assert_slopes_agree, directions, finite_slopes, numbers, vectors
+
+few = settings(max_examples=15, derandomize=True, deadline=None)
+ANY_SIZE = (1.0, 1e-5, 1e-12, 0.0)
+
+RNG = np.random.default_rng(0)
+A, B = RNG.normal(size=(2, 4, 3))
+X, Y = RNG.normal(size=(2, 4))
+FUNCTIONS = {
+    "numbers": (vec.numbers, (A,)),
+    "components": (vec.components, (A,)),
+    "stack": (vec.stack, (X, Y, X)),
+    "fence": (vec.fence, (A,)),
+    "once": (vec.once, (X, Y)),
+    "dot": (vec.dot, (A, B)),
+    "cross": (vec.cross, (A, B)),
+    "scale": (vec.scale, (A, X)),
+    "safe_sqrt": (vec.safe_sqrt, (X**2,)),
+    "safe_divide": (vec.safe_divide, (X, Y)),
+    "safe_arctan2": (vec.safe_arctan2, (X, Y)),
+    "cos_sin": (vec.cos_sin, (X,)),
+    "add": (vec.add, (A, B)),
+    "length": (vec.length, (A,)),
+    "unit": (vec.unit, (A, B)),
+    "reject": (vec.reject, (A, B)),
+}
+
+
+def everything(args):
+    return {name: function(*args[name]) for name, (function, _) in FUNCTIONS.items()}
+
+
+def products(a, b, weight):
+    """Several answers in one program: most of a test's time goes into compiling."""
+    return (
+        vec.dot(a, b),
+        vec.cross(a, b),
+        vec.reject(a, b),
+        vec.length(a),
+        vec.scale(a, weight),
+        vec.fence(a),
+    )
+
+
+def test_precision_follows_the_inputs():
+    for dtype in (jnp.float32, jnp.float64):
+        args = {
+            name: [jnp.asarray(x, dtype) for x in args] for name, (_, args) in FUNCTIONS.items()
+        }
+        for name, answer in jax.eval_shape(everything, args).items():
+            assert {leaf.dtype for leaf in jax.tree.leaves(answer)} == {jnp.dtype(dtype)}, name
+
+
+def test_a_compiled_batch_is_many_singles():
+    args = {name: [jnp.asarray(x) for x in args] for name, (_, args) in FUNCTIONS.items()}
+    batch, singles = jax.jit(everything)(args), jax.jit(jax.vmap(everything))(args)
+    for name in FUNCTIONS:
+        for one, other in zip(*map(jax.tree.leaves, (batch[name], singles[name])), strict=True):
+            assert_allclose(one, other, 1e-14, 1e-14, err_msg=name)
+
+
+def test_one_vector_broadcasts_against_many():
+    one = jnp.asarray(B[0])
+    assert_allclose(vec.cross(jnp.asarray(A), one), np.cross(A, B[0]), atol=1e-15)
+    assert vec.dot(one, jnp.zeros((2, 5, 3))).shape == (2, 5)
+    assert vec.scale(one, jnp.asarray(X)).shape == (4, 3)
+    assert vec.unit(jnp.zeros((2, 4, 3)), jnp.asarray(A)).shape == (2, 4, 3)
+
+
+def test_a_constant_takes_the_precision_of_its_companion():
+    for dtype in (jnp.float32, jnp.float64):
+        up = vec.constant((0.0, 1.0, 0.0), jnp.zeros(2, dtype))
+        assert up.dtype == dtype and up.tolist() == [0.0, 1.0, 0.0]
+
+
+@few
+@given(vectors(ANY_SIZE), vectors(ANY_SIZE))
+def test_products_are_those_of_numpy(a, b):
+    ja, jb = jnp.asarray(a), jnp.asarray(b)
+    assert_allclose(vec.dot(ja, jb), np.dot(a, b), rtol=1e-12, atol=1e-15)
+    assert_allclose(vec.cross(ja, jb), np.cross(a, b), rtol=1e-12, atol=1e-15)
+    assert_allclose(vec.add(ja, jb), a + b, atol=0)
+    assert_allclose(vec.length(ja), np.linalg.norm(a), rtol=1e-12)
+    assert_allclose(vec.stack(*vec.components(ja)), a, atol=0)
+    assert_allclose(vec.fence(ja), a, atol=0)
+    assert_allclose(vec.once(ja, jnp.asarray(2.0)), (a, np.full_like(a, 2.0)), atol=0)
+
+
+def test_the_vector_product_is_right_handed():
+    x, y, z = jnp.eye(3)
+    assert_allclose(vec.cross(x, y), z, atol=0)
+    assert_allclose(vec.cross(y, x), -z, atol=0)
+
+
+@few
+@given(vectors(ANY_SIZE), directions())
+def test_a_unit_has_length_one_and_the_same_direction_or_is_the_fallback(v, pair):
+    fallback = jnp.asarray(pair[0])
+    answer = vec.unit(jnp.asarray(v), fallback)
+    assert_allclose(vec.length(answer), 1.0, atol=1e-14)
+    if v.any():
+        assert_allclose(np.cross(answer, v), 0, atol=1e-14)
+        assert vec.dot(answer, jnp.asarray(v)) > 0
+    else:
+        assert_allclose(answer, fallback, atol=0)
+
+
+@few
+@given(vectors(ANY_SIZE), directions())
+def test_what_is_rejected_is_at_right_angles_and_the_rest_along(v, pair):
+    direction = jnp.asarray(pair[0])
+    across = vec.reject(jnp.asarray(v), direction)
+    assert_allclose(vec.dot(across, direction), 0, atol=1e-14)
+    assert_allclose(np.cross(v - across, direction), 0, atol=1e-14)
+
+
+@few
+@given(numbers(), numbers())
+def test_safe_functions_are_the_plain_ones_away_from_their_limits(x, y):
+    jx, jy = jnp.asarray(x), jnp.asarray(y)
+    assert_allclose(vec.safe_sqrt(jx), np.sqrt(max(x, 0.0)))
+    assert_allclose(vec.safe_divide(jx, jy, otherwise=7.0), x / y if y else 7.0)
+    if (x, y) != (0, 0):
+        assert_allclose(vec.safe_arctan2(jy, jx), np.arctan2(y, x))
+
+
+def test_an_angle_is_told_to_the_last_digits_all_around_and_at_every_size():
+    angle = np.linspace(-np.pi, np.pi, 4001)[:, None]
+    for dtype, sizes in ((np.float32, (1e-30, 1.0, 1e30)), (np.float64, (1e-200, 1.0, 1e200))):
+        y = (np.sin(angle) * sizes).astype(dtype)
+        x = (np.cos(angle) * sizes).astype(dtype)
+        exact = np.arctan2(y.astype(np.float64), x.astype(np.float64))
+        answer = vec.safe_arctan2(jnp.asarray(y), jnp.asarray(x))
+        assert answer.dtype == dtype
+        assert_allclose(answer, exact, rtol=6 * np.finfo(dtype).eps)
+
+
+def test_cosines_and_sines_are_told_to_the_last_digits_all_around():
+    angle = np.linspace(-20.0, 20.0, 4001)
+    for dtype in (np.float32, np.float64):
+        given = angle.astype(dtype)
+        cos, sin = vec.cos_sin(jnp.asarray(given))
+        assert cos.dtype == sin.dtype == dtype
+        exact = given.astype(np.float64)
+        # One rounding of the result, and that of an angle which holds several turns.
+        allowed = np.finfo(dtype).eps * (2.0 + 0.5 * np.abs(exact))
+        assert np.all(np.abs(np.asarray(cos, np.float64) - np.cos(exact)) <= allowed)
+        assert np.all(np.abs(np.asarray(sin, np.float64) - np.sin(exact)) <= allowed)
+
+
+def test_safe_functions_are_flat_at_their_limits():
+    assert vec.safe_sqrt(jnp.asarray(0.0)) == vec.safe_sqrt(jnp.asarray(-1.0)) == 0
+    assert vec.safe_arctan2(jnp.asarray(0.0), jnp.asarray(0.0)) == 0
+    for x in (0.0, -1.0):
+        assert_allclose(finite_slopes(vec.safe_sqrt, x), 0, atol=0)
+    assert_allclose(finite_slopes(vec.safe_divide, 1.0, 0.0), 0, atol=0)
+    assert_allclose(finite_slopes(vec.safe_arctan2, 0.0, 0.0), 0, atol=0)
+    assert_allclose(finite_slopes(vec.length, np.zeros(3)), 0, atol=0)
+    assert_allclose(finite_slopes(vec.unit, np.zeros(3), np.eye(3)[0])[:, :3], 0, atol=0)
+
+
+@few
+@given(vectors((1.0, 1e-5, 0.0)), vectors(), numbers())
+def test_slopes_of_products_and_lengths_are_those_of_differences(a, b, weight):
+    assert_slopes_agree(products, a, b, weight)
+
+
+@few
+@given(vectors(), vectors())
+def test_slopes_of_directions_are_those_of_differences(v, fallback):
+    assert_slopes_agree(vec.unit, v, fallback)
+
+
+@few
+@given(numbers(0.1, 2), numbers(0.1, 2), st.sampled_from([1.0, 1e-3]), st.sampled_from([1, -1]))
+def test_slopes_of_safe_functions_are_those_of_differences(x, y, size, sign):
+    assert_slopes_agree(vec.safe_sqrt, size * x)
+    assert_slopes_agree(vec.safe_divide, x, sign * size * y)
+    assert_slopes_agree(vec.safe_arctan2, size * x, sign * y)
+    assert_slopes_agree(vec.cos_sin, sign * x)
+
+
+def test_slopes_stay_finite_in_single_precision_however_short_the_vector():
+    sizes = 10.0 ** -jnp.asarray([3, 6, 9, 15, 30], jnp.float32)
+    v = sizes[:, None] * jnp.asarray([1.0, 0.0, 0.0], jnp.float32)
+    fallback = jnp.asarray([0.0, 1.0, 0.0], jnp.float32)
+    of_unit = jax.jit(jax.vmap(jax.jacrev(vec.unit), (0, None)))(v, fallback)
+    of_length = jax.jit(jax.vmap(jax.jacfwd(vec.length)))(v)
+    for slope in (of_unit, of_length):
+        assert slope.dtype == jnp.float32 and jnp.isfinite(slope).all()

@@ -1,0 +1,194 @@
+"""The ozz, Unreal and Mec pipelines against their independent NumPy references."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import jaxik
+from reference import maths, mec, ozz, poses, things, unreal
+from reference.terrain import LegTerrains
+from reference.terrain import Terrain as PlainTerrain
+from support.clips import to_frames, to_ik, to_leg_terrains, to_rig, to_terrain, wandering
+
+POSITION = 1e-5  # m
+ANGLE = 1e-4  # rad
+FRAMES = 600
+STANDS = (0.05, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.95)  # from, to, ..., shares of the clip
+SYSTEMS: dict[str, Any] = {"ozz": ozz, "unreal": unreal, "mec": mec}
+CASES: list[tuple[str, str, dict[str, Any], int]] = [
+    ("ozz", "as it is", {}, 2),
+    ("ozz", "only its pelvis", {"root.enabled": False, "leg.enabled": False}, 2),
+    ("ozz", "only its legs", {"pelvis.enabled": False, "foot.enabled": False}, 3),
+    (
+        "ozz",
+        "odd",
+        {
+            "root.ray_up": 0.02,
+            "probe.ray_up": 0.3,
+            "probe.ray_down": 0.08,
+            "target.foot_height": 0.09,
+            "target.max_slope": 0.05,
+            "leg.soften": 0.9,
+            "leg.twist": 0.2,
+            "leg.weight": 0.8,
+            "foot.offset": [0.02, 0.03, -0.04],
+            "foot.twist": -0.3,
+            "foot.weight": 0.7,
+        },
+        2,
+    ),
+    ("unreal", "as it is", {}, 2),
+    ("unreal", "without the latch", {"effector.latch": False}, 3),
+    (
+        "unreal",
+        "odd",
+        {
+            "probe.ray_up": 0.7,
+            "probe.ray_down": 0.01,
+            "contact.idle_speed": 0.1,
+            "target.adjust": 0.02,
+            "pelvis.speed": 3.0,
+            "pelvis.half_height": 0.8,
+            "effector.speed": 9.0,
+            "effector.latch_distance": 0.003,
+            "effector.mesh_scale": 1.25,
+            "leg.weight": 0.9,
+        },
+        2,
+    ),
+    ("unreal", "without its pelvis", {"pelvis.enabled": False, "contact.idle_speed": np.inf}, 2),
+    ("mec", "as it is", {}, 2),
+    ("mec", "never planted", {"lock.plant": False, "probe.by_speed": False}, 3),
+    (
+        "mec",
+        "odd",
+        {
+            "probe.ray_up": 0.3,
+            "probe.foot_length": 0.16,
+            "probe.half_width": 0.06,
+            "probe.extra_min": 0.01,
+            "probe.extra_max": 0.06,
+            "probe.stable_height": 0.13,
+            "target.foot_height": 0.085,
+            "lock.plant_weight": 0.6,
+            "pelvis.min_length": 0.86,
+            "pelvis.max_length": 0.89,
+            "pelvis.speed": 4.0,
+            "effector.transition_time": 0.11,
+            "leg.hint_offset": [0.1, -0.05, 0.2],
+            "leg.soften": 0.95,
+            "leg.twist": -0.1,
+            "leg.weight": 0.9,
+            "foot.max_tilt": 0.1,
+        },
+        2,
+    ),
+    (
+        "mec",
+        "one active foot, fixed rays, undamped",
+        {
+            "probe.active": [True, False],
+            "probe.by_height": False,
+            "probe.by_speed": False,
+            "probe.extra": 0.02,
+            "pelvis.damp": False,
+            "effector.transition_time": 0.0,
+        },
+        2,
+    ),
+]
+UNLIKE_CASES = [("mec", {}, 2), ("mec", {"pelvis.enabled": False, "lock.plant_weight": 0.5}, 3)]
+JOINTS = ("hip", "knee", "ankle", "toe")
+OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # what only this system tells
+    "ozz": {
+        "lift": lambda result: result.trace.sensed.root_ws[:, 1],
+        "foot_reached": lambda result: result.aimed,
+    },
+    "unreal": {
+        "half_height": lambda result: result.trace.advanced.state.pelvis.half_height,
+        "effector": lambda result: result.trace.advanced.state.effector.height,
+        "asleep": lambda result: result.trace.advanced.state.effector.asleep,
+        "idle": lambda result: result.trace.sensed.contact.planted[:, 0],
+    },
+    "mec": {
+        "extra": lambda result: result.trace.sensed.ground.rays.below,
+        "planted": lambda result: result.trace.advanced.held.locked,
+        "plant_weight": lambda result: result.trace.advanced.state.lock.share,
+        "fade": lambda result: result.trace.advanced.state.effector.share,
+    },
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_defaults_are_those_of_the_reference(name):
+    ik = getattr(jaxik.presets, name)()
+    wanted = SYSTEMS[name].DEFAULTS
+    for key in set(wanted) - {"probe.forward"}:  # a rig's foot axes say it in ours
+        stage, _, leaf = key.partition(".")
+        came = np.asarray(getattr(getattr(ik, stage), leaf))
+        np.testing.assert_allclose(came, wanted[key], rtol=1e-6, err_msg=key)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "legs"),
+    [(name, values, legs) for name, _, values, legs in CASES],
+    ids=[f"{name}, {how}" for name, how, _, _ in CASES],
+)
+def test_600_frames_agree_with_the_reference(name, values, legs):
+    rng = np.random.default_rng(7)
+    ground = poses.rough(rng, cells=14, size=4.5)
+    compare(name, values, legs, rng, ground, to_terrain(ground))
+
+
+@pytest.mark.parametrize(("name", "values", "legs"), UNLIKE_CASES)
+def test_feet_with_an_up_of_their_own_agree_with_the_reference(name, values, legs):
+    rng = np.random.default_rng(8)
+    triangles = poses.rough(rng, cells=14, size=4.5).triangles
+    tilts = [maths.turn(axis, 0.25) for axis in (maths.X, -maths.Z, maths.Z)]
+    ups = [maths.Y, *(maths.rotate(tilt, maths.Y) for tilt in tilts)]
+    body, *each = [PlainTerrain(up, triangles=triangles) for up in ups]
+    under_legs = LegTerrains(body, each[:legs])
+    compare(name, values, legs, rng, under_legs, to_leg_terrains(under_legs))
+
+
+def compare(
+    name: str, values: dict[str, Any], legs: int, rng: np.random.Generator, plain: Any, ours: Any
+) -> None:
+    """Every output of 600 frames."""
+    rig = poses.make_rig(rng, legs)
+    frames = wandering(rig, rng, FRAMES, stand=STANDS)
+    system = SYSTEMS[name]
+    arrays = {k: np.asarray(v) if isinstance(v, list) else v for k, v in values.items()}
+    parameters = things.Parameters(arrays, defaults=system.DEFAULTS)
+    expected = system.run(parameters, rig, plain, frames)
+    result = jaxik.run(to_ik(values, name), to_rig(rig), ours, to_frames(frames))
+
+    found = np.asarray(result.trace.sensed.foothold.found) > 0
+    np.testing.assert_array_equal(found, expected["found"])
+    assert 0.1 < found.mean() < 0.98, "the clip meets both ground and misses"
+    advanced, sensed = result.trace.advanced, result.trace.sensed
+    if name == "unreal" and values == {}:
+        assert np.abs(np.diff(expected["asleep"].astype(int))).sum() >= 6, "it sleeps and wakes"
+    pairs = {
+        "body_pos": result.body.pos,
+        "body_offset_ws": sensed.root_ws + advanced.state.pelvis.offset_ws,
+        "pelvis_height": advanced.state.pelvis.height,
+        "target_ws": advanced.effector.target_ws,
+        "weight": advanced.effector.weight,
+        **{f"{joint}_pos": getattr(result.pose, joint).pos for joint in JOINTS},
+        **{key: read(result) for key, read in OWN[name].items()},
+    }
+    if not values.get("leg.enabled", True):
+        del pairs["weight"]  # the reference tells that of the legs alone, ours that of the feet too
+    for key, came in pairs.items():
+        wanted = expected[key]
+        if key == "target_ws":  # a leg that is not solved has none
+            seen = (expected["weight"] > 0)[..., None]
+            came, wanted = np.where(seen, came, 0.0), np.where(seen, wanted, 0.0)
+        np.testing.assert_allclose(np.asarray(came), wanted, rtol=0, atol=POSITION, err_msg=key)
+    for joint in JOINTS:
+        rot = np.asarray(getattr(result.pose, joint).rot)
+        assert poses.turn_angle(rot, expected[f"{joint}_rot"]) < ANGLE, joint
+    np.testing.assert_array_equal(np.asarray(result.reached) > 0.5, expected["reached"] > 0.5)

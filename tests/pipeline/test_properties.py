@@ -1,0 +1,586 @@
+"""What every pipeline keeps: symmetries, memory, batches, dtypes, programs and finite slopes."""
+
+import dataclasses
+import functools
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.datasets.frames import frames_of
+from fitting.datasets.synthetic import walker
+from jaxik import Smooth, Transform
+from jaxik.maths import parameter_tree, quat
+from jaxik.world.skeleton import bone_lengths
+from reference import maths, poses
+from reference import record as reference
+from reference.terrain import Terrain as PlainTerrain
+from support.clips import (
+    BROKEN,
+    FLAT,
+    FRAMES,
+    HZ,
+    ODD,
+    assert_close,
+    at,
+    make_rig,
+    padded,
+    planes,
+    stepping,
+    to_frames,
+    to_ik,
+    to_rig,
+    to_terrain,
+    to_transform,
+    wandering,
+)
+
+EXACT = 1e-9  # m, and the length of a difference of unit quaternions
+JOINTS = ("hip", "knee", "ankle", "toe")
+PARAMETERS = {"adult": {}, "odd": ODD}
+
+
+@functools.cache
+def wander(legs: int = 2) -> jaxik.Frame:
+    """A clip that meets everything, on a platform that drifts and turns."""
+    frames = to_frames(wandering(make_rig(legs=legs), np.random.default_rng(1)))
+    time = np.cumsum(np.asarray(frames.dt))
+    angle = 0.1 * np.sin(2.0 * time)
+    pos = np.stack([0.05 * time, 0.0 * time, 0.03 * np.sin(time)], axis=-1)
+    rot = np.stack([np.cos(angle / 2), 0 * angle, np.sin(angle / 2), 0 * angle], axis=-1)
+    platform = Transform(jnp.asarray(pos), jnp.asarray(rot))
+    return dataclasses.replace(frames, platform=platform)
+
+
+@functools.cache
+def wandered(name: str, legs: int = 2) -> jaxik.Result:
+    return jaxik.run(
+        to_ik(PARAMETERS[name]), to_rig(make_rig(legs=legs)), to_terrain(BROKEN), wander(legs)
+    )
+
+
+def offset_of(result: jaxik.Result) -> np.ndarray:
+    """The lock's offset, world, m (frames, legs, 3)."""
+    advanced, sensed = result.trace.advanced, result.trace.sensed
+    lift = sensed.contact.lift[..., None] * sensed.up_ws[:, None]
+    return np.asarray(advanced.effector.target_ws - advanced.foothold_ws - lift)
+
+
+def assert_same_rot(came, wanted, tolerance: float) -> None:
+    came, wanted = np.asarray(came), np.asarray(wanted)
+    apart = np.minimum(
+        np.linalg.norm(came - wanted, axis=-1), np.linalg.norm(came + wanted, axis=-1)
+    )
+    assert apart.max() <= tolerance
+
+
+def assert_same_transform(came, wanted, tolerance: float = EXACT) -> None:
+    np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=tolerance)
+    assert_same_rot(came.rot, wanted.rot, tolerance)
+
+
+def assert_same_pose(came, wanted, tolerance: float = EXACT) -> None:
+    for joint in JOINTS:
+        assert_same_transform(getattr(came, joint), getattr(wanted, joint), tolerance)
+
+
+# Flat ground.
+
+
+def limits_kept(ik: jaxik.FootIK, frames: jaxik.Frame, result: jaxik.Result) -> np.ndarray:
+    """Frames in which no lock holds a foot back and no leg is beyond `soften` times its reach."""
+    held = np.linalg.norm(offset_of(result), axis=-1).max(axis=-1) > 1e-6
+    a, b = (np.asarray(bone) for bone in bone_lengths(frames.pose))
+    free = parameter_tree.get(ik, "leg.soften") * np.sqrt(
+        a * a + b * b - 2 * a * b * np.cos(parameter_tree.get(ik, "leg.max_knee_angle"))
+    )
+    reach = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
+    return ~held & (reach <= np.asarray(free)).all(axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre(seed):
+    rig = make_rig(seed)
+    ik, frames = to_ik({}), to_frames(stepping(rig, heading=0.3 * seed, foot=0.05 * seed))
+    frames = dataclasses.replace(frames, world_from_model=along_heading(frames))
+    result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
+    kept = limits_kept(ik, frames, result)
+    assert kept.all(), "the feet stand still and no leg is too straight: nothing is left out"
+    locks = np.diff(result.trace.advanced.state.lock.locked, axis=0)
+    assert (locks == 1).any() and (locks == -1).any()
+    assert_same_pose(result.pose, frames.pose, 1e-4)
+    assert np.abs(result.body.pos).max() < 1e-4
+    assert_same_rot(result.body.rot, quat.identity(), 1e-4)
+
+
+def along_heading(frames: jaxik.Frame) -> Transform:
+    """The root's travel turned with it, so that it walks where it looks."""
+    root = frames.world_from_model
+    return Transform(quat.rotate(root.rot, root.pos), root.rot)
+
+
+def test_flat_ground_changes_feet_that_slip_only_by_their_locks():
+    rig = make_rig()
+    slipping = lambda time: [0.1 * max(time - 2.0, 0.0), 0.0, 0.6 * time]  # noqa: E731
+    ik, frames = to_ik({}), to_frames(stepping(rig, place=slipping))
+    result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
+    kept = limits_kept(ik, frames, result)
+    assert 0.4 < kept.mean() < 0.6, "locks are at work, and only in the second half"
+    assert_same_pose(at(result.pose, kept), at(frames.pose, kept), 1e-4)
+    offset = offset_of(result)
+    assert np.abs(offset).max() > 0.01
+    for leg in range(2):
+        moved = np.asarray(result.pose.ankle.pos - frames.pose.ankle.pos)[:, leg]
+        reached = np.asarray(result.reached)[:, leg] > 0
+        np.testing.assert_allclose(moved[reached], offset[reached, leg], rtol=0, atol=1e-4)
+
+
+def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
+    """Left out: legs beyond `soften` times their reach. Ankles that roll over heel and ball move
+    while they stand, so a lock holds them: there the ankle goes by the lock's offset, no more.
+    """
+    clip = walker.walk(FRAMES / HZ, HZ, seed=3)
+    rig, frames = clip.rig, frames_of(clip)
+    # Names and joints are part of the program: ours save compiling another.
+    names = {name: getattr(to_rig(make_rig()), name) for name in ("names", "joints", "pelvis")}
+    rig = dataclasses.replace(rig, **names)
+
+    unlocked = {"lock.enabled": False}
+    result = jaxik.run(to_ik(unlocked), rig, to_terrain(FLAT), frames)
+    kept = limits_kept(to_ik(unlocked), frames, result)
+    assert kept.mean() > 0.5
+    assert_same_pose(at(result.pose, kept), at(frames.pose, kept), 1e-4)
+
+    result = jaxik.run(to_ik({}), rig, to_terrain(FLAT), frames)
+    offset, reached = offset_of(result), np.asarray(result.reached) > 0
+    assert reached.mean() > 0.5 and np.abs(offset[reached]).max() > 0.01
+    moved = jax.vmap(lambda root, a, b: quat.rotate(root.rot, a - b))(
+        frames.world_from_model, result.pose.ankle.pos, frames.pose.ankle.pos
+    )
+    np.testing.assert_allclose(moved[reached], offset[reached], rtol=0, atol=1e-4)
+
+
+# Symmetries.
+
+
+def moved_ground(ground: PlainTerrain, by: reference.Transform) -> PlainTerrain:
+    return PlainTerrain(
+        maths.rotate(by.rot, ground.up),
+        planes=[
+            (maths.apply(by, point), maths.rotate(by.rot, normal))
+            for point, normal in ground.planes
+        ],
+    )
+
+
+def moved_frames(frames: jaxik.Frame, by: Transform) -> jaxik.Frame:
+    return dataclasses.replace(
+        frames,
+        world_from_model=by @ frames.world_from_model,
+        platform=by @ frames.platform,
+        velocity_ws=quat.rotate(by.rot, frames.velocity_ws),
+        stride=dataclasses.replace(
+            frames.stride,
+            last_ws=by.apply(frames.stride.last_ws),
+            next_ws=by.apply(frames.stride.next_ws),
+        ),
+    )
+
+
+def some_move(kind: str) -> reference.Transform:
+    rng = np.random.default_rng(len(kind))
+    pos = rng.uniform(-3.0, 3.0, 3)
+    if kind == "moved":
+        return reference.Transform(pos, maths.IDENTITY)
+    if kind == "turned about up":
+        return reference.Transform(np.zeros(3), maths.turn(maths.Y, 2.1))
+    return reference.Transform(pos, poses.random_rot(rng))
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("kind", ["moved", "turned about up", "turned anyhow", "turned, up too"])
+def test_moving_and_turning_the_world_moves_and_turns_the_answer(kind, name):
+    by = some_move(kind)
+    ground = moved_ground(BROKEN, by)
+    before = wandered(name)
+    after = jaxik.run(
+        to_ik(PARAMETERS[name]),
+        to_rig(make_rig()),
+        to_terrain(ground),
+        moved_frames(wander(), to_transform(by)),
+    )
+    assert_same_pose(after.pose, before.pose)
+    assert_same_transform(after.body, before.body)
+    np.testing.assert_array_equal(after.reached, before.reached)
+    target_ws = to_transform(by).apply(before.trace.advanced.effector.target_ws)
+    np.testing.assert_allclose(after.trace.advanced.effector.target_ws, target_ws, atol=EXACT)
+    for joint in ("hip", "knee", "ankle"):
+        assert_same_rot(
+            getattr(after.corrections, joint), getattr(before.corrections, joint), EXACT
+        )
+
+
+def mirrored(tree):
+    """Left for right: places, and rotations by their axes, in every transform."""
+
+    def flip(t):
+        if not isinstance(t, Transform):
+            return t
+        return Transform(t.pos * jnp.array([-1.0, 1, 1]), t.rot * jnp.array([1.0, 1, -1, -1]))
+
+    return jax.tree.map(flip, tree, is_leaf=lambda t: isinstance(t, Transform))
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_mirroring_the_world_mirrors_the_answer(name):
+    ik = to_ik(PARAMETERS[name])
+    rig = to_rig(make_rig())
+    other = dataclasses.replace(
+        rig,
+        side=-rig.side,
+        knee_axis_ls=rig.knee_axis_ls * jnp.array([1.0, -1, -1]),  # an axis of rotation
+        ankle_from_foot=rig.ankle_from_foot * jnp.array([1.0, 1, -1, -1]),
+    )
+    flip = np.array([-1.0, 1.0, 1.0])
+    ground = PlainTerrain(BROKEN.up, planes=[(p * flip, n * flip) for p, n in BROKEN.planes])
+    ik = parameter_tree.replace(ik, {"leg.twist": -parameter_tree.get(ik, "leg.twist")})
+    after = jaxik.run(ik, other, to_terrain(ground), mirrored(wander()))
+    before = wandered(name)
+    assert_same_pose(after.pose, mirrored(before.pose))
+    assert_same_transform(after.body, mirrored(before.body))
+    np.testing.assert_allclose(offset_of(after), offset_of(before) * flip, atol=EXACT)
+
+
+def test_naming_the_legs_the_other_way_round_swaps_their_rows():
+    rig, frames = to_rig(make_rig()), wander()
+    swap = lambda tree: at(tree, jnp.array([1, 0]))  # noqa: E731
+    rows = lambda tree: at(tree, (slice(None), jnp.array([1, 0])))  # noqa: E731
+    swapped = dataclasses.replace(frames, pose=rows(frames.pose), weight=rows(frames.weight))
+    after = jaxik.run(to_ik(ODD), swap(rig), to_terrain(BROKEN), swapped)
+    assert_same_pose(after.pose, rows(wandered("odd").pose))
+    assert_same_transform(after.body, wandered("odd").body)
+
+
+# Bones.
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_bones_keep_their_lengths(name):
+    def lengths(pose):
+        chain = [np.asarray(getattr(pose, joint).pos) for joint in JOINTS]
+        return np.stack(
+            [np.linalg.norm(b - a, axis=-1) for a, b in zip(chain, chain[1:], strict=False)]
+        )
+
+    solved, animated = lengths(wandered(name).pose), lengths(wander().pose)
+    np.testing.assert_allclose(solved, animated, rtol=0, atol=1e-6)
+    for joint in JOINTS:
+        size = np.linalg.norm(getattr(wandered(name).pose, joint).rot, axis=-1)
+        np.testing.assert_allclose(size, 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
+    result, frames = wandered(name), wander()
+    carried = jax.vmap(lambda pose, body: pose.moved(body))(frames.pose, result.body)
+    for joint in ("hip", "knee"):
+        parent_turn = (
+            quat.identity()
+            if joint == "hip"
+            else quat.multiply(result.pose.hip.rot, quat.conjugate(carried.hip.rot))
+        )
+        turned = quat.multiply(
+            quat.multiply(parent_turn, getattr(carried, joint).rot),
+            getattr(result.corrections, joint),
+        )
+        assert_same_rot(turned, getattr(result.pose, joint).rot, EXACT)
+    target = jax.vmap(lambda w, t: w.inverse().apply(t))(
+        frames.world_from_model, result.trace.advanced.effector.target_ws
+    )
+    gap = np.linalg.norm(result.pose.ankle.pos - target, axis=-1)
+    reached = np.asarray(result.reached) > 0.5
+    assert reached.any() == (name == "adult"), "a leg of weight 0.9 never quite arrives"
+    assert gap[reached].max(initial=0.0) < EXACT
+
+
+# Memory.
+
+
+def test_steps_equal_the_scan():
+    ik, rig, ground, frames = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
+    state, whole = jaxik.init(ik, rig), wandered("odd")
+    for index in range(0, FRAMES):
+        state, result = jaxik.step(ik, rig, ground, state, at(frames, index), trace=True)
+        if index % 20 == 0 or index == FRAMES - 1:
+            assert_close(result, at(whole, index), EXACT)
+            assert_close(state, at(whole.trace.advanced.state, index), EXACT)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_a_clip_cut_in_two_and_resumed_equals_the_whole(name):
+    ik, rig, ground, frames = (
+        to_ik(PARAMETERS[name]),
+        to_rig(make_rig()),
+        to_terrain(BROKEN),
+        wander(),
+    )
+    half = FRAMES // 2
+    state, first = jaxik.resume(ik, rig, ground, jaxik.init(ik, rig), at(frames, slice(half)))
+    assert np.asarray(state.lock.locked).any() and np.linalg.norm(state.lock.offset) > 0
+    end, second = jaxik.resume(ik, rig, ground, state, at(frames, slice(half, None)))
+    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+    assert_close(joined, wandered(name), EXACT)
+    assert_close(end, at(wandered(name).trace.advanced.state, -1), EXACT)
+
+
+def walk_at(hz: float) -> jaxik.Frame:
+    """Two seconds up a slope with feet that slip, at any rate."""
+    return to_frames(padded(stepping(make_rig(), drift=0.05, hz=hz, count=int(2 * hz))))
+
+
+def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz():
+    ground = to_terrain(planes((0.1, 0.05, 0.0), (-0.1, 0.0, 0.1)))
+    runs = {
+        hz: jaxik.run(to_ik({}), to_rig(make_rig()), ground, walk_at(hz)) for hz in (30, 60, 120)
+    }
+    fine = at(runs[120], slice(0, FRAMES, 4))
+    for hz, most, mean in ((30, 3e-3, 1e-3), (60, 1.2e-3, 5e-4)):  # m; 2.3 and 0.8 mm measured
+        coarse = at(runs[hz], slice(0, 2 * hz, hz // 30))
+        apart = np.stack(
+            [
+                np.linalg.norm(getattr(coarse.pose, j).pos - getattr(fine.pose, j).pos, axis=-1)
+                for j in JOINTS
+            ]
+        )
+        assert apart.max() < most and apart.mean() < mean
+
+
+# Batches.
+
+
+def padded_leg(tree, legs: int, axis: int):
+    """Rows of nothing behind the legs: no place, no bones."""
+
+    def widen(leaf):
+        missing = legs - leaf.shape[axis]
+        return jnp.pad(leaf, [(0, missing if a == axis else 0) for a in range(leaf.ndim)])
+
+    return jax.tree.map(widen, tree)
+
+
+def three_legged(rig: jaxik.Rig, frames: jaxik.Frame) -> tuple[jaxik.Rig, jaxik.Frame]:
+    """A rig and its clip with one leg of padding, which claims to take part."""
+    wide = padded_leg(rig, 3, axis=0)
+    names, joints = to_rig(make_rig(legs=3)).names, to_rig(make_rig(legs=3)).joints
+    wide = dataclasses.replace(wide, names=names, joints=joints, pelvis=12)
+    pose = padded_leg(frames.pose, 3, axis=1)
+    weight = jnp.concatenate([frames.weight, jnp.ones((FRAMES, 1))], axis=1)
+    told = {
+        name: padded_leg(getattr(frames, name), 3, axis=1)
+        for name in ("foot_speed", "toe_speed", "stride")
+    }
+    return wide, dataclasses.replace(frames, pose=pose, weight=weight, **told)
+
+
+CROWD_GROUNDS = (BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)))
+
+
+@functools.cache
+def crowd() -> tuple[jaxik.FootIK, jaxik.Rig, object, jaxik.Frame]:
+    """Two characters of two legs, padded, and one of three; rigs, grounds and parameters differ."""
+    iks = [to_ik({}), to_ik(ODD), to_ik({"leg.soften": 0.9, "lock.enabled": False})]
+    pairs = [three_legged(to_rig(make_rig(seed)), wander_of(seed)) for seed in range(2)]
+    pairs.append((to_rig(make_rig(legs=3)), wander(3)))
+    rigs, frames = zip(*pairs, strict=True)
+    stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
+    grounds = [to_terrain(ground) for ground in CROWD_GROUNDS]
+    return tuple(jax.tree.map(stack, *each) for each in (iks, rigs, grounds, frames))  # type: ignore[return-value]
+
+
+@functools.cache
+def wander_of(seed: int) -> jaxik.Frame:
+    return to_frames(wandering(make_rig(seed), np.random.default_rng(seed)))
+
+
+@functools.cache
+def crowd_run():
+    return jax.jit(jax.vmap(jaxik.run))
+
+
+@functools.cache
+def crowd_result() -> jaxik.Result:
+    return crowd_run()(*crowd())
+
+
+@pytest.mark.parametrize("member", range(2))
+def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
+    ik, _, ground, _ = at(crowd(), member)
+    alone = jaxik.run(ik, to_rig(make_rig(member)), ground, wander_of(member))
+    together = at(crowd_result(), member)
+    legs = at(together.pose, (slice(None), slice(2)))
+    assert_same_pose(legs, alone.pose)
+    assert_same_transform(together.body, alone.body)
+    np.testing.assert_array_equal(together.reached[:, :2], alone.reached)
+    np.testing.assert_allclose(offset_of(together)[:, :2], offset_of(alone), atol=EXACT)
+
+
+def test_a_batched_character_of_three_legs_equals_itself_alone():
+    ik, rig, ground, frames = at(crowd(), 2)
+    assert_close(at(crowd_result(), 2), jaxik.run(ik, rig, ground, frames), EXACT)
+
+
+def test_padded_legs_give_finite_numbers():
+    for leaf in jax.tree.leaves(crowd_result()):
+        assert np.isfinite(leaf).all()
+
+
+def test_one_bad_member_does_not_spoil_the_others_of_a_batch():
+    ik, rig, ground, frames = crowd()
+    spoiled = eqx.tree_at(
+        lambda f: f.pose.ankle.pos, frames, frames.pose.ankle.pos.at[1, 40:50, 0].set(jnp.nan)
+    )
+    result = crowd_run()(ik, rig, ground, spoiled)
+    assert np.isnan(result.pose.ankle.pos[1]).any()
+    for member in (0, 2):
+        assert_close(at(result, member), at(crowd_result(), member), 0.0)
+
+
+# Precision.
+
+
+def single(tree):
+    return jax.tree.map(
+        lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+    )
+
+
+def single_inputs(ik: jaxik.FootIK):
+    return single((ik, to_rig(make_rig()), to_terrain(BROKEN), wander()))
+
+
+@pytest.mark.parametrize("gate", [jaxik.HARD, Smooth(1.0)])
+def test_a_program_of_single_precision_has_no_double_in_it(gate):
+    inputs = (*single_inputs(to_ik(ODD)), single(gate))
+    with jax.numpy_dtype_promotion("strict"):
+        program = jax.make_jaxpr(jaxik.run)(*inputs)
+    assert not list(doubles(program.jaxpr))
+    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(inputs[3].dt)
+    assert list(doubles(leak.jaxpr)), "a double that gets in is seen"
+
+
+def doubles(program):
+    """What a program computes in double precision; a Python number's double gives way (is weak)."""
+    for equation in program.eqns:
+        for variable in equation.outvars:
+            if variable.aval.dtype == jnp.float64 and not variable.aval.weak_type:
+                yield equation
+        for inner in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
+        ):
+            if hasattr(inner, "eqns"):
+                yield from doubles(getattr(inner, "jaxpr", inner))
+
+
+def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
+    result = jaxik.run(*single_inputs(to_ik(ODD)))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(result):
+        floating = jnp.issubdtype(leaf.dtype, jnp.floating)
+        assert not floating or leaf.dtype == jnp.float32, jax.tree_util.keystr(path)
+    double = wandered("odd")
+    np.testing.assert_array_equal(
+        result.trace.advanced.state.lock.locked, double.trace.advanced.state.lock.locked
+    )
+    for joint in JOINTS:
+        came, wanted = getattr(result.pose, joint), getattr(double.pose, joint)
+        np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-5)
+        assert_same_rot(came.rot, wanted.rot, 1e-4)
+    thigh = np.linalg.norm(result.pose.knee.pos - result.pose.hip.pos, axis=-1)
+    np.testing.assert_allclose(thigh, poses.THIGH, atol=1e-6)
+
+
+# Programs.
+
+
+@pytest.fixture
+def compilations():
+    """A list that grows by one with every program that XLA compiles."""
+    events: list[str] = []
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del duration_secs, kwargs
+        if event.endswith("backend_compile_duration"):
+            events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield events
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_nothing_compiles_at_a_second_call_with_other_values(compilations):
+    iks = [to_ik({}), to_ik(ODD)]
+    rigs = [to_rig(make_rig(seed)) for seed in range(2)]
+    grounds = [to_terrain(BROKEN), to_terrain(planes((0.1, 0.0, 0.0)))]
+    clips = [wander_of(0), wander_of(1)]
+    gates = [Smooth(0.5), Smooth(0.1)]
+    frames = [at(clip, 3) for clip in clips]
+
+    def calls(i: int) -> None:
+        jaxik.run(iks[i], rigs[i], grounds[i], clips[i])
+        jaxik.run(iks[i], rigs[i], grounds[i], clips[i], gates[i])
+        state = jaxik.init(iks[i], rigs[i])
+        state, _ = jaxik.step(iks[i], rigs[i], grounds[i], state, frames[i])
+        jaxik.resume(iks[i], rigs[i], grounds[i], state, clips[i])
+
+    jax.block_until_ready(jnp.tanh(jnp.ones((2, 3, 5, 7))))
+    assert compilations, "a new program is noticed"
+    calls(0)
+    compilations.clear()
+    calls(1)
+    assert not compilations
+
+
+def test_the_hard_program_contains_no_sigmoid_and_the_smooth_one_does():
+    inputs = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
+    hard = str(jax.make_jaxpr(jaxik.run)(*inputs))
+    smooth = str(jax.make_jaxpr(jaxik.run)(*inputs, Smooth(1.0)))
+    assert not {"logistic", "tanh", "erf"} & set(re.findall(r"= (\w+)", hard))
+    assert "logistic" in re.findall(r"= (\w+)", smooth)
+
+
+def test_steps_and_clips_run_inside_jit_vmap_and_scan():
+    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN)
+    frames = wander()
+
+    @jax.jit
+    def scanned(ik, gains):
+        def one(gain):
+            changed = parameter_tree.replace(ik, {"pelvis.on_gain": gain})
+            return jax.lax.scan(
+                lambda state, frame: jaxik.step(changed, rig, ground, state, frame),
+                jaxik.init(changed, rig),
+                frames,
+            )[1].body
+
+        return jax.vmap(one)(gains)
+
+    bodies = scanned(ik, jnp.array([0.3, 0.6]))
+    assert_same_transform(at(bodies, 0), wandered("odd").body)
+    assert np.abs(bodies.pos[1] - bodies.pos[0]).max() > 1e-3
+
+
+def test_smooth_tends_to_hard_as_softness_falls():
+    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN)
+    apart = []
+    for softness in (1.0, 0.1, 1e-2, 1e-4, 1e-6):
+        soft = jaxik.run(ik, rig, ground, wander(), Smooth(softness))
+        gaps = [
+            np.abs(getattr(soft.pose, j).pos - getattr(wandered("odd").pose, j).pos).mean()
+            for j in JOINTS
+        ]
+        apart.append(max(gaps))
+    assert apart == sorted(apart, reverse=True)
+    assert apart[0] > 1e-3 and apart[-1] < 1e-7

@@ -1,0 +1,361 @@
+"""The game's record: bytes, CSV text, and the parameters they mean."""
+
+import math
+import struct
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxik
+from jaxik import record
+from jaxik.maths import parameter_tree
+from jaxik.record import FLAG_NAMES, FLOAT_NAMES, Reading, Record
+from reference import poses
+from support.clips import to_rig
+from support.records import ADULT, packed
+
+LENGTHS = (
+    "footPlantedAnkleHeightMS",
+    "footRaisedAnkleHeightMS",
+    "raycastDistanceUp",
+    "raycastDistanceDown",
+)
+NAN_WITH_PAYLOAD = b"\x34\x12\xa0\xff"
+
+
+def leaves_of(ik: jaxik.FootIK) -> dict[str, np.ndarray]:
+    return {
+        name: np.asarray(parameter_tree.get(ik, name)) for name in parameter_tree.declarations(ik)
+    }
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(min_size=record.SIZE, max_size=record.SIZE + 40))
+def test_any_bytes_come_back_as_they_were(data):
+    assert record.to_bytes(record.from_bytes(data)) == data
+
+
+def test_nan_payloads_padding_bits_and_tail_come_back_as_they_were():
+    data = bytearray(range(0x80)) + b"\x00tail\xff"
+    data[1] = 0b10101_010
+    data[4:8] = NAN_WITH_PAYLOAD
+    data[8:12] = b"\x01\x00\x80\x7f"  # a signalling NaN
+    kept = record.from_bytes(bytes(data))
+    assert record.to_bytes(kept) == data
+    assert math.isnan(kept.value("originalGroundHeightMS"))
+    assert (kept.flags >> 3, kept.padding, kept.tail) == (0b10101, b"\x02\x03", b"\x00tail\xff")
+
+
+def test_fields_lie_where_the_layout_says():
+    data = bytearray(0x80)
+    data[0], data[1] = 4, 0b011
+    for index, value in enumerate(ADULT.values()):
+        struct.pack_into("<f", data, 4 + 4 * index, value)
+    read = record.from_bytes(bytes(data))
+    assert read.knee_axis_type == 4
+    assert [read.flag(name) for name in FLAG_NAMES] == [True, True, False]
+    assert tuple(ADULT) == FLOAT_NAMES and len(FLOAT_NAMES) == 31
+    for name, value in ADULT.items():
+        assert read.value(name) == np.float32(value)
+
+
+def test_too_few_bytes_are_refused():
+    with pytest.raises(ValueError, match="at least 128 bytes; these are 127"):
+        record.from_bytes(bytes(127))
+
+
+@pytest.mark.parametrize("read", [Record().value, Record().flag])
+def test_a_name_that_the_record_lacks_is_answered_with_those_it_has(read):
+    with pytest.raises(ValueError, match=r"no (float|flag) 'knee'; it has \["):
+        read("knee")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"knee_axis_type": 256}, "knee_axis_type is 256"),
+        ({"flags": -1}, "flags is -1"),
+        ({"padding": b"\0"}, "padding and floats"),
+        ({"floats": (b"\0\0\0\0",) * 30}, "padding and floats"),
+    ],
+)
+def test_a_record_that_has_no_bytes_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Record(**wrong)
+
+
+def test_the_adults_record_means_the_default_parameters():
+    meant = leaves_of(record.to_ik(packed()))
+    for name, default in leaves_of(jaxik.presets.record()).items():
+        # The defaults are given to seven digits, the record holds a float32.
+        np.testing.assert_allclose(meant[name], default, rtol=2e-6, atol=1e-7, err_msg=name)
+
+
+@pytest.mark.parametrize("name", FLOAT_NAMES)
+def test_every_float_reaches_a_parameter_of_its_own(name):
+    before = leaves_of(record.to_ik(packed()))
+    after = leaves_of(record.to_ik(packed(**{name: ADULT[name] * 0.9 + 0.001})))
+    changed = [key for key in before if not np.array_equal(before[key], after[key])]
+    ours = {theirs: ours for theirs, ours, _ in record.FLOATS}[name].split("[")[0]
+    assert changed == [ours]
+
+
+@pytest.mark.parametrize(("bit", "name"), list(enumerate(FLAG_NAMES)))
+def test_every_flag_reaches_a_switch_of_its_own(bit, name):
+    ours = ("lock.enabled", "probe.use_toe", "pelvis.vertical_only")
+    ik = record.to_ik(Record(flags=0b111 & ~(1 << bit), floats=packed().floats))
+    assert [bool(parameter_tree.get(ik, switch)) for switch in ours] == [i != bit for i in range(3)]
+    assert not Record(flags=0b111 & ~(1 << bit)).flag(name)
+
+
+def test_what_the_record_lacks_keeps_its_default():
+    ik = record.to_ik(packed(), Reading(tick_hz=60.0))
+    assert parameter_tree.get(ik, "lock.lock_half_life") == 0.05 and np.isinf(
+        parameter_tree.get(ik, "lock.max_speed")
+    )
+    assert (
+        parameter_tree.get(ik, "lean.tick_hz") == parameter_tree.get(ik, "pelvis.tick_hz") == 60.0
+    )
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_float_that_is_not_finite_is_named(value):
+    with pytest.raises(ValueError, match="undulationGain is .*finite"):
+        record.to_ik(packed(undulationGain=value))
+
+
+def test_centimetres_are_recognised_with_a_warning():
+    centimetres = packed(**{name: 100.0 * ADULT[name] for name in LENGTHS})
+    with pytest.warns(UserWarning, match="centimetres") as caught:
+        read = leaves_of(record.to_ik(centimetres))
+    assert [str(w.message).split(" = ")[0] for w in caught] == list(LENGTHS)
+    for name, expected in leaves_of(record.to_ik(packed())).items():
+        np.testing.assert_allclose(read[name], expected, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 0.16), ("cm", 0.0016)])
+def test_a_given_length_unit_is_taken_without_a_warning(unit, metres):
+    ik = record.to_ik(packed(), Reading(length_unit=unit))
+    assert parameter_tree.get(ik, "contact.raised_height") == pytest.approx(metres)
+    ik = record.to_ik(packed(raycastDistanceUp=6.0), Reading(length_unit="m"))
+    assert parameter_tree.get(ik, "probe.ray_up") == 6.0
+    assert parameter_tree.get(ik, "target.max_ankle_height") == pytest.approx(0.55), (
+        "other heights are in metres"
+    )
+
+
+def test_a_cosine_out_of_range_is_degrees_with_a_warning():
+    with pytest.warns(UserWarning, match="cosineMaxKneeAngle = 170.0 .*degrees"):
+        ik = record.to_ik(packed(cosineMaxKneeAngle=170.0))
+    assert parameter_tree.get(ik, "leg.max_knee_angle") == pytest.approx(math.radians(170.0))
+
+
+def test_flexion_is_counted_from_the_straight_leg():
+    # At least 8 and at most 140 degrees bent: the interior angle lies between 40 and 172.
+    bent = packed(
+        cosineMaxKneeAngle=math.cos(math.radians(140)), cosineMinKneeAngle=math.cos(math.radians(8))
+    )
+    ik = record.to_ik(bent, Reading(knee_convention="flexion"))
+    limits = [parameter_tree.get(ik, f"leg.{name}_knee_angle") for name in ("min", "max")]
+    np.testing.assert_allclose(np.degrees(limits), [40, 172], rtol=1e-6)
+    again = record.from_ik(record.to_ik(bent, Reading(knee_convention="flexion")), bent)
+    assert again != bent
+    again = record.from_ik(
+        record.to_ik(bent, Reading(knee_convention="flexion")),
+        bent,
+        Reading(knee_convention="flexion"),
+    )
+    assert again == bent
+
+
+def test_the_sign_of_the_lean_may_be_turned():
+    ik = record.to_ik(packed(), Reading(lean_sign=-1))
+    names = ("forward_rate", "side_rate", "forward_rate_slide", "side_rate_slide", "gain")
+    rates = [parameter_tree.get(ik, f"lean.{name}") for name in names]
+    np.testing.assert_allclose(rates, [0.30, 0.10, -0.80, -0.60, 0.19], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"length_unit": "inch"}, "length_unit is 'inch'; it is one of"),
+        ({"knee_convention": "outer"}, "knee_convention is 'outer'"),
+        ({"lean_sign": 0}, "lean_sign is 0"),
+        ({"tick_hz": 0.0}, "tick_hz is 0.0"),
+        ({"tick_hz": math.nan}, "tick_hz is nan"),
+    ],
+)
+def test_a_reading_that_does_not_exist_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Reading(**wrong)
+
+
+def test_the_knee_axis_is_the_enums():
+    axes = [record.knee_axis(Record(knee_axis_type=kind)) for kind in range(6)]
+    np.testing.assert_array_equal(axes, [*np.eye(3), *-np.eye(3)])
+    for call in (record.knee_axis, record.to_ik):
+        with pytest.raises(ValueError, match="kneeAxisType is 6; 0 to 5"):
+            call(Record(knee_axis_type=6))
+
+
+def test_a_games_rig_takes_the_records_knee_axis_and_keeps_the_rest():
+    rig = to_rig(poses.make_rig(np.random.default_rng(0)))
+    turned = record.with_knee_axis(rig, Record(knee_axis_type=3))
+    np.testing.assert_array_equal(turned.knee_axis_ls, [[-1, 0, 0]] * 2)
+    assert turned.knee_axis_ls.dtype == rig.knee_axis_ls.dtype
+    np.testing.assert_array_equal(turned.ankle_from_foot, rig.ankle_from_foot)
+
+
+def finite_records(count: int, seed: int = 0) -> list[Record]:
+    """Random bits in every field; floats finite, of any size."""
+    rng = np.random.default_rng(seed)
+    records = []
+    for _ in range(count):
+        bits = rng.integers(0, 256, (31, 4), np.uint8)
+        exponents = rng.integers(90, 140, 31)  # 2^-37 to 2^12: what any unit keeps apart
+        bits[:, 3] = (bits[:, 3] & 0x80) | (exponents >> 1)
+        bits[:, 2] = (bits[:, 2] & 0x7F) | ((exponents & 1) << 7)
+        head = int(rng.integers(6)), int(rng.integers(256)), rng.bytes(2)
+        records.append(Record(*head, tuple(row.tobytes() for row in bits), rng.bytes(7)))
+    return records
+
+
+@pytest.mark.filterwarnings("ignore:.*(centimetres|degrees)")
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("length_unit", ["auto", "m", "cm"])
+@pytest.mark.parametrize("knee_convention", ["interior", "flexion"])
+@pytest.mark.parametrize("lean_sign", [1, -1])
+def test_parameters_of_a_record_give_the_record_again(
+    single, length_unit, knee_convention, lean_sign
+):
+    reading = Reading(length_unit, knee_convention, lean_sign)
+    for kept in [packed(), *finite_records(10)]:
+        ik = record.to_ik(kept, reading)
+        if single:
+            ik = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), ik)
+        assert record.to_bytes(record.from_ik(ik, kept, reading)) == record.to_bytes(kept)
+
+
+def test_a_record_made_from_parameters_alone_means_these_parameters():
+    changes = {"lean.gain": 0.3, "leg.max_knee_angle": 2.8, "lock.enabled": False}
+    ik = parameter_tree.replace(jaxik.presets.record(), changes)
+    meant = record.to_ik(record.from_ik(ik))
+    for name, expected in leaves_of(ik).items():
+        np.testing.assert_allclose(leaves_of(meant)[name], expected, atol=2e-6, err_msg=name)
+    assert not parameter_tree.get(meant, "lock.enabled")
+
+
+def test_a_changed_parameter_changes_its_own_bytes_only():
+    kept = packed()
+    ik = parameter_tree.replace(
+        record.to_ik(kept), {"pelvis.limit": 0.25, "pelvis.vertical_only": False}
+    )
+    made = record.from_ik(ik, kept)
+    changed = [
+        name for name, a, b in zip(FLOAT_NAMES, kept.floats, made.floats, strict=True) if a != b
+    ]
+    assert changed == ["heightOffsetLimit"] and made.value("heightOffsetLimit") == 0.25
+    assert (made.flags, made.tail) == (0b011, kept.tail)
+
+
+def test_a_record_in_centimetres_stays_in_centimetres():
+    kept = packed(**{name: 100.0 * ADULT[name] for name in LENGTHS})
+    with pytest.warns(UserWarning, match="centimetres"):
+        ik = record.to_ik(kept)
+    made = record.from_ik(parameter_tree.replace(ik, {"probe.ray_up": 0.6}), kept)
+    assert made.value("raycastDistanceUp") == pytest.approx(60.0)
+    assert made.value("raycastDistanceDown") == pytest.approx(80.0)
+
+
+def test_lengths_that_would_be_read_in_another_unit_are_not_written():
+    ik = parameter_tree.replace(jaxik.presets.record(), {"probe.ray_up": 6.0})
+    with pytest.raises(ValueError, match='written in m .* give length_unit "m" or "cm"'):
+        record.from_ik(ik)
+    assert record.from_ik(ik, reading=Reading(length_unit="m")).value("raycastDistanceUp") == 6.0
+
+
+def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
+    ik = jaxik.presets.record()
+    same = parameter_tree.replace(
+        ik, {"probe.toe_ls": [[0.01, -0.07, 0.2]] * 2, "leg.soften": [0.9, 0.8]}
+    )
+    assert record.from_ik(same).value("footEndLS_X") == np.float32(0.01)
+    with pytest.raises(ValueError, match=r"foot.max_pitch is \[0.4, 0.5\].*one value"):
+        record.from_ik(parameter_tree.replace(ik, {"foot.max_pitch": [0.5, 0.4]}))
+    with pytest.raises(ValueError, match="beyond a 32-bit float"):
+        record.from_ik(parameter_tree.replace(ik, {"pelvis.limit": 1e39}))
+
+
+def test_csv_of_one_and_of_many_records_comes_back_to_the_byte():
+    odd = record.from_bytes(bytes([255, 255, 1, 2]) + NAN_WITH_PAYLOAD * 31 + b"\0\xff")
+    plain = Record(floats=(b"\0\0\xc0\x7f", b"\0\0\x80\xff", b"\0\0\0\x80") + packed().floats[3:])
+    for records in ([packed()], [odd, plain, *finite_records(40)], []):
+        assert record.from_csv(record.to_csv(records)) == records
+
+
+def test_csv_is_written_under_the_records_own_names():
+    head, row = record.to_csv([packed()]).splitlines()
+    assert head.split(",") == list(record.COLUMNS)
+    cells = dict(zip(head.split(","), row.split(","), strict=True))
+    assert cells["footPlantedAnkleHeightMS"] == "0.1" and cells["useFootLocking"] == "1"
+    assert (cells["pad1"], cells["pad3"], cells["kneeAxisType"]) == ("0000", "", "2")
+
+
+def test_csv_without_padding_and_in_another_order_is_read():
+    columns = [name for name in reversed(record.COLUMNS) if not name.startswith("pad")]
+    values = {name: str(value) for name, value in ADULT.items()}
+    values |= dict.fromkeys(FLAG_NAMES, "1") | {"kneeAxisType": "2"}
+    text = ",".join(columns) + "\n" + ", ".join(values[name] for name in columns) + "\n"
+    assert record.from_csv(text) == [packed()]
+
+
+def with_cell(name: str, cell: str) -> str:
+    """Two rows, the second with one cell exchanged."""
+    head, row = record.to_csv([packed()]).splitlines()
+    cells = row.split(",")
+    cells[head.split(",").index(name)] = cell
+    return "\n".join([head, row, ",".join(cells), ""])
+
+
+@pytest.mark.parametrize(
+    ("name", "cell", "wanted"),
+    [
+        ("heightOffsetLimit", "wide", "a 32-bit number"),
+        ("heightOffsetLimit", "", "a 32-bit number"),
+        ("heightOffsetLimit", "1e39", "a 32-bit number"),
+        ("heightOffsetLimit", "nan(0x12)", "a 32-bit number"),
+        ("kneeAxisType", "256", "a whole number from 0 to 255"),
+        ("kneeAxisType", "-1", "a whole number from 0 to 255"),
+        ("kneeAxisType", "2.5", "a whole number from 0 to 255"),
+        ("useFootEndRay", "2", "0 or 1"),
+        ("useFootEndRay", "yes", "0 or 1"),
+        ("padflag", "32", "a whole number from 0 to 31"),
+        ("pad1", "00zz", "bytes in hexadecimal"),
+        ("pad1", "00", "two bytes"),
+        ("pad1", "000000", "two bytes"),
+        ("pad3", "0", "bytes in hexadecimal"),
+    ],
+)
+def test_a_cell_that_cannot_be_read_is_named_by_row_and_column(name, cell, wanted):
+    with pytest.raises(ValueError, match=f"row 3, column {name}: '.*' is not {wanted}") as caught:
+        record.from_csv(with_cell(name, cell))
+    assert repr(cell) in str(caught.value)
+
+
+def test_columns_that_are_missing_unknown_or_double_are_named():
+    head, row = record.to_csv([packed()]).splitlines()
+    with pytest.raises(ValueError, match=r"no column \['undulationGain'\]"):
+        record.from_csv(f"{head.replace('undulationGain,', 'undulatoinGain,')}\n{row}\n")
+    with pytest.raises(ValueError, match=r"unknown columns \['mass'\]; a record has \['kneeAxis"):
+        record.from_csv(f"{head},mass\n{row},80\n")
+    with pytest.raises(ValueError, match=r"column \['pad1'\] more than once"):
+        record.from_csv(f"{head},pad1\n{row},0000\n")
+    with pytest.raises(ValueError, match="no column"):
+        record.from_csv("")
+    for cells in (row + ",1", row.rsplit(",", 2)[0]):
+        with pytest.raises(ValueError, match="row 2 has not the 38 cells of the header"):
+            record.from_csv(f"{head}\n{cells}\n")

@@ -1,0 +1,151 @@
+"""Frames on which a stride's formulas have no answer: values and slopes stay finite."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_systems_singular import (
+    BENT,
+    FOLDED,
+    STRAIGHT,
+    backward_slopes,
+    held,
+    standing,
+    tangents_of,
+    turned,
+)
+
+import jaxik
+from jaxik import HARD, Smooth
+from support.cases import QUICK, RIG, Inputs, measured, swinging, total
+from support.clips import FLAT, planes, to_frames, to_ik, to_rig
+from support.clips import to_terrain as to_ground
+
+UPHILL, STEEP = planes((0.4, 0, 0)), planes((0, 0.9, 0))
+AT_WORK = {  # everything that the defaults leave off
+    "lock.enabled": True,
+    "target.rise_half_life": 0.1,
+    "target.fall_half_life": 0.05,
+    "target.spring": True,
+    "pelvis.rise_half_life": 0.1,
+    "pelvis.fall_half_life": 0.05,
+    "pelvis.spring": True,
+}
+
+
+def told(share: float, **changes: Any) -> jaxik.Frame:
+    """Feet half way of their stride in plan, when this share of its time has passed."""
+    frames = to_frames(swinging(share))
+    return dataclasses.replace(frames, stride=dataclasses.replace(frames.stride, **changes))
+
+
+def untold(velocity: float) -> jaxik.Frame:
+    """Feet half way of a stride that follows from the character's speed forward, m/s."""
+    frames = to_frames(swinging(0.5, told=False))
+    return dataclasses.replace(frames, velocity_ws=frames.velocity_ws * (velocity / 0.8))
+
+
+def nowhere() -> jaxik.Frame:
+    """A stride that ends where it began."""
+    frames = told(0.5)
+    return dataclasses.replace(
+        frames, stride=dataclasses.replace(frames.stride, next_ws=frames.stride.last_ws)
+    )
+
+
+SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any]]] = {
+    "share 0": (told(0.0), UPHILL, {}),
+    "share 1": (told(1.0), UPHILL, {}),
+    "share at the end of the rise": (told(0.75), UPHILL, {"probe.rise_end": 0.75}),
+    "no time to rise": (told(0.5), UPHILL, {"probe.rise_start": 0.5, "probe.rise_end": 0.5}),
+    "last is next": (nowhere(), UPHILL, {}),
+    "no velocity": (untold(0.0), UPHILL, {}),
+    "hardly any velocity": (untold(1e-12), UPHILL, {}),
+    "no ground": (told(0.5), FLAT, {"probe.layers": 0}),
+    "no ground, untold": (untold(0.8), FLAT, {"probe.layers": 0}),
+    "ground out of reach": (told(0.5), planes((0, 0, -0.9)), {}),
+    "one leg out of reach": (standing(), planes((0, 4.0, 0)), {}),
+    "a wall": (told(0.5), planes((1e6, 0, 0)), {}),
+    "no weight": (standing(weight=0.0), UPHILL, {}),
+    "half weight": (standing(weight=0.5), UPHILL, {}),
+    "no time": (dataclasses.replace(standing(), dt=0.0 * standing().dt), UPHILL, {}),
+    "on the surface": (standing(), FLAT, {"probe.clearance": 0.0}),
+    "straight": (held(*STRAIGHT), FLAT, {}),
+    "straight and too far": (held(*STRAIGHT), planes((0, 0, -0.3)), {}),
+    "folded": (held(*FOLDED), FLAT, {}),
+    "target on the hip": (held(*BENT), planes((0, 0, 0.75)), {}),
+    "no bones": (held(*[[0, 0.5, 0]] * 3), FLAT, {}),
+    "no thigh": (held([0, 0.5, 0], [0, 0.5, 0], [0, 0.1, 0]), FLAT, {}),
+    "no foot": (held([0, 0.9, 0], [0, 0.5, 0.1], [0.0, 0.1, 0]), STEEP, {}),
+    "no rise of the heel": (standing(), STEEP, {"effector.max_lift": 0.0}),
+    "looks straight up": (turned(0.5**0.5, -(0.5**0.5), 0.0, 0.0), UPHILL, {}),
+    "stands on its head": (turned(0.0, 0.0, 0.0, 1.0), FLAT, {}),
+    "feet point along up": (standing(foot=np.pi / 2), FLAT, {}),
+    "at once": (standing(), UPHILL, {name: 0.0 for name in AT_WORK if "half_life" in name}),
+    "never": (standing(), UPHILL, {name: np.inf for name in AT_WORK if "half_life" in name}),
+}
+BOTH = [(preset, name) for preset in ("stride", "by speed") for name in SINGULAR]
+
+
+def inputs_of(preset: str, name: str) -> Inputs:
+    frames, ground, values = SINGULAR[name]
+    ik = to_ik(AT_WORK | values, preset)
+    return ik, frames, to_ground(ground), jaxik.init(ik, to_rig(RIG))
+
+
+@pytest.mark.parametrize(("preset", "name"), BOTH)
+@pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
+def test_values_and_slopes_are_finite(preset: str, name: str, gate: Any):
+    inputs = inputs_of(preset, name)
+    values, slopes, after = measured(inputs, tangents_of(inputs), gate)
+    for numbers in (values, slopes):
+        assert np.isfinite(list(numbers.values())).all(), numbers
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+
+
+@pytest.mark.parametrize(("preset", "name"), BOTH)
+def test_slopes_are_finite_and_the_same_both_ways(preset: str, name: str):
+    inputs = inputs_of(preset, name)
+    tangents = tangents_of(inputs)
+    forward = measured(inputs, tangents, HARD)[1]["everything"]
+    backward = jax.tree.map(np.asarray, backward_slopes(inputs))
+    for path, slope in jax.tree_util.tree_leaves_with_path(backward):
+        assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
+    pairs = zip(jax.tree.leaves(backward), jax.tree.leaves(tangents), strict=True)
+    parts = [np.sum(slope * np.asarray(tangent)) for slope, tangent in pairs]
+    np.testing.assert_allclose(sum(parts), forward, rtol=1e-9, atol=1e-9 * np.abs(parts).max())
+
+
+@functools.partial(jax.jit, compiler_options=QUICK)
+def slopes_of(inputs: tuple[Any, ...]) -> Any:
+    floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
+
+    def summed(floats: Any) -> jax.Array:
+        ik, rig, ground, frames = eqx.combine(floats, rest)
+        result = jaxik.run(ik, rig, ground, frames)
+        return total((result.pose, result.body))
+
+    return jax.grad(summed)(floats)
+
+
+@pytest.mark.parametrize("present", [[True, False], [False, False]], ids=["one", "both"])
+def test_slopes_are_finite_with_a_foot_absent(present: list[bool]):
+    """Its leg is nothing at all: no place, no bones, no stride."""
+    here = np.asarray(present)[:, None]
+    frames = told(0.5)
+    kept = jax.tree.map(
+        lambda leaf: leaf * here if leaf.ndim == 3 else leaf * here[:, 0],
+        (frames.pose, frames.stride, frames.foot_speed, frames.toe_speed),
+    )
+    names = ("pose", "stride", "foot_speed", "toe_speed")
+    frames = dataclasses.replace(frames, **dict(zip(names, kept, strict=True)))
+    rig = dataclasses.replace(to_rig(RIG), present=jnp.asarray(present))
+    for preset in ("stride", "by speed"):
+        slopes = slopes_of((to_ik(AT_WORK, preset), rig, to_ground(UPHILL), frames))
+        for path, slope in jax.tree_util.tree_leaves_with_path(slopes):
+            assert np.isfinite(slope).all(), jax.tree_util.keystr(path)

@@ -1,0 +1,223 @@
+"""The vector that a fit moves: transforms, order, priors, losses, and what a user may misspell."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fitting.problem import loss, space
+from fitting.problem.problem import Problem
+from jaxik.maths import smoothing
+from support import toy
+
+NAMES = ("lock.height_off", "lock.height_on", "body.gain", "foot.limit[1]", "lock.release")
+TOLERANCE = 1e-9
+
+
+@eqx.filter_jit
+def unpack_and_pack(made: space.Space, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Values, and `u` again from the system and from the values."""
+    values = made.values(u)
+    named = dict(zip(made.names, values, strict=True))
+    return values, made.pack(made.unpack(u)), made.pack(named)
+
+
+def make(*names: str, **overrides) -> space.Space:
+    return space.make_space(toy.Toy(), [space.free(toy.Toy(), n, **overrides) for n in names])
+
+
+SPACE = make(*NAMES)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-12, 12), min_size=len(NAMES), max_size=len(NAMES)))
+def test_values_stay_in_their_bounds_and_in_their_order_for_every_u(u):
+    values = np.asarray(unpack_and_pack(SPACE, jnp.asarray(u))[0])
+    assert (values >= np.asarray(SPACE.low) - 1e-12).all()
+    assert (values <= np.asarray(SPACE.high) + 1e-12).all()
+    assert values[0] >= values[1]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-6, 6), min_size=len(NAMES), max_size=len(NAMES)))
+def test_packing_what_was_unpacked_gives_u_again(u):
+    _, from_system, from_values = unpack_and_pack(SPACE, jnp.asarray(u))
+    np.testing.assert_allclose(from_system, u, atol=1e-6)
+    np.testing.assert_allclose(from_values, u, atol=1e-6)
+
+
+def test_the_middle_of_a_gain_is_the_geometric_middle_of_its_half_lives():
+    one = make("body.gain")
+    gain = one.values(jnp.zeros(1))[0]
+    ends = smoothing.half_life_of_gain(jnp.asarray([0.02, 0.9]), jnp.asarray(30.0))
+    middle = smoothing.half_life_of_gain(gain, jnp.asarray(30.0))
+    np.testing.assert_allclose(middle, jnp.sqrt(ends[0] * ends[1]), rtol=TOLERANCE)
+
+
+def test_the_middle_of_a_logarithmic_range_is_its_geometric_middle():
+    value = make("lock.release").values(jnp.zeros(1))[0]
+    np.testing.assert_allclose(value, np.sqrt(0.01 * 0.5), rtol=TOLERANCE)
+
+
+def test_one_leg_can_be_free_and_the_other_keeps_its_value():
+    made = make("foot.limit[1]")
+    np.testing.assert_allclose(made.unpack(jnp.zeros(1)).foot.limit, [0.4, 0.45], rtol=TOLERANCE)
+
+
+def test_a_bare_name_frees_one_value_for_all_legs():
+    made = make("foot.limit")
+    assert made.size == 1
+    np.testing.assert_allclose(made.unpack(jnp.zeros(1)).foot.limit, [0.45, 0.45], rtol=TOLERANCE)
+
+
+def test_a_value_stays_above_a_fixed_partner_too():
+    made = make("lock.height_off")
+    assert made.values(jnp.full(1, -30.0))[0] == pytest.approx(0.06)
+
+
+def test_the_prior_is_centred_at_the_present_values():
+    made = make(*NAMES)
+    np.testing.assert_allclose(made.pack({}), made.u0, rtol=TOLERANCE)
+    np.testing.assert_array_equal(made.prior_rows(made.u0), 0)
+    np.testing.assert_allclose(made.prior_rows(made.u0 + 1.6), 1, rtol=TOLERANCE)
+
+
+def test_a_prior_at_a_bound_is_moved_inside_where_u_is_finite():
+    made = make("body.rise", prior_mean=0.0)
+    assert made.u0[0] == -space.CENTRE_LIMIT
+
+
+def test_a_default_outside_the_given_bounds_is_taken_to_the_nearest_one():
+    assert space.free(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
+
+
+def test_smooth_and_thresholds_share_the_parameters_out():
+    made = make("lock.height_on", "body.rise")
+    assert made.smooth == (False, True)
+    assert made.thresholds == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "said"),
+    [
+        ("lock.hight_on", {}, "nearest is 'lock.height_on'.*there are"),
+        ("foot.limit[2]", {}, r"there are \['foot.limit\[0\]', 'foot.limit\[1\]'\]"),
+        ("foot.limit[-1]", {}, "no element"),
+        ("foot.share[0]", {}, "shared by the legs"),
+        ("foot.share", {"lower": 0}, "unknown.*lower.*takes"),
+        ("foot.share", {"low": 2.0}, "bounds are 2.0 to 1.2"),
+        ("foot.share", {"low": float("nan")}, "bounds are nan"),
+        ("lock.release", {"low": 0.0}, "strictly between 0.0"),
+        ("body.gain", {"high": 1.0}, "and 1.0 for the scale 'gain'"),
+        ("foot.share", {"prior_mean": 1.5}, "prior_mean is 1.5"),
+        ("foot.share", {"prior_sd": 0.0}, "prior_sd is 0.0"),
+        ("foot.share", {"scale": "square"}, "scale is 'square'"),
+        ("foot.share", {"kind": "soft"}, "kind is 'soft'"),
+    ],
+)
+def test_what_cannot_be_free_is_answered_with_what_can(name, overrides, said):
+    with pytest.raises(ValueError, match=said):
+        space.free(toy.Toy(), name, **overrides)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ((), "nothing is free"),
+        (("foot.share", "foot.share"), "free twice"),
+        (("foot.limit", "foot.limit[0]"), "free twice"),
+    ],
+)
+def test_a_space_of_nothing_or_of_doubles_is_refused(names, said):
+    with pytest.raises(ValueError, match=said):
+        make(*names)
+
+
+def test_a_partner_that_leaves_no_room_is_refused():
+    frees = [space.free(toy.Toy(), "lock.height_on"), space.free(toy.Toy(), "lock.height_off")]
+    frees[1] = dataclasses.replace(frees[1], high=0.11)
+    with pytest.raises(ValueError, match="stays above lock.height_on, which reaches 0.12"):
+        space.make_space(toy.Toy(), frees)
+
+
+def test_two_that_stay_above_each_other_are_refused():
+    frees = [space.free(toy.Toy(), "lock.height_on"), space.free(toy.Toy(), "lock.height_off")]
+    frees[0] = dataclasses.replace(frees[0], above="lock.height_off", high=0.3)
+    frees[1] = dataclasses.replace(frees[1], high=0.4)
+    with pytest.raises(ValueError, match="above"):
+        space.make_space(toy.Toy(), frees)
+
+
+def test_packing_a_name_that_is_not_free_is_refused():
+    with pytest.raises(ValueError, match=r"not free: \['foot.share'\]; free are \['body.rise'\]"):
+        make("body.rise").pack({"foot.share": 0.5})
+
+
+LOSSES = {
+    "squares": lambda z: z,
+    "huber": lambda z: np.where(z > loss.HUBER**2, 2 * loss.HUBER * np.sqrt(z) - loss.HUBER**2, z),
+    "cauchy": lambda z: loss.CAUCHY**2 * np.log1p(z / loss.CAUCHY**2),
+}
+ROWS = jnp.asarray([0.0, 1e-200, 1e-30, 1e-9, 1e-3, 0.5, 1.0, 1.345, 3.0, 1e3, 1e9, -1e-9, -2.0])
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_square_of_a_robust_row_is_the_loss(loss):
+    rows = loss.robustify(ROWS, loss)
+    np.testing.assert_allclose(rows**2, LOSSES[loss](np.asarray(ROWS) ** 2), rtol=1e-9)
+    np.testing.assert_array_equal(jnp.sign(rows), jnp.sign(ROWS))
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_slope_of_a_robust_row_is_one_at_zero_and_finite_everywhere(loss, dtype):
+    rows = ROWS.astype(dtype)
+    slopes = jax.vmap(jax.grad(lambda row: loss.robustify(row[None], loss)[0]))(rows)
+    assert slopes.dtype == dtype
+    assert jnp.isfinite(slopes).all()
+    np.testing.assert_allclose(slopes[:4], 1, rtol=1e-6)
+
+
+def test_an_unknown_loss_is_refused():
+    with pytest.raises(ValueError, match="loss is 'absolute', wanted one of"):
+        loss.robustify.__wrapped__(ROWS, "absolute")  # the tests' type check would come first
+
+
+def residuals(ik: toy.Toy, data: jax.Array) -> jax.Array:
+    return jnp.sqrt(ik.foot.share - data)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_log_probability_is_minus_half_the_losses_and_prior(loss):
+    problem = Problem(make("foot.share"), jnp.asarray([-9.0, 0.1]), residuals, loss)
+    u = jnp.asarray([0.7])
+    z = np.asarray(problem.space.values(u)[0] - problem.data)
+    prior = float(problem.space.prior_rows(u)[0])
+    expected = -0.5 * (LOSSES[loss](z).sum() + prior**2)
+    np.testing.assert_allclose(problem.log_probability(u), expected, rtol=TOLERANCE)
+    np.testing.assert_allclose(problem.cost(u), -expected, rtol=TOLERANCE)
+
+
+def test_the_log_probability_of_residuals_that_are_not_finite_is_minus_infinity():
+    problem = Problem(make("foot.share"), jnp.asarray([0.9]), residuals)
+    assert problem.log_probability(jnp.asarray([-3.0])) == -jnp.inf
+
+
+def test_other_data_bounds_and_centres_do_not_compile_again():
+    traces = []
+
+    @eqx.filter_jit
+    def cost(problem: Problem, u: jax.Array) -> jax.Array:
+        traces.append(1)
+        return problem.cost(u)
+
+    for value in (0.1, 0.2):
+        made = make("foot.share")
+        made = eqx.tree_at(lambda s: (s.low, s.u0), made, (made.low - value, made.u0 + value))
+        cost(Problem(made, jnp.asarray([value]), residuals), jnp.asarray([value]))
+    assert len(traces) == 1

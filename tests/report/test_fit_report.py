@@ -1,0 +1,334 @@
+"""Reports: numbers in texts and tables, pictures that are there, sections that do not pile up."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.analysis import limit_activity, playback
+from fitting.datasets.synthetic import walker
+from fitting.experiments.experiment import (
+    ClipEntry,
+    Experiment,
+    free_parameters,
+    make_scene,
+    system,
+)
+from fitting.inference.identifiability import Identification, Profile
+from fitting.inference.optimisation import search
+from fitting.inference.sampling.posterior import Posterior
+from fitting.problem import residuals
+from fitting.problem.problem import Problem
+from fitting.problem.space import make_space
+from fitting.report import fit_report
+from fitting.studies import run_folder, study
+from jaxik.maths import parameter_tree
+from jaxik.world import terrain
+
+VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
+TRUTH = """
+preset = "record"
+[contact]
+planted_height = 0.10
+[pelvis]
+on_gain = 0.5
+vertical_only = true
+[probe]
+toe_ls = [0.0, -0.07, 0.2]
+[noise]
+ankle = 0.01
+"""
+SIGMAS = {"ankle": 0.02, "pelvis": 0.03, "foot": 0.1, "contact": 0.5, "smooth": 20.0}
+SIGMAS |= {"knee": 0.03, "body": 0.2, "correlation": 0.4}
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory) -> Experiment:
+    folder = tmp_path_factory.mktemp("experiment")
+    (folder / "truth.toml").write_text(TRUTH)
+    entry = ClipEntry(folder / "walk.npz", folder / "slope.ply", truth=folder / "truth.toml")
+    path, free = folder / "hill.toml", {name: {} for name in VALUES}
+    return Experiment(path, (replace(entry, truth=None), entry), free, name="hill")
+
+
+@pytest.fixture(scope="module")
+def fitted(experiment) -> study.Fit:
+    """A fit of a two-second walk uphill that nothing has solved: its numbers are made up."""
+    clip = walker.walk(seconds=2.0, fps=15.0)
+    ground = terrain.plane(point=(0.0, 0.02, 0.0), normal=(0.1, 1.0, -0.3))
+    ik = system(experiment)
+    space = make_space(ik, free_parameters(experiment, ik))
+    scene = make_scene(clip, clip, ground, SIGMAS)
+    problem = Problem(space, (scene,), residuals.rows_of_scenes)
+    u = np.asarray(space.pack(VALUES))
+    history = [search.Progress("start", 0, 0, 900.0, 900.0, 1.0)]
+    history += [search.Progress("blocks", 0, i, 800.0 / i, 800.0 / i, 1.0 + i) for i in range(1, 9)]
+    solution = search.Solution(
+        names=space.names,
+        u=u,
+        values=np.asarray(space.values(jnp.asarray(u))),
+        cost_before=900.0,
+        cost=100.0,
+        converged=False,
+        message="Not converged: the 8 steps allowed for a start were used up.",
+        jacobian=np.zeros((1, 3)),
+        history=tuple(history),
+        steps=8,
+        seconds=9.0,
+    )
+    sides = np.array([0.0, 0.4])
+    profile = Profile(sides, sides, (0.10, 0.12), (7.5, -0.25))
+    identification = Identification(
+        names=space.names,
+        contraction=np.array([0.99, 0.97, 0.1]),
+        interval=np.array([[0.10, 0.12], [0.2, 0.4], [0.81, 0.99]]),
+        sd=np.array([np.nan, 0.1, 1.5]),
+        at_bound=("", "", "high"),
+        eigenvalues=np.array([0.1, 20.0]),
+        weakest=("leg.soften",),
+        correlated=(("pelvis.on_gain", "leg.soften", -0.93),),
+        profiles={"contact.planted_height": profile},
+        improvement=0.25,
+    )
+    return study.Fit(experiment, problem, solution, identification)
+
+
+def made_posterior(stuck: list[int] | None = None) -> Posterior:
+    """Normal draws around known values."""
+    random = np.random.default_rng(0)
+    u = random.normal(size=(120, 12, 3))
+    values = np.array([0.105, 0.3, 0.9]) + u * np.array([0.005, 0.01, 0.02])
+    return Posterior(
+        names=tuple(VALUES),
+        u=u,
+        log_probability=-0.5 * np.sum(u**2, axis=-1),
+        values=values,
+        thin_by=2,
+        burn_in=20,
+        autocorrelation_time=np.array([2.0, 3.0, 4.0]),
+        acceptance=np.full(12, 0.25),
+        apart=[],
+        stuck=stuck or [],
+        converged=True,
+        message="Converged: the chain is long enough.",
+        seconds=3.0,
+    )
+
+
+def size_of_png(path: Path) -> tuple[int, int]:
+    head = path.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    return struct.unpack(">II", head[16:24])
+
+
+def line_of(text: str, name: str) -> str:
+    return next(line for line in text.splitlines() if line.strip("| ").startswith(name))
+
+
+def test_the_truth_is_that_of_the_first_clip_that_has_one(experiment):
+    assert fit_report.truth_of(experiment) == {
+        "contact.planted_height": 0.10,
+        "pelvis.on_gain": 0.5,
+        "probe.toe_ls": pytest.approx(0.13 / 3),
+        "probe.toe_ls[0]": 0.0,
+        "probe.toe_ls[1]": -0.07,
+        "probe.toe_ls[2]": 0.2,
+    }
+    assert fit_report.truth_of(replace(experiment, clips=experiment.clips[:1])) is None
+
+
+def test_the_truth_of_one_leg_is_that_of_all(experiment):
+    one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
+    truth = fit_report.truth_of(one_leg)
+    assert truth is not None and truth["pelvis.on_gain[1]"] == 0.5
+
+
+def test_a_truth_that_is_no_toml_is_refused_with_its_name(experiment, tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text("contact = [")
+    entry = replace(experiment.clips[0], truth=path)
+    with pytest.raises(ValueError, match=r"broken\.toml: not TOML"):
+        fit_report.truth_of(replace(experiment, clips=(entry,)))
+
+
+def test_the_terminal_tells_values_truth_bounds_and_what_is_undetermined(fitted, experiment):
+    text = fit_report.fit_text(run_folder.describe_fit(fitted), fit_report.truth_of(experiment))
+    assert text.startswith("Not converged")
+    assert "Cost 900 before, 100 after" in text
+    # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.01 to 0.95.
+    planted = line_of(text, "contact.planted_height")
+    assert "0.11 " in planted and "2.5 % of range" in planted and "0.1 to 0.12" in planted
+    assert "21.3 % of range" in line_of(text, "pelvis.on_gain")
+    soften = line_of(text, "leg.soften")
+    assert "undetermined by these clips" in soften and "at its upper bound" in soften
+    assert "unknown" in soften
+    assert text.endswith("1 of 2 determined parameters within 5 % of their range")
+
+
+def test_a_gain_is_told_as_half_life_and_at_30_and_60_hz(fitted):
+    text = fit_report.fit_text(run_folder.describe_fit(fitted), None)
+    cells = text.split("gain at 60 Hz")[1].split()[-5:]
+    half_life = np.log(0.5) / np.log(0.7) / 30.0
+    assert cells[0] == "pelvis.on_gain"
+    np.testing.assert_allclose(float(cells[1]), half_life, rtol=1e-3)
+    np.testing.assert_allclose(float(cells[3]), 0.3, rtol=1e-3)
+    np.testing.assert_allclose(float(cells[4]), 1 - np.sqrt(0.7), rtol=1e-3)
+    assert "truth" not in text and "determined parameters within" not in text
+
+
+def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
+    fit_report.write_fit(tmp_path, fitted)
+    text = (tmp_path / run_folder.SUMMARY).read_text()
+    names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
+    wanted = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
+    wanted |= {"worst.png"}
+    assert set(names) == wanted
+    assert {path.name for path in tmp_path.iterdir()} == wanted | {run_folder.SUMMARY}
+    for name in names:
+        wide, high = size_of_png(tmp_path / name)
+        assert 1000 < wide < 2000 and 400 < high < 2500, name
+    assert "| contact.planted_height | 0.11 | m |" in text
+    assert "Undetermined: `leg.soften`." in text
+    assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
+    assert "| leg.soften | smooth | 0.100 | undetermined |" in text
+    assert "+7.5" in line_of(text.split("threshold moves")[1], "contact.planted_height")
+    scene = fitted.problem.data[0]
+    asked = limit_activity.exercise(fitted.ik, scene)
+    share = f"{100 * asked.limits['pelvis.limit']:.1f} %"
+    assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {share} |"
+
+
+def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(fit_report, "_keep", lambda run, name, caption, figure: {name: caption})
+    problem = fitted.problem
+    twice = Problem(problem.space, problem.data * 2, problem.residuals, problem.loss)
+    played = playback.play(fitted.ik, problem.data[0])
+    pictures = fit_report._draw_clip(tmp_path, replace(fitted, problem=twice), 1, played)
+    assert set(pictures) == {
+        "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png"
+    }  # fmt: skip
+    assert all(caption.startswith("hill, clip 2: ") for caption in pictures.values())
+    section = fit_report._worst(tmp_path, replace(fitted, problem=twice), [played, played])
+    assert [part for part in section if part.startswith("![")] == [
+        f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)" for number in (1, 2)
+    ]
+
+
+def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
+    scene = fitted.problem.data[0]
+    played = playback.play(fitted.ik, scene)
+    assert played.used == list(playback.KINDS)
+    rows = np.concatenate([np.ravel(played.rows[kind]) for kind in playback.KINDS])
+    np.testing.assert_allclose(rows, residuals.rows_of_scene(fitted.ik, scene), atol=1e-9)
+
+
+def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
+    scene = fitted.problem.data[0]
+    legs = walker.walk(seconds=2.0, fps=15.0).leg_pose_ws()
+    captured = playback.play(fitted.ik, scene).captured
+    np.testing.assert_allclose(captured.hip, legs.hip.pos, atol=1e-6)
+    np.testing.assert_allclose(captured.toe, legs.toe.pos, atol=1e-6)
+    span = np.linalg.norm(np.asarray(legs.hip.pos - legs.ankle.pos), axis=-1)
+    thigh, shin = np.asarray(scene.rig.thigh), np.asarray(scene.rig.shin)
+    cosine = (thigh**2 + shin**2 - span**2) / (2 * thigh * shin)
+    np.testing.assert_allclose(np.cos(captured.knee_angle), cosine, atol=1e-6)
+
+
+def test_limits_act_where_they_are_tight_and_never_at_the_end_of_their_range(fitted):
+    scene = fitted.problem.data[0]
+    values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}
+    ends = limit_activity.exercise(parameter_tree.replace(fitted.ik, values), scene).limits
+    assert [ends[name] for name in values] == [0.0, 0.0, 0.0]
+    tight = limit_activity.exercise(
+        parameter_tree.replace(fitted.ik, {"pelvis.limit": 0.0}), scene
+    ).limits
+    assert tight["pelvis.limit"] > 0.7
+    assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
+    assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
+
+
+def test_counters_count_feet_that_lock_release_and_find_ground(fitted):
+    scene = fitted.problem.data[0]
+    asked = limit_activity.exercise(fitted.ik, scene)
+    result = jaxik.run(fitted.ik, scene.rig, scene.terrain, scene.frames)
+    locked = np.asarray(result.trace.advanced.state.lock.locked)
+    assert asked.frames == 30 and asked.seconds == pytest.approx(2.0)
+    assert asked.locks == tuple(int(n) for n in (np.diff(locked, axis=0) == 1).sum(axis=0))
+    assert sum(asked.locks) > 0 and sum(asked.releases) > 0
+    np.testing.assert_allclose(asked.locked, locked.mean(axis=0))
+    ankle = np.asarray(walker.walk(seconds=2.0, fps=15.0).leg_pose_ws().ankle.pos)
+    below = ankle[..., 1] + 0.5 - (0.02 - 0.1 * ankle[..., 0] + 0.3 * ankle[..., 2])
+    np.testing.assert_allclose(asked.found, ((0 <= below) & (below <= 1.3)).mean(axis=0))
+    assert asked.found.max() < 1.0, "the hill rises out of reach of the rays"
+
+
+def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
+    scene, space = fitted.problem.data[0], fitted.problem.space
+    base = parameter_tree.replace(space.base, {"lock.enabled": False})
+    unlocked = make_space(base, space.frees)
+    problem = Problem(unlocked, (scene,), residuals.rows_of_scenes)
+    (down, up) = limit_activity.flipped_decisions(problem, np.asarray(unlocked.pack(VALUES)))[
+        "contact.planted_height"
+    ]
+    lift = np.asarray(scene.frames.pose.ankle.pos[..., 1])
+    # Of four decisions a foot and frame only `planted` follows the threshold.
+    assert down == pytest.approx(np.mean((0.07 < lift) & (lift <= 0.11)) / 4)
+    assert up == pytest.approx(np.mean((0.11 < lift) & (lift <= 0.15)) / 4)
+    assert down > 0 and up > 0
+
+
+def test_the_terminal_tells_a_posterior_with_its_health():
+    posterior = made_posterior(stuck=[3])
+    text = fit_report.posterior_text(
+        posterior, {"contact.planted_height": 0.106, "leg.soften": 0.8}
+    )
+    first = posterior.summary[0]
+    line = line_of(text, "contact.planted_height")
+    assert f"{first['median']:.4g}" in line and f"{first['low95']:.4g} to" in line
+    assert line.endswith("yes")
+    assert line_of(text, "leg.soften").endswith("no")
+    assert f"{first['ess']:.0f}" in line and "2 steps" in line
+    assert "12 walkers, 240 steps, the first 40 left out" in text
+    assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3;" in text
+    assert "Converged: the chain is long enough." in text
+    assert "The 95 % intervals cover the truth of 1 of 2 parameters." in text
+    assert "truth" not in fit_report.posterior_text(posterior, None)
+
+
+def test_a_posterior_is_written_after_the_fit_and_once_only(fitted, experiment, tmp_path):
+    (tmp_path / run_folder.FIT).write_text(json.dumps(run_folder.describe_fit(fitted)))
+    (tmp_path / run_folder.SUMMARY).write_text("# hill\n\n## Parameters\n\nof the fit\n")
+    fit_report.write_posterior(tmp_path, experiment, made_posterior())
+    once = (tmp_path / run_folder.SUMMARY).read_text()
+    fit_report.write_posterior(tmp_path, experiment, made_posterior())
+    assert (tmp_path / run_folder.SUMMARY).read_text() == once
+    assert once.startswith("# hill\n\n## Parameters\n\nof the fit\n\n## Posterior\n")
+    assert (
+        "the truth of 1 of 2 parameters; of those that the fit calls determined, of 1 of 2." in once
+    )
+    assert "| pelvis.on_gain | 1/tick |" in once
+    for name in ("corner.png", "chain.png"):
+        assert f"({name})" in once
+        assert min(size_of_png(tmp_path / name)) > 400
+
+
+def test_a_posterior_makes_its_own_summary_where_there_is_none(fitted, experiment, tmp_path):
+    (tmp_path / run_folder.FIT).write_text(json.dumps(run_folder.describe_fit(fitted)))
+    clips = (replace(experiment.clips[0], truth=None),)
+    fit_report.write_posterior(tmp_path, replace(experiment, clips=clips), made_posterior([0]))
+    text = (tmp_path / run_folder.SUMMARY).read_text()
+    assert text.startswith("# hill\n\n## Posterior\n") and "truth" not in text
+
+
+def test_a_parameter_that_never_moves_still_has_a_corner(fitted, experiment, tmp_path):
+    (tmp_path / run_folder.FIT).write_text(json.dumps(run_folder.describe_fit(fitted)))
+    posterior = made_posterior()
+    still = posterior.values.copy()
+    still[..., 2] = 0.9
+    fit_report.write_posterior(tmp_path, experiment, replace(posterior, values=still))
+    assert min(size_of_png(tmp_path / "corner.png")) > 400

@@ -1,0 +1,154 @@
+"""Heels that rise about the ball: against a search for the turn, and along whole walks."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize_scalar
+
+import jaxik
+from jaxik.maths import quat
+from jaxik.stages import effector
+from reference import maths, poses
+from support.cases import QUICK, RIG
+from support.clips import to_frames, to_ik, to_rig, to_terrain
+from support.slopes import finite_slopes
+from support.strides import blocks, walk
+
+COUNT = 240  # frames
+VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.2}
+angle_of = jax.jit(effector.heel_angle)
+
+
+def searched(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: float) -> float:
+    """The smallest turn, rad, that brings the ankle within `length` m, or else as near as it gets.
+
+    0 for a leg that is short enough, or that a small turn would only make longer.
+    """
+
+    def distance(angle: float) -> float:
+        return maths.length(to_ball + maths.rotate(maths.turn(axis, -angle), arm))
+
+    if distance(0.0) <= length or distance(1e-5) > distance(0.0):
+        return 0.0
+    best = minimize_scalar(distance, bounds=(0.0, np.pi), method="bounded", options={"xatol": 1e-9})
+    if distance(best.x) >= length:
+        return float(best.x)
+    return brentq(lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12)
+
+
+def draws(count: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+    """Balls under hips, ankles behind and over them, and lengths that are short of it or not."""
+    rng = np.random.default_rng(2)
+    drawn = []
+    for _ in range(count):
+        axis = maths.unit(np.array([-1.0, *rng.normal(0.0, 0.3, 2)]), maths.X)
+        to_ball = np.array([rng.normal(0.0, 0.1), -0.9, rng.uniform(-0.6, 0.6)])
+        arm = np.array([rng.normal(0.0, 0.02), rng.uniform(0.0, 0.1), rng.uniform(-0.18, -0.1)])
+        short = rng.choice([-0.02, 0.01, 0.05, 0.3])
+        drawn.append((to_ball, arm, axis, maths.length(to_ball + arm) - short))
+    return drawn
+
+
+def test_the_turn_of_the_heel_is_the_one_that_a_search_finds():
+    drawn = draws(60)
+    wanted = np.array([searched(*each) for each in drawn])
+    came = angle_of(*(jnp.asarray(np.stack(column)) for column in zip(*drawn, strict=True)))
+    assert 0.2 < (wanted > 0).mean() < 0.9
+    # The turn that comes nearest is only as sharp as a minimum.
+    np.testing.assert_allclose(np.maximum(came, 0.0), wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("to_ball", "arm", "length"),
+    [
+        ([0.0, -0.9, 0.0], [0.0, 0.0, 0.0], 0.8),  # ankle on the ball
+        ([0.0, 0.0, 0.0], [0.0, 0.1, -0.1], 0.8),  # ball on the hip
+        ([0.0, -0.9, -0.9], [0.0, 0.1, 0.1], 0.8),  # as near as it gets
+        ([0.0, -0.9, 0.2], [0.0, 0.0, -0.1], 0.0),  # no leg
+        ([0.0, -0.9, 0.0], [0.1, 0.0, 0.0], 0.8),  # along the axis
+    ],
+    ids=["no foot", "folded", "nearest", "no leg", "along the axis"],
+)
+def test_the_turn_has_finite_slopes_where_it_has_no_answer(to_ball, arm, length):
+    one_leg = (np.array(row)[None] for row in (to_ball, arm, -maths.X, length))
+    finite_slopes(effector.heel_angle, *one_leg)
+
+
+@functools.cache
+def walked() -> tuple[jaxik.Frame, jaxik.Result]:
+    """Across uneven blocks."""
+    frames = to_frames(walk(RIG, COUNT, start=(0.0, 0.0, -2.5), heading=0.1))
+    ground = to_terrain(blocks(np.random.default_rng(5), most=0.2, odd=False))
+    run = jax.jit(jaxik.run, compiler_options=QUICK)
+    return frames, run(to_ik(VALUES, "stride"), to_rig(RIG), ground, frames)
+
+
+@functools.cache
+def heels() -> dict[str, np.ndarray]:
+    """Of every foot of the walk: by how much its heel rose and should have, rad; hip to ankle
+    before and after and how far they may be apart, m.
+    """
+    frames, result = walked()
+    sensed, advanced = result.trace.sensed, result.trace.advanced
+    hip = sensed.hip_ws + advanced.state.pelvis.offset_ws[:, None]
+    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
+    before = advanced.foothold_ws + advanced.held.offset_ws + lift - hip
+    after = advanced.effector.target_ws - hip
+    animated = np.linalg.norm(sensed.ankle_ws - sensed.hip_ws, axis=-1)
+    longest = np.maximum(VALUES["effector.extension"] * (poses.THIGH + poses.SHIN), animated)
+
+    arm = sensed.ankle_ws - sensed.ball_ws
+    axis = -np.asarray(quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X)))
+    wanted = [
+        searched(ball, arm, axis[index], length)
+        for index, rows in enumerate(
+            zip(*map(np.asarray, (before - arm, arm, longest)), strict=True)
+        )
+        for ball, arm, length in zip(*rows, strict=True)
+    ]
+    cosine = np.abs(np.sum(advanced.effector.rot_ws * sensed.ankle_rot_ws, axis=-1))
+    return {
+        "lift": 2.0 * np.arccos(np.minimum(cosine, 1.0)),
+        "wanted": np.reshape(wanted, longest.shape),
+        "before": np.linalg.norm(before, axis=-1),
+        "after": np.linalg.norm(after, axis=-1),
+        "longest": longest,
+    }
+
+
+def test_a_heel_rises_on_a_walk_as_a_search_finds_and_no_further_than_it_may():
+    spans, most = heels(), VALUES["effector.max_lift"]
+    assert 0.02 < (spans["wanted"] > 0.0).mean() < 0.9 and (spans["wanted"] > most).any()
+    np.testing.assert_allclose(spans["lift"], np.minimum(spans["wanted"], most), rtol=0, atol=1e-6)
+
+
+def test_a_leg_is_kept_within_its_length_where_a_heel_that_rises_can_do_so():
+    spans, most = heels(), VALUES["effector.max_lift"]
+    rises = (spans["lift"] > 1e-6) & (spans["wanted"] < most)
+    assert rises.mean() > 0.02
+    np.testing.assert_allclose(spans["after"][rises], spans["longest"][rises], rtol=0, atol=1e-9)
+
+
+def test_a_heel_stays_down_where_the_leg_is_short_enough():
+    spans = heels()
+    short = spans["before"] < spans["longest"] - 1e-9
+    assert short.mean() > 0.1
+    assert spans["lift"][short].max() < 1e-7
+    np.testing.assert_allclose(spans["after"][short], spans["before"][short], rtol=0, atol=1e-12)
+
+
+def test_the_ball_stays_where_the_target_has_it_while_the_heel_rises():
+    frames, result = walked()
+    sensed, advanced = result.trace.sensed, result.trace.advanced
+    place = jax.vmap(lambda root, ball: root.apply(ball))
+    ball = place(frames.world_from_model, result.pose.toe.pos)
+    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
+    asked = advanced.foothold_ws + lift + (sensed.ball_ws - sensed.ankle_ws)
+    # The sole is laid on the slope about the ankle afterwards: only level ground keeps the ball.
+    level = np.asarray(sensed.ground.ankle.normal)[..., 1] * np.asarray(sensed.contact.weight)
+    arrived = (np.asarray(result.reached) > 0) & ((level == 0) | (level > 1 - 1e-12))
+    assert (heels()["lift"][arrived] > 0.02).any()
+    np.testing.assert_allclose(ball[arrived], asked[arrived], rtol=0, atol=1e-8)

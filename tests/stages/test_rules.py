@@ -1,0 +1,261 @@
+"""Rules by name: in experiments and parameter files, and through everything that keeps them."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.cli import main
+from fitting.experiments import ablations, experiment, parameter_files, systems
+from fitting.inference.identifiability import Identification
+from fitting.inference.optimisation.solution import Solution
+from fitting.report import fit_report
+from fitting.studies import run_folder, translation
+from fitting.studies.study import Fit
+from jaxik import presets
+from jaxik.maths import parameter_tree
+from jaxik.stages import contact, leg, pelvis
+from support.experiments import CLIP, ROOT, SECOND, write
+
+PRESETS = ("record", "ozz", "unreal", "mec")
+RULES = 'rules = { pelvis = "CapsulePelvis", contact = "IdleContact" }'
+FREE = "pelvis.speed = {}\nfoot.max_pitch = { low = 0.1 }"
+
+
+def written(folder, text):
+    path = folder / "parameters.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_every_rule_that_a_preset_has_is_known_at_its_stage():
+    assert list(systems.STAGES) == [one.name for one in dataclasses.fields(jaxik.FootIK)]
+    for name in PRESETS:
+        for stage, there in systems.rules_of(systems.name_preset(name)).items():
+            assert there in systems.STAGES[stage]
+    assert systems.STAGES["leg"]["PoleLeg"] is leg.PoleLeg
+    abstract = [n for rules in systems.STAGES.values() for n in rules if n.startswith("Abstract")]
+    assert not abstract
+
+
+def test_an_exchanged_rule_has_its_defaults_and_one_that_is_there_keeps_its_values():
+    ozz = presets.ozz()
+    made = systems.with_rules(ozz, {"pelvis": "CapsulePelvis", "probe": "FootProbe"}, "here")
+    assert type(made.pelvis) is pelvis.CapsulePelvis
+    np.testing.assert_array_equal(
+        parameter_tree.get(made, "pelvis.speed"), pelvis.CapsulePelvis().speed
+    )
+    assert made.probe is ozz.probe and np.isinf(parameter_tree.get(made, "probe.ray_down"))
+    assert systems.exchanged(made, ozz) == {"pelvis": "CapsulePelvis"}
+    assert systems.exchanged(ozz, presets.ozz()) == {}
+
+
+@pytest.mark.parametrize(
+    ("rules", "said"),
+    [
+        ({"pelvs": "LowestPelvis"}, "here: unknown key 'pelvs'; nearest is 'pelvis' of"),
+        ({"pelvis": "LowPelvis"}, "here: pelvis has no rule 'LowPelvis'; it has .'LowestPelvis',"),
+        ({"pelvis": "TwoBone"}, "pelvis has no rule 'TwoBone'"),
+        ({"pelvis": "AbstractPelvis"}, "pelvis has no rule 'AbstractPelvis'"),
+        ({"pelvis": 3}, "pelvis has no rule 3"),
+        ({"pelvis": ["LowestPelvis"]}, r"pelvis has no rule \['LowestPelvis'\]"),
+    ],
+)
+def test_an_unknown_stage_or_rule_is_refused_with_what_exists(rules, said):
+    with pytest.raises(ValueError, match=said):
+        systems.with_rules(presets.record(), rules, "here")
+
+
+# Parameter files
+
+
+def test_rules_come_back_from_a_parameter_file_with_their_values(tmp_path):
+    names = {"pelvis": "LegLengthPelvis", "leg": "PoleLeg", "contact": "IdleContact"}
+    ik = systems.with_rules(presets.record(), names, "here")
+    ik = parameter_tree.replace(ik, {"pelvis.max_length": 0.91, "contact.idle_speed": 0.07})
+    text = parameter_files.to_toml(ik)
+    back, preset = parameter_files.from_toml(written(tmp_path, text))
+    assert preset == "record" and systems.rules_of(back) == systems.rules_of(ik)
+    for name in systems.leaf_names(ik):
+        np.testing.assert_array_equal(
+            parameter_tree.get(back, name), parameter_tree.get(ik, name), err_msg=name
+        )
+
+
+def test_a_preset_s_own_rules_are_not_written():
+    for name in PRESETS:
+        assert "rules" not in parameter_files.to_toml(systems.name_preset(name), name)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("rules = 3", "parameters.toml: rules is 3; wanted a table"),
+        ("[rules]\npelvs = 'x'", r"parameters.toml \[rules\]: unknown key 'pelvs'"),
+        ("[rules]\npelvis = 'x'", r"parameters.toml \[rules\]: pelvis has no rule 'x'; it has"),
+        (
+            "[rules]\npelvis = 'CapsulePelvis'\n[pelvis]\non_gain = 0.1",
+            "unknown key 'pelvis.on_gain'",
+        ),
+    ],
+)
+def test_wrong_rules_of_a_parameter_file_are_refused(tmp_path, text, said):
+    with pytest.raises(ValueError, match=said):
+        parameter_files.from_toml(written(tmp_path, text))
+
+
+def test_a_record_with_another_rule_is_no_record(tmp_path, capsys):
+    path = written(tmp_path, "[rules]\npelvis = 'CapsulePelvis'\n")
+    words = ["record", "to-bytes", str(path), "-o", str(tmp_path / "a.bin")]
+    assert main.main(words) == main.MISTAKE
+    assert "rules {'pelvis': 'CapsulePelvis'}; only those of 'record'" in capsys.readouterr().err
+    assert not (tmp_path / "a.bin").exists()
+
+
+# Experiments
+
+
+def test_an_experiment_may_exchange_rules_and_free_their_parameters(tmp_path):
+    rest = "[parameters]\ncontact.idle_speed = 0.5"
+    read = experiment.load_experiment(write(tmp_path, top=RULES, free=FREE, rest=rest))
+    assert read.rules == {"pelvis": "CapsulePelvis", "contact": "IdleContact"}
+    problem = experiment.make_problem(read)
+    base = problem.space.unpack(problem.space.u0)
+    assert type(base.pelvis) is pelvis.CapsulePelvis
+    assert type(base.contact) is contact.IdleContact
+    assert float(parameter_tree.get(base, "contact.idle_speed")) == 0.5
+    assert problem.space.names == ("pelvis.speed", "foot.max_pitch")
+
+
+@pytest.mark.parametrize(
+    ("top", "said"),
+    [
+        ("rules = 3", "rules is 3; wanted a table"),
+        ("rules = { pelvs = 'x' }", r"\[rules\]: unknown key 'pelvs'; nearest is 'pelvis'"),
+        ("rules = { pelvis = 'Low' }", r"\[rules\]: pelvis has no rule 'Low'; it has \["),
+    ],
+)
+def test_wrong_rules_of_an_experiment_are_refused(tmp_path, top, said):
+    with pytest.raises(ValueError, match=said):
+        experiment.load_experiment(write(tmp_path, top=top))
+
+
+def test_a_parameter_of_a_rule_that_was_exchanged_is_unknown(tmp_path):
+    read = experiment.load_experiment(write(tmp_path, top=RULES))
+    with pytest.raises(ValueError, match="no parameter named 'pelvis.on_gain'"):
+        experiment.make_problem(read)
+
+
+def test_the_truth_of_an_experiment_is_read_with_its_rules(tmp_path):
+    (tmp_path / "truth.toml").write_text("[pelvis]\nspeed = 3.5\n")
+    clip = "truth = 'truth.toml'"
+    read = experiment.load_experiment(write(tmp_path, top=RULES, free=FREE, clip=clip))
+    assert fit_report.truth_of(read) == {"pelvis.speed": 3.5}
+
+
+def test_rules_are_kept_through_a_run(tmp_path):
+    read = experiment.load_experiment(write(tmp_path, top=RULES, free=FREE, clips=CLIP + SECOND))
+    problem = experiment.make_problem(read)
+    u = np.array([0.4, -0.3])
+    values = np.asarray(problem.space.values(problem.space.u0 * 0 + u))
+    names = problem.space.names
+    solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
+    found = Identification(
+        names, np.ones(2), np.array([[0.1, 0.2]] * 2), np.ones(2), ("", ""), np.ones(2), (), (),
+        {}, 0.0,
+    )  # fmt: skip
+    run = tmp_path / "run"
+    run_folder.save_fit(run, Fit(read, problem, solution, found))
+    again, told = run_folder.load_fit(run)
+    assert again.rules == read.rules
+    assert json.loads((run / run_folder.FIT).read_text())["parameters"] == told["parameters"]
+    ik, _ = parameter_files.from_toml(run / run_folder.PARAMETERS)
+    assert systems.rules_of(ik) == systems.rules_of(experiment.system(read))
+    fitted = [float(parameter_tree.get(ik, name)) for name in names]
+    np.testing.assert_allclose(fitted, values, rtol=1e-12)
+
+
+def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):
+    def lifted(source, base, ground):
+        return base.with_motion(base.positions_ws + [0.0, 0.1, 0.0], base.rotations_ws)
+
+    monkeypatch.setattr(translation, "_solved", lifted)
+    path = tmp_path / "mine.toml"
+    path.write_text("leg.soften = 0.9\n[rules]\npelvis = 'CapsulePelvis'\n[pelvis]\nspeed = 4.0\n")
+    source = translation.read_system("ozz", "--from")
+    target = translation.read_system(str(path), "--to")
+    clip = ROOT / "data" / "clips" / "uneven_walk_base.npz"
+    ground = ROOT / "data" / "terrains" / "uneven_walk.ply"
+    made = translation.plan(
+        source, target, [clip], [ground], tmp_path / "run", named={"pelvis.speed": {}}, fps=5.0
+    )
+    assert made.experiment.rules == {"pelvis": "CapsulePelvis"}
+    assert made.experiment.parameters == {"pelvis.speed": 4.0, "leg.soften": 0.9}
+    assert made.experiment.clips[0].truth is None, "its parameters are others"
+    again = experiment.system(made.experiment)
+    assert systems.rules_of(again) == systems.rules_of(target.ik)
+    fitted = made.problem.space.unpack(made.problem.space.u0)
+    assert systems.rules_of(fitted) == systems.rules_of(target.ik)
+
+
+# Variants
+
+WITHOUT = """
+[[without]]
+name = "pelvis"
+rules = { pelvis = "CapsulePelvis" }
+[[without]]
+name = "locks"
+parameters = { lock.enabled = false, "leg.soften" = 1.0 }
+"""
+
+
+def test_variants_are_read_with_their_rules_and_parameters(tmp_path):
+    read = experiment.load_experiment(write(tmp_path, rest=WITHOUT))
+    assert read.without == (
+        ablations.Variant("pelvis", {"pelvis": "CapsulePelvis"}, {}),
+        ablations.Variant("locks", {}, {"lock.enabled": False, "leg.soften": 1.0}),
+    )
+
+
+def test_variants_are_kept_through_a_run_s_own_file(tmp_path):
+    read = experiment.load_experiment(write(tmp_path, rest=WITHOUT))
+    (tmp_path / "again.toml").write_text(run_folder.resolved(read))
+    assert experiment.load_experiment(tmp_path / "again.toml").without == read.without
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("without = 3", r"without is 3; wanted \[\[without\]\], one for each variant"),
+        ("without = [3]", r"\[\[without\]\] is 3; wanted a table"),
+        ("[[without]]\nrules = { pelvis = 'CapsulePelvis' }", "a variant without a name"),
+        ("[[without]]\nname = ' '\nparameters = { leg.soften = 1 }", "a variant without a name"),
+        ("[[without]]\nname = 3", "name is 3; wanted a text"),
+        ("[[without]]\nname = 'a'", "a: nothing is otherwise"),
+        ("[[without]]\nname = 'a'\nrules = { leg = 'TwoBone' }", "a: nothing is otherwise"),
+        ("[[without]]\nname = 'a'\nrule = 3", "unknown key 'rule'; nearest is 'rules'"),
+        ("[[without]]\nname = 'a'\nrules = 3", "rules is 3; wanted a table"),
+        ("[[without]]\nname = 'a'\nrules = { leg = 'x' }", "a: rules: leg has no rule 'x'; it has"),
+        ("[[without]]\nname = 'a'\nrules = { lg = 'x' }", "a: rules: unknown key 'lg'"),
+        (
+            "[[without]]\nname = 'a'\nparameters = { leg.softn = 1 }",
+            "a: parameters: unknown key 'leg.softn'; nearest is 'leg.soften'",
+        ),
+        (
+            "[[without]]\nname = 'a'\nparameters = { leg.soften = 'x' }",
+            "a: parameters: leg.soften is 'x'; wanted a number",
+        ),
+        (
+            "[[without]]\nname = 'all rules'\nparameters = { leg.soften = 1 }",
+            "there already is a variant named 'all rules'",
+        ),
+        (2 * "[[without]]\nname = 'a'\nparameters = { leg.soften = 1 }\n", "a variant named 'a'"),
+    ],
+)
+def test_a_wrong_variant_is_refused(tmp_path, table, said):
+    place = "top" if table.startswith("without") else "rest"
+    with pytest.raises(ValueError, match=f"experiment.toml.*{said}"):
+        experiment.load_experiment(write(tmp_path, **{place: table}))

@@ -1,0 +1,166 @@
+"""Feet that know their next foothold: nothing moves on a flat floor, and nothing ever jumps."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import jaxik
+from jaxik import HARD
+from reference import maths, poses, things
+from reference.terrain import Terrain as PlainTerrain
+from support.cases import QUICK, RIG
+from support.clips import (
+    FLAT,
+    FRAMES,
+    animate,
+    assert_close,
+    to_frames,
+    to_ik,
+    to_rig,
+    to_terrain,
+)
+from support.strides import walk
+
+JOINTS = ("hip", "knee", "ankle", "toe")
+run = jax.jit(jaxik.run, compiler_options=QUICK)
+
+
+def stepped(*tops: tuple[float, float, float]) -> PlainTerrain:
+    """Three level blocks, each from one place forward to another and at a height, m.
+
+    The last stands for those that are missing: equal shapes share a program.
+    """
+    triangles = []
+    for near, far, height in (*tops, *(tops[-1:] * 3))[:3]:
+        a, b, c, d = ([x, height, z] for x in (-2.0, 2.0) for z in (near, far))
+        triangles += [[a, b, c], [b, d, c]]
+    return PlainTerrain(maths.Y, triangles=np.array(triangles))
+
+
+# Flat floor.
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["told", "untold"])
+def test_nothing_at_all_changes_on_a_flat_floor(told: bool):
+    frames = to_frames(walk(RIG, FRAMES, told=told, heading=0.4, start=(0.3, 0.0, -0.2)))
+    legs = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
+    assert legs.max() > 0.99 * (poses.THIGH + poses.SHIN), "knees are straight, heels rise"
+    ik = to_ik({"lock.enabled": True}, "stride")
+    result = run(ik, to_rig(RIG), to_terrain(FLAT), frames)
+    assert 0.3 < np.asarray(result.trace.advanced.state.lock.locked).mean() < 0.9
+    sensed, effector = result.trace.sensed, result.trace.advanced.effector
+    assert_close(effector.target_ws, sensed.ankle_ws, 1e-9)
+    assert_close(effector.rot_ws, sensed.ankle_rot_ws, 1e-9)
+    assert np.abs(result.body.pos).max() < 1e-9
+    for joint in JOINTS:
+        came, wanted = (getattr(pose, joint) for pose in (result.pose, frames.pose))
+        np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-9, err_msg=joint)
+        assert poses.turn_angle(np.asarray(came.rot), np.asarray(wanted.rot)) < 1e-7, joint
+
+
+# The ground under a swinging foot.
+
+
+def swing(shares: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jaxik.Frame:
+    """Feet on their way from one place forward to the next, m; both may be one for each frame."""
+    frame = animate(RIG, count=1)[0]
+    frames = []
+    for share, start, end in np.broadcast(shares, last, following):
+        sideways = frame.toe.pos * [1.0, 0.0, 0.0]
+        stride = things.Stride(
+            standing=np.zeros(2),
+            last_ws=sideways + start * maths.Z,
+            next_ws=sideways + end * maths.Z,
+            share=np.full(2, share),
+            known=np.ones(2),
+        )
+        ahead = maths.lerp(start, end, maths.smooth01(share)) - frame.toe.pos[0, 2]
+        root = frame.world_from_model._replace(pos=ahead * maths.Z)
+        frames.append(dataclasses.replace(frame, stride=stride, world_from_model=root))
+    return to_frames(frames)
+
+
+@functools.partial(jax.jit, compiler_options=QUICK)
+def heights(ground: Any, frames: jaxik.Frame) -> jax.Array:
+    """Ground under the left ankle as the probe of `stride` tells it, m (frames)."""
+    ik, rig = to_ik({}, "stride"), to_rig(RIG)
+
+    def look(frame: jaxik.Frame) -> jax.Array:
+        contact = ik.contact.sense(frame, HARD)
+        seen = ik.probe.sense(rig, ground, frame, contact, ik.target.foot_height, HARD)
+        return seen.ankle.point[0, 1]
+
+    return jax.vmap(look)(frames)
+
+
+STEP_UP = stepped((-3.0, 0.3, 0.0), (0.3, 3.0, 0.25))
+STEP_DOWN = stepped((-3.0, 0.5, 0.25), (0.5, 3.0, 0.0))
+HURDLE = stepped((-3.0, 0.35, 0.0), (0.35, 0.45, 0.2), (0.45, 3.0, 0.0))
+CLIFF = stepped((-3.0, 0.5, 0.0), (0.5, 3.0, -0.8))
+FINE = np.linspace(0.0, 1.0, 801)
+
+
+@pytest.mark.parametrize(
+    ("ground", "end", "highest"),
+    [(STEP_UP, 0.25, 0.25), (STEP_DOWN, 0.0, 0.25), (HURDLE, 0.0, 0.2)],
+    ids=["up", "down", "over a hurdle"],
+)
+def test_the_ground_of_a_swing_does_not_jump_and_leads_to_the_next_foothold(ground, end, highest):
+    height = np.asarray(heights(to_terrain(ground), swing(FINE)))
+    assert height[-1] == pytest.approx(end, abs=1e-12)
+    assert 0.1 < height.max() <= highest + 1e-12
+    coarse, fine = (np.abs(np.diff(height[::step])).max() for step in (8, 1))
+    assert coarse < 0.02 and fine < coarse / 6, "where it jumped, both would be as large"
+
+
+def test_a_cliff_is_not_followed_and_its_edge_is_not_felt():
+    assert np.abs(heights(to_terrain(CLIFF), swing(FINE))).max() == 0.0
+    along_edge = swing(np.full(801, 0.6), following=np.linspace(0.4, 0.6, 801))
+    assert np.abs(heights(to_terrain(CLIFF), along_edge)).max() == 0.0
+
+
+def test_a_step_loses_its_say_by_and_by_as_it_grows_too_high():
+    """Between 0.6 and 0.7 m down, the foot comes back to the height of its last ground."""
+    drops, arrived = np.linspace(0.5, 0.8, 61), swing(np.full(801, 1.0))
+    grounds = [to_terrain(stepped((-3.0, 0.5, 0.0), (0.5, 3.0, -drop))) for drop in drops]
+    height = np.array([heights(ground, arrived)[0] for ground in grounds])
+    followed, lost = drops < 0.6, drops > 0.7 + 1e-9
+    np.testing.assert_allclose(height[followed], -drops[followed], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(height[lost], 0.0, rtol=0, atol=1e-12)
+    assert np.abs(np.diff(height)).max() < 0.06, "0.6 m within 0.1 m, at most half as fast again"
+
+
+# Feet that stand.
+
+
+def drifting_walk() -> jaxik.Frame:
+    """A walk whose standing feet slip sideways while their heels rise."""
+    frames = []
+    for index, frame in enumerate(walk(RIG, FRAMES)):
+        root = frame.world_from_model
+        slipped = root._replace(pos=root.pos + 0.08 * index / 60 * maths.X)
+        frames.append(dataclasses.replace(frame, world_from_model=slipped))
+    return to_frames(poses.with_speeds(frames))
+
+
+def ball_slip(hold_ball: bool) -> np.ndarray:
+    """How far a locked foot's solved ball moves along the ground in a frame, m."""
+    values = {"lock.enabled": True, "lock.hold_ball": hold_ball, "lock.lock_half_life": 0.0}
+    frames = drifting_walk()
+    result = run(to_ik(values, "stride"), to_rig(RIG), to_terrain(FLAT), frames)
+    ball = jax.vmap(lambda root, ball: root.apply(ball))(
+        frames.world_from_model, result.pose.toe.pos
+    )
+    locked = np.asarray(result.trace.advanced.state.lock.locked) > 0
+    held = locked[1:] & locked[:-1] & (np.asarray(result.reached) > 0)[1:]
+    assert held.mean() > 0.3
+    return np.linalg.norm(np.diff(ball, axis=0)[..., [0, 2]], axis=-1)[held]
+
+
+def test_a_locked_ball_does_not_slide_while_the_heel_rises():
+    assert ball_slip(hold_ball=True).max() < 1e-9
+    assert ball_slip(hold_ball=False).max() > 1e-3, "as a locked ankle lets it"

@@ -1,0 +1,283 @@
+"""What every number, switch and mask of the other systems does, and its slope."""
+
+from typing import Any
+
+import jax
+import pytest
+
+from jaxik import HARD, Smooth
+from support.cases import (
+    ANKLE_DEEP,
+    DESCENT,
+    KINK,
+    RAMP_UP,
+    Case,
+    assert_effect,
+    assert_slope,
+    has_slope,
+    run_case,
+)
+from support.clips import FLAT, planes, to_ik
+
+NONE, ALL = 0xFFFFFFFE, 0xFFFFFFFF  # masks without and with the layer of the planes
+KEPT = {"root.enabled": False}
+STIFF = {"pelvis.enabled": False}
+FREE = {"lock.plant": False}
+FIXED = {"probe.by_height": False}
+IDLE = {"contact.idle_speed": 1.0}  # at a walk
+FOLLOWS = IDLE | {"effector.latch": False}
+RAISED, LOWERED = planes((0, 0, 0.1)), planes((0, 0, -0.3))
+HIGH, LOW, LOWER = planes((0, 0, 0.4)), planes((0, 0, -0.22)), planes((0, 0, -0.5))
+RIGHT_KINK = planes((0, 0, 0), (0, -0.5, -0.065))  # rises 0.03 m to the right of the right ankle
+
+
+def roots(**base: Any) -> tuple[Case, ...]:
+    """A character that looks for its own ground; whether a ray finds it has no slope."""
+    return (
+        Case("root.enabled", "standing", RAISED, (False, True), "root height", 1),
+        Case(
+            "root.ray_up",
+            "standing",
+            planes((0, 0, 0.5)),
+            (0.3, 0.8),
+            "root height",
+            1,
+            base,
+            slope=False,
+        ),
+        Case("root.ray_down", "standing", LOWER, (0.3, 0.8), "root height", -1, base, slope=False),
+        Case("root.layers", "standing", RAISED, (NONE, ALL), "root height", 1, base),
+    )
+
+
+def legs(low: Any, **base: Any) -> tuple[Case, ...]:
+    """What every two-bone leg has; `low` is ground out of its reach."""
+    base = STIFF | base
+    return (
+        Case("leg.soften", "standing", low, (0.85, 0.95), "knee angle", 1, base),
+        Case("leg.twist", "standing", FLAT, (0.0, 0.2), "knee left", -1, base),
+        Case("leg.weight", "standing", RAISED, (0.3, 0.8), "miss", -1, base),
+    )
+
+
+# The knee of a leg whose aim leans forward: the hint's height counts once it stands aside.
+ASIDE = (0.1, 0.0, 0.0)
+
+CASES: dict[str, tuple[Case, ...]] = {
+    "ozz": (
+        *roots(),
+        Case("probe.ray_up", "standing", HIGH, (0.2, 0.6), "target height", 1, KEPT, slope=False),
+        Case(
+            "probe.ray_down", "standing", LOWER, (0.3, 0.8), "target height", -1, KEPT, slope=False
+        ),
+        Case("probe.layers", "standing", RAISED, (NONE, ALL), "target height", 1, KEPT),
+        Case("target.foot_height", "standing", FLAT, (0.05, 0.1), "target height", 1),
+        Case("target.max_slope", "standing", planes((1.0, 0, 0)), (0.3, 0.6), "target height", 1),
+        Case("pelvis.enabled", "standing", LOWERED, (False, True), "pelvis height", -1, KEPT),
+        Case("pelvis.limit", "standing", LOWER, (0.1, 0.2), "pelvis height", -1, KEPT),
+        Case("pelvis.on_gain", "goes forward", RAMP_UP, (0.1, 0.3), "pelvis height", 1, KEPT),
+        Case(
+            "pelvis.off_gain",  # counts by how much no foot stands
+            "goes forward",
+            RAMP_UP,
+            (0.05, 0.2),
+            "pelvis height",
+            1,
+            KEPT | {"leg.weight": 0.5, "pelvis.on_gain": 0.1},
+        ),
+        Case(
+            "pelvis.tick_hz",
+            "goes forward",
+            RAMP_UP,
+            (30.0, 60.0),
+            "pelvis height",
+            1,
+            KEPT | {"pelvis.on_gain": 0.1},
+        ),
+        *legs(LOWERED, **KEPT),
+        Case("leg.enabled", "standing", RAISED, (False, True), "miss", -1, KEPT | STIFF),
+        Case("foot.enabled", "standing", planes((0.3, 0, 0)), (False, True), "pitch", 1),
+        # The turned foot brings the ray's start to the side that the offset has left.
+        Case("foot.offset[0]", "standing", FLAT, ((0, 0, 0), (0.1, 0, 0)), "left roll", 1),
+        Case("foot.offset[2]", "standing", FLAT, ((0, 0, 0), (0, 0, 0.1)), "pitch", 1),
+        Case("foot.twist", "standing", FLAT, (0.0, 0.2), "yaw", 1),
+        Case("foot.weight", "standing", planes((0.3, 0, 0)), (0.3, 0.8), "pitch", 1),
+    ),
+    "unreal": (
+        *roots(**{"root.enabled": True}),
+        Case("probe.ray_up", "standing", HIGH, (0.2, 0.6), "target height", 1, slope=False),
+        Case(
+            "probe.ray_down",
+            "standing",
+            planes((0, 0, -0.4)),
+            (0.2, 0.6),
+            "target height",
+            -1,
+            slope=False,
+        ),
+        Case("probe.layers", "standing", RAISED, (NONE, ALL), "target height", 1),
+        Case("contact.idle_speed", "goes forward", RAISED, (0.4, 0.8), "target height", 1),
+        Case("target.adjust", "standing", FLAT, (0.0, 0.05), "target height", 1),
+        Case("pelvis.enabled", "standing", LOWERED, (False, True), "pelvis height", -1),
+        Case("pelvis.speed", "goes forward", DESCENT, (2.0, 6.0), "pelvis height", -1, FOLLOWS),
+        Case("pelvis.half_height", "standing", LOWERED, (0.8, 1.0), "half height", 1),
+        Case("effector.speed", "goes forward", RAMP_UP, (2.0, 6.0), "target height", 1, FOLLOWS),
+        Case("effector.latch", "goes forward", RAMP_UP, (False, True), "target height", -1, IDLE),
+        Case(
+            "effector.latch_distance",  # stops that far short of a ground it rises to
+            "stops",
+            planes((0, 0, 0.3)),
+            (0.005, 0.05),
+            "target height",
+            -1,
+            {"contact.idle_speed": 0.1},
+        ),
+        Case("effector.mesh_scale", "standing", RAISED, (0.8, 1.25), "target height", -1),
+        Case("leg.max_knee_angle", "standing", LOWERED, (2.6, 2.8), "knee angle", 1, STIFF),
+        Case("leg.min_knee_angle", "standing", planes((0, 0, 0.5)), (0.9, 1.2), "knee angle", 1),
+        Case(
+            "leg.as_animated",
+            "standing",
+            FLAT,
+            (False, True),
+            "knee angle",
+            1,
+            STIFF | {"leg.max_knee_angle": 2.2},
+        ),
+        *legs(LOWERED),
+    ),
+    "mec": (
+        *roots(**{"root.enabled": True}),
+        Case("probe.active", "standing", RAISED, (False, True), "target height", 1),
+        Case(
+            "probe.ray_up",
+            "standing",
+            planes((0, 0, 0.3)),
+            (0.1, 0.5),
+            "target height",
+            1,
+            slope=False,
+        ),
+        Case("probe.extra", "standing", LOW, (0.1, 0.3), "target height", -1, FIXED),
+        Case("probe.extra_max", "standing", LOW, (0.1, 0.3), "target height", -1),
+        Case(
+            "probe.extra_min",
+            "standing",
+            LOW,
+            (0.1, 0.3),
+            "target height",
+            -1,
+            {"probe.stable_height": 0.0},
+        ),
+        Case("probe.stable_height", "standing", LOW, (0.05, 0.12), "target height", -1),
+        Case(
+            "probe.stable_speed",
+            "goes forward",
+            LOW,
+            (0.4, 0.8),
+            "target height",
+            -1,
+            FIXED | {"probe.by_speed": True},
+        ),
+        Case(
+            "probe.by_height",  # an unstable foot looks less far, and loses the ground
+            "standing",
+            LOW,
+            (False, True),
+            "target height",
+            1,
+            {"probe.stable_height": 0.0},
+        ),
+        Case(
+            "probe.by_speed",
+            "goes forward",
+            LOW,
+            (False, True),
+            "target height",
+            1,
+            FIXED | {"probe.stable_speed": 0.3},
+        ),
+        Case("probe.layers", "standing", RAISED, (NONE, ALL), "target height", 1),
+        Case("probe.foot_length", "standing", KINK, (0.25, 0.35), "pitch", 1),
+        Case("probe.half_width", "standing", RIGHT_KINK, (0.04, 0.06), "roll", -1),
+        Case("target.foot_height", "standing", FLAT, (0.08, 0.12), "target height", 1),
+        Case("lock.plant", "drifts slowly", FLAT, (False, True), "slip", -1),
+        Case("lock.plant_weight", "drifts slowly", FLAT, (0.2, 0.8), "slip", -1),
+        Case(
+            "lock.plant_speed",  # planting that was off holds the feet back the sooner
+            "drifts slowly",
+            FLAT,
+            (0.5, 2.0),
+            "target left",
+            -1,
+            before={"lock.plant_weight": 0.0},
+        ),
+        Case("pelvis.enabled", "standing", LOW, (False, True), "pelvis height", -1),
+        Case("pelvis.min_length", "standing", HIGH, (0.45, 0.55), "pelvis height", 1),
+        Case("pelvis.max_length", "standing", LOW, (0.8, 0.85), "pelvis height", 1),
+        Case("pelvis.damp", "goes forward", DESCENT, (False, True), "pelvis height", 1, FREE),
+        Case("pelvis.speed", "goes forward", DESCENT, (2.0, 6.0), "pelvis height", -1, FREE),
+        Case("effector.transition_time", "lifts its feet", FLAT, (0.2, 0.6), "weight", 1),
+        Case("leg.hint_offset[0]", "standing", FLAT, ((0, 0, 0), ASIDE), "knee left", 1),
+        Case("leg.hint_offset[1]", "standing", FLAT, (ASIDE, (0.1, 0.2, 0)), "knee left", -1),
+        Case("leg.hint_offset[2]", "standing", FLAT, (ASIDE, (0.1, 0, 0.2)), "knee left", -1),
+        *legs(LOW),
+        Case("foot.max_tilt", "standing", planes((0.8, 0, 0)), (0.3, 0.5), "pitch", 1),
+    ),
+}
+# What the other rules of a system do not ask for: its cases are those of the record.
+INERT: dict[str, tuple[Case, ...]] = {
+    "ozz": (
+        Case("probe.use_toe", "standing", KINK, (False, True), "everything", 0),
+        Case(
+            "probe.toe_ls",
+            "standing",
+            KINK,
+            ((0, -0.07, 0.2), (0, -0.07, 0.3)),
+            "everything",
+            0,
+            {"probe.use_toe": True},
+        ),
+        Case("pelvis.vertical_only", "standing", ANKLE_DEEP, (False, True), "everything", 0),
+        # Along the ray.
+        Case("foot.offset[1]", "standing", KINK, ((0, 0, 0), (0, 0.1, 0)), "everything", 0),
+    ),
+    "unreal": (),
+    "mec": (),
+}
+
+
+def listed(cases: dict[str, tuple[Case, ...]]) -> Any:
+    each = [(preset, case) for preset in cases for case in cases[preset]]
+    names = [f"{preset} {case.name}" for preset, case in each]
+    return pytest.mark.parametrize(("preset", "case"), each, ids=names)
+
+
+SLOPED = {
+    preset: tuple(case for case in cases if has_slope(case, preset))
+    for preset, cases in CASES.items()
+}
+
+
+@pytest.mark.parametrize("preset", CASES)
+def test_every_number_switch_and_mask_of_a_system_has_a_case(preset: str):
+    paths = jax.tree_util.tree_leaves_with_path(to_ik({}, preset))
+    leaves = {jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths}
+    assert {case.leaf for case in CASES[preset] + INERT[preset]} == leaves
+
+
+@listed(CASES)
+def test_a_leaf_moves_the_result_the_way_it_should(preset: str, case: Case):
+    assert_effect(case, preset)
+
+
+@listed(INERT)
+def test_a_leaf_that_no_rule_of_the_system_asks_for_changes_nothing(preset: str, case: Case):
+    before, after = (run_case(case, value, preset)[0] for value in case.values)
+    assert after == pytest.approx(before, abs=1e-9)
+
+
+@listed(SLOPED)
+@pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
+def test_a_numbers_slope_is_its_difference_quotient(preset: str, case: Case, gate: Any):
+    assert_slope(case, preset, gate)

@@ -1,0 +1,353 @@
+"""Clips, grounds and rigs for the tests of the pipeline, and the way from the reference's to ours.
+
+Clips have `FRAMES` frames, two legs and grounds of three planes unless a test asks for another:
+equal shapes share one compiled program.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxik
+from jaxik.maths import parameter_tree
+from jaxik.stages import contact, pelvis
+from jaxik.world import terrain
+from reference import maths, poses, things
+from reference import record as reference
+from reference.terrain import LegTerrains
+from reference.terrain import Terrain as PlainTerrain
+
+FRAMES = 240
+HZ = 60.0
+ODD: dict[str, Any] = {  # every parameter away from its default
+    "contact.ground_height": 0.01,
+    "contact.planted_height": 0.095,
+    "contact.raised_height": 0.15,
+    "probe.ray_up": 0.4,
+    "probe.ray_down": 0.42,
+    "probe.toe_ls": [0.02, -0.05, 0.18],
+    "target.min_ankle_height": 0.05,
+    "target.max_ankle_height": 0.24,
+    "target.foot_height": 0.07,
+    "target.max_slope": 0.3,
+    "target.rise_half_life": 0.03,
+    "target.fall_half_life": 0.06,
+    "target.spring": True,
+    "lean.forward_rate": 0.5,
+    "lean.side_rate": -0.4,
+    "lean.forward_rate_slide": -0.6,
+    "lean.side_rate_slide": 0.7,
+    "lean.gain": 0.3,
+    "lean.gain_slide": 0.5,
+    "lean.slide_on_gain": 0.3,
+    "lean.slide_off_gain": 0.2,
+    "lean.spring": True,
+    "lock.release_min_angle": 1.2,
+    "lock.release_max_angle": 2.9,
+    "lock.release_cone": 0.2,
+    "lock.release_distance": 0.12,
+    "lock.relock_threshold": 0.4,
+    "lock.max_speed": 0.9,
+    "lock.hold_ball": True,
+    "lock.release_heading": 0.15,
+    "lock.release_speed": 1.2,
+    "lock.lock_half_life": 0.02,
+    "lock.unlock_half_life": 0.07,
+    "pelvis.limit": 0.05,
+    "pelvis.on_gain": 0.3,
+    "pelvis.off_gain": 0.15,
+    "pelvis.vertical_only": False,
+    "leg.max_knee_angle": 2.8,
+    "leg.min_knee_angle": 1.6,
+    "leg.soften": 0.94,
+    "leg.twist": 0.1,
+    "leg.as_animated": True,
+    "leg.weight": 0.9,
+    "foot.max_pitch": 0.1,
+    "foot.min_pitch": -0.15,
+    "foot.max_roll": 0.08,
+    "foot.min_roll": -0.1,
+}
+
+
+def to_transform(t: reference.Transform) -> jaxik.Transform:
+    return jaxik.Transform(jnp.asarray(t.pos), jnp.asarray(t.rot))
+
+
+def to_rig(rig: reference.Rig) -> jaxik.Rig:
+    legs = len(rig.side)
+    ones = jnp.ones(legs)
+    return jaxik.Rig(
+        knee_axis_ls=jnp.asarray(rig.knee_axis_ls),
+        ankle_from_foot=jnp.asarray(rig.ankle_from_foot),
+        thigh=ones * poses.THIGH,
+        shin=ones * poses.SHIN,
+        foot=ones * 0.15,
+        side=jnp.asarray(rig.side, float),
+        present=jnp.ones(legs, bool),
+        names=tuple(f"leg {leg}" for leg in range(legs)),
+        joints=tuple((4 * leg, 4 * leg + 1, 4 * leg + 2, 4 * leg + 3) for leg in range(legs)),
+        pelvis=4 * legs,
+    )
+
+
+def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
+    """The frames stacked on a leading axis."""
+
+    def stacked(rows: Iterable[np.ndarray]) -> jax.Array:
+        return jnp.asarray(np.stack(list(rows)))
+
+    def transform(name: str) -> jaxik.Transform:
+        each = [getattr(frame, name) for frame in frames]
+        return to_transform(
+            reference.Transform(np.stack([t.pos for t in each]), np.stack([t.rot for t in each]))
+        )
+
+    return jaxik.Frame(
+        world_from_model=transform("world_from_model"),
+        pose=jaxik.LegPose(*map(transform, ("hip", "knee", "ankle", "toe"))),
+        weight=stacked(frame.weight for frame in frames),
+        slide=jnp.asarray([float(frame.slide) for frame in frames]),
+        velocity_ws=stacked(frame.travel_ws for frame in frames),
+        foot_speed=stacked(frame.foot_speed for frame in frames),
+        toe_speed=stacked(frame.toe_speed for frame in frames),
+        stride=jaxik.world.frame.Stride(
+            **{
+                field.name: stacked(getattr(frame.stride, field.name) for frame in frames)
+                for field in dataclasses.fields(things.Stride)
+            }
+        ),
+        dt=jnp.asarray([float(frame.dt) for frame in frames]),
+        platform=transform("platform"),
+    )
+
+
+def by_speed() -> jaxik.FootIK:
+    """`stride` with the rules for animations without labels, and the other pelvis."""
+    rules = {"contact": contact.SpeedContact(), "pelvis": pelvis.SupportPelvis()}
+    return dataclasses.replace(jaxik.presets.stride(), **rules)
+
+
+BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
+
+
+def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
+    """The preset or the blend of that name with other values."""
+    return parameter_tree.replace((BLENDS.get(preset) or getattr(jaxik.presets, preset))(), values)
+
+
+def to_terrain(ground: PlainTerrain) -> terrain.Terrain:
+    surfaces = [
+        terrain.plane(point, normal, up=ground.up, layer=layer)
+        for (point, normal), layer in zip(ground.planes, ground.plane_layers, strict=True)
+    ]
+    if len(ground.triangles):
+        vertices = np.asarray(ground.triangles).reshape(-1, 3)
+        triangles = np.arange(len(vertices)).reshape(-1, 3)
+        layers = np.asarray(ground.triangle_layers)
+        surfaces.append(terrain.mesh(vertices, triangles, up=ground.up, layer=layers))
+    return terrain.combine(*surfaces)
+
+
+def to_leg_terrains(ground: LegTerrains) -> terrain.LegTerrains:
+    return terrain.LegTerrains(to_terrain(ground.body), tuple(map(to_terrain, ground.legs)))
+
+
+def make_rig(seed: int = 0, legs: int = 2) -> reference.Rig:
+    """Joint spaces drawn at random."""
+    return poses.make_rig(np.random.default_rng(seed), legs)
+
+
+def planes(*tilts: tuple[float, float, float]) -> PlainTerrain:
+    """Three planes, each given by how steeply it rises forward and left, and its height, m.
+
+    Those that are missing are the last, each 100 m further down: of two planes that are one, which
+    has the slope is a matter of rounding. Rays meet the highest below their start.
+    """
+    listed = (*tilts, *((*tilts[-1][:2], tilts[-1][2] - deep) for deep in (100.0, 200.0)))[:3]
+    return PlainTerrain(
+        maths.Y,
+        planes=[
+            (np.array([0.0, height, 0.0]), np.array([-left, 1.0, -forward]))
+            for forward, left, height in listed
+        ],
+    )
+
+
+FLAT = planes((0.0, 0.0, 0.0))
+BROKEN = planes((0.2, 0.0, 0.0), (-0.25, 0.3, -0.3), (0.0, -0.35, -0.95))  # `wandering` meets two
+
+
+def animate(
+    rig: reference.Rig,
+    ankles: Any = None,
+    *,
+    count: int = FRAMES,
+    hz: float = HZ,
+    hip_height: Any = 0.90,
+    place: Any = (0.0, 0.0, 0.0),
+    heading: Any = 0.0,
+    foot: Any = 0.0,
+    slide: Any = 0.0,
+    weight: Any = 1.0,
+    platform: Any = poses.STILL,
+) -> list[reference.Frame]:
+    """Frames of two legs from what may each be a number, or a function of time, s.
+
+    Args:
+        rig: joint spaces.
+        ankles: (legs, 3), m, model space; standing unless given.
+        count: frames.
+        hz: frames a second.
+        hip_height: m.
+        place: root in the world, m.
+        heading: of the root about up, rad.
+        foot: pitch of the feet, rad, toes up.
+        slide: 0..1.
+        weight: 0..1, one for both legs or one each.
+        platform: world_from_platform.
+    """
+
+    def at(x: Any, time: float) -> Any:
+        return x(time) if callable(x) else x
+
+    frames = []
+    for index in range(count):
+        time = index / hz
+        root = reference.Transform(
+            np.asarray(at(place, time), float), maths.turn(maths.Y, at(heading, time))
+        )
+        frame = poses.make_frame(
+            rig,
+            np.asarray(at(poses.standing() if ankles is None else ankles, time), float),
+            hip_height=at(hip_height, time),
+            world_from_model=root,
+            slide=at(slide, time),
+            weight=np.broadcast_to(at(weight, time), len(rig.side)).astype(float),
+            dt=1.0 / hz,
+            platform=at(platform, time),
+        )
+        tilt = maths.turn(-maths.X, at(foot, time))
+        rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
+        frames.append(dataclasses.replace(frame, ankle=frame.ankle._replace(rot=rot)))
+    return poses.with_speeds(frames)
+
+
+def stepping(rig: reference.Rig, drift: float = 0.0, **changes: Any) -> list[reference.Frame]:
+    """A walk of 0.6 m/s: a foot rises straight, swings, and comes down straight.
+
+    While an ankle is below the raised height it does not move over the ground, but for `drift`,
+    m/s, by which the whole walk slides sideways.
+    """
+
+    def ankles(time: float) -> np.ndarray:
+        return np.array([_step(2.0 * time, leg) for leg in range(2)])
+
+    def place(time: float) -> list[float]:
+        return [drift * time, 0.0, 0.6 * time]
+
+    changes.setdefault("place", place)
+    return animate(rig, ankles, **changes)
+
+
+def _step(cycles: float, leg: int) -> list[float]:
+    cycle, phase = divmod(cycles + 0.5 * leg, 1.0)
+    swing = min(max((phase - 0.65) / 0.2, 0.0), 1.0)
+    lifted = min(max((phase - 0.5) / 0.15, 0.0), 1.0, (1.0 - phase) / 0.15)
+    stride = 0.3 * (cycle + swing - 0.5 * leg) - 0.3 * cycles + 0.05
+    return [0.1 - 0.2 * leg, poses.ANKLE + 0.12 * lifted, stride]
+
+
+def padded(frames: list, count: int = FRAMES) -> list:
+    """The clip made longer by its last frame."""
+    return frames + [frames[-1]] * (count - len(frames))
+
+
+def wandering(
+    rig: reference.Rig,
+    rng: np.random.Generator,
+    count: int = FRAMES,
+    stand: tuple[float, ...] = (),
+) -> list:
+    """A clip that meets everything: steps, drifting feet, slides, half-weighted legs, odd frame
+    times, a turning root, swinging hips, tilted feet. Its stride is told in the first half.
+
+    Between the shares `stand` of the clip (from, to, and again from, to) the root stands where it
+    is, at a speed of exactly 0, and the feet, held in their step, only sway and bob a little.
+    """
+    stands = list(zip(stand[::2], stand[1::2], strict=True))
+    legs = len(rig.side)
+    frames = []
+    heading, place, phase, stood = 0.3, np.array([-2.2, 0.0, -2.4]), 0.0, 0.0
+    for index in range(count):
+        dt = 1 / 60 if index % 97 else 1 / 30
+        sway = np.zeros(3)
+        if any(start <= index / count < end for start, end in stands):
+            stood += dt
+            sway = np.array([0.004, 0.01, 0.004]) * np.sin(np.array([5.0, 9.0, 7.0]) * stood)
+        else:
+            phase += dt / 1.05
+            heading += 0.25 * dt * np.sin(phase)
+            place = place + dt * 0.6 * np.array([np.sin(heading), 0.0, np.cos(heading)])
+        turned = maths.turn(maths.Y, heading)
+        ankles, swung = [], []
+        for leg in range(legs):
+            cycle = (phase + leg / legs) % 1.0
+            swung.append(np.clip((cycle - 0.55) / 0.4, 0.0, 1.0) % 1.0)
+            swing = np.sin(np.pi * swung[-1])
+            x = 0.1 * rig.side[leg] + 0.01 * np.sin(3.1 * phase)
+            ankle = [x, 0.08 + 0.12 * swing, 0.18 * np.cos(2 * np.pi * cycle)]
+            ankles.append(ankle + sway * (-1.0) ** leg)
+        share = index / count
+        weight = np.ones(legs)
+        if 0.67 < share < 0.73:
+            weight[0] = 0.5
+        if 0.77 < share < 0.78:
+            weight[-1] = 0.0
+        frame = poses.make_frame(
+            rig,
+            np.array(ankles),
+            hip_height=0.86 + 0.02 * np.sin(4 * np.pi * phase),
+            hinge_yaw=0.2 * np.sin(phase),
+            world_from_model=reference.Transform(place.copy(), turned),
+            weight=weight,
+            slide=float(0.3 < share < 0.5),
+            dt=dt,
+        )
+        axis = rng.normal(size=3)
+        tilt = maths.turn(axis / np.linalg.norm(axis), rng.uniform(0.0, 0.2))
+        rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
+        stride = _strides(frame, np.array(swung), known=share < 0.5)
+        ankle = frame.ankle._replace(rot=rot)
+        frames.append(dataclasses.replace(frame, ankle=ankle, stride=stride))
+    return poses.with_speeds(frames)
+
+
+def _strides(frame: reference.Frame, share: np.ndarray, known: bool) -> things.Stride:
+    """Strides of half a metre forward, of which each foot has come the share (legs)."""
+    balls = np.array([maths.apply(frame.world_from_model, pos) for pos in frame.toe.pos])
+    forward = 0.5 * maths.rotate(frame.world_from_model.rot, maths.Z)
+    return things.Stride(
+        standing=(share == 0.0).astype(float),
+        last_ws=balls - share[:, None] * forward,
+        next_ws=balls + (1.0 - share[:, None]) * forward,
+        share=share,
+        known=np.full(len(share), float(known)),
+    )
+
+
+def at(tree: Any, index: Any) -> Any:
+    """The rows of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def assert_close(came: Any, wanted: Any, tolerance: float) -> None:
+    """Every leaf of two equal trees within `tolerance`; NaN is never close."""
+    paths = jax.tree_util.tree_leaves_with_path(wanted)
+    for (path, b), a in zip(paths, jax.tree.leaves(came), strict=True):
+        name = jax.tree_util.keystr(path)
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, equal_nan=False, err_msg=name)
