@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fitting.report.fit_plots import WORDS
+from fitting.report.plots.fit_plots import WORDS
 from fitting.report.tables import share
 
 from .playback import Playback

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from fitting.report.style import STAGES, styled
+from fitting.report.plots.style import STAGES, styled
 
 from .measure import Series
 

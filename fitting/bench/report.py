@@ -10,7 +10,8 @@ from typing import Any
 
 import jax
 
-from fitting.report import style, tables
+from fitting.report import tables
+from fitting.report.plots import style
 from fitting.runtime import files
 from fitting.runtime.threads import cores
 

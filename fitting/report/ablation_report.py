@@ -18,8 +18,9 @@ from fitting.experiments.experiment import Experiment
 from fitting.runtime import files
 from fitting.studies.ablation import Row
 
-from . import style, tables
-from .style import AFTER, CAPTURED, STAGES, legend, styled
+from . import tables
+from .plots import style
+from .plots.style import AFTER, CAPTURED, STAGES, legend, styled
 from .tables import Table, markdown
 
 TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"

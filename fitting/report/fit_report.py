@@ -19,7 +19,8 @@ from fitting.runtime.validation import flat, read_toml
 from fitting.studies import run_folder
 from fitting.studies.study import Fit
 
-from . import fit_plots, posterior_plots, style, tables, worst_window_plots
+from . import tables
+from .plots import fit_plots, posterior_plots, style, worst_window_plots
 from .tables import Truth, markdown
 
 HEADING = "## Posterior"  # what follows it in summary.md is of `write_posterior`

@@ -12,7 +12,7 @@ from fitting.datasets.terrain.reconstruction import KINDS, Ground
 from fitting.datasets.terrain.surfaces import Blocks, Plane, Smooth
 from fitting.runtime import files
 
-from . import style, terrain_plots
+from .plots import style, terrain_plots
 from .tables import Table, span
 
 NUMBERS, FIGURE = ".json", ".png"  # beside the mesh, under its name

@@ -16,8 +16,9 @@ from fitting.studies.study import Fit
 from fitting.studies.translation import Translation
 from jaxik.maths import parameter_tree
 
-from . import fit_report, style, tables
-from .difference_plots import difference as draw
+from . import fit_report, tables
+from .plots import style
+from .plots.difference_plots import difference as draw
 
 NUMBERS = "translation.json"
 

@@ -19,7 +19,8 @@ from fitting.datasets.clips.clip import Clip
 from fitting.experiments import parameter_files
 from fitting.experiments.experiment import check_shapes
 from fitting.experiments.systems import leaf_names, name_preset
-from fitting.report import comparison_plots, style, tables
+from fitting.report import tables
+from fitting.report.plots import comparison_plots, style
 from fitting.runtime import files, program_cache
 from fitting.runtime.validation import located
 from jaxik.maths import parameter_tree, vec

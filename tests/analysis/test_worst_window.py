@@ -10,8 +10,8 @@ from fitting.analysis import worst_window
 from fitting.analysis.playback import KINDS, Motion, Playback
 from fitting.analysis.worst_window import find_worst
 from fitting.problem.residuals import Sigmas
-from fitting.report import worst_window_plots
-from fitting.report.style import save
+from fitting.report.plots import worst_window_plots
+from fitting.report.plots.style import save
 
 FPS, FRAMES = 30.0, 300
 LEGS = ("left", "right")

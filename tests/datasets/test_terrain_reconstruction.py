@@ -16,7 +16,7 @@ from fitting.datasets.synthetic import gait
 from fitting.datasets.terrain import blocks, mesh_files, reconstruction, surfaces
 from fitting.datasets.terrain.blocks import Footprints, Grid
 from fitting.datasets.terrain.reconstruction import Prediction
-from fitting.report import style
+from fitting.report.plots import style
 from jaxik.world import terrain
 from support.clips_made import walker
 from support.experiments import ROOT

@@ -15,7 +15,7 @@ from fitting.cli import main
 from fitting.datasets import clips
 from fitting.datasets.clips import edit
 from fitting.datasets.flat_animation import load_base
-from fitting.report import comparison_plots, style
+from fitting.report.plots import comparison_plots, style
 from fitting.runtime import program_cache
 from fitting.studies import comparison
 from jaxik.world import terrain

@@ -1,0 +1,1 @@
+"""Pictures: each function draws one matplotlib figure. `style` has what they share."""
