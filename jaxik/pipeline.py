@@ -26,7 +26,7 @@ from jaxik.stages.pelvis import AbstractPelvis
 from jaxik.stages.probe import AbstractProbe, foot_heading
 from jaxik.stages.root import AbstractRoot
 from jaxik.stages.target import AbstractTarget
-from jaxik.world.frame import Contact, Frame, Sensed, animated
+from jaxik.world.frame import Contact, Frame, Sensed, animated_ankles
 from jaxik.world.skeleton import LegPose, Rig, Transform, bone_lengths
 from jaxik.world.terrain import LegTerrains, Terrain
 
@@ -126,7 +126,7 @@ def sense(
     weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
     with jax.named_scope("root"):
         root_ws = vec.scale(terrain.up_ws, ik.root.sense(terrain, frame))
-        frame = frame.moved(root_ws)
+        frame = frame.translated(root_ws)
     with jax.named_scope("probe"):
         ground = ik.probe.sense(rig, terrain, frame, contact, ik.target.foot_height, gate)
     with jax.named_scope("target"):
@@ -136,7 +136,7 @@ def sense(
     with jax.named_scope("foot"):
         rot_ws = ik.foot.sense(rig, frame, up, ground, gate)
     thigh, shin = bone_lengths(frame.pose)
-    ankle = animated(frame)
+    ankle = animated_ankles(frame)
     return Sensed(
         up_ws=terrain.up_ws,
         leg_up_ws=up,
@@ -208,7 +208,7 @@ def pose(
     effector = advanced.effector
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
-        carried = frame.pose.moved(body.copies(rig.side.size))
+        carried = frame.pose.transformed(body.repeat(rig.side.size))
         bend = ik.leg.pose(rig, frame, sensed, carried, target_ms, effector.weight, gate)
     with jax.named_scope("foot"):
         planted = ik.foot.pose(rig, frame, sensed, effector, bend, gate)
@@ -240,8 +240,8 @@ def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform
     """The body's move in model space: a turn about the middle of the hips, then an offset."""
     into_model = quat.conjugate(frame.world_from_model.rot)
     present = rig.present.astype(offset_ws.dtype)
-    share = present / jnp.maximum(vec.total(present), 1.0)
-    pivot = vec.fence(vec.total_of(vec.scale(frame.pose.hip.pos, share)))
+    share = present / jnp.maximum(vec.sum_last(present), 1.0)
+    pivot = vec.barrier(vec.sum_vectors(vec.scale(frame.pose.hip.pos, share)))
     turn = quat.multiply(into_model, quat.multiply(turn_ws, quat.conjugate(into_model)))
     offset = quat.rotate(into_model, offset_ws)
     return Transform(pivot + offset - quat.rotate(turn, pivot), turn)

@@ -68,7 +68,7 @@ def measure(ik: jaxik.FootIK, scene: Scene) -> Difference:
 def correction_of(scene: Scene) -> dict[str, np.ndarray]:
     """How far the scene's reference is from its animation, by kind, m or rad."""
     world = scene.frames.world_from_model
-    animated = scene.frames.pose.moved(Transform(world.pos[:, None], world.rot[:, None]))
+    animated = scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
     return _apart(scene, world @ scene.pelvis, animated)
 
 

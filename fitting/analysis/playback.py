@@ -107,7 +107,7 @@ def play(ik: jaxik.FootIK, scene: Scene) -> Playback:
 def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
     result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
-    animated, solved = scene.frames.pose.moved(_per_leg(world)), legs_ws(scene, result)
+    animated, solved = scene.frames.pose.transformed(_per_leg(world)), legs_ws(scene, result)
     base, carried = world @ scene.pelvis, pelvis_ws(scene, result)
     # The reference knows no hips and toes: they hang on the pelvis and the ankles as in the base.
     hips = _per_leg(reference.pelvis).apply(_per_leg(base).inverse().apply(animated.hip.pos))

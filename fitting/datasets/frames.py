@@ -69,7 +69,7 @@ def _out_of(
     world: jaxik.Transform, body: jaxik.Transform, pose: jaxik.LegPose
 ) -> tuple[jaxik.Transform, jaxik.LegPose]:
     """The body's move and the legs of each frame in world space."""
-    return world @ body @ world.inverse(), pose.moved(world)
+    return world @ body @ world.inverse(), pose.transformed(world)
 
 
 def _velocity(places: np.ndarray, fps: float) -> np.ndarray:

@@ -59,7 +59,7 @@ def turn_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Arra
 def legs_ws(scene: Scene, result: jaxik.Result) -> jaxik.LegPose:
     """The solved legs, (frames legs), world space."""
     world = scene.frames.world_from_model
-    return result.pose.moved(Transform(world.pos[:, None], world.rot[:, None]))
+    return result.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
 
 
 def errors_of(scene: Scene, result: jaxik.Result) -> dict[str, Array]:

@@ -129,7 +129,7 @@ def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
     given, rate = jnp.asarray(gain), jnp.asarray(tick_hz)
     readings = {"half_life": float(smoothing.half_life_of_gain(given, rate))}
     for hz in TICKS:
-        share = smoothing.share_of_gain(given, jnp.asarray(1.0 / hz), rate)
+        share = smoothing.fraction_of_gain(given, jnp.asarray(1.0 / hz), rate)
         readings[f"gain_at_{hz:.0f}_hz"] = float(share)
     return readings
 

@@ -36,12 +36,12 @@ class AbstractGate(eqx.Module):
         """`x` kept between `low` and `high`."""
 
     @abstractmethod
-    def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+    def minimum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
         """The smallest along the last axis."""
 
-    def largest(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        """The largest along the last axis."""
-        return -self.least(-x, band=band)
+    def maximum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+        """The maximum along the last axis."""
+        return -self.minimum(-x, band=band)
 
 
 class Hard(AbstractGate):
@@ -60,12 +60,12 @@ class Hard(AbstractGate):
         capped = jnp.where(x > high, high, x)
         return jnp.where(capped < low, low, capped)
 
-    def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+    def minimum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
         # Not jnp.min: its slope picks the branch by bitwise equality after fusion. Nor what argmin
         # points at: in reverse mode that is a loop over the batch. NaN is passed on.
         del band
         return functools.reduce(
-            lambda a, b: jnp.where((b < a) | jnp.isnan(b), b, a), vec.numbers(x)
+            lambda a, b: jnp.where((b < a) | jnp.isnan(b), b, a), vec.unstack(x)
         )
 
 
@@ -93,7 +93,7 @@ class Smooth(AbstractGate):
         over = jnp.where(open_high, 0.0, width * jax.nn.softplus((x - roof) / width))
         return above - over
 
-    def least(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
+    def minimum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
         # Counted from the smallest: at a small width `x / width` is too large for its rounding not
         # to matter, and a compiled softmax of it is NaN. The answer does not depend on the shift.
         smallest = jax.lax.stop_gradient(jnp.min(x, axis=-1, keepdims=True))

@@ -12,13 +12,13 @@ from . import vec
 
 def components(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array, Array]:
     """The w, x, y and z of `q`, each of shape `*b`."""
-    w, x, y, z = vec.numbers(q)
+    w, x, y, z = vec.unstack(q)
     return w, x, y, z
 
 
 def stack(w: Array, x: Array, y: Array, z: Array) -> Float[Array, "*b 4"]:
     """The quaternion with these components, which are broadcast against each other."""
-    return vec.joined(w, x, y, z)
+    return vec.stack(w, x, y, z)
 
 
 def identity(dtype=None) -> Float[Array, "4"]:
@@ -37,7 +37,7 @@ def multiply(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Float[Array, "
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
     )
-    return vec.fence(product)
+    return vec.barrier(product)
 
 
 def conjugate(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -57,7 +57,7 @@ def rotate(q: Float[Array, "*a 4"], v: Float[Array, "*b 3"]) -> Float[Array, "*c
         vy + w * ty + z * tx - x * tz,
         vz + w * tz + x * ty - y * tx,
     )
-    return vec.fence(turned)
+    return vec.barrier(turned)
 
 
 def axes(q: Float[Array, "*b 4"]) -> tuple[Array, Array, Array]:
@@ -82,13 +82,13 @@ def dot(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Array:
     return aw * bw + ax * bx + ay * by + az * bz
 
 
-def unit(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     """`q` at length one; the identity, with zero slope, where `q` has no direction."""
     square = dot(q, q)
     known = square > jnp.finfo(q.dtype).eps ** 2
     inverse = 1.0 / jnp.sqrt(jnp.where(known, square, 1.0))
     w, x, y, z = (jnp.where(known, part * inverse, 0.0) for part in components(q))
-    return vec.fence(stack(jnp.where(known, w, 1.0), x, y, z))
+    return vec.barrier(stack(jnp.where(known, w, 1.0), x, y, z))
 
 
 def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array, Array]:
@@ -106,31 +106,31 @@ def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array,
 
 def half_cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
     """Cosine and sine of half an angle, rad."""
-    cos, sin = vec.once(*vec.cos_sin(0.5 * angle))
+    cos, sin = vec.stacked_barrier(*vec.cos_sin(0.5 * angle))
     return cos, sin
 
 
-def from_half(
+def from_half_angle(
     axis: Float[Array, "*a 3"], half_cos: Float[Array, "*b"], half_sin: Float[Array, "*b"]
 ) -> Float[Array, "*c 4"]:
     """Turn about the unit `axis`, given the cosine and sine of half its angle."""
     x, y, z = vec.components(axis)
-    return vec.fence(stack(half_cos, x * half_sin, y * half_sin, z * half_sin))
+    return vec.barrier(stack(half_cos, x * half_sin, y * half_sin, z * half_sin))
 
 
 def from_cos_sin(
     axis: Float[Array, "*a 3"], cos: Float[Array, "*b"], sin: Float[Array, "*b"]
 ) -> Float[Array, "*c 4"]:
     """Turn about the unit `axis` by the angle with this cosine and sine, without trigonometry."""
-    return from_half(axis, *half_angle(cos, sin))
+    return from_half_angle(axis, *half_angle(cos, sin))
 
 
 def from_axis_angle(axis: Float[Array, "*a 3"], angle: Float[Array, "*b"]) -> Float[Array, "*c 4"]:
     """Turn about the unit `axis` by `angle`, rad, right-handed."""
-    return from_half(axis, *half_cos_sin(angle))
+    return from_half_angle(axis, *half_cos_sin(angle))
 
 
-@vec.recomputed
+@vec.remat
 def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     """Turn about `v` by its length, rad; smooth through zero (Taylor series there)."""
     square = vec.dot(v, v)
@@ -143,7 +143,7 @@ def from_rotvec(v: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     return stack(cos, x * half_sinc, y * half_sinc, z * half_sinc)
 
 
-def arc(
+def shortest_arc(
     a: Float[Array, "*a 3"], b: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]
 ) -> Float[Array, "*c 4"]:
     """Shortest rotation from the unit vector `a` to the unit vector `b`.
@@ -164,7 +164,7 @@ def arc(
         jnp.where(known, y * inverse, fy),
         jnp.where(known, z * inverse, fz),
     )
-    return vec.fence(turn)
+    return vec.barrier(turn)
 
 
 def nlerp(
@@ -174,20 +174,20 @@ def nlerp(
     opposed = dot(a, b) < 0
     # By components: a weight that is broadcast is summed number by number in reverse mode.
     pairs = zip(components(a), components(b), strict=True)
-    return unit(stack(*(x + (jnp.where(opposed, -y, y) - x) * weight for x, y in pairs)))
+    return normalize(stack(*(x + (jnp.where(opposed, -y, y) - x) * weight for x, y in pairs)))
 
 
-def part(q: Float[Array, "*a 4"], weight: Float[Array, "*w"]) -> Float[Array, "*c 4"]:
+def nlerp_identity(q: Float[Array, "*a 4"], weight: Float[Array, "*w"]) -> Float[Array, "*c 4"]:
     """A share of a turn, 0..1: `nlerp` from the identity."""
     w, x, y, z = components(q)
     share = jnp.where(w < 0, -weight, weight)
-    return unit(stack(1.0 - weight + w * share, x * share, y * share, z * share))
+    return normalize(stack(1.0 - weight + w * share, x * share, y * share, z * share))
 
 
-def half_part(
+def nlerp_half(
     half_cos: Float[Array, "*a"], half_sin: Float[Array, "*a"], weight: Float[Array, "*w"]
 ) -> tuple[Array, Array]:
-    """`part` of a turn about a fixed axis, by the cosine (>= 0) and sine of half its angle."""
+    """`nlerp_identity` of a turn about a fixed axis, by the cosine (>= 0) and sine of half its angle."""
     cos, sin = 1.0 - weight + half_cos * weight, half_sin * weight
     inverse = 1.0 / jnp.sqrt(cos * cos + sin * sin)
     return cos * inverse, sin * inverse

@@ -1,9 +1,9 @@
-"""Smoothing laws: how far a value moves towards its goal in `dt` seconds.
+"""Smoothing laws: how far a value moves move_towards its goal in `dt` seconds.
 
-A law gives a `share` 0..1 of the gap, and `approach` goes that share of the way. Gain and half-life
+A law gives a `share` 0..1 of the gap, and `lerp` goes that share of the way. Gain and half-life
 are the same exponential in two notations and exact at any `dt`; the clamped speed is not, and is
 kept as its engine has it; the critically damped spring is exact and also carries a velocity. A
-weight that moves at one pace (`towards`) closes its gap in steps.
+weight that moves at one pace (`move_towards`) closes its gap in steps.
 """
 
 import jax.numpy as jnp
@@ -15,13 +15,13 @@ LN2 = 0.6931471805599453
 JUMP_GAP = 1e-4  # m: gaps below it are closed at once by the clamped speed
 
 
-def approach(value: Array, goal: Array, share: Array) -> Array:
+def lerp(value: Array, goal: Array, share: Array) -> Array:
     """`value` moved by `share` (0..1) of the way to `goal`."""
     return value + share * (goal - value)
 
 
-@vec.recomputed
-def share_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
+@vec.remat
+def fraction_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
     """Share of the gap that a gain per tick of 1/`tick_hz` s closes in `dt` s; gain 1 jumps.
 
     `1 - (1 - gain)^(dt tick_hz)`; at gain 1 the slope with respect to the gain is zero.
@@ -30,14 +30,14 @@ def share_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
     return jnp.where(damped, -jnp.expm1(dt * tick_hz * jnp.log1p(-jnp.where(damped, gain, 0))), 1.0)
 
 
-@vec.recomputed
-def share_of_half_life(half_life: Array, dt: Array) -> Array:
+@vec.remat
+def fraction_of_half_life(half_life: Array, dt: Array) -> Array:
     """Share of the gap closed in `dt` s when half of it takes `half_life` s; 0 or less jumps."""
     damped = half_life > 0
     return jnp.where(damped, -jnp.expm1(-LN2 * dt / jnp.where(damped, half_life, 1.0)), 1.0)
 
 
-def share_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
+def fraction_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
     """Unreal's interp-to: `clamp(dt speed, 0, 1)`; jumps at speed 0 or less, or a gap under 0.1 mm.
 
     Depends on the frame rate: its half-life is -ln 2 dt / ln(1 - dt speed).
@@ -46,8 +46,8 @@ def share_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
     return jnp.where((speed > 0) & (jnp.abs(gap) > JUMP_GAP), share, 1.0)
 
 
-def towards(value: Array, goal: Array, step: Array) -> Array:
-    """`value` moved towards `goal` by `step` (0 or more), or as far as the goal."""
+def move_towards(value: Array, goal: Array, step: Array) -> Array:
+    """`value` moved move_towards `goal` by `step` (0 or more), or as far as the goal."""
     gap = goal - value
     return value + jnp.where(gap > step, step, jnp.where(gap < -step, -step, gap))
 
@@ -71,15 +71,15 @@ def spring(
     half_life: Array,
     dt: Array,
 ) -> tuple[Array, Array]:
-    """Value and velocity after `dt` s of a critically damped spring towards a still `goal`.
+    """Value and velocity after `dt` s of a critically damped spring move_towards a still `goal`.
 
     `x'' = -w² (x - goal) - 2 w x'` solved exactly, with `w = 2 ln 2 / half_life`; a half-life of
     0 or less jumps and stops.
     """
-    return _sprung(value, velocity, goal, share_of_half_life(half_life, dt), dt)
+    return _sprung(value, velocity, goal, fraction_of_half_life(half_life, dt), dt)
 
 
-@vec.recomputed
+@vec.remat
 def follow(
     value: Array, velocity: Array, goal: Array, share: Array, dt: Array, springy: Array
 ) -> tuple[Array, Array]:
@@ -89,7 +89,7 @@ def follow(
     the half-life of that exponential. A share of 1 jumps and stops.
     """
     sprung, speed = _sprung(value, velocity, goal, share, dt)
-    eased = approach(value, goal, share)
+    eased = lerp(value, goal, share)
     return jnp.where(springy, sprung, eased), jnp.where(springy, speed, jnp.zeros_like(speed))
 
 
@@ -118,7 +118,7 @@ def half_life_of_gain(gain: Array, tick_hz: Array) -> Array:
 
 def gain_of_half_life(half_life: Array, tick_hz: Array) -> Array:
     """Gain per tick of 1/`tick_hz` s with this half-life, s; 0 or less gives 1."""
-    return share_of_half_life(half_life, 1.0 / tick_hz)
+    return fraction_of_half_life(half_life, 1.0 / tick_hz)
 
 
 def half_life_of_speed(speed: Array, dt: Array) -> Array:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.polynomial import chebyshev
 
 
-def numbers(v: Float[Array, "*b n"]) -> tuple[Array, ...]:
+def unstack(v: Float[Array, "*b n"]) -> tuple[Array, ...]:
     """What stands on the last axis, one by one, each of shape `*b`."""
     # Split, not sliced: in reverse mode a slice is a padded array, and all of them are summed.
     parts = jax.lax.split(v, (1,) * v.shape[-1], axis=v.ndim - 1)
@@ -26,25 +26,25 @@ def numbers(v: Float[Array, "*b n"]) -> tuple[Array, ...]:
 
 def components(v: Float[Array, "*b 3"]) -> tuple[Array, Array, Array]:
     """The x, y and z of `v`, each of shape `*b`."""
-    x, y, z = numbers(v)
+    x, y, z = unstack(v)
     return x, y, z
 
 
-def total(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
+def sum_last(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
     """Sum over a short last axis, such as that of the legs.
 
     Added one by one: a CPU calls a library for `jnp.sum`, which takes ten times as long.
     """
-    return functools.reduce(jnp.add, numbers(x))
+    return functools.reduce(jnp.add, unstack(x))
 
 
-def total_of(v: Float[Array, "*b n 3"]) -> Float[Array, "*b 3"]:
+def sum_vectors(v: Float[Array, "*b n 3"]) -> Float[Array, "*b 3"]:
     """Sum of a few vectors, on the axis before the last."""
-    return stack(*map(total, components(v)))
+    return stack(*map(sum_last, components(v)))
 
 
-def joined(*values: Array) -> Float[Array, "*b n"]:
-    """Numbers on a last axis, broadcast against each other; the inverse of `numbers`."""
+def stack(*values: Array) -> Float[Array, "*b n"]:
+    """Numbers on a last axis, broadcast against each other; the inverse of `unstack`."""
     # Not `jnp.stack`: mapped over single numbers it puts the mapped axis last, and what is mapped
     # lies one way here and another there.
     values = jnp.broadcast_arrays(*values)
@@ -54,10 +54,10 @@ def joined(*values: Array) -> Float[Array, "*b n"]:
 
 def stack(x: Array, y: Array, z: Array) -> Float[Array, "*b 3"]:
     """The vector with these components, which are broadcast against each other."""
-    return joined(x, y, z)
+    return stack(x, y, z)
 
 
-def fence(x: Array) -> Array:
+def barrier(x: Array) -> Array:
     """`x`, computed once.
 
     XLA's fusion on a CPU computes a cheap value again in each consumer; through a chain of
@@ -68,12 +68,12 @@ def fence(x: Array) -> Array:
     return jax.lax.optimization_barrier(x)
 
 
-def once(*values: Array) -> tuple[Array, ...]:
-    """Numbers, broadcast against each other, stacked behind a fence: angles, cosines, lengths."""
-    return numbers(fence(joined(*values)))
+def stacked_barrier(*values: Array) -> tuple[Array, ...]:
+    """Numbers, broadcast against each other, stacked behind a barrier: angles, cosines, lengths."""
+    return unstack(barrier(stack(*values)))
 
 
-def recomputed(function: Callable) -> Callable:
+def remat(function: Callable) -> Callable:
     """The function, of which reverse mode keeps the arguments and computes the rest again.
 
     For what is cheap and called in a scan, where each number kept is one more array to write.
@@ -81,10 +81,10 @@ def recomputed(function: Callable) -> Callable:
     return jax.checkpoint(function, prevent_cse=False)
 
 
-def copies(v: Float[Array, "*b n"], count: int) -> Float[Array, "*b count n"]:
+def repeat(v: Float[Array, "*b n"], count: int) -> Float[Array, "*b count n"]:
     """`v` so many times, on an axis before its own."""
     axis = v.ndim - 1
-    return fence(jax.lax.concatenate([jax.lax.expand_dims(v, (axis,))] * count, axis))
+    return barrier(jax.lax.concatenate([jax.lax.expand_dims(v, (axis,))] * count, axis))
 
 
 @jax.jit
@@ -105,20 +105,20 @@ def cross(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 
 @jax.jit
 def add(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
     """Sum of a place and what was turned, kept: `+` turns anew for each that needs the sum."""
-    return fence(stack(*(x + y for x, y in zip(components(a), components(b), strict=True))))
+    return barrier(stack(*(x + y for x, y in zip(components(a), components(b), strict=True))))
 
 
 @jax.jit
 def subtract(a: Float[Array, "*a 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:
     """The vector from one place to another, kept: `-` is taken anew for each that needs it."""
-    return fence(stack(*(x - y for x, y in zip(components(a), components(b), strict=True))))
+    return barrier(stack(*(x - y for x, y in zip(components(a), components(b), strict=True))))
 
 
 @jax.jit
 def scale(v: Float[Array, "*b 3"], factor: Array) -> Float[Array, "*c 3"]:
     """`v` times one number per vector."""
     # By components: a factor that is broadcast is summed by a library in reverse mode.
-    return fence(stack(*(part * factor for part in components(v))))
+    return barrier(stack(*(part * factor for part in components(v))))
 
 
 def safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -218,21 +218,21 @@ def has_direction(v: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
 
 @jax.custom_jvp
 @jax.jit
-def unit(v: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]) -> Float[Array, "*c 3"]:
+def normalize(v: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]) -> Float[Array, "*c 3"]:
     """`v` at length one; `fallback`, flat in `v`, where `v` is too short to have a direction."""
     known = has_direction(v)
     inverse = 1.0 / jnp.sqrt(jnp.where(known, dot(v, v), 1.0))
     # Stacked and fenced, or each who needs it would take the length again.
     pairs = zip(components(v), components(fallback), strict=True)
-    return fence(stack(*(jnp.where(known, part * inverse, other) for part, other in pairs)))
+    return barrier(stack(*(jnp.where(known, part * inverse, other) for part, other in pairs)))
 
 
-@unit.defjvp
+@normalize.defjvp
 def _unit_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     # Told in terms of the answer. JAX's own rule goes through v four times and its reverse is long;
     # fused, and computed again in each consumer, it took a third of a gradient's time.
     (v, fallback), (v_slope, fallback_slope) = primals, tangents
-    direction, known = unit(v, fallback), has_direction(v)
+    direction, known = normalize(v, fallback), has_direction(v)
     inverse = 1.0 / jnp.sqrt(jnp.where(known, dot(v, v), 1.0))
     along = dot(direction, v_slope)
     pairs = zip(components(v_slope), components(direction), strict=True)
@@ -250,7 +250,7 @@ def constant(v: tuple[float, float, float], like: Array) -> Float[Array, "3"]:
     return jnp.asarray(v, like.dtype)
 
 
-def normal(
+def triangle_normal(
     a: Float[Array, "*b 3"], b: Float[Array, "*b 3"], c: Float[Array, "*b 3"], up: Float[Array, "3"]
 ) -> Float[Array, "*b 3"]:
     """Unit normal of triangles, on the side of up; up where they have no area.

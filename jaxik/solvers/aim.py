@@ -6,10 +6,10 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
 
-from .two_bone import LENGTH_BAND, arc_beside, turn_about
+from .two_bone import LENGTH_BAND, arc_beside, rotation_about
 
 
-def aim_turn(
+def aim_rotation(
     to_target: Float[Array, "*t 3"],
     forward: Float[Array, "*f 3"],
     offset: Float[Array, "*o 3"],
@@ -49,10 +49,10 @@ def aim_turn(
 
     nowhere = vec.constant((0.0, 0.0, 0.0), to_target)
     away = distance > jnp.finfo(distance.dtype).eps
-    target = vec.unit(to_target, forward)
-    up = vec.unit(up, nowhere)
-    arc = arc_beside(vec.unit(meeting, target), target, up)
-    facing = turn_about(target, quat.rotate(arc, up), vec.unit(pole, nowhere))
+    target = vec.normalize(to_target, forward)
+    up = vec.normalize(up, nowhere)
+    arc = arc_beside(vec.normalize(meeting, target), target, up)
+    facing = rotation_about(target, quat.rotate(arc, up), vec.normalize(pole, nowhere))
     turn = quat.multiply(facing, arc)
     turn = quat.multiply(quat.from_axis_angle(target, twist), turn)
     weight = jnp.where(away, reached, 0.0)

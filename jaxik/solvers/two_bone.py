@@ -19,7 +19,7 @@ def local(rot: Array, turn: Array) -> Array:
     return quat.stack(w, *vec.components(quat.unrotate(rot, vec.stack(x, y, z))))
 
 
-def opposite_side(a2: Array, b2: Array, ab: Array, cos: Array) -> Array:
+def third_side(a2: Array, b2: Array, ab: Array, cos: Array) -> Array:
     """Third side of a triangle, by the squares and the product of two sides and their cosine."""
     return vec.safe_sqrt(a2 + b2 - 2.0 * ab * cos)
 
@@ -47,7 +47,9 @@ def quartic_limit(x: Array, free: Array, limit: Array) -> Array:
     return jnp.where(beyond, limit - room * left, x)
 
 
-def hinge_turn(to_hip: Array, to_ankle: Array, hinge: Array, reach: Array) -> tuple[Array, Array]:
+def hinge_rotation(
+    to_hip: Array, to_ankle: Array, hinge: Array, reach: Array
+) -> tuple[Array, Array]:
     """Cosine and sine of half the knee's turn about `hinge` that takes hip and ankle `reach` apart.
 
     The interior angle is 0..pi after the turn, whatever side the leg was bent to before. Clamped to
@@ -58,7 +60,7 @@ def hinge_turn(to_hip: Array, to_ankle: Array, hinge: Array, reach: Array) -> tu
     a2, b2 = vec.dot(thigh, thigh), vec.dot(shin, shin)
     across2 = reach * reach - (along_thigh - along_shin) ** 2
     cos_now, sin_now = vec.dot(thigh, shin), vec.dot(hinge, vec.cross(thigh, shin))
-    return _opening(*vec.once(a2, b2, across2, cos_now, sin_now))
+    return _opening(*vec.stacked_barrier(a2, b2, across2, cos_now, sin_now))
 
 
 def _opening(
@@ -122,14 +124,14 @@ def bounded(x: Array) -> Array:
     return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
 
 
-def swing_turn(bent: Array, to_target: Array, hinge: Array, twist: Array) -> Array:
+def swing_rotation(bent: Array, to_target: Array, hinge: Array, twist: Array) -> Array:
     """Rotation of the hip that takes the ankle's direction to the target's and keeps the hinge.
 
     The shortest arc, then a turn about the target's direction that lines the hinge up with where it
     was, seen along that direction; then `twist`, rad, about it.
     """
-    start = vec.unit(bent, vec.constant(DOWN, bent))
-    aim = vec.unit(to_target, start)
+    start = vec.normalize(bent, vec.constant(DOWN, bent))
+    aim = vec.normalize(to_target, start)
     swing = _lined_up(*jnp.broadcast_arrays(start, aim, hinge))
     return quat.multiply(quat.from_axis_angle(aim, twist), swing)
 
@@ -137,7 +139,7 @@ def swing_turn(bent: Array, to_target: Array, hinge: Array, twist: Array) -> Arr
 @jax.custom_jvp
 def _lined_up(start: Array, aim: Array, hinge: Array) -> Array:
     """Rotation from one unit vector to another that keeps the hinge in line."""
-    facing = quat.from_half(aim, *_facing(start, aim, hinge))
+    facing = quat.from_half_angle(aim, *_facing(start, aim, hinge))
     return quat.multiply(facing, arc_beside(start, aim, hinge))
 
 
@@ -193,16 +195,16 @@ def arc_beside(start: Array, aim: Array, side: Array) -> Array:
     down, left = vec.constant(DOWN, start), vec.constant(LEFT, start)
     beside = vec.reject(side, start)
     beside = jnp.where(vec.has_direction(beside)[..., None], beside, vec.reject(down, start))
-    return quat.arc(start, aim, vec.unit(beside, left))
+    return quat.shortest_arc(start, aim, vec.normalize(beside, left))
 
 
-def turn_about(axis: Array, start: Array, aim: Array) -> Array:
+def rotation_about(axis: Array, start: Array, aim: Array) -> Array:
     """Turn about the unit `axis` that lines `start` up with `aim`, both unit, seen along the axis.
 
     The identity where one of them lies along the axis or is zero.
     """
     cos, sin, _ = _angle_about(axis, start, aim)
-    return quat.unit(quat.from_cos_sin(axis, cos, sin))
+    return quat.normalize(quat.from_cos_sin(axis, cos, sin))
 
 
 def _angle_about(axis: Array, start: Array, aim: Array) -> tuple[Array, Array, Array]:
@@ -243,7 +245,7 @@ def pole_bend(
 ) -> PoleBend:
     """Bends a limb to its target in the plane that contains the pole, as ozz's two-bone job does.
 
-    From systems.md, 0. The bones' whole lengths make the triangle: unlike with `hinge_turn`, a
+    From systems.md, 0. The bones' whole lengths make the triangle: unlike with `hinge_rotation`, a
     hinge that is not square to the limb leaves the ankle beside its target, and the plane beside
     the pole. All vectors are in one rigid space and are broadcast.
 
@@ -277,17 +279,17 @@ def pole_bend(
     sin_now = _lengthened(normal, vec.dot(across, across), normal, a2 * b2)
     half_cos, half_sin = _opening(a2, b2, reach * reach, vec.dot(to_hip, to_ankle), sin_now)
 
-    bent = quat.rotate(quat.from_half(hinge, half_cos, half_sin), to_ankle) - to_hip
+    bent = quat.rotate(quat.from_half_angle(hinge, half_cos, half_sin), to_ankle) - to_hip
     return PoleBend(_pole_swing(bent, to_target, hinge, pole, twist), half_cos, half_sin, reached)
 
 
 def _pole_swing(bent: Array, to_target: Array, hinge: Array, pole: Array, twist: Array) -> Array:
     """Rotation of the hip that points the bent limb at its target and its knee at the pole."""
     away = vec.dot(to_target, to_target) > jnp.finfo(to_target.dtype).eps ** 2
-    aim = vec.unit(to_target, vec.constant(DOWN, to_target))
-    arc = arc_beside(vec.unit(bent, aim), aim, hinge)
+    aim = vec.normalize(to_target, vec.constant(DOWN, to_target))
+    arc = arc_beside(vec.normalize(bent, aim), aim, hinge)
     normal = quat.rotate(arc, hinge)
-    pole = vec.unit(pole, vec.constant((0.0, 0.0, 0.0), pole))
+    pole = vec.normalize(pole, vec.constant((0.0, 0.0, 0.0), pole))
     cos, sin, known = _angle_about(aim, normal, vec.cross(aim, pole))
     # Ozz takes the angle between the normals, not between their parts across the target. The two
     # are the same unless the hinge is tilted.
@@ -295,7 +297,7 @@ def _pole_swing(bent: Array, to_target: Array, hinge: Array, pole: Array, twist:
     sin = _lengthened(sin, (along * cos) ** 2, vec.dot(normal, pole), jnp.ones_like(along))
     cos = cos * vec.length(vec.reject(normal, aim))
     facing = quat.from_cos_sin(aim, jnp.where(known, cos, 1.0), jnp.where(known, sin, 0.0))
-    swing = quat.multiply(quat.unit(facing), arc)
+    swing = quat.multiply(quat.normalize(facing), arc)
     swing = quat.multiply(quat.from_axis_angle(aim, twist), swing)
     return jnp.where(away[..., None], swing, quat.identity(swing.dtype))
 

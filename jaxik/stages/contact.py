@@ -154,6 +154,6 @@ class SpeedContact(AbstractContact):
         one, zero = jnp.ones_like(before), jnp.zeros_like(before)
         standing = gate.choose(contact.planted, one, before)
         standing = gate.choose(contact.lifted, zero, standing)
-        share = jnp.where(started, smoothing.share_of_half_life(self.half_life, dt), 1.0)
-        weight = smoothing.approach(state.weight, standing, share)
+        share = jnp.where(started, smoothing.fraction_of_half_life(self.half_life, dt), 1.0)
+        weight = smoothing.lerp(state.weight, standing, share)
         return SpeedState(standing, weight), Contact(contact.lift, weight, standing, 1.0 - standing)

@@ -198,9 +198,9 @@ class BodyEffector(AbstractEffector):
         awake = self.awake(sensed, state, gate)
         asked = asked_heights(sensed, target_ws)
         goal = asked - pelvis.goal
-        share = smoothing.share_of_speed(self.speed, sensed.dt, goal - state.height)
+        share = smoothing.fraction_of_speed(self.speed, sensed.dt, goal - state.height)
         share = awake * jnp.where(started, share, 1.0)
-        height = smoothing.approach(state.height, goal, share)
+        height = smoothing.lerp(state.height, goal, share)
 
         near = gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
         arrived = jnp.prod(jnp.where(sensed.weight > 0, near, 1.0))
@@ -214,7 +214,7 @@ class BodyEffector(AbstractEffector):
     def _still(self, sensed: Sensed, gate: AbstractGate) -> Float[Array, ""]:
         """1 while all feet stand."""
         standing = jnp.where(sensed.weight > 0, sensed.contact.planted, 1.0)
-        return gate.least(standing, band=0.1)
+        return gate.minimum(standing, band=0.1)
 
 
 @struct
@@ -256,7 +256,7 @@ class FadeEffector(AbstractEffector):
     ) -> tuple[FadeState, Effector]:
         found = sensed.foothold.found
         step = jnp.where(started, smoothing.step_of_time(self.transition_time, sensed.dt), 1.0)
-        share = smoothing.towards(state.share, found, step)
+        share = smoothing.move_towards(state.share, found, step)
         asked = target_ws - sensed.ankle_ws
         offset_ws = gate.choose(found[..., None], asked, state.offset_ws)
         turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))

@@ -10,9 +10,9 @@ from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.solvers.aim import aim_turn
-from jaxik.solvers.two_bone import turn_about
-from jaxik.world.frame import FORWARD, UP, Frame, Ground, Sensed, animated
+from jaxik.solvers.aim import aim_rotation
+from jaxik.solvers.two_bone import rotation_about
+from jaxik.world.frame import FORWARD, UP, Frame, GroundHits, Sensed, animated_ankles
 from jaxik.world.skeleton import LegPose, Rig, Transform
 from jaxik.world.terrain import Hit
 
@@ -42,7 +42,7 @@ class AbstractFoot(eqx.Module):
 
     @abstractmethod
     def sense(
-        self, rig: Rig, frame: Frame, up_ws: Array, ground: Ground, gate: AbstractGate
+        self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate
     ) -> Float[Array, "legs 4"]:
         """The ankles' rotation in the world that memory may keep, before the legs are solved."""
 
@@ -63,9 +63,9 @@ class AbstractAnimatedFoot(AbstractFoot):
     """Turns feet from where the animation has them."""
 
     def sense(
-        self, rig: Rig, frame: Frame, up_ws: Array, ground: Ground, gate: AbstractGate
+        self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate
     ) -> Float[Array, "legs 4"]:
-        return animated(frame).rot
+        return animated_ankles(frame).rot
 
 
 class PitchRollFoot(AbstractAnimatedFoot):
@@ -96,11 +96,11 @@ class PitchRollFoot(AbstractAnimatedFoot):
         up = sensed.leg_up_ws
         left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
         outer = vec.scale(left, rig.side)
-        ahead = vec.unit(vec.reject(sole, up), sensed.slope.forward_ws)
+        ahead = vec.normalize(vec.reject(sole, up), sensed.slope.forward_ws)
         right = vec.cross(ahead, up)
 
-        pitch, roll = vec.once(*ground_angles(sensed, ahead, right, rig.side))
-        shin = vec.unit(
+        pitch, roll = vec.stacked_barrier(*ground_angles(sensed, ahead, right, rig.side))
+        shin = vec.normalize(
             bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
         shin = quat.rotate(world.rot, shin)
@@ -108,7 +108,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
         pitch = limited(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
         roll = limited(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
 
-        pitch, roll = vec.once(pitch, roll)
+        pitch, roll = vec.stacked_barrier(pitch, roll)
         # Rolled about the level axis and then pitched: as pitched, then rolled about the pitched.
         tilt = quat.multiply(
             quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, roll * rig.side)
@@ -146,7 +146,7 @@ class AimFoot(AbstractAnimatedFoot):
         aim = into_model.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
         upward, ahead = (quat.rotate(foot, vec.constant(axis, aim)) for axis in (UP, FORWARD))
         start = quat.rotate(foot, self.offset)
-        turn, reached = aim_turn(aim, upward, start, ahead, ahead, self.twist, gate)
+        turn, reached = aim_rotation(aim, upward, start, ahead, ahead, self.twist, gate)
         weight = jnp.where(self.enabled, effector.weight * sensed.foothold.found, 0.0)
         turn = quat.nlerp(quat.identity(turn.dtype), turn, weight * self.weight)
         full = jnp.where(weight * self.weight >= 1, 1.0, 0.0)
@@ -163,7 +163,7 @@ class FlatFoot(AbstractFoot):
     max_tilt: Array = parameter(0.7853981634, unit="rad", low=0.0, high=1.5)
 
     def sense(
-        self, rig: Rig, frame: Frame, up_ws: Array, ground: Ground, gate: AbstractGate
+        self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate
     ) -> Float[Array, "legs 4"]:
         ahead, right = foot_heading(rig, frame, up_ws)
         pitch = rise_angle(ground.ankle, ground.toe, ahead, up_ws)
@@ -171,7 +171,7 @@ class FlatFoot(AbstractFoot):
         tilt = quat.multiply(quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, -roll))
         level = quat.multiply(upright(ahead, up_ws), quat.conjugate(rig.ankle_from_foot))
         flat = quat.multiply(at_most(tilt, self.max_tilt, gate), level)
-        return quat.nlerp(animated(frame).rot, flat, ground.ankle.found)
+        return quat.nlerp(animated_ankles(frame).rot, flat, ground.ankle.found)
 
     def pose(
         self,
@@ -227,9 +227,9 @@ def rise_angle(low: Hit, high: Hit, along: Array, up_ws: Array) -> Array:
 
 def upright(ahead: Array, up_ws: Array) -> Array:
     """Rotation of a foot with its y along up and its z along `ahead`, unit and at right angles."""
-    raised = quat.arc(vec.constant(UP, ahead), up_ws, vec.constant(LEFT, ahead))
+    raised = quat.shortest_arc(vec.constant(UP, ahead), up_ws, vec.constant(LEFT, ahead))
     return quat.multiply(
-        turn_about(up_ws, quat.rotate(raised, vec.constant(FORWARD, ahead)), ahead), raised
+        rotation_about(up_ws, quat.rotate(raised, vec.constant(FORWARD, ahead)), ahead), raised
     )
 
 
@@ -255,7 +255,7 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
     facing, rising = vec.dot(ankle.normal, up), -vec.dot(ankle.normal, ahead)
     two = (toe.found * ankle.found > 0) & (run > SHORTEST_SOLE)
     rise, run = jnp.where(two, vec.dot(across, up), rising), jnp.where(two, run, facing)
-    rise, run, facing, rising = vec.once(rise, run, facing, rising)
+    rise, run, facing, rising = vec.stacked_barrier(rise, run, facing, rising)
     pitch = vec.safe_arctan2(rise, run)
     # Of the normal, the part along the up of a foot so pitched.
     upward = vec.safe_divide(run * facing + rise * rising, vec.safe_sqrt(run * run + rise * rise))
@@ -267,7 +267,7 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
 def joint_angle(axis: Array, shin: Array) -> Array:
     """Angle, rad, by which `axis` of the foot rises from the plane at right angles to the shin."""
     along = vec.dot(axis, shin)
-    along, across = vec.once(along, vec.length(axis - vec.scale(shin, along)))
+    along, across = vec.stacked_barrier(along, vec.length(axis - vec.scale(shin, along)))
     return vec.safe_arctan2(-along, across)
 
 

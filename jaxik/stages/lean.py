@@ -11,7 +11,7 @@ from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import constant, parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Frame, Ground, Slope, heading
+from jaxik.world.frame import Contact, Frame, GroundHits, Slope, heading
 
 
 @struct
@@ -31,7 +31,7 @@ class AbstractLean(eqx.Module):
 
     @abstractmethod
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, weight: Array
     ) -> Slope:
         """The slope that this frame alone shows."""
 
@@ -85,12 +85,12 @@ class SlopeLean(AbstractLean):
         return LeanState(zero, zero, zero, zero, zero)
 
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, weight: Array
     ) -> Slope:
         forward_ws, right_ws = heading(frame.world_from_model, up_ws)
         share = contact.weight * ground.ankle.found * weight
-        normal = vec.total_of(vec.scale(ground.ankle.normal, share))
-        normal = jnp.where(vec.total(share) > 0, normal, up_ws)
+        normal = vec.sum_vectors(vec.scale(ground.ankle.normal, share))
+        normal = jnp.where(vec.sum_last(share) > 0, normal, up_ws)
         up = vec.dot(normal, up_ws)
         return Slope(
             vec.safe_arctan2(-vec.dot(normal, forward_ws), up),
@@ -111,11 +111,11 @@ class SlopeLean(AbstractLean):
     ) -> tuple[LeanState, Lean]:
         entering = gate.above(slide - state.slide, jnp.zeros_like(slide), band=0.1)
         slide_gain = gate.choose(entering, self.slide_on_gain, self.slide_off_gain)
-        slide_share = smoothing.share_of_gain(slide_gain, dt, self.tick_hz)
-        sliding = smoothing.approach(state.slide, slide, jnp.where(started, slide_share, 1.0))
+        slide_share = smoothing.fraction_of_gain(slide_gain, dt, self.tick_hz)
+        sliding = smoothing.lerp(state.slide, slide, jnp.where(started, slide_share, 1.0))
 
-        gain = smoothing.approach(self.gain, self.gain_slide, sliding)
-        share = jnp.where(started, smoothing.share_of_gain(gain, dt, self.tick_hz), 1.0)
+        gain = smoothing.lerp(self.gain, self.gain_slide, sliding)
+        share = jnp.where(started, smoothing.fraction_of_gain(gain, dt, self.tick_hz), 1.0)
         forward, forward_speed = smoothing.follow(
             state.forward, state.forward_speed, slope.forward, share, dt, self.spring
         )
@@ -123,10 +123,8 @@ class SlopeLean(AbstractLean):
             state.side, state.side_speed, slope.side, share, dt, self.spring
         )
 
-        lean_forward = forward * smoothing.approach(
-            self.forward_rate, self.forward_rate_slide, sliding
-        )
-        lean_side = side * smoothing.approach(self.side_rate, self.side_rate_slide, sliding)
+        lean_forward = forward * smoothing.lerp(self.forward_rate, self.forward_rate_slide, sliding)
+        lean_side = side * smoothing.lerp(self.side_rate, self.side_rate_slide, sliding)
         turn = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
         lean = Lean(quat.from_rotvec(turn), _normal(slope, up_ws, forward, side))
         return LeanState(forward, side, sliding, forward_speed, side_speed), lean
@@ -139,7 +137,7 @@ class NoLean(AbstractLean):
         return None
 
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, weight: Array
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, weight: Array
     ) -> Slope:
         level = jnp.zeros_like(frame.dt)
         return Slope(level, level, *heading(frame.world_from_model, up_ws))
@@ -157,10 +155,10 @@ class NoLean(AbstractLean):
         return None, Lean(quat.identity(up_ws.dtype), up_ws)
 
 
-@vec.recomputed
+@vec.remat
 def _normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
     """Unit normal of ground that rises by these angles, rad, ahead and to the right."""
     (level, rising), (across, tilted) = vec.cos_sin(forward), vec.cos_sin(side)
     ahead = vec.scale(slope.forward_ws, rising * across)
     aside = vec.scale(slope.right_ws, level * tilted)
-    return vec.unit(vec.scale(up_ws, level * across) - ahead - aside, up_ws)
+    return vec.normalize(vec.scale(up_ws, level * across) - ahead - aside, up_ws)

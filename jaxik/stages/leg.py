@@ -12,12 +12,12 @@ from jaxik.maths.parameter_tree import parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.two_bone import (
     LENGTH_BAND,
-    hinge_turn,
+    hinge_rotation,
     local,
-    opposite_side,
     pole_bend,
     soft_limit,
-    swing_turn,
+    swing_rotation,
+    third_side,
 )
 from jaxik.world.frame import Frame, Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
@@ -90,11 +90,11 @@ class TwoBone(AbstractLeg):
         """The leg by itself: `pose` with its ankle at `target_ms`, m, model space."""
         to_hip, to_ankle, hinge = bones(rig, pose)
         to_target = vec.subtract(target_ms, pose.hip.pos)
-        reach, reached = vec.once(*self._reach(to_hip, to_ankle, to_target, gate))
-        half_cos, half_sin = hinge_turn(to_hip, to_ankle, hinge, reach)
-        turn = quat.from_half(hinge, half_cos, half_sin)
+        reach, reached = vec.stacked_barrier(*self._reach(to_hip, to_ankle, to_target, gate))
+        half_cos, half_sin = hinge_rotation(to_hip, to_ankle, hinge, reach)
+        turn = quat.from_half_angle(hinge, half_cos, half_sin)
         bent = quat.rotate(turn, to_ankle) - to_hip
-        swing = swing_turn(bent, to_target, hinge, self.twist)
+        swing = swing_rotation(bent, to_target, hinge, self.twist)
         return bend_leg(rig, pose, swing, half_cos, half_sin, reached, weight)
 
     def _reach(
@@ -103,12 +103,14 @@ class TwoBone(AbstractLeg):
         """Distance from hip to ankle that the limits allow, m, and 1 where that is the target's."""
         animated, distance = vec.length(to_ankle - to_hip), vec.length(to_target)
         thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
-        thigh2, shin2, animated, distance = vec.once(thigh2, shin2, animated, distance)
+        thigh2, shin2, animated, distance = vec.stacked_barrier(thigh2, shin2, animated, distance)
         product = vec.safe_sqrt(thigh2 * shin2)
         # Once, or each leg's loop would call the C library for them.
-        cos_max, cos_min = vec.once(jnp.cos(self.max_knee_angle), jnp.cos(self.min_knee_angle))
-        longest = opposite_side(thigh2, shin2, product, cos_max)
-        shortest = opposite_side(thigh2, shin2, product, cos_min)
+        cos_max, cos_min = vec.stacked_barrier(
+            jnp.cos(self.max_knee_angle), jnp.cos(self.min_knee_angle)
+        )
+        longest = third_side(thigh2, shin2, product, cos_max)
+        shortest = third_side(thigh2, shin2, product, cos_min)
         free = self.soften * longest
         longest = jnp.where(self.as_animated & (animated > longest), animated, longest)
         free = jnp.where(self.as_animated & (animated > free), animated, free)
@@ -211,9 +213,9 @@ def bend_leg(
 ) -> Bend:
     """The leg with its knee turned about its hinge, then its hip, each by a share `weight`."""
     to_hip, to_ankle, hinge = bones(rig, pose)
-    half_cos, half_sin = quat.half_part(half_cos, half_sin, weight)
-    turn = quat.from_half(hinge, half_cos, half_sin)
-    swing = quat.part(swing, weight)
+    half_cos, half_sin = quat.nlerp_half(half_cos, half_sin, weight)
+    turn = quat.from_half_angle(hinge, half_cos, half_sin)
+    swing = quat.nlerp_identity(swing, weight)
 
     knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -to_hip))
     whole = quat.multiply(swing, turn)
@@ -231,6 +233,6 @@ def bend_leg(
     return Bend(
         solved,
         local(pose.hip.rot, swing),
-        quat.from_half(rig.knee_axis_ls, half_cos, half_sin),
+        quat.from_half_angle(rig.knee_axis_ls, half_cos, half_sin),
         reached * jnp.where(weight >= 1, 1.0, 0.0),
     )

@@ -150,10 +150,10 @@ class OffsetLock(AbstractLock):
         locked = gate.choose(starts, one, state.locked)
         locked = gate.choose(stays, locked, zero)
 
-        on = smoothing.share_of_half_life(self.lock_half_life, sensed.dt)
-        off = smoothing.share_of_half_life(self.unlock_half_life, sensed.dt)
-        risen = smoothing.approach(state.factor, one, on)
-        factor = gate.choose(locked, risen, smoothing.approach(state.factor, zero, off))
+        on = smoothing.fraction_of_half_life(self.lock_half_life, sensed.dt)
+        off = smoothing.fraction_of_half_life(self.unlock_half_life, sensed.dt)
+        risen = smoothing.lerp(state.factor, one, on)
+        factor = gate.choose(locked, risen, smoothing.lerp(state.factor, zero, off))
         held = before - vec.scale(moved, risen)
         decayed = vec.scale(before, 1.0 - off)
         offset_ws = gate.choose(locked[..., None], held, decayed)
@@ -254,7 +254,7 @@ class PlantLock(AbstractLock):
         up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
         before = state.locked
         kept_ws = gate.choose(before[..., None], platform.apply(state.foothold), foothold_ws)
-        kept_rot = quat.nlerp(sensed.rot_ws, platform.turn(state.rot), before)
+        kept_rot = quat.nlerp(sensed.rot_ws, platform.apply_rot(state.rot), before)
 
         hit = cast(
             terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
@@ -266,7 +266,7 @@ class PlantLock(AbstractLock):
 
         locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
         step = jnp.where(started, smoothing.step_of_speed(self.plant_speed, sensed.dt), 1.0)
-        share = smoothing.towards(state.share, self.plant_weight, step)
+        share = smoothing.move_towards(state.share, self.plant_weight, step)
         counts = locked * share
         held = Held(
             vec.scale(planted_ws - foothold_ws, counts),

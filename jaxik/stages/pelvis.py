@@ -93,19 +93,19 @@ class LowestPelvis(AbstractPelvis):
         asked = asked_heights(sensed, target_ws)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         taking_part = sensed.weight > 0
-        top = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
-        asked = jnp.where(taking_part, smoothing.approach(top, asked, weight), top)
-        lowest = gate.least(asked, band=HEIGHT_BAND)
-        standing = gate.largest(weight, band=0.1)
+        top = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
+        asked = jnp.where(taking_part, smoothing.lerp(top, asked, weight), top)
+        lowest = gate.minimum(asked, band=HEIGHT_BAND)
+        standing = gate.maximum(weight, band=0.1)
         goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, goal, 0.0)
-        share = smoothing.approach(
-            smoothing.share_of_gain(self.off_gain, sensed.dt, self.tick_hz),
-            smoothing.share_of_gain(self.on_gain, sensed.dt, self.tick_hz),
+        share = smoothing.lerp(
+            smoothing.fraction_of_gain(self.off_gain, sensed.dt, self.tick_hz),
+            smoothing.fraction_of_gain(self.on_gain, sensed.dt, self.tick_hz),
             standing,
         )
         share = awake * jnp.where(started, share, 1.0)
-        height = smoothing.approach(state.height, goal, share)
+        height = smoothing.lerp(state.height, goal, share)
         along = jnp.where(self.vertical_only, sensed.up_ws, lean.normal_ws)
         return PelvisState.at(height, goal, along)
 
@@ -133,14 +133,14 @@ class CapsulePelvis(AbstractPelvis):
         gate: AbstractGate,
     ) -> PelvisState:
         asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target_ws), 0.0)
-        lowest = gate.least(asked, band=HEIGHT_BAND)
+        lowest = gate.minimum(asked, band=HEIGHT_BAND)
         zero = jnp.zeros_like(lowest)
         sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, sunk, 0.0)
 
         def follow(value: Array, goal: Array) -> Array:
-            share = smoothing.share_of_speed(self.speed, sensed.dt, goal - value)
-            return smoothing.approach(value, goal, awake * jnp.where(started, share, 1.0))
+            share = smoothing.fraction_of_speed(self.speed, sensed.dt, goal - value)
+            return smoothing.lerp(value, goal, awake * jnp.where(started, share, 1.0))
 
         height = follow(state.height, goal)
         half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
@@ -177,13 +177,13 @@ class LegLengthPelvis(AbstractPelvis):
         asks = (sensed.foothold.found > 0) & (sensed.weight > 0)
         zero = jnp.zeros_like(lowest[:1])
         lifted = jnp.concatenate([jnp.where(asks, lowest, -FAR), zero])
-        lift = gate.largest(lifted, band=HEIGHT_BAND)
+        lift = gate.maximum(lifted, band=HEIGHT_BAND)
         bounds = jnp.concatenate([jnp.where(asks, highest, FAR), lift[None]])
-        goal = jnp.where(self.enabled, gate.least(bounds, band=HEIGHT_BAND), 0.0)
+        goal = jnp.where(self.enabled, gate.minimum(bounds, band=HEIGHT_BAND), 0.0)
 
-        share = smoothing.share_of_speed(self.speed, sensed.dt, goal - state.height)
+        share = smoothing.fraction_of_speed(self.speed, sensed.dt, goal - state.height)
         share = awake * jnp.where(started & self.damp, share, 1.0)
-        height = smoothing.approach(state.height, goal, share)
+        height = smoothing.lerp(state.height, goal, share)
         return PelvisState.at(height, goal, sensed.up_ws)
 
 
@@ -214,14 +214,14 @@ class AbstractFollowingPelvis(AbstractPelvis):
         gap = goal - state.height
         share = gate.choose(
             gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
-            smoothing.share_of_half_life(self.rise_half_life, sensed.dt),
-            smoothing.share_of_half_life(self.fall_half_life, sensed.dt),
+            smoothing.fraction_of_half_life(self.rise_half_life, sensed.dt),
+            smoothing.fraction_of_half_life(self.fall_half_life, sensed.dt),
         )
         share = jnp.where(started, share, 1.0)
         height, velocity = smoothing.follow(
             state.height, state.velocity, goal, share, sensed.dt, self.spring
         )
-        height = smoothing.approach(state.height, height, awake)
+        height = smoothing.lerp(state.height, height, awake)
         after = PelvisState.at(height, goal, sensed.up_ws)
         return dataclasses.replace(after, velocity=awake * velocity)
 
@@ -243,13 +243,11 @@ class SupportPelvis(AbstractFollowingPelvis):
     def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
         asked = asked_heights(sensed, target_ws)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
-        total = vec.total(weight)
+        total = vec.sum_last(weight)
         taking_part = sensed.weight > 0
-        lowest = gate.least(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
-        support = vec.safe_divide(vec.total(weight * asked), total)
-        return jnp.where(
-            total > 0, smoothing.approach(support, lowest, self.lowest_share), otherwise
-        )
+        lowest = gate.minimum(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
+        support = vec.safe_divide(vec.sum_last(weight * asked), total)
+        return jnp.where(total > 0, smoothing.lerp(support, lowest, self.lowest_share), otherwise)
 
 
 class ReachPelvis(AbstractFollowingPelvis):
@@ -273,9 +271,9 @@ class ReachPelvis(AbstractFollowingPelvis):
         asked = asked_heights(sensed, target_ws)
         taking_part = sensed.weight > 0
         mean = mean_height(sensed, asked)
-        highest = gate.largest(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
+        highest = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
         highest = jnp.where(jnp.any(taking_part), highest, mean)
-        wanted = smoothing.approach(mean, highest, self.highest_share)
+        wanted = smoothing.lerp(mean, highest, self.highest_share)
         longest = self.extension * (sensed.thigh + sensed.shin)
 
         def reachable(ankle_ws: Array, wanted: Array) -> Array:
@@ -289,7 +287,7 @@ class ReachPelvis(AbstractFollowingPelvis):
 
 def mean_height(sensed: Sensed, asked: Array) -> Float[Array, ""]:
     """Mean of what legs ask for, m, by their share of foot IK; 0 where none takes part."""
-    return vec.safe_divide(vec.total(sensed.weight * asked), vec.total(sensed.weight))
+    return vec.safe_divide(vec.sum_last(sensed.weight * asked), vec.sum_last(sensed.weight))
 
 
 def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import parameter, switch
-from jaxik.world.frame import FORWARD, Contact, Frame, Ground, Rays, animated, heading
+from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
 
@@ -33,7 +33,7 @@ class AbstractProbe(eqx.Module):
         contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
-    ) -> Ground:
+    ) -> GroundHits:
         """What the rays of each leg see in this frame; `foot_height`, m, is sole to ankle."""
 
 
@@ -54,15 +54,15 @@ class FootProbe(AbstractProbe):
         contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
-    ) -> Ground:
+    ) -> GroundHits:
         reach = self.ray_up + self.ray_down
         above = vec.scale(terrain.leg_up_ws, self.ray_up)
-        ankle_ws = animated(frame).pos
+        ankle_ws = animated_ankles(frame).pos
         toe_ws = frame.world_from_model.apply(toe_point(rig, frame, self.toe_ls))
         ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
         toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
         rays = rays_of(ankle, self.ray_up, self.ray_down, self.layers)
-        return Ground(ankle, toe, unseen(ankle), rays)
+        return GroundHits(ankle, toe, unseen(ankle), rays)
 
 
 class RootProbe(AbstractProbe):
@@ -84,13 +84,13 @@ class RootProbe(AbstractProbe):
         contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
-    ) -> Ground:
-        up, ankle_ws = terrain.leg_up_ws, animated(frame).pos
+    ) -> GroundHits:
+        up, ankle_ws = terrain.leg_up_ws, animated_ankles(frame).pos
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
         start = ankle_ws + vec.scale(up, self.ray_up - over_root)
         hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
         rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
-        return Ground(hit, unseen(hit), unseen(hit), rays)
+        return GroundHits(hit, unseen(hit), unseen(hit), rays)
 
 
 class CornerProbe(AbstractProbe):
@@ -124,8 +124,8 @@ class CornerProbe(AbstractProbe):
         contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
-    ) -> Ground:
-        up, foot = terrain.leg_up_ws, animated(frame)
+    ) -> GroundHits:
+        up, foot = terrain.leg_up_ws, animated_ankles(frame)
         below = foot_height + self._extra(frame, foot.pos, up, gate)
         reach = self.ray_up + below
 
@@ -150,7 +150,7 @@ class CornerProbe(AbstractProbe):
             for hit, aside in zip(look(*(over + aside for aside in sides)), sides, strict=True)
         )
         rays = rays_of(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
-        return Ground(ankle, toe, corner, rays)
+        return GroundHits(ankle, toe, corner, rays)
 
     def _extra(self, frame: Frame, foot_ws: Array, up_ws: Array, gate: AbstractGate) -> Array:
         """How far under a standing sole each foot's rays end, m."""
@@ -185,9 +185,9 @@ def foot_heading(rig: Rig, frame: Frame, up_ws: Array) -> tuple[Array, Array]:
 
     A foot that points along up has the character's.
     """
-    foot = quat.multiply(animated(frame).rot, rig.ankle_from_foot)
+    foot = quat.multiply(animated_ankles(frame).rot, rig.ankle_from_foot)
     sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
-    ahead = vec.unit(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
+    ahead = vec.normalize(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
     return ahead, vec.cross(ahead, up_ws)
 
 

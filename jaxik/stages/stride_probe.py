@@ -7,7 +7,7 @@ from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import parameter
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Frame, Ground, Stride, animated
+from jaxik.world.frame import Contact, Frame, GroundHits, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
 
@@ -64,7 +64,7 @@ class StrideProbe(AbstractProbe):
         contact: Contact,
         foot_height: Array,
         gate: AbstractGate,
-    ) -> Ground:
+    ) -> GroundHits:
         level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
         stride = self._stride(frame, contact, level, gate)
         last, low = self._look(terrain, level, stride.last_ws)
@@ -76,7 +76,7 @@ class StrideProbe(AbstractProbe):
         rise = trust * (high - low)
         normal_rise = vec.scale(next_.normal - normal, trust)
 
-        share = vec.safe_divide(stride.share - self.rise_start, self.rise_end - self.rise_start)
+        share = vec.safe_divide(stride.fraction - self.rise_start, self.rise_end - self.rise_start)
         share = s_curve(share, self.steepness)
         height = low + rise * share
         top = low + jnp.where(rise > 0, rise, 0.0)
@@ -84,18 +84,18 @@ class StrideProbe(AbstractProbe):
         height += self._over_edges(terrain, level, stride, feet, height, top, gate)
         height = jnp.where(found > 0, height, 0.0)
 
-        ankle_ws = level.at(animated(frame).pos) + vec.scale(level.up_ws, height)
+        ankle_ws = level.at(animated_ankles(frame).pos) + vec.scale(level.up_ws, height)
         tilted = normal + vec.scale(normal_rise, share)
-        hit = Hit(ankle_ws, vec.unit(tilted, level.up_ws), self.ray_up - height, found)
+        hit = Hit(ankle_ws, vec.normalize(tilted, level.up_ws), self.ray_up - height, found)
         rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
-        return Ground(hit, unseen(hit), unseen(hit), rays)
+        return GroundHits(hit, unseen(hit), unseen(hit), rays)
 
     def _stride(self, frame: Frame, contact: Contact, level: "Level", gate: AbstractGate) -> Stride:
         """The stride as it is told, or else as velocity foretells it."""
         told = frame.stride
         velocity = vec.reject(frame.velocity_ws, level.up_ws)
         ball = level.at(frame.world_from_model.apply(frame.pose.toe.pos))
-        ankle, hip = animated(frame).pos, frame.world_from_model.apply(frame.pose.hip.pos)
+        ankle, hip = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.hip.pos)
         half = 0.5 * self.stance_time
         ahead = vec.safe_divide(vec.dot(ankle - hip, velocity), vec.dot(velocity, velocity))
         ahead = gate.clip(ahead, -half, half, band=0.02)
@@ -110,7 +110,7 @@ class StrideProbe(AbstractProbe):
             jnp.where(known[..., None], place, ball + vec.scale(velocity, time))
             for place, time in ((told.last_ws, -past), (told.next_ws, left))
         )
-        share = jnp.where(known, told.share, share)
+        share = jnp.where(known, told.fraction, share)
         return Stride(told.standing, last_ws, next_ws, share, told.known)
 
     def _look(
@@ -130,7 +130,7 @@ class StrideProbe(AbstractProbe):
 
     def _feet(self, rig: Rig, frame: Frame, level: "Level", foot_height: Array) -> Array:
         """The soles' heels and balls as animated, (2 legs 3), m, world space."""
-        ankle = animated(frame)
+        ankle = animated_ankles(frame)
         foot = quat.multiply(ankle.rot, rig.ankle_from_foot)
         under = vec.stack(jnp.zeros_like(self.heel_length), -foot_height, -self.heel_length)
         heel = ankle.pos + quat.rotate(foot, under)
@@ -161,10 +161,14 @@ class StrideProbe(AbstractProbe):
         lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
         need = over - lift
         need = jnp.where(hit.found[:, None] > 0, need, NOWHERE)
-        most = gate.largest(jnp.moveaxis(need.reshape(-1, *height.shape), 0, -1), band=HEIGHT_BAND)
+        most = gate.maximum(jnp.moveaxis(need.reshape(-1, *height.shape), 0, -1), band=HEIGHT_BAND)
         zero = jnp.zeros_like(most)
         most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)
-        return most * smooth_share(stride.share / ENDS) * smooth_share((1.0 - stride.share) / ENDS)
+        return (
+            most
+            * smooth_share(stride.fraction / ENDS)
+            * smooth_share((1.0 - stride.fraction) / ENDS)
+        )
 
 
 @struct

@@ -11,7 +11,7 @@ from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Foothold, Frame, Ground, animated, foothold
+from jaxik.world.frame import Contact, Foothold, Frame, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
 
 HEIGHT_BAND = 0.01  # m
@@ -28,7 +28,7 @@ class AbstractTarget(eqx.Module):
 
     @abstractmethod
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, gate: AbstractGate
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
     ) -> Foothold:
         """The foothold that this frame alone asks for."""
 
@@ -82,13 +82,13 @@ class SlopeTarget(AbstractTarget):
         return TargetState(each, each)
 
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, gate: AbstractGate
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
     ) -> Foothold:
         hit = ground.ankle
         over = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
         standing = hit.point + vec.scale(up_ws, over - self.foot_height)
         point_ws = gate.choose(
-            hit.found[..., None], standing, _under(animated(frame).pos, up_ws, contact.lift)
+            hit.found[..., None], standing, _under(animated_ankles(frame).pos, up_ws, contact.lift)
         )
         return foothold(frame, up_ws, point_ws, contact.lift, hit.found)
 
@@ -104,8 +104,8 @@ class SlopeTarget(AbstractTarget):
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         share = gate.choose(
             rising,
-            smoothing.share_of_half_life(self.rise_half_life, dt),
-            smoothing.share_of_half_life(self.fall_half_life, dt),
+            smoothing.fraction_of_half_life(self.rise_half_life, dt),
+            smoothing.fraction_of_half_life(self.fall_half_life, dt),
         )
         height, velocity = smoothing.follow(
             state.height,
@@ -131,11 +131,11 @@ class SoleTarget(AbstractInstantTarget):
     max_slope: Array = parameter(1.5, unit="rad", low=0.1, high=1.5)
 
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, gate: AbstractGate
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
     ) -> Foothold:
         hit = ground.ankle
         lift = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
-        bare = _under(animated(frame).pos, up_ws, lift)
+        bare = _under(animated_ankles(frame).pos, up_ws, lift)
         point_ws = gate.choose(hit.found[..., None], hit.point, bare)
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
@@ -149,11 +149,11 @@ class ContactTarget(AbstractInstantTarget):
     foot_height: Array = parameter(0.10, unit="m", low=0.0, high=0.2)
 
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, gate: AbstractGate
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
     ) -> Foothold:
         hit = ground.ankle
         lift = jnp.broadcast_to(self.foot_height, hit.found.shape)
-        bare = _under(animated(frame).pos, up_ws, lift)
+        bare = _under(animated_ankles(frame).pos, up_ws, lift)
         point_ws = gate.choose(hit.found[..., None], hit.point, bare)
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
@@ -174,9 +174,9 @@ class RootTarget(AbstractInstantTarget):
         return jnp.zeros_like(self.adjust)
 
     def sense(
-        self, frame: Frame, up_ws: Array, ground: Ground, contact: Contact, gate: AbstractGate
+        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
     ) -> Foothold:
-        hit, ankle_ws = ground.ankle, animated(frame).pos
+        hit, ankle_ws = ground.ankle, animated_ankles(frame).pos
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up_ws)
         standing = contact.weight * hit.found
         lift = over_root + standing * self.adjust

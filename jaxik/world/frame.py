@@ -26,7 +26,9 @@ class Stride:
     standing: Float[Array, "*b legs"]  # 0..1, the animation's own contact label
     last_ws: Float[Array, "*b legs 3"]  # m
     next_ws: Float[Array, "*b legs 3"]  # m
-    share: Float[Array, "*b legs"]  # 0..1, of the swing's time that has passed; 0 while it stands
+    fraction: Float[
+        Array, "*b legs"
+    ]  # 0..1, of the swing's time that has passed; 0 while it stands
     known: Float[Array, "*b legs"]  # 1, or 0 where nobody tells and places follow from velocity
 
     @classmethod
@@ -56,7 +58,7 @@ class Frame:
         """Of the character, m/s."""
         return vec.length(self.velocity_ws)
 
-    def moved(self, offset_ws: Float[Array, "*b 3"]) -> "Frame":
+    def translated(self, offset_ws: Float[Array, "*b 3"]) -> "Frame":
         """The frame with the whole character moved, m."""
         world = Transform(self.world_from_model.pos + offset_ws, self.world_from_model.rot)
         return dataclasses.replace(self, world_from_model=world)
@@ -72,7 +74,7 @@ class Rays:
 
 
 @struct
-class Ground:
+class GroundHits:
     """What the rays of each leg saw."""
 
     ankle: Hit  # legs
@@ -133,17 +135,17 @@ class Sensed:
     rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule wants them
     thigh: Float[Array, " legs"]  # m, in this frame
     shin: Float[Array, " legs"]  # m
-    ground: Ground
+    ground: GroundHits
     contact: Contact
     foothold: Foothold
     slope: Slope
 
 
-def animated(frame: Frame) -> Transform:
+def animated_ankles(frame: Frame) -> Transform:
     """The animated ankles, (legs), world space."""
     return Transform(
         frame.world_from_model.apply(frame.pose.ankle.pos),
-        frame.world_from_model.turn(frame.pose.ankle.rot),
+        frame.world_from_model.apply_rot(frame.pose.ankle.rot),
     )
 
 
@@ -162,5 +164,5 @@ def heading(world_from_model: Transform, up_ws: Float[Array, "*legs 3"]) -> tupl
     """
     forward = quat.rotate(world_from_model.rot, vec.constant(FORWARD, up_ws))
     upright = quat.rotate(world_from_model.rot, vec.constant(UP, up_ws))
-    forward_ws = vec.unit(vec.reject(forward, up_ws), upright)
+    forward_ws = vec.normalize(vec.reject(forward, up_ws), upright)
     return forward_ws, vec.cross(forward_ws, up_ws)

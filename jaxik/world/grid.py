@@ -81,7 +81,7 @@ class Grid(eqx.Module):
         """
         grid, origins = jax.lax.stop_gradient((self, origins_ws))
         offset = origins - grid.centre_ws
-        place = vec.once(*(vec.dot(offset, grid.axes_ws[axis]) for axis in range(3)))
+        place = vec.stacked_barrier(*(vec.dot(offset, grid.axes_ws[axis]) for axis in range(3)))
         return _first_met(grid, *place, mask)
 
 
@@ -112,7 +112,7 @@ def _first_met(
         # stays in the cache. It changes nothing, for the test is complete.
         entry = jnp.where(step < count, start + step, 0)
         triangle = grid.members.at[entry].get(mode="promise_in_bounds")
-        row = vec.numbers(grid.corners.at[triangle].get(mode="promise_in_bounds"))
+        row = vec.unstack(grid.corners.at[triangle].get(mode="promise_in_bounds"))
         ax, bx, cx = row[0] - x, row[3] - x, row[6] - x
         az, bz, cz = row[1] - z, row[4] - z, row[7] - z
         (a, by_a), (b, by_b), (c, by_c) = (

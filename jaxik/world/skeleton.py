@@ -19,7 +19,7 @@ class Transform:
         """Points of space b, m, in space a."""
         return vec.add(self.pos, quat.rotate(self.rot, points))
 
-    def turn(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*c 4"]:
+    def apply_rot(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*c 4"]:
         """Rotations of space b in space a."""
         return quat.multiply(self.rot, rot)
 
@@ -28,16 +28,16 @@ class Transform:
         back = quat.conjugate(self.rot)
         return Transform(-quat.rotate(back, self.pos), back)
 
-    def copies(self, count: int) -> "Transform":
+    def repeat(self, count: int) -> "Transform":
         """So many of it, on a last axis such as that of legs.
 
         Broadcast instead, each of its uses would sum its slopes over the legs in reverse mode.
         """
-        return Transform(vec.copies(self.pos, count), vec.copies(self.rot, count))
+        return Transform(vec.repeat(self.pos, count), vec.repeat(self.rot, count))
 
     def __matmul__(self, other: "Transform") -> "Transform":
         """`a_from_b @ b_from_c` is `a_from_c`."""
-        return Transform(self.apply(other.pos), self.turn(other.rot))
+        return Transform(self.apply(other.pos), self.apply_rot(other.rot))
 
 
 def still(dtype=None) -> Transform:
@@ -100,7 +100,7 @@ class LegPose:
     ankle: Transform
     toe: Transform
 
-    def moved(self, by: Transform) -> "LegPose":
+    def transformed(self, by: Transform) -> "LegPose":
         """The whole pose carried by one transform."""
         return LegPose(by @ self.hip, by @ self.knee, by @ self.ankle, by @ self.toe)
 

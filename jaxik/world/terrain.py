@@ -59,7 +59,7 @@ class Plane(AbstractSurface):
         distance = _drop(origins_ws, up_ws, self.point_ws, self.normal_ws)
         rise = vec.dot(self.normal_ws, up_ws)
         # A ray that starts on the plane meets it, whatever rounding makes of the difference.
-        size = vec.total(jnp.abs(origins_ws)) + vec.total(jnp.abs(self.point_ws))
+        size = vec.sum_last(jnp.abs(origins_ws)) + vec.sum_last(jnp.abs(self.point_ws))
         allowance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(size)
         seen = (rise != 0) & (distance * jnp.abs(rise) >= -allowance) & (self.layers & mask != 0)
         normal = jnp.where(rise < 0, -self.normal_ws, self.normal_ws)
@@ -98,7 +98,7 @@ class Mesh(AbstractSurface):
             self.vertices_ws.at[ends[..., corner]].get(mode="promise_in_bounds")
             for corner in range(3)
         )
-        normal = vec.normal(a, b, c, up_ws)
+        normal = vec.triangle_normal(a, b, c, up_ws)
         distance = _drop(origins_ws, up_ws, a, normal)
         # A ray let in by rounding lies outside its triangle by a hair, which a steep plane makes
         # long: the value stays between the corners, the slope is that of the plane.
@@ -107,7 +107,7 @@ class Mesh(AbstractSurface):
         high = jnp.maximum(jnp.maximum(drops[0], drops[1]), drops[2])
         distance += jax.lax.stop_gradient(jnp.clip(distance, low, high) - distance)
         # Once, or all that is made of a hit would compute it from the corners again.
-        x, y, z, distance = vec.once(*vec.components(normal), distance)
+        x, y, z, distance = vec.stacked_barrier(*vec.components(normal), distance)
         return distance, vec.stack(x, y, z), seen
 
 
@@ -204,10 +204,10 @@ def _nearest(
         nearer = seen & (drop <= distance)
         distance = jnp.where(nearer, drop, distance)
         pairs = zip(vec.components(facing), vec.components(normal), strict=True)
-        normal = vec.fence(vec.stack(*(jnp.where(nearer, new, old) for new, old in pairs)))
+        normal = vec.barrier(vec.stack(*(jnp.where(nearer, new, old) for new, old in pairs)))
         found |= nearer
     # Of all that follows much asks for a hit, and would work it out anew.
-    distance, found = vec.once(distance, found.astype(distance.dtype))
+    distance, found = vec.stacked_barrier(distance, found.astype(distance.dtype))
     point = origins_ws - vec.scale(terrain.up_ws, distance)
     return Hit(point, normal, distance, found)
 

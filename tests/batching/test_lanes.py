@@ -77,7 +77,7 @@ def started(x):
 
 
 CASES = {
-    "vectors": lambda x: (vec.cross(x, x[::-1]), vec.unit(x, jnp.ones(3)), vec.total(x)),
+    "vectors": lambda x: (vec.cross(x, x[::-1]), vec.normalize(x, jnp.ones(3)), vec.sum_last(x)),
     "rotations": lambda x: quat.rotate(vec_to_quat(x), x),
     "a number beside an array": lambda x: jnp.where(x[0] > 0, x, 2.0) + jnp.maximum(x, 0.1),
     "a bound for all": lambda x: lax.clamp(x[0], x, x[0] + 1.0),
@@ -116,7 +116,7 @@ CASES = {
     )[0],
     "what is computed again": lambda x: jax.checkpoint(jnp.tanh)(x) * 2.0,
     "slopes told by hand": lambda x: bent(x, x[::-1]),
-    "slopes": lambda x: jax.grad(lambda x: bent(vec.unit(x, x), x[::-1]).sum())(x),
+    "slopes": lambda x: jax.grad(lambda x: bent(vec.normalize(x, x), x[::-1]).sum())(x),
     "a jitted function": lambda x: jax.jit(vec.dot)(x, 2 * x) + vec.dot(jnp.ones(3), jnp.ones(3)),
     "what all share": lambda x: (jnp.arange(3), carried(jnp.ones(3)), x),
     "one within another": lambda x: lanes(lambda y: vec.cross(x, y))(jnp.eye(3)),
@@ -126,7 +126,7 @@ CASES = {
 
 
 def vec_to_quat(x):
-    return vec.once(*vec.components(x), jnp.ones(()))[3] * jnp.asarray([*[0.5] * 4])
+    return vec.stacked_barrier(*vec.components(x), jnp.ones(()))[3] * jnp.asarray([*[0.5] * 4])
 
 
 @pytest.mark.parametrize("name", CASES)

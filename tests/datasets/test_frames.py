@@ -123,9 +123,9 @@ def test_strides_lead_from_stance_to_stance(clip):
         ):
             np.testing.assert_array_equal(made.last_ws[first:then, leg], [here] * (then - first))
             np.testing.assert_array_equal(made.next_ws[first:then, leg], [there] * (then - first))
-            np.testing.assert_array_equal(made.share[first : last + 1, leg], 0.0)
+            np.testing.assert_array_equal(made.fraction[first : last + 1, leg], 0.0)
             np.testing.assert_allclose(
-                np.diff(made.share[last:then, leg]), 1 / (then - last), rtol=1e-9
+                np.diff(made.fraction[last:then, leg]), 1 / (then - last), rtol=1e-9
             )
 
 

@@ -38,11 +38,11 @@ def clip_of_given_softness(gate: AbstractGate, x, low, high):
 
 
 def least(gate: AbstractGate, x):
-    return gate.least(x, band=BAND)
+    return gate.minimum(x, band=BAND)
 
 
 def largest(gate: AbstractGate, x):
-    return gate.largest(x, band=BAND)
+    return gate.maximum(x, band=BAND)
 
 
 def choose(gate: AbstractGate, weight, yes, no):

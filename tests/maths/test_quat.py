@@ -38,17 +38,17 @@ FUNCTIONS = {
     "axes": (quat.axes, (Q,)),
     "unrotate": (quat.unrotate, (Q, A)),
     "dot": (quat.dot, (P, Q)),
-    "unit": (quat.unit, (3.0 * Q,)),
+    "unit": (quat.normalize, (3.0 * Q,)),
     "half_angle": (quat.half_angle, (COS, SIN)),
     "half_cos_sin": (quat.half_cos_sin, (ANGLE,)),
-    "from_half": (quat.from_half, (AXIS, COS, SIN)),
+    "from_half": (quat.from_half_angle, (AXIS, COS, SIN)),
     "from_cos_sin": (quat.from_cos_sin, (AXIS, COS, SIN)),
     "from_axis_angle": (quat.from_axis_angle, (AXIS, ANGLE)),
     "from_rotvec": (quat.from_rotvec, (A,)),
-    "arc": (quat.arc, (A, B, AXIS)),
+    "arc": (quat.shortest_arc, (A, B, AXIS)),
     "nlerp": (quat.nlerp, (P, Q, ANGLE)),
-    "part": (quat.part, (Q, ANGLE)),
-    "half_part": (quat.half_part, (np.abs(COS), SIN, ANGLE)),
+    "part": (quat.nlerp_identity, (Q, ANGLE)),
+    "half_part": (quat.nlerp_half, (np.abs(COS), SIN, ANGLE)),
     "angle": (quat.angle, (P, Q)),
 }
 
@@ -56,7 +56,7 @@ FUNCTIONS = {
 def turned(p, q, v):
     """Several answers in one program: most of a test's time goes into compiling."""
     products = quat.multiply(p, q), quat.rotate(q, v), quat.unrotate(q, v)
-    return *products, quat.unit(q), quat.from_rotvec(v)
+    return *products, quat.normalize(q), quat.from_rotvec(v)
 
 
 def turns_about(axis, angle, cos, sin):
@@ -65,7 +65,7 @@ def turns_about(axis, angle, cos, sin):
 
 def arc_between(a, b, axis):
     """The arc between the directions of two vectors: its slopes stay on the unit sphere."""
-    return quat.arc(vec.unit(a, axis), vec.unit(b, axis), axis)
+    return quat.shortest_arc(vec.normalize(a, axis), vec.normalize(b, axis), axis)
 
 
 def scipy(q) -> Rotation:
@@ -180,7 +180,7 @@ def test_small_rotation_vectors_do_not_see_where_the_series_ends(size):
 @given(directions(1e-9))
 def test_an_arc_carries_one_direction_to_the_other_by_the_shortest_way(pair):
     a, b, axis = map(jnp.asarray, pair)
-    q = quat.arc(a, b, axis)
+    q = quat.shortest_arc(a, b, axis)
     assert_allclose(jnp.linalg.norm(q), 1.0, atol=1e-12)
     assert_allclose(quat.rotate(q, a), b, atol=1e-7)
     assert_allclose(quat.dot(q, jnp.asarray([0.0, *np.add(a, b)])), 0, atol=1e-12)  # no twist
@@ -191,15 +191,15 @@ def test_an_arc_carries_one_direction_to_the_other_by_the_shortest_way(pair):
 
 def test_an_arc_between_opposed_directions_is_half_a_turn_about_the_fallback_and_flat():
     a, axis = np.eye(3)[0], np.eye(3)[1]
-    assert_allclose(quat.arc(*map(jnp.asarray, (a, -a, axis))), [0, *axis], atol=0)
-    assert_allclose(finite_slopes(quat.arc, a, -a, axis)[:, :6], 0, atol=0)
+    assert_allclose(quat.shortest_arc(*map(jnp.asarray, (a, -a, axis))), [0, *axis], atol=0)
+    assert_allclose(finite_slopes(quat.shortest_arc, a, -a, axis)[:, :6], 0, atol=0)
 
 
 @few
 @given(directions(1e-4))
 def test_an_arc_in_single_precision_is_of_length_one_and_good_to_a_millimetre_a_metre(pair):
     a, b, axis = (jnp.asarray(v, jnp.float32) for v in pair)
-    q = quat.arc(a, b, axis)
+    q = quat.shortest_arc(a, b, axis)
     assert_allclose(jnp.linalg.norm(q), 1.0, atol=1e-6)
     assert_allclose(quat.rotate(q, a), b, atol=1e-3)
 
@@ -207,12 +207,12 @@ def test_an_arc_in_single_precision_is_of_length_one_and_good_to_a_millimetre_a_
 @few
 @given(quaternions(), st.sampled_from([1e-9, 1e-3, 1.0, 1e6]))
 def test_a_unit_quaternion_is_the_same_turn_at_length_one(q, size):
-    assert_allclose(quat.unit(jnp.asarray(size * q)), q, atol=1e-14)
+    assert_allclose(quat.normalize(jnp.asarray(size * q)), q, atol=1e-14)
 
 
 def test_a_quaternion_without_direction_becomes_the_identity_and_is_flat():
-    assert_allclose(quat.unit(jnp.zeros((2, 4))), [[1, 0, 0, 0]] * 2, atol=0)
-    assert_allclose(finite_slopes(quat.unit, np.zeros(4)), 0, atol=0)
+    assert_allclose(quat.normalize(jnp.zeros((2, 4))), [[1, 0, 0, 0]] * 2, atol=0)
+    assert_allclose(finite_slopes(quat.normalize, np.zeros(4)), 0, atol=0)
 
 
 @few
@@ -232,12 +232,14 @@ def test_a_part_of_a_turn_is_the_blend_from_no_turn(q, pair, angle, weight):
     axis, weight = jnp.asarray(pair[0]), jnp.asarray(weight)
     still = quat.identity()
     assert_allclose(
-        quat.part(jnp.asarray(q), weight), quat.nlerp(still, jnp.asarray(q), weight), atol=1e-14
+        quat.nlerp_identity(jnp.asarray(q), weight),
+        quat.nlerp(still, jnp.asarray(q), weight),
+        atol=1e-14,
     )
     half = quat.half_cos_sin(jnp.asarray(angle))
     assert_allclose(
-        quat.from_half(axis, *quat.half_part(*half, weight)),
-        quat.part(quat.from_half(axis, *half), weight),
+        quat.from_half_angle(axis, *quat.nlerp_half(*half, weight)),
+        quat.nlerp_identity(quat.from_half_angle(axis, *half), weight),
         atol=1e-14,
     )
 

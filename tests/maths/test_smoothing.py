@@ -20,10 +20,10 @@ half_lives = st.sampled_from([0.0, 1e-6, 1e-3]) | numbers(0.005, 3)
 
 X = np.array([0.1, 0.4, 0.7])
 FUNCTIONS = {
-    "approach": (smoothing.approach, (X, -X, X)),
-    "share_of_gain": (smoothing.share_of_gain, (X, X, 30 * X)),
-    "share_of_half_life": (smoothing.share_of_half_life, (X, X)),
-    "share_of_speed": (smoothing.share_of_speed, (X, X, X)),
+    "lerp": (smoothing.lerp, (X, -X, X)),
+    "fraction_of_gain": (smoothing.fraction_of_gain, (X, X, 30 * X)),
+    "fraction_of_half_life": (smoothing.fraction_of_half_life, (X, X)),
+    "fraction_of_speed": (smoothing.fraction_of_speed, (X, X, X)),
     "spring": (smoothing.spring, (X, -X, 2 * X, X, X)),
     "follow": (smoothing.follow, (X, -X, 2 * X, X, X, X > 0.3)),
     "half_life_of_gain": (smoothing.half_life_of_gain, (X, 30 * X)),
@@ -41,16 +41,14 @@ def everything(args):
 
 
 def sprung(value, velocity, goal, half_life, dt):
-    return smoothing.spring(value, velocity, goal, half_life, dt), smoothing.approach(
-        value, goal, dt
-    )
+    return smoothing.spring(value, velocity, goal, half_life, dt), smoothing.lerp(value, goal, dt)
 
 
 def shares(gain, half_life, dt, tick_hz):
     """Several answers in one program: most of a test's time goes into compiling."""
     return (
-        smoothing.share_of_gain(gain, dt, tick_hz),
-        smoothing.share_of_half_life(half_life, dt),
+        smoothing.fraction_of_gain(gain, dt, tick_hz),
+        smoothing.fraction_of_half_life(half_life, dt),
         smoothing.gain_of_half_life(half_life, tick_hz),
     )
 
@@ -77,12 +75,12 @@ def test_a_compiled_batch_is_many_singles():
 def test_two_half_steps_are_one_step(gain, half_life, dt):
     start, goal = jnp.asarray(3.0), jnp.asarray(1.0)
     for share in (
-        lambda dt: call(smoothing.share_of_gain, gain, dt, 30.0),
-        lambda dt: call(smoothing.share_of_half_life, half_life, dt),
+        lambda dt: call(smoothing.fraction_of_gain, gain, dt, 30.0),
+        lambda dt: call(smoothing.fraction_of_half_life, half_life, dt),
     ):
         half = share(dt / 2)
-        twice = smoothing.approach(smoothing.approach(start, goal, half), goal, half)
-        assert_allclose(twice, smoothing.approach(start, goal, share(dt)), rtol=1e-13)
+        twice = smoothing.lerp(smoothing.lerp(start, goal, half), goal, half)
+        assert_allclose(twice, smoothing.lerp(start, goal, share(dt)), rtol=1e-13)
         assert 0 <= half <= share(dt) <= 1
 
 
@@ -99,8 +97,8 @@ def test_two_half_steps_of_the_spring_are_one_step(value, velocity, goal, half_l
 @few
 @given(gains, st.sampled_from([30.0, 60.0]))
 def test_a_gain_closes_its_share_in_a_tick_and_all_but_its_power_in_many(gain, tick_hz):
-    assert_allclose(call(smoothing.share_of_gain, gain, 1 / tick_hz, tick_hz), gain, rtol=1e-13)
-    many = call(smoothing.share_of_gain, gain, 7 / tick_hz, tick_hz)
+    assert_allclose(call(smoothing.fraction_of_gain, gain, 1 / tick_hz, tick_hz), gain, rtol=1e-13)
+    many = call(smoothing.fraction_of_gain, gain, 7 / tick_hz, tick_hz)
     assert_allclose(many, 1 - (1 - gain) ** 7, rtol=1e-9)
 
 
@@ -110,34 +108,34 @@ def test_a_gain_and_its_half_life_are_the_same_law(gain, tick_hz, dt):
     half_life = call(smoothing.half_life_of_gain, gain, tick_hz)
     assert_allclose(call(smoothing.gain_of_half_life, half_life, tick_hz), gain, rtol=1e-12)
     assert_allclose(
-        call(smoothing.share_of_half_life, half_life, dt),
-        call(smoothing.share_of_gain, gain, dt, tick_hz),
+        call(smoothing.fraction_of_half_life, half_life, dt),
+        call(smoothing.fraction_of_gain, gain, dt, tick_hz),
         rtol=1e-12,
     )
 
 
 def test_half_a_gap_is_closed_in_a_half_life_and_three_quarters_in_two():
-    assert_allclose(call(smoothing.share_of_half_life, 0.2, 0.2), 0.5, rtol=1e-15)
-    assert_allclose(call(smoothing.share_of_half_life, 0.2, 0.4), 0.75, rtol=1e-15)
+    assert_allclose(call(smoothing.fraction_of_half_life, 0.2, 0.2), 0.5, rtol=1e-15)
+    assert_allclose(call(smoothing.fraction_of_half_life, 0.2, 0.4), 0.75, rtol=1e-15)
     assert_allclose(call(smoothing.half_life_of_gain, 0.5, 30.0), 1 / 30, rtol=1e-15)
 
 
 def test_gain_one_and_half_lives_of_zero_or_less_jump_and_gain_zero_stays():
     dt, hz = 1 / 60, 30.0
-    assert call(smoothing.share_of_gain, 1.0, dt, hz) == 1
-    assert call(smoothing.share_of_gain, 0.0, dt, hz) == 0
+    assert call(smoothing.fraction_of_gain, 1.0, dt, hz) == 1
+    assert call(smoothing.fraction_of_gain, 0.0, dt, hz) == 0
     for half_life in (0.0, -0.1):
-        assert call(smoothing.share_of_half_life, half_life, dt) == 1
+        assert call(smoothing.fraction_of_half_life, half_life, dt) == 1
         assert call(smoothing.gain_of_half_life, half_life, hz) == 1
         assert call(smoothing.spring, 3.0, 2.0, 1.0, half_life, dt) == (1.0, 0.0)
     assert call(smoothing.half_life_of_gain, 1.0, hz) == 0
     assert call(smoothing.half_life_of_gain, 0.0, hz) == np.inf
-    assert call(smoothing.share_of_half_life, np.inf, dt) == 0
+    assert call(smoothing.fraction_of_half_life, np.inf, dt) == 0
 
 
 def test_no_time_moves_nothing():
-    assert call(smoothing.share_of_gain, 0.3, 0.0, 30.0) == 0
-    assert call(smoothing.share_of_half_life, 0.3, 0.0) == 0
+    assert call(smoothing.fraction_of_gain, 0.3, 0.0, 30.0) == 0
+    assert call(smoothing.fraction_of_half_life, 0.3, 0.0) == 0
     assert call(smoothing.spring, 3.0, 2.0, 1.0, 0.3, 0.0) == (3.0, 2.0)
 
 
@@ -146,14 +144,14 @@ def test_no_time_moves_nothing():
 def test_the_clamped_speed_is_unreals_interp_to(speed, dt, gap):
     jumps = speed <= 0 or abs(gap) <= smoothing.JUMP_GAP
     expected = 1.0 if jumps else min(dt * speed, 1.0)
-    assert_allclose(call(smoothing.share_of_speed, speed, dt, gap), expected, rtol=1e-15)
+    assert_allclose(call(smoothing.fraction_of_speed, speed, dt, gap), expected, rtol=1e-15)
 
 
 @few
 @given(numbers(-1, 40), frame_times)
 def test_the_half_life_of_a_speed_halves_the_gap_and_depends_on_the_frame_time(speed, dt):
     half_life = float(call(smoothing.half_life_of_speed, speed, dt))
-    share = float(call(smoothing.share_of_speed, speed, dt, 1.0))
+    share = float(call(smoothing.fraction_of_speed, speed, dt, 1.0))
     if share == 1:
         assert half_life == 0
     else:
@@ -202,7 +200,7 @@ def test_what_follows_goals_told_frame_by_frame_solves_the_equation_of_each():
             rtol=1e-11,
             atol=1e-12,
         ).y[:, -1]
-        share = call(smoothing.share_of_half_life, half_life, dt)
+        share = call(smoothing.fraction_of_half_life, half_life, dt)
         sprung = np.array(call(smoothing.follow, *sprung, goal, share, dt, True))
         assert_allclose(sprung, wanted, atol=1e-8)
         moved, velocity = call(smoothing.follow, eased, 3.0, goal, share, dt, False)
@@ -240,7 +238,7 @@ def test_slopes_of_the_spring_are_those_of_differences(value, velocity, goal, ha
 @few
 @given(st.sampled_from([-1.0, 0.5, 5.0, 25.0, 70.0]), st.sampled_from([0.0, 5e-3, -1.0]))
 def test_slopes_of_the_clamped_speed_are_those_of_differences(speed, gap):
-    assert_slopes_agree(smoothing.share_of_speed, speed, 1 / 50, gap)
+    assert_slopes_agree(smoothing.fraction_of_speed, speed, 1 / 50, gap)
     assert_slopes_agree(smoothing.half_life_of_speed, speed, 1 / 50)
 
 
@@ -252,7 +250,7 @@ def test_slopes_stay_finite_at_the_limits():
         finite_slopes(shares, 0.5, half_life, 1 / 60, 30.0)
         finite_slopes(sprung, 3.0, 2.0, 1.0, half_life, 1 / 60)
     for speed in (0.0, 60.0, 1e-9):
-        finite_slopes(smoothing.share_of_speed, speed, 1 / 60, 0.0)
-        finite_slopes(smoothing.share_of_speed, speed, 1 / 60, 1e-4)
+        finite_slopes(smoothing.fraction_of_speed, speed, 1 / 60, 0.0)
+        finite_slopes(smoothing.fraction_of_speed, speed, 1 / 60, 1e-4)
         finite_slopes(smoothing.half_life_of_speed, speed, 1 / 60)
     finite_slopes(smoothing.half_life_of_gain, 1.0, 30.0)

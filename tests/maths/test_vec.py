@@ -17,11 +17,11 @@ RNG = np.random.default_rng(0)
 A, B = RNG.normal(size=(2, 4, 3))
 X, Y = RNG.normal(size=(2, 4))
 FUNCTIONS = {
-    "numbers": (vec.numbers, (A,)),
+    "numbers": (vec.unstack, (A,)),
     "components": (vec.components, (A,)),
     "stack": (vec.stack, (X, Y, X)),
-    "fence": (vec.fence, (A,)),
-    "once": (vec.once, (X, Y)),
+    "fence": (vec.barrier, (A,)),
+    "once": (vec.stacked_barrier, (X, Y)),
     "dot": (vec.dot, (A, B)),
     "cross": (vec.cross, (A, B)),
     "scale": (vec.scale, (A, X)),
@@ -31,7 +31,7 @@ FUNCTIONS = {
     "cos_sin": (vec.cos_sin, (X,)),
     "add": (vec.add, (A, B)),
     "length": (vec.length, (A,)),
-    "unit": (vec.unit, (A, B)),
+    "unit": (vec.normalize, (A, B)),
     "reject": (vec.reject, (A, B)),
 }
 
@@ -48,7 +48,7 @@ def products(a, b, weight):
         vec.reject(a, b),
         vec.length(a),
         vec.scale(a, weight),
-        vec.fence(a),
+        vec.barrier(a),
     )
 
 
@@ -74,7 +74,7 @@ def test_one_vector_broadcasts_against_many():
     assert_allclose(vec.cross(jnp.asarray(A), one), np.cross(A, B[0]), atol=1e-15)
     assert vec.dot(one, jnp.zeros((2, 5, 3))).shape == (2, 5)
     assert vec.scale(one, jnp.asarray(X)).shape == (4, 3)
-    assert vec.unit(jnp.zeros((2, 4, 3)), jnp.asarray(A)).shape == (2, 4, 3)
+    assert vec.normalize(jnp.zeros((2, 4, 3)), jnp.asarray(A)).shape == (2, 4, 3)
 
 
 def test_a_constant_takes_the_precision_of_its_companion():
@@ -92,8 +92,8 @@ def test_products_are_those_of_numpy(a, b):
     assert_allclose(vec.add(ja, jb), a + b, atol=0)
     assert_allclose(vec.length(ja), np.linalg.norm(a), rtol=1e-12)
     assert_allclose(vec.stack(*vec.components(ja)), a, atol=0)
-    assert_allclose(vec.fence(ja), a, atol=0)
-    assert_allclose(vec.once(ja, jnp.asarray(2.0)), (a, np.full_like(a, 2.0)), atol=0)
+    assert_allclose(vec.barrier(ja), a, atol=0)
+    assert_allclose(vec.stacked_barrier(ja, jnp.asarray(2.0)), (a, np.full_like(a, 2.0)), atol=0)
 
 
 def test_the_vector_product_is_right_handed():
@@ -106,7 +106,7 @@ def test_the_vector_product_is_right_handed():
 @given(vectors(ANY_SIZE), directions())
 def test_a_unit_has_length_one_and_the_same_direction_or_is_the_fallback(v, pair):
     fallback = jnp.asarray(pair[0])
-    answer = vec.unit(jnp.asarray(v), fallback)
+    answer = vec.normalize(jnp.asarray(v), fallback)
     assert_allclose(vec.length(answer), 1.0, atol=1e-14)
     if v.any():
         assert_allclose(np.cross(answer, v), 0, atol=1e-14)
@@ -166,7 +166,7 @@ def test_safe_functions_are_flat_at_their_limits():
     assert_allclose(finite_slopes(vec.safe_divide, 1.0, 0.0), 0, atol=0)
     assert_allclose(finite_slopes(vec.safe_arctan2, 0.0, 0.0), 0, atol=0)
     assert_allclose(finite_slopes(vec.length, np.zeros(3)), 0, atol=0)
-    assert_allclose(finite_slopes(vec.unit, np.zeros(3), np.eye(3)[0])[:, :3], 0, atol=0)
+    assert_allclose(finite_slopes(vec.normalize, np.zeros(3), np.eye(3)[0])[:, :3], 0, atol=0)
 
 
 @few
@@ -178,7 +178,7 @@ def test_slopes_of_products_and_lengths_are_those_of_differences(a, b, weight):
 @few
 @given(vectors(), vectors())
 def test_slopes_of_directions_are_those_of_differences(v, fallback):
-    assert_slopes_agree(vec.unit, v, fallback)
+    assert_slopes_agree(vec.normalize, v, fallback)
 
 
 @few
@@ -194,7 +194,7 @@ def test_slopes_stay_finite_in_single_precision_however_short_the_vector():
     sizes = 10.0 ** -jnp.asarray([3, 6, 9, 15, 30], jnp.float32)
     v = sizes[:, None] * jnp.asarray([1.0, 0.0, 0.0], jnp.float32)
     fallback = jnp.asarray([0.0, 1.0, 0.0], jnp.float32)
-    of_unit = jax.jit(jax.vmap(jax.jacrev(vec.unit), (0, None)))(v, fallback)
+    of_unit = jax.jit(jax.vmap(jax.jacrev(vec.normalize), (0, None)))(v, fallback)
     of_length = jax.jit(jax.vmap(jax.jacfwd(vec.length)))(v)
     for slope in (of_unit, of_length):
         assert slope.dtype == jnp.float32 and jnp.isfinite(slope).all()

@@ -286,7 +286,7 @@ def test_bones_keep_their_lengths(name):
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     result, frames = wandered(name), wander()
-    carried = jax.vmap(lambda pose, body: pose.moved(body))(frames.pose, result.body)
+    carried = jax.vmap(lambda pose, body: pose.transformed(body))(frames.pose, result.body)
     for joint in ("hip", "knee"):
         parent_turn = (
             quat.identity()

@@ -99,7 +99,7 @@ def lean(
     else:
         rising = frame.slide > state.slide_weight
         slide_gain = parameters["lean.slide_on_gain" if rising else "lean.slide_off_gain"]
-        share = maths.share_of_gain(slide_gain, hz, frame.dt)
+        share = maths.fraction_of_gain(slide_gain, hz, frame.dt)
         slide = lerp(state.slide_weight, float(frame.slide), share)
         gain = lerp(parameters["lean.gain"], parameters["lean.gain_slide"], slide)
         half_life, spring = maths.half_life_of_gain(gain, hz), parameters["lean.spring"]
@@ -200,10 +200,10 @@ def lock(
 
     if locked:
         half_life = parameters.of_leg("lock.lock_half_life", leg)
-        factor += maths.share_of_half_life(half_life, frame.dt) * (1.0 - factor)
+        factor += maths.fraction_of_half_life(half_life, frame.dt) * (1.0 - factor)
         offset = offset - factor * moved
     else:
-        kept_share = 1.0 - maths.share_of_half_life(
+        kept_share = 1.0 - maths.fraction_of_half_life(
             parameters.of_leg("lock.unlock_half_life", leg), frame.dt
         )
         factor, offset, pointed = factor * kept_share, offset * kept_share, foot.heading_ws
@@ -254,6 +254,6 @@ def pelvis_height(
     if state is None:
         return goal
     hz = parameters["pelvis.tick_hz"]
-    on = maths.share_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
-    off = maths.share_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
+    on = maths.fraction_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
+    off = maths.fraction_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
     return lerp(state.pelvis_height, goal, lerp(off, on, contact))

@@ -159,14 +159,14 @@ def clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
-def share_of_gain(gain: float, tick_hz: float, dt: float) -> float:
+def fraction_of_gain(gain: float, tick_hz: float, dt: float) -> float:
     """Part of the way covered in `dt` s by a gain per tick; a gain of 1 or more jumps."""
     if gain >= 1.0:
         return 1.0
     return 1.0 - (1.0 - gain) ** (dt * tick_hz)
 
 
-def share_of_half_life(half_life: float, dt: float) -> float:
+def fraction_of_half_life(half_life: float, dt: float) -> float:
     """Part of the way covered in `dt` s; a half-life <= 0 s jumps, an infinite one stays."""
     if half_life <= 0.0:
         return 1.0
@@ -201,7 +201,7 @@ def follow(before: Eased | None, goal: float, half_life: float, dt: float, sprin
     if before is None or half_life <= 0.0:
         return Eased(goal, 0.0)
     if not spring:
-        return Eased(lerp(before.value, goal, share_of_half_life(half_life, dt)), 0.0)
+        return Eased(lerp(before.value, goal, fraction_of_half_life(half_life, dt)), 0.0)
     w = 2.0 * math.log(2.0) / half_life
     a = before.value - goal
     b = before.velocity + w * a

@@ -158,8 +158,8 @@ def pelvis_height(
     if state is None:
         return goal
     hz = parameters["pelvis.tick_hz"]
-    on = maths.share_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
-    off = maths.share_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
+    on = maths.fraction_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
+    off = maths.fraction_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
     return maths.lerp(state.pelvis_height, goal, maths.lerp(off, on, contact))
 
 

@@ -220,7 +220,7 @@ def stand_by_speed(
         stands = before.standing
     if before is None:
         return Standing(stands, float(stands))
-    share = maths.share_of_half_life(parameters.of_leg("contact.half_life", leg), frame.dt)
+    share = maths.fraction_of_half_life(parameters.of_leg("contact.half_life", leg), frame.dt)
     return Standing(stands, lerp(before.weight, float(stands), share))
 
 

@@ -124,14 +124,14 @@ class Stride:
     """Where each leg is in its stride: what an animation's own labels tell.
 
     `standing` (legs) is 0..1; `last_ws` and `next_ws` (legs 3), m, are where the ball stood and
-    will stand, while it stands where it does; `share` (legs) is the part of the swing's time that
+    will stand, while it stands where it does; `fraction` (legs) is the part of the swing's time that
     has passed, 0 while standing; where `known` (legs) is 0 only `standing` is told.
     """
 
     standing: Array
     last_ws: Array
     next_ws: Array
-    share: Array
+    fraction: Array
     known: Array
 
     @classmethod

@@ -49,7 +49,7 @@ def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bo
     stride = frame.stride
     if stride.known[leg] > 0.5:
         places = (level(frame, up, place[leg]) for place in (stride.last_ws, stride.next_ws))
-        return Swing(*places, float(stride.share[leg]))
+        return Swing(*places, float(stride.fraction[leg]))
     stance_time = parameters.of_leg("probe.stance_time", leg)
     swing_time = parameters.of_leg("probe.swing_time", leg)
     velocity = across(frame.travel_ws, up)
@@ -96,14 +96,14 @@ def ground_of_stride(
 
     start = parameters.of_leg("probe.rise_start", leg)
     end = parameters.of_leg("probe.rise_end", leg)
-    x = clip((stride.share - start) / (end - start), 0.0, 1.0)
+    x = clip((stride.fraction - start) / (end - start), 0.0, 1.0)
     k = parameters.of_leg("probe.steepness", leg)
     risen = x**k / (x**k + (1.0 - x) ** k)
     ground = lerp(low, high, risen)
     normal = unit(last.normal + risen * (next_normal - last.normal), up)
 
     need = lift_over_edges(parameters, rig, terrain, frame, leg, stride, ground, max(low, high))
-    window = smooth01(stride.share / EDGE_SHARE) * smooth01((1.0 - stride.share) / EDGE_SHARE)
+    window = smooth01(stride.fraction / EDGE_SHARE) * smooth01((1.0 - stride.fraction) / EDGE_SHARE)
     return Hit(True, here + up * (ground + window * need), normal), stride
 
 

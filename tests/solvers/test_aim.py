@@ -22,7 +22,7 @@ NOWHERE, LEVEL = np.zeros(3), np.float64(0.0)
 def aimed(to_target, forward, offset, up, pole, twist):
     """The turn, and whether the target is reached."""
     args = map(jnp.asarray, (to_target, forward, offset, up, pole, twist))
-    return aim.aim_turn(*args, gate=HARD)
+    return aim.aim_rotation(*args, gate=HARD)
 
 
 def axes(to_target, forward, *rest):
@@ -100,7 +100,7 @@ def test_the_line_may_pass_beside_the_joint_no_farther_than_the_target_is():
         if not reached:
             assert_allclose(turn, quat.identity(jnp.float64), atol=0)
         args = map(jnp.asarray, (X, X, height * Y, Y, Y, LEVEL))
-        smooth = aim.aim_turn(*args, gate=Smooth(0.1))[1]
+        smooth = aim.aim_rotation(*args, gate=Smooth(0.1))[1]
         assert (smooth >= 0.5) == reached
 
 
@@ -117,7 +117,7 @@ def test_a_target_on_the_joint_turns_nothing():
 def test_without_a_pole_or_an_up_seen_along_the_target_the_arc_is_the_shortest(up, pole):
     # Up along x comes to lie along the target, z; the poles along z do from the start.
     turn, reached = aimed(2.0 * Z, X, NOWHERE, up, pole, LEVEL)
-    direct = quat.arc(jnp.asarray(X), jnp.asarray(Z), jnp.asarray(Y))
+    direct = quat.shortest_arc(jnp.asarray(X), jnp.asarray(Z), jnp.asarray(Y))
     assert_allclose(turn, direct, atol=1e-14)
     assert reached == 1
 
@@ -177,7 +177,7 @@ def test_slopes_are_finite_there_in_single_precision_too():
 
 def test_slopes_are_finite_through_a_smooth_gate():
     def smooth(*case):
-        turn, reached = aim.aim_turn(*map(jnp.asarray, case), gate=Smooth(1.0))
+        turn, reached = aim.aim_rotation(*map(jnp.asarray, case), gate=Smooth(1.0))
         return quat.rotate(turn, jnp.asarray(X)), reached
 
     for case in SINGULAR.values():
@@ -199,5 +199,5 @@ def test_a_compiled_batch_is_many_singles_in_either_precision():
 def test_targets_are_broadcast_against_one_joint():
     target = jnp.asarray(np.broadcast_to(X + Y, (3, 2, 3)))
     x, y, nowhere = (jnp.asarray(v) for v in (X, Y, NOWHERE))
-    turn, reached = aim.aim_turn(target, x, nowhere, y, y, jnp.asarray(0.3), HARD)
+    turn, reached = aim.aim_rotation(target, x, nowhere, y, y, jnp.asarray(0.3), HARD)
     assert turn.shape == (3, 2, 4) and reached.shape == (3, 2)

@@ -106,8 +106,8 @@ def two_bone(rows: Rows, dtype: DTypeLike = jnp.float64) -> Answer:
 
     half = bend.half_cos, bend.half_sin
     start = blended(bend.swing, rows)
-    mid = blended(quat.from_half(jnp.asarray(rows.mid_axis, dtype), *half), rows)
-    turn = blended(quat.from_half(given[2], *half), rows)
+    mid = blended(quat.from_half_angle(jnp.asarray(rows.mid_axis, dtype), *half), rows)
+    turn = blended(quat.from_half_angle(given[2], *half), rows)
     place = quat.rotate(start, quat.rotate(turn, given[1]) - given[0])
     reached = (np.asarray(bend.reached) == 1) & (rows.weight >= 1)
     end = points(rows.start, np.asarray(place, np.float64))
@@ -125,7 +125,7 @@ def aimed(rows: Rows, dtype: DTypeLike = jnp.float64) -> tuple[np.ndarray, np.nd
     target, pole = to_aim(rows)
     given = (target, rows.forward, rows.offset, rows.up, pole, rows.twist_angle)
     given = [jnp.asarray(x, dtype) for x in given]
-    turn, reached = jax.jit(lambda x: aim.aim_turn(*x, gate=HARD))(given)
+    turn, reached = jax.jit(lambda x: aim.aim_rotation(*x, gate=HARD))(given)
     return np.asarray(blended(turn, rows)), np.asarray(reached) == 1
 
 

@@ -24,7 +24,7 @@ def solved(to_hip, to_ankle, hinge, to_target, pole, soften, twist):
     """Knee and ankle, from the hip, the hinge and the swing after the bend; and `reached`."""
     args = map(jnp.asarray, (to_hip, to_ankle, hinge, to_target, pole, soften, twist))
     bend = two_bone.pole_bend(*args, gate=HARD)
-    turn = quat.from_half(hinge, bend.half_cos, bend.half_sin)
+    turn = quat.from_half_angle(hinge, bend.half_cos, bend.half_sin)
     knee = -quat.rotate(bend.swing, to_hip)
     ankle = knee + quat.rotate(bend.swing, quat.rotate(turn, to_ankle))
     return knee, ankle, quat.rotate(bend.swing, hinge), bend.swing, bend.reached
@@ -202,7 +202,7 @@ def test_a_pole_without_a_plane_leaves_the_shortest_arc(pole):
     hinge = (Z + 0.2 * Y) / np.sqrt(1.04)
     knee, ankle, _, swing, _ = solved(0.5 * X, 0.4 * Y, hinge, 0.7 * Y, pole, ONE, NONE)
     bent = quat.unrotate(swing, jnp.asarray(ankle))
-    direct = quat.arc(vec.unit(bent, bent), jnp.asarray(Y), jnp.asarray(X))
+    direct = quat.shortest_arc(vec.normalize(bent, bent), jnp.asarray(Y), jnp.asarray(X))
     assert_allclose(quat.angle(direct, swing), 0.0, atol=1e-12)
     assert_allclose(knee, -quat.rotate(direct, jnp.asarray(0.5 * X)), atol=1e-12)
 
@@ -328,7 +328,7 @@ def test_legs_and_batches_are_broadcast():
 
 def swung(bent, to_target, hinge, twist):
     """The axes after a swing: free of a quaternion's choice of sign."""
-    return quat.axes(two_bone.swing_turn(bent, to_target, hinge, twist))
+    return quat.axes(two_bone.swing_rotation(bent, to_target, hinge, twist))
 
 
 @few
@@ -347,16 +347,16 @@ def test_the_slopes_of_a_knee_agree_with_differences(drawn, share):
     to_hip, to_ankle, hinge = drawn[:3]
     thigh, shin = np.linalg.norm(to_hip), np.linalg.norm(to_ankle)
     reach = abs(thigh - shin) + share * (thigh + shin - abs(thigh - shin))
-    assert_slopes_agree(two_bone.hinge_turn, to_hip, to_ankle, hinge, reach)
+    assert_slopes_agree(two_bone.hinge_rotation, to_hip, to_ankle, hinge, reach)
 
 
 def test_slopes_are_finite_where_a_swing_or_a_knee_has_no_single_answer():
     swings = ((X, -X, Y), (X, -X, X), (X, Y, X), (X, Y, Y), (X, X, X), (0 * X, Y, Z))
     for bent, target, hinge in swings:
-        finite_slopes(two_bone.swing_turn, bent, target, hinge, 0.3)
+        finite_slopes(two_bone.swing_rotation, bent, target, hinge, 0.3)
     for hip, ankle, hinge in ((X, -X, Y), (X, X, Y), (X, Y, X), (0 * X, Y, Z), (X, Y, Z)):
         for reach in (0.0, 1.0, 2.0, 3.0):
-            finite_slopes(two_bone.hinge_turn, hip, ankle, hinge, reach)
+            finite_slopes(two_bone.hinge_rotation, hip, ankle, hinge, reach)
 
 
 @few
@@ -366,5 +366,5 @@ def test_a_limb_straight_to_within_rounding_has_no_slope_by_its_reach(drawn):
     whole = np.linalg.norm(to_hip) + np.linalg.norm(to_ankle)
     for reach in (whole, np.nextafter(whole, 0.0), np.nextafter(whole, 9.0)):
         given_as = [jnp.asarray(x) for x in (to_hip, to_ankle, hinge, reach)]
-        slopes = jax.jacfwd(two_bone.hinge_turn, argnums=3)(*given_as)
+        slopes = jax.jacfwd(two_bone.hinge_rotation, argnums=3)(*given_as)
         np.testing.assert_array_equal(slopes, 0.0)

@@ -75,7 +75,7 @@ def swing(shares: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jaxik.
             standing=np.zeros(2),
             last_ws=sideways + start * maths.Z,
             next_ws=sideways + end * maths.Z,
-            share=np.full(2, share),
+            fraction=np.full(2, share),
             known=np.ones(2),
         )
         ahead = maths.lerp(start, end, maths.smooth01(share)) - frame.toe.pos[0, 2]

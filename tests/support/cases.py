@@ -160,7 +160,7 @@ def swinging(share: float, told: bool = True) -> list[things.Frame]:
         standing=np.zeros(2),
         last_ws=frame.toe.pos - half_way,
         next_ws=frame.toe.pos + half_way,
-        share=np.full(2, share),
+        fraction=np.full(2, share),
         known=np.full(2, float(told)),
     )
     velocity = 0.8 * np.asarray(FORWARD)

@@ -335,7 +335,7 @@ def _strides(frame: reference.Frame, share: np.ndarray, known: bool) -> things.S
         standing=(share == 0.0).astype(float),
         last_ws=balls - share[:, None] * forward,
         next_ws=balls + (1.0 - share[:, None]) * forward,
-        share=share,
+        fraction=share,
         known=np.full(len(share), float(known)),
     )
 

@@ -89,7 +89,7 @@ def walk(
             standing=np.array([step.standing for step in steps]),
             last_ws=_places([step.last for step in steps], rig, turned, start),
             next_ws=_places([step.next for step in steps], rig, turned, start),
-            share=np.array([step.share for step in steps]),
+            fraction=np.array([step.share for step in steps]),
             known=np.full(legs, float(told)),
         )
         frames.append(_posed(rig, steps, speed * time, root, stride, hip_height, 1.0 / hz))

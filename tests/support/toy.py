@@ -115,14 +115,14 @@ def run(ik: Toy, inputs: Inputs) -> tuple[Array, Array, Array]:
         locked = near * slow
         anchor = HARD.choose(locked, anchor, pos)
         half_life = HARD.choose(locked, lock.half_life, lock.release)
-        share = smoothing.share_of_half_life(half_life, dt)
-        offset = smoothing.approach(offset, locked * (anchor - pos), share)
-        goal = HARD.clip(HARD.least(ground, band=0.01), -body.drop, body.rise, band=0.01)
-        pelvis = smoothing.approach(
-            pelvis, goal, smoothing.share_of_gain(body.gain, dt, body.tick_hz)
+        share = smoothing.fraction_of_half_life(half_life, dt)
+        offset = smoothing.lerp(offset, locked * (anchor - pos), share)
+        goal = HARD.clip(HARD.minimum(ground, band=0.01), -body.drop, body.rise, band=0.01)
+        pelvis = smoothing.lerp(
+            pelvis, goal, smoothing.fraction_of_gain(body.gain, dt, body.tick_hz)
         )
         tilt = HARD.clip(foot.share * slope, -foot.limit, foot.limit, band=0.03)
-        pitch = smoothing.approach(pitch, tilt, smoothing.share_of_half_life(foot.half_life, dt))
+        pitch = smoothing.lerp(pitch, tilt, smoothing.fraction_of_half_life(foot.half_life, dt))
         return (pos, anchor, offset, locked, pelvis, pitch), (pos + offset, pelvis, pitch)
 
     first = inputs.pos[0]

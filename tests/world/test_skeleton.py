@@ -80,7 +80,7 @@ def test_transforms_are_the_matrices_of_scipy(a, b, point):
     assert_allclose(
         matrix(inverse.pos, inverse.rot), np.linalg.inv(matrix(a.pos, a.rot)), atol=1e-14
     )
-    assert_allclose(a.turn(b.rot), ours.rot, atol=0)
+    assert_allclose(a.apply_rot(b.rot), ours.rot, atol=0)
 
 
 @few
@@ -192,7 +192,7 @@ def leg_pose() -> LegPose:
 @few
 @given(transforms())
 def test_a_pose_carried_along_keeps_its_bones(by):
-    moved = leg_pose().moved(by)
+    moved = leg_pose().transformed(by)
     thigh, shin = bone_lengths(moved)
     assert_allclose(thigh, [0.4, 0.5], atol=1e-14)
     assert_allclose(shin, [0.3, 0.45], atol=1e-14)
@@ -202,11 +202,11 @@ def test_a_pose_carried_along_keeps_its_bones(by):
 
 def test_copies_of_a_transform_are_it_and_add_up_their_slopes():
     one = Transform(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([0.5, 0.5, -0.5, 0.5]))
-    several = one.copies(3)
+    several = one.repeat(3)
     assert_allclose(several.pos, np.tile(one.pos, (3, 1)), atol=0)
     assert_allclose(several.rot, np.tile(one.rot, (3, 1)), atol=0)
     weights = jnp.asarray([[1.0], [10.0], [100.0]])
-    slope = jax.grad(lambda one: jnp.sum(weights * one.copies(3).pos))(one)
+    slope = jax.grad(lambda one: jnp.sum(weights * one.repeat(3).pos))(one)
     assert_allclose(slope.pos, [111.0] * 3, atol=0)
 
 
