@@ -7,7 +7,7 @@ import pytest
 
 from fitting.runtime import xla
 
-xla.use()  # as the commands do
+xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -124,7 +124,7 @@ def _decisions(result: jaxik.Result) -> np.ndarray:
     return np.stack([np.asarray(one) > 0.5 for one in every], axis=-1).ravel()
 
 
-@program_cache.kept
+@program_cache.cached
 def _step_each(ik: jaxik.FootIK, scene: Scene, before: jaxik.State) -> tuple[Array, ...]:
     """Body and legs of every frame, each stepped from its own memory."""
 

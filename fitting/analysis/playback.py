@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxik
 from fitting.problem.residuals import Scene, errors_of, legs_ws, pelvis_ws, rows_by_kind
-from fitting.runtime.program_cache import kept
+from fitting.runtime.program_cache import cached
 from jaxik.maths import vec
 from jaxik.world import frame
 from jaxik.world.skeleton import Transform
@@ -103,7 +103,7 @@ def play(ik: jaxik.FootIK, scene: Scene) -> Playback:
     return jax.tree.map(np.asarray, _watch(ik, scene))
 
 
-@kept
+@cached
 def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
     result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxik
-from fitting.runtime.threads import at_once, cores, on_all_cores
+from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
 from jaxik.world.terrain import Terrain, plane
 
 from . import setup
@@ -27,7 +27,7 @@ def outcome(crowd: setup.Crowd, ground: Terrain, given: tuple) -> tuple:
 
 
 def _taken(ik: jaxik.FootIK, crowd: setup.Crowd, ground: Terrain, frames: jaxik.Frame) -> tuple:
-    result = jaxik.run(ik, crowd.rig, ground, frames, block=at_once(BLOCK))
+    result = jaxik.run(ik, crowd.rig, ground, frames, block=cpu_block(BLOCK))
     return result.corrections, result.body, result.reached
 
 
@@ -115,4 +115,4 @@ def _leg_frames(row: Row, what: str, name: str, count: int, **reach: Any) -> Non
         f"workspace of a chunk {work.workspace / 1e6:.0f} MB"
     )
     scale = 1e-6 * count
-    row.timed(what, name, "M", scale, rate=True, threads=cores(), note=note, **reach)
+    row.timed(what, name, "M", scale, rate=True, threads=usable_cores(), note=note, **reach)

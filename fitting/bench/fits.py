@@ -26,7 +26,7 @@ from fitting.inference.optimisation.search import solve
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling.posterior import sample_problem
 from fitting.problem.problem import Problem
-from fitting.runtime.threads import cores
+from fitting.runtime.threads import usable_cores
 
 from . import peers, setup
 from .measure import Row, clocked
@@ -167,10 +167,10 @@ def posterior(row: Row, sizes: Sizes) -> None:
     one = row.work["rows"]  # all walkers of a step read the clip once
     row.work["chain"] = dataclasses.replace(one * calls, moved=one.moved * sizes.steps)
     a_call = 1e3 * row.samples["chain"][0] / calls
-    note = f"{a_call:.2f} ms a log-probability; {cores()} cores"
+    note = f"{a_call:.2f} ms a log-probability; {usable_cores()} cores"
     reach: dict[str, Any] = {"at_most": 60.0} if calls >= CALLS else {}  # fewer are no proof
     what = f"{sizes.walkers} walkers, {sizes.steps} steps"
-    row.timed(what, "chain", "s", threads=cores(), note=note, **reach)
+    row.timed(what, "chain", "s", threads=usable_cores(), note=note, **reach)
 
 
 def main() -> None:

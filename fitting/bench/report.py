@@ -13,7 +13,7 @@ import jax
 from fitting.report import tables
 from fitting.report.plots import style
 from fitting.runtime import files
-from fitting.runtime.threads import cores
+from fitting.runtime.threads import usable_cores
 
 from . import plots
 from .measure import Figure, Report, Row, load, medians
@@ -28,7 +28,7 @@ def hardware() -> dict[str, Any]:
     return {
         "cpu": _told(CPU, "model name") or platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
-        "threads": cores(),
+        "threads": usable_cores(),
         "memory_gb": _memory_gb(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
@@ -164,7 +164,7 @@ def check_places(numbers: Path | None, plot: Path | None) -> Path | None:
         raise ValueError(f"{numbers}: the numbers and the curves cannot be one file")
     for place in (numbers, drawn):
         if place is not None:
-            files.check_place(place)
+            files.check_output_file(place)
     return drawn
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import jaxik
 from fitting.datasets.frames import frames_of
 from fitting.datasets.terrain import mesh_files
-from fitting.runtime.threads import at_once, cores, on_all_cores
+from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
 from jaxik.stages.effector import Effector
 from jaxik.stages.leg import Bend
 from jaxik.world.terrain import Terrain, cast, plane
@@ -41,13 +41,18 @@ def machine(row: Row, sizes: Sizes) -> None:
             calls[floats] = row.compiled(floats, _product, square)
     row.race(calls)
     moved, done = float(long.nbytes), 2.0 * sizes.side**3
-    all_cores = {"rate": True, "threads": cores()}
+    all_cores = {"rate": True, "threads": usable_cores()}
     row.timed("memory, read", "memory", "GB/s", 1e-9 * moved, **all_cores)
     for floats in ("float32", "float64"):
         row.timed(f"{floats}, matrix product", floats, "GFLOP/s", 1e-9 * done, **all_cores)
     row.timed("a program that does nothing", "dispatch", "µs", 1e6)
     # Where the CPU computes, the time that it gave: another process does not lower a ceiling.
-    shared = {"memory": cores(), "float32": cores(), "float64": cores(), "dispatch": 1}
+    shared = {
+        "memory": usable_cores(),
+        "float32": usable_cores(),
+        "float64": usable_cores(),
+        "dispatch": 1,
+    }
     best = {
         name: min(row.busy[name]) / threads
         if jax.default_backend() == "cpu"
@@ -111,7 +116,7 @@ def side_by_side(of_one: Callable[[setup.Batch], Any]) -> Callable[[jaxik.FootIK
 
     def of_many(ik: jaxik.FootIK, parts: tuple) -> Any:
         one = lambda parts: of_one(setup.Batch(ik, *parts))  # noqa: E731
-        return jaxik.lanes(one, in_axes=-1, out_axes=-1, block=at_once(BLOCK))(parts)
+        return jaxik.lanes(one, in_axes=-1, out_axes=-1, block=cpu_block(BLOCK))(parts)
 
     return of_many
 
@@ -138,7 +143,7 @@ def _shared_out(
 ) -> Callable[[], Any]:
     """A call in which each core computes its share of the many: one program, of a share."""
     count = jax.tree.leaves(many)[0].shape[axis]
-    share = -(-count // cores())
+    share = -(-count // usable_cores())
 
     def from_number(first: int) -> list[jax.Array]:
         first = min(first, count - share)  # the last reaches back, to be as long
@@ -161,8 +166,8 @@ def _per_leg(row: Row, count: int, **reach: Any) -> None:
     """The figure of a kernel."""
     work = row.work["ours"]
     note = f"{work.moved / count:.0f} bytes and {work.operations / count:.0f} operations a leg"
-    scale = 1e9 * cores() / count
-    row.timed("a leg and core", "ours", "ns", scale, threads=cores(), note=note, **reach)
+    scale = 1e9 * usable_cores() / count
+    row.timed("a leg and core", "ours", "ns", scale, threads=usable_cores(), note=note, **reach)
 
 
 def legs(row: Row, sizes: Sizes) -> None:
@@ -213,7 +218,7 @@ def rays(row: Row, sizes: Sizes) -> None:
         calls["Embree, which triangle"] = lambda: tracer.intersects_first(wide, down)
         calls["Embree, where"] = lambda: tracer.intersects_location(wide, down, multiple_hits=False)
     row.race(calls, sizes.crowd_repeats)
-    all_cores = {"rate": True, "threads": cores()}
+    all_cores = {"rate": True, "threads": usable_cores()}
     note = "the limit reads each ray once, and of the ground nothing"
     row.timed("rays a second", "ours", "M", 1e-6 * len(origins), note=note, **all_cores)
     if tracer is None:

@@ -205,14 +205,14 @@ def convert(options: argparse.Namespace) -> int:
         if options.csv:
             print(record.to_csv(read).rstrip())
         else:
-            with validation.located(options.file):
+            with validation.error_context(options.file):
                 print("\n\n".join(record_files.shown(one, reading) for one in read))
         return 0
     (only, *more) = read
     if more:
         raise ValueError(f"{options.file} has {1 + len(more)} rows; give a file with one record")
     if options.way == "to-toml":
-        with validation.located(options.file):
+        with validation.error_context(options.file):
             text = parameter_files.to_toml(record.to_ik(only, reading))
         files.write_text(options.output, text)
     else:
@@ -267,7 +267,7 @@ def _told_where(run: Path, fitted: study.Fit) -> int:
 def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
     if options.output.suffix.lower() != ".npz":
         raise ValueError(f"{options.output}: wanted a name that ends in .npz")
-    files.check_place(options.output)
+    files.check_output_file(options.output)
     base = load_base(options.clip)
     ground = mesh_files.load_terrain(options.terrain, file_up=options.file_up)
     motion = frames.frames_of(base, floor=options.floor)

@@ -37,7 +37,7 @@ interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and gives its exit status; a user's mistake makes one line on stderr."""
     options = parser().parse_args(arguments)
-    xla.use()
+    xla.configure_xla()
     try:
         from . import commands  # imports JAX: `--help` need not wait for it
 

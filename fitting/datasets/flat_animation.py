@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from fitting.runtime.validation import located
+from fitting.runtime.validation import error_context
 
 from .clips import contacts, load_clip
 from .clips.clip import Clip
@@ -87,7 +87,7 @@ def rigid_legs(clip: Clip) -> Clip:
 def load_base(path: Path) -> Clip:
     """The animation in a file as foot IK takes it: a blocks file's base, with rigid legs."""
     clip = load_clip(path, variant="base" if is_blocks(path) else "captured")
-    with located(path):
+    with error_context(path):
         return rigid_legs(clip)
 
 

@@ -151,7 +151,7 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     for key in ("clips", "free"):
         if not content.get(key):
             raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
-    with validation.located(path):
+    with validation.error_context(path):
         ik = name_preset(content.get("preset", "record"))
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
     check_table(content.get("sigmas", {}), SIGMA, f"{path} [sigmas]")
@@ -164,7 +164,7 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     sample = check_table(content.get("sample", {}), SAMPLE, f"{path} [sample]")
     made["sample"] = SampleOptions(**sample)
     if "walkers" in sample:
-        with validation.located(f"{path} [sample]"):
+        with validation.error_context(f"{path} [sample]"):
             posterior.check_walkers(len(made["free"]), sample["walkers"])
     made.setdefault("name", path.stem)
     return Experiment(path=path, **made)
@@ -191,7 +191,7 @@ def system(experiment: Experiment) -> jaxik.FootIK:
 
 def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[Free]:
     """The free parameters as the experiment and the rules declare them."""
-    with validation.located(f"{experiment.path} [free]"):
+    with validation.error_context(f"{experiment.path} [free]"):
         return [free(ik, name, **options) for name, options in experiment.free.items()]
 
 
@@ -200,7 +200,7 @@ def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Cl
     ground = mesh_files.load_terrain(entry.terrain, file_up=entry.file_up)
     captured = clips.load_clip(entry.reference)
     if entry.mask_pops:
-        with validation.located(entry.reference):
+        with validation.error_context(entry.reference):
             captured = edit.mask_pops(captured)  # at its own rate: a pop is shorter than others
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
@@ -216,7 +216,7 @@ def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Cl
 
 
 def _cut(clip: clips.Clip, path: Path, entry: ClipEntry, fps: float | None) -> clips.Clip:
-    with validation.located(path):
+    with validation.error_context(path):
         clip = edit.trim(clip, entry.start, entry.end)
     return clip if fps is None else edit.resample(clip, fps)
 
@@ -284,12 +284,12 @@ def problem_of(
     """
     ik = system(experiment)
     frees = free_parameters(experiment, ik)
-    with validation.located(f"{experiment.path} [free]"):
+    with validation.error_context(f"{experiment.path} [free]"):
         space = make_space(ik, frees)
     made = []
     for entry, pair in zip(experiment.clips, pairs, strict=True):
         scene = make_scene(*pair, experiment.sigmas, entry.label)
-        with validation.located(f"{experiment.path} [parameters]"):
+        with validation.error_context(f"{experiment.path} [parameters]"):
             check_shapes(ik, scene.rig, scene.terrain, scene.frames)
         made.append(scene)
     times = np.concatenate([np.asarray(scene.frames.dt) for scene in made])
@@ -327,6 +327,6 @@ def _entry(given: Any, path: Path) -> ClipEntry:
         if key in table:
             made[key] = (path.parent / table[key]).resolve()
             if not made[key].is_file():
-                why = validation.missing(made[key])
+                why = validation.why_missing(made[key])
                 raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {why}")
     return ClipEntry(**made)

@@ -13,8 +13,8 @@ from . import parameter_files, systems
 def read_bytes(path: Path) -> record.Record:
     """The record in a binary file; ValueError for none."""
     if not path.is_file():
-        raise ValueError(f"{path}: {validation.missing(path)}, wanted a record")
-    with validation.located(path):
+        raise ValueError(f"{path}: {validation.why_missing(path)}, wanted a record")
+    with validation.error_context(path):
         return record.from_bytes(path.read_bytes())
 
 

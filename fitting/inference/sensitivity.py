@@ -11,7 +11,7 @@ from jaxtyping import Array
 import jaxik
 from fitting.problem.residuals import Scene, rows_of_scenes
 from fitting.problem.space import PRIOR_SD, Space, free, make_space
-from fitting.runtime.program_cache import kept
+from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
 from .optimisation.population import POPULATION, from_values
@@ -83,6 +83,6 @@ def _rows(space: Space, scenes: tuple[Scene, ...], some: np.ndarray) -> np.ndarr
     return np.asarray(_rows_of_all(space, scenes, filled))[: len(some)]
 
 
-@kept
+@cached
 def _rows_of_all(space: Space, scenes: tuple[Scene, ...], candidates: Array) -> Array:
     return jax.vmap(lambda u: rows_of_scenes(space.unpack(u), scenes))(candidates)

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.runtime.program_cache import kept
+from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
 PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
@@ -214,7 +214,7 @@ class Space(eqx.Module):
         tree = self.base if isinstance(given, Mapping) else given
         return self._pack(tree, {name: jnp.asarray(value) for name, value in named.items()})
 
-    @kept  # apart, every line would be a program
+    @cached  # apart, every line would be a program
     def _pack(self, tree: Any, named: dict[str, Array]) -> Array:
         leaves = self._leaves(tree)
         u = [jnp.zeros(())] * self.size

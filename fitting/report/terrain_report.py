@@ -22,7 +22,7 @@ def check_places(mesh: Path) -> None:
     """ValueError where the mesh, its numbers or its picture cannot be written."""
     mesh_files.check_mesh_name(mesh)
     for path in (mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)):
-        files.check_place(path)
+        files.check_output_file(path)
 
 
 def write(mesh: Path, found: Ground, clip: Clip, sole: float, margin: float) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 
-def check_place(path: Path) -> None:
+def check_output_file(path: Path) -> None:
     """ValueError where no file can be written, before anything is computed for it."""
     if path.is_dir():
         raise ValueError(f"{path}: cannot be written: it is a folder")
@@ -21,7 +21,7 @@ def write(path: Path, fill: Callable[[Path], Any]) -> None:
     Raises:
         ValueError: where the folder is not there or may not be written.
     """
-    check_place(path)
+    check_output_file(path)
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}", suffix=path.suffix)
     except OSError as error:

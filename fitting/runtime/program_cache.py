@@ -50,7 +50,7 @@ class _Unknown(Exception):
     """Something whose source may change without our knowing."""
 
 
-def kept(function: Callable[Given, Made]) -> Callable[Given, Made]:
+def cached(function: Callable[Given, Made]) -> Callable[Given, Made]:
     """`equinox.filter_jit`, and where JAX keeps compiled programs the traced one is kept too.
 
     Arrays of the arguments are traced and everything else is static. A program is only kept if all
@@ -178,4 +178,4 @@ def _write(path: Path, program: Program) -> None:
         files.write(path, lambda temporary: temporary.write_bytes(kept_as))
 
 
-run = kept(jaxik.run)
+run = cached(jaxik.run)

@@ -10,14 +10,14 @@ from typing import Any
 import jax
 
 
-def cores() -> int:
+def usable_cores() -> int:
     """Cores that programs share: all that this process may use; one where a GPU computes."""
     if jax.default_backend() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def at_once(count: int) -> int | None:
+def cpu_block(count: int) -> int | None:
     """So many at a time on a CPU, whose cache is to hold them; all where a GPU computes."""
     return count if jax.default_backend() == "cpu" else None
 
@@ -37,7 +37,7 @@ def on_all_cores(calls: Sequence[Callable[[], Any]]) -> list:
         finally:
             left.clear()
 
-    helpers = cores() - 1
+    helpers = usable_cores() - 1
     helping = [_threads(helpers).submit(compute) for _ in range(helpers)]
     compute()
     for one in helping:

@@ -55,20 +55,20 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         ValueError: a file that is not there or no TOML.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: {missing(path)}, wanted {what} file")
+        raise ValueError(f"{path}: {why_missing(path)}, wanted {what} file")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not TOML: {error}") from None
 
 
-def missing(path: Path) -> str:
+def why_missing(path: Path) -> str:
     """Why there is nothing to read, in words."""
     return "a folder" if path.is_dir() else "no such file"
 
 
 @contextmanager
-def located(where: Path | str) -> Iterator[None]:
+def error_context(where: Path | str) -> Iterator[None]:
     """Says in front of a ValueError from within where it is."""
     try:
         yield

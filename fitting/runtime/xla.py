@@ -20,7 +20,7 @@ XLA = (
 ASYNC = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
 
 
-def use() -> None:
+def configure_xla() -> None:
     """Sets what the environment has not; to be called before JAX computes anything.
 
     Besides XLA's flags: a program runs in the thread that calls it. To wake another one for it, as

@@ -104,7 +104,7 @@ def contribution(
         one.name: changed(experiment, one) for one in experiment.without
     }
     for name, variant in variants.items():
-        with validation.located(name):
+        with validation.error_context(name):
             if frees := free_parameters(variant, system(variant)):
                 make_space(system(variant), frees)
     kept = {row.key: row for row in read(folder)}
@@ -119,7 +119,7 @@ def contribution(
             row = kept.pop(key, None)
             if row is None:
                 fitted = True
-                with validation.located(f"{name}, {one.name}"):
+                with validation.error_context(f"{name}, {one.name}"):
                     row = _fit(variant, one, _named(progress, f"{name}, {one.name}"))
                 row = replace(row, key=key, variant=name, part=part % len(splits))
                 _write(folder, [*rows, row, *kept.values()])

@@ -22,7 +22,7 @@ from fitting.experiments.systems import leaf_names, name_preset
 from fitting.report import tables
 from fitting.report.plots import comparison_plots, style
 from fitting.runtime import files, program_cache
-from fitting.runtime.validation import located
+from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree, vec
 from jaxik.world.terrain import Terrain, cast
 
@@ -122,12 +122,12 @@ def compare(
     """
     motion = frames.frames_of(clip, floor=floor)
     for name, ik in systems.items():
-        with located(name):
+        with error_context(name):
             check_shapes(ik, clip.rig, ground, motion)
     clips = {ANIMATED: clip}
     reached = {ANIMATED: np.full((clip.frames, len(clip.rig.joints)), np.nan)}
     for name, ik in systems.items():
-        with located(name), during(name):
+        with error_context(name), during(name):
             result, clips[name] = solve(ik, clip, ground, motion, floor)
         found = np.asarray(result.trace.sensed.foothold.found) > 0
         reached[name] = np.where(found, np.asarray(result.reached, np.float64), np.nan)

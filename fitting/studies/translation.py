@@ -86,7 +86,7 @@ def read_system(given: str, option: str) -> System:
     if path.suffix.lower() == ".toml":
         ik, preset = parameter_files.from_toml(path)
         return System(path.stem, preset, ik)
-    with validation.located(f"{option} takes a preset or a parameter .toml"):
+    with validation.error_context(f"{option} takes a preset or a parameter .toml"):
         return System(given, given, systems.name_preset(given))
 
 
@@ -106,7 +106,7 @@ def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
         named = {one.strip(): {} for one in given.split(",") if one.strip()}
     if not named:
         raise ValueError(f"--free {given}: names no parameter")
-    with validation.located("--free"):
+    with validation.error_context("--free"):
         for name, options in named.items():
             free(ik, name, **options)
     return named
@@ -194,7 +194,7 @@ def plan(
 def _solved(source: System, base: clips.Clip, ground: Any) -> clips.Clip:
     """What the source makes of a clip."""
     motion = frames.frames_of(base)
-    with validation.located(source.name):
+    with validation.error_context(source.name):
         experiment.check_shapes(source.ik, base.rig, ground, motion)
         _, solved = solve(source.ik, base, ground, motion, 0.0)
     return replace(solved, source=f"{source.name} on {base.source}")

@@ -15,7 +15,7 @@ from fitting.bench.setup import Sizes
 from fitting.inference.optimisation.search import solve
 from fitting.problem.problem import Problem
 from fitting.problem.space import free, make_space
-from fitting.runtime.threads import cores
+from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
 from support.quick import TARGETS, rows_of_scenes
@@ -56,7 +56,7 @@ def test_the_machines_ceilings_are_its_best_runs():
     (row,) = measure.measure(tasks, SMALL, True, lambda line: None).rows
     assert set(row.ceilings) == {"memory", "float32", "float64", "dispatch"}
     assert row.ceilings["dispatch"] == min(row.busy["dispatch"])
-    assert row.ceilings["float64"] == 2 * 8**3 * cores() / min(row.busy["float64"])
+    assert row.ceilings["float64"] == 2 * 8**3 * usable_cores() / min(row.busy["float64"])
 
 
 def test_imports_are_counted_beyond_jaxs_own(monkeypatch):

@@ -55,7 +55,7 @@ def same(found, wanted):
 
 def again():
     """What another process would have."""
-    return program_cache.kept(stretch)
+    return program_cache.cached(stretch)
 
 
 def test_what_is_kept_answers_like_the_function_and_is_traced_once(folder):
@@ -113,7 +113,7 @@ def by_function(change, at):
 def test_what_is_static_is_kept_by_its_name_where_its_source_is_known(folder, monkeypatch):
     monkeypatch.setattr(by_function, "__module__", "fitting.somewhere")
     for _ in range(2):
-        found = program_cache.kept(by_function)(vec.sum_last, points())
+        found = program_cache.cached(by_function)(vec.sum_last, points())
         np.testing.assert_array_equal(found, vec.sum_last(points()))
     assert len(TRACED) == len(list(folder.iterdir())) == 1
 
@@ -125,7 +125,7 @@ def test_a_function_of_the_users_is_called_and_not_kept(folder, monkeypatch, cha
         monkeypatch.setattr(stretch, "__module__", "mine")
         change = functools.partial(stretch, 1.0)
     for _ in range(2):
-        found = program_cache.kept(by_function)(change, points())
+        found = program_cache.cached(by_function)(change, points())
     assert jax.tree.leaves(found)[0].shape == (4, 3)
     assert len(TRACED) >= 2 and not folder.exists()
 
@@ -154,7 +154,7 @@ def test_one_within_another_that_knows_all_its_arguments_waits_for_nobody(folder
         return p + inner(2.0, known)["longer"]  # nothing of the inner call is traced
 
     monkeypatch.setattr(outer, "__module__", "fitting.somewhere")
-    found = program_cache.kept(outer)(points())
+    found = program_cache.cached(outer)(points())
     np.testing.assert_allclose(found, points() + stretch(2.0, points())["longer"])
 
 

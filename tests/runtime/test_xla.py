@@ -11,13 +11,13 @@ from fitting.runtime import xla
 
 def test_flags_are_set_where_none_are(monkeypatch):
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    xla.use()
+    xla.configure_xla()
     assert os.environ["XLA_FLAGS"] == xla.XLA
 
 
 def test_flags_of_the_user_stay(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
-    xla.use()
+    xla.configure_xla()
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
 
 
@@ -30,7 +30,7 @@ def test_programs_run_where_they_are_called_unless_the_user_has_said(monkeypatch
     before = jax.config.values[name]
     jax.config.update(name, True)
     try:
-        xla.use()
+        xla.configure_xla()
         assert jax.config.values[name] == (user is not None)
     finally:
         jax.config.update(name, before)

@@ -9,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array
 
 from fitting.problem.problem import Problem
-from fitting.runtime.program_cache import kept
+from fitting.runtime.program_cache import cached
 
 from .jacobian import Model, turned
 
@@ -40,7 +40,7 @@ class Position(eqx.Module):
         return self.solver.aux
 
 
-@kept
+@cached
 def begin(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
     """A march that has not evaluated anything yet."""
     zero, endless = jnp.zeros((), int), jnp.asarray(jnp.inf, u.dtype)
@@ -53,7 +53,7 @@ def begin(model: Model, u: Array, args: tuple[Problem, Array]) -> Position:
     return Position(u, endless, zero, zero, zero, state)
 
 
-@kept
+@cached
 def step(model: Model, at: Position, args: tuple[Problem, Array]) -> Position:
     """One step of Levenberg–Marquardt; the first only evaluates where it stands."""
     before = at.solver

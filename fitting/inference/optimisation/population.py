@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.problem.problem import Problem
 from fitting.problem.space import EDGE, Space
-from fitting.runtime.program_cache import kept
+from fitting.runtime.program_cache import cached
 
 POPULATION = 64  # candidates in one vmapped call
 SWEEP = 6  # values of one parameter, spread over its range
@@ -34,12 +34,12 @@ def from_values(
     return _in_parts(_from_values, space, values)
 
 
-@kept
+@cached
 def _from_values(space: Space, values: Array) -> Array:
     return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(values)
 
 
-@kept
+@cached
 def _values_of(space: Space, candidates: Array) -> Array:
     return jax.vmap(space.values)(candidates)
 
@@ -56,7 +56,7 @@ def _in_parts(
     return np.concatenate(parts)
 
 
-@kept
+@cached
 def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
     rows = jax.vmap(problem.rows)(candidates)
     return 0.5 * jnp.sum(rows**2, axis=1), rows

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
-from fitting.runtime.program_cache import kept
+from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
 from .chain import Chain, Identity, Last
@@ -41,7 +41,7 @@ class _Recorder(emcee.backends.Backend):
         self.record(state.coords, state.log_prob, accepted, state.random_state)
 
 
-@kept
+@cached
 def _log_probabilities(
     problem: Problem, u: Float[Array, "walkers free"]
 ) -> Float[Array, " walkers"]:
