@@ -52,11 +52,6 @@ def stack(*values: Array) -> Float[Array, "*b n"]:
     return jax.lax.concatenate([jax.lax.expand_dims(x, (last,)) for x in values], last)
 
 
-def stack(x: Array, y: Array, z: Array) -> Float[Array, "*b 3"]:
-    """The vector with these components, which are broadcast against each other."""
-    return stack(x, y, z)
-
-
 def barrier(x: Array) -> Array:
     """`x`, computed once.
 
