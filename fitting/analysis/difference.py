@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import jaxik
-from fitting.problem.residuals import Scene, legs_ws, pelvis_ws, turn_between
+from fitting.problem.residuals import Scene, legs_ws, pelvis_ws, rotation_between
 from fitting.report.tables import Table, number, share
 from fitting.runtime import program_cache
 from jaxik.world.skeleton import Transform
@@ -80,7 +80,7 @@ def _apart(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str, np
         return np.linalg.norm(np.asarray(apart), axis=-1)
 
     def angle(a: Any, b: Any) -> np.ndarray:
-        return 2.0 * np.arcsin(np.minimum(0.5 * length(turn_between(a, b)), 1.0))
+        return 2.0 * np.arcsin(np.minimum(0.5 * length(rotation_between(a, b)), 1.0))
 
     return {
         "ankle": length(legs.ankle.pos - reference.ankle.pos)[:, present],

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxik
-from fitting.problem.residuals import Scene, errors_of, legs_ws, pelvis_ws, rows_by_kind
+from fitting.problem.residuals import Scene, errors_by_kind, legs_ws, pelvis_ws, residuals_by_kind
 from fitting.runtime.program_cache import cached
 from jaxik.maths import vec
 from jaxik.world import frame
@@ -116,7 +116,7 @@ def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
         cast(scene.terrain, joints + vec.scale(up, jnp.asarray(ABOVE)), REACH)
         for joints in (reference.ankle.pos, toes)
     )
-    errors = errors_of(scene, result)
+    errors = errors_by_kind(scene, result)
     return Playback(
         before=Motion(base.pos, *_positions(animated)),
         after=Motion(carried.pos, *_positions(solved)),
@@ -136,7 +136,7 @@ def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
         slide=scene.frames.slide,
         seen=reference.seen,
         errors=errors,
-        rows=rows_by_kind(scene, errors),
+        rows=residuals_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},
         label=reference.label,
     )

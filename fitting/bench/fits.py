@@ -24,7 +24,7 @@ from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
 from fitting.inference.optimisation.search import solve
 from fitting.inference.optimisation.solution import Solution
-from fitting.inference.sampling.posterior import sample_problem
+from fitting.inference.sampling.posterior import sample_posterior
 from fitting.problem.problem import Problem
 from fitting.runtime.threads import usable_cores
 
@@ -43,7 +43,7 @@ def _rows(problem: Problem, u: jax.Array) -> jax.Array:
 
 def slopes_of(problem: Problem, u: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Rows and slopes."""
-    return problem.rows_and_jacobian(u)
+    return problem.residuals_and_jacobian(u)
 
 
 def jacobian(row: Row, sizes: Sizes) -> None:
@@ -151,7 +151,7 @@ def posterior(row: Row, sizes: Sizes) -> None:
     sd = np.clip(np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))), 1e-3, 0.5)
 
     def sampled(steps: int) -> None:
-        made = sample_problem(
+        made = sample_posterior(
             problem, centre, sd, walkers=sizes.walkers, max_steps=steps, stop_at=1e9,
             progress=lambda now: row.tell(f"posterior: step {now.step} of {now.max_steps}"),
         )  # fmt: skip

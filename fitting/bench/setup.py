@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxik
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.synthetic import course, walker
+from fitting.datasets.synthetic import terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip
 from fitting.experiments.experiment import make_scene
 from fitting.problem.problem import Problem
-from fitting.problem.residuals import rows_of_scenes
+from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.space import free, make_space
 from jaxik.maths import parameter_tree, quat
 from jaxik.world import terrain
@@ -102,7 +102,7 @@ def walk(count: int, *, uneven_pace: bool = False) -> Clip:
     return walker.walk(seconds, FPS, SEED, slips=slips, slides=slides)
 
 
-def field(cells: int, seed: int = 0) -> course.Mesh:
+def field(cells: int, seed: int = 0) -> terrain_meshes.Mesh:
     """Hills and rubble over EXTENT by EXTENT, 2 cells² triangles of about one size."""
     random = np.random.default_rng(seed)
     pitch = EXTENT / cells
@@ -114,10 +114,10 @@ def field(cells: int, seed: int = 0) -> course.Mesh:
     corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
     a, b, c, d = corner, corner + 1, corner + cells + 1, corner + cells + 2
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)])
-    return course.Mesh(np.stack([x, y, z], -1).reshape(-1, 3), faces.astype(np.int64))
+    return terrain_meshes.Mesh(np.stack([x, y, z], -1).reshape(-1, 3), faces.astype(np.int64))
 
 
-def ground(mesh: course.Mesh) -> terrain.Terrain:
+def ground(mesh: terrain_meshes.Mesh) -> terrain.Terrain:
     """The terrain of a mesh, in 32 bits."""
     return terrain.mesh(np.asarray(mesh.vertices, np.float32), mesh.faces)
 
@@ -184,7 +184,7 @@ def batch(legs: int) -> Batch:
     """So many legs, two a character, on a tilted plane, each with an ankle's target of its own."""
     clip = walk(600)
     rig = single(clip.rig)
-    motion = single(tiled(frames.frames_of(clip), max(legs // 2, 1)))
+    motion = single(tiled(clip_frames.frames_from_clip(clip), max(legs // 2, 1)))
     ik = single(jaxik.presets.record())
     tilted = single(terrain.plane(normal=(0.1, 1.0, 0.05)))
     sensed = _sensed(ik, rig, tilted, motion)
@@ -242,7 +242,7 @@ def crowd(characters: int, span: int, seed: int = 0) -> Crowd:
     return Crowd(
         single(jaxik.presets.record()),
         single(clip.rig),
-        single(frames.frames_of(clip)),
+        single(clip_frames.frames_from_clip(clip)),
         single(drawn),
         jnp.asarray(place, jnp.float32),
         jnp.asarray(random.integers(0, span, characters), jnp.int32),
@@ -258,13 +258,15 @@ def others() -> tuple[str, ...]:
     return (*left, "probe.toe_ls[2]")
 
 
-def recording(count: int) -> tuple[Clip, Clip, course.Mesh]:
+def recording(count: int) -> tuple[Clip, Clip, terrain_meshes.Mesh]:
     """A clip of `count` frames that known parameters made, plus noise; its base, its ground."""
     random = np.random.default_rng(SEED)
-    base, made = walk(count, uneven_pace=True), course.uneven()
+    base, made = walk(count, uneven_pace=True), terrain_meshes.uneven()
     truth = parameter_tree.replace(jaxik.presets.record(), TRUTH)
     uneven = terrain.mesh(made.vertices, made.faces)
-    solved = frames.solved_clip(base, jaxik.run(truth, base.rig, uneven, frames.frames_of(base)))
+    solved = clip_frames.clip_from_result(
+        base, jaxik.run(truth, base.rig, uneven, clip_frames.frames_from_clip(base))
+    )
     reference = solved.with_motion(
         solved.positions_ws + random.normal(0.0, POSITION_NOISE, solved.positions_ws.shape),
         _shaken(solved.rotations_ws, random),
@@ -278,7 +280,9 @@ def problem_of(
     """The fit of these parameters to a recording."""
     scene = make_scene(reference, base, uneven, SIGMAS)
     ik = jaxik.presets.record()
-    return Problem(make_space(ik, [free(ik, name) for name in names]), (scene,), rows_of_scenes)
+    return Problem(
+        make_space(ik, [free(ik, name) for name in names]), (scene,), residuals_of_scenes
+    )
 
 
 def problem(count: int, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:

@@ -4,7 +4,7 @@ preset = "record"                    # a function of jaxik.presets
 rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
 [[clips]]
 reference = "walk.npz"               # the captured motion; paths are relative to the file
-base = "walk_base.npz"               # the flat animation; without it `base.flat_base` makes one
+base = "walk_base.npz"               # the flat animation; without it `base.flatten_clip` makes one
 terrain = "course.ply"
 [parameters]                         # fixed values that differ from the preset's
 lock.enabled = true
@@ -27,15 +27,15 @@ import jax
 import numpy as np
 
 import jaxik
-from fitting.datasets import clips, frames
+from fitting.datasets import clip_frames, clips
 from fitting.datasets.clips import edit
-from fitting.datasets.flat_animation import flat_base, load_base
+from fitting.datasets.flat_animation import flatten_clip, load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.inference.sampling import posterior
 from fitting.problem.loss import Loss
 from fitting.problem.problem import Problem
-from fitting.problem.residuals import Reference, Scene, Sigmas, rows_of_scenes
-from fitting.problem.space import Free, free, make_space
+from fitting.problem.residuals import Reference, Scene, Sigmas, residuals_of_scenes
+from fitting.problem.space import FreeParameter, free, make_space
 from fitting.runtime import validation
 from fitting.runtime.validation import check_table, flat
 from jaxik.world.skeleton import Transform
@@ -189,7 +189,7 @@ def system(experiment: Experiment) -> jaxik.FootIK:
     return with_parameters(ik, experiment.parameters, f"{experiment.path} [parameters]")
 
 
-def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[Free]:
+def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[FreeParameter]:
     """The free parameters as the experiment and the rules declare them."""
     with validation.error_context(f"{experiment.path} [free]"):
         return [free(ik, name, **options) for name, options in experiment.free.items()]
@@ -204,8 +204,8 @@ def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Cl
             captured = edit.mask_pops(captured)  # at its own rate: a pop is shorter than others
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
-        return reference, flat_base(reference, mesh_files.heights(ground)), ground
-    base = _cut(load_base(entry.base), entry.base, entry, fps)
+        return reference, flatten_clip(reference, mesh_files.height_function(ground)), ground
+    base = _cut(load_flat_animation(entry.base), entry.base, entry, fps)
     ours, theirs = (
         f"{one.frames} frames at {one.fps:g} Hz of the legs {list(one.rig.names)}"
         for one in (base, reference)
@@ -229,12 +229,12 @@ def make_scene(
     label: str = "captured",
 ) -> Scene:
     """The data of one clip; `label` is what pictures call the reference."""
-    animation = frames.frames_of(base)
+    animation = clip_frames.frames_from_clip(base)
     pelvis = _joint_ws(base, base.rig.pelvis)
     legs = reference.leg_pose_ws()
     stance = reference.stance
     labels = np.zeros(legs.ankle.pos.shape[:2]) if stance is None else stance.astype(float)
-    seen = np.ones(reference.frames, bool) if reference.mask is None else reference.mask
+    seen = np.ones(reference.frame_count, bool) if reference.mask is None else reference.mask
     given = SIGMAS | dict(sigmas)
     if stance is None:
         given["contact"] = float("inf")
@@ -294,7 +294,7 @@ def problem_of(
         made.append(scene)
     times = np.concatenate([np.asarray(scene.frames.dt) for scene in made])
     share = min(1.0, float(times.mean()) / max(experiment.independent_every, 1e-9))
-    return Problem(space, tuple(made), rows_of_scenes, experiment.loss, share)
+    return Problem(space, tuple(made), residuals_of_scenes, experiment.loss, share)
 
 
 def check_shapes(ik: jaxik.FootIK, rig: jaxik.Rig, ground: Terrain, motion: jaxik.Frame) -> None:

@@ -37,7 +37,7 @@ class Profile:
 
 
 @dataclasses.dataclass(frozen=True)
-class Identification:
+class Identifiability:
     """How well each free parameter is determined; arrays in the order of the names."""
 
     names: tuple[str, ...]
@@ -58,7 +58,7 @@ class Identification:
         return tuple(name for name, contraction in pairs if contraction < CONTRACTED)
 
 
-def identify(problem: Problem, solution: Solution) -> Identification:
+def identify(problem: Problem, solution: Solution) -> Identifiability:
     """What the data of a problem determine around its solution.
 
     The contraction of a smooth parameter is `1 - (posterior sd / prior sd)²` in `u`, the thresholds
@@ -97,7 +97,7 @@ def identify(problem: Problem, solution: Solution) -> Identification:
     names = [space.names[i] for i in chosen]
     weights = np.abs(directions[:, :1])
     best = min([0.0, *(float(one.rises.min()) for one in profiles.values())])
-    return Identification(
+    return Identifiability(
         names=space.names,
         contraction=contraction,
         interval=interval,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxik
-from fitting.problem.residuals import Scene, rows_of_scenes
+from fitting.problem.residuals import Scene, residuals_of_scenes
 from fitting.problem.space import PRIOR_SD, Space, free, make_space
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
@@ -85,4 +85,4 @@ def _rows(space: Space, scenes: tuple[Scene, ...], some: np.ndarray) -> np.ndarr
 
 @cached
 def _rows_of_all(space: Space, scenes: tuple[Scene, ...], candidates: Array) -> Array:
-    return jax.vmap(lambda u: rows_of_scenes(space.unpack(u), scenes))(candidates)
+    return jax.vmap(lambda u: residuals_of_scenes(space.unpack(u), scenes))(candidates)

@@ -11,7 +11,7 @@ CAUCHY = 2.385  # sigmas, likewise
 Loss = Literal["squares", "huber", "cauchy"]
 
 
-def robustify(rows: Float[Array, " rows"], loss: Loss) -> Float[Array, " rows"]:
+def apply_loss(rows: Float[Array, " rows"], loss: Loss) -> Float[Array, " rows"]:
     """Rows whose squares are `rho(row²)`; slope 1 at zero and finite everywhere.
 
     Huber's rho is `z` up to HUBER sigmas and linear in the residual beyond; Cauchy's is

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik import lanes
 
-from .loss import Loss, robustify
+from .loss import Loss, apply_loss
 from .space import Space
 
 
@@ -36,9 +36,9 @@ class Problem(eqx.Module):
     @eqx.filter_jit  # traced once for all programs around it
     def rows(self, u: Float[Array, " free"]) -> Float[Array, " rows"]:
         """Robust residuals and prior rows; half their sum of squares is the cost."""
-        residuals = robustify(self.residuals(self.space.unpack(u), self.data), self.loss)
+        residuals = apply_loss(self.residuals(self.space.unpack(u), self.data), self.loss)
         residuals *= jnp.sqrt(self.independent.astype(residuals.dtype))
-        return jnp.concatenate([residuals, self.space.prior_rows(u)])
+        return jnp.concatenate([residuals, self.space.prior_residuals(u)])
 
     def cost(self, u: Float[Array, " free"]) -> Float[Array, ""]:
         """Minus the log-probability where that is finite, NaN or infinite where residuals are."""
@@ -49,9 +49,9 @@ class Problem(eqx.Module):
 
         Not `jax.jacfwd`, which took the wrong branch of a minimum in a pipeline-sized program.
         """
-        return self.rows_and_jacobian(u)[1]
+        return self.residuals_and_jacobian(u)[1]
 
-    def rows_and_jacobian(
+    def residuals_and_jacobian(
         self, u: Float[Array, " free"], below: Float[Array, ""] | float = jnp.inf
     ) -> tuple[Array, Array]:
         """Both from one linearisation; the slopes are 0 where the cost is not at most `below`."""

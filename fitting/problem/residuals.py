@@ -50,7 +50,7 @@ def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:
     return scene.frames.world_from_model @ (result.body @ scene.pelvis)
 
 
-def turn_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+def rotation_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
     """Turn from `a` to `b`, rad, exact to third order: twice the sine of half its angle."""
     w, x, y, z = quat.components(quat.multiply(quat.conjugate(a), b))
     return 2.0 * vec.scale(vec.stack(x, y, z), jnp.where(w < 0, -1.0, 1.0))
@@ -62,7 +62,7 @@ def legs_ws(scene: Scene, result: jaxik.Result) -> jaxik.LegPose:
     return result.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
 
 
-def errors_of(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
+def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     """How far a result is from the reference, by kind of residual, in the unit of its sigma."""
     reference, present = scene.reference, scene.rig.present[:, None]
     legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
@@ -73,14 +73,14 @@ def errors_of(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
         "ankle": ankle,
         "knee": (legs.knee.pos - reference.knee_ws) * present,
         "pelvis": pelvis.pos - reference.pelvis.pos,
-        "foot": turn_between(reference.ankle.rot, legs.ankle.rot) * present,
-        "body": turn_between(reference.pelvis.rot, pelvis.rot),
+        "foot": rotation_between(reference.ankle.rot, legs.ankle.rot) * present,
+        "body": rotation_between(reference.pelvis.rot, pelvis.rot),
         "contact": standing * scene.rig.present,
         "smooth": (ankle[2:] - 2.0 * ankle[1:-1] + ankle[:-2]) / step**2,
     }
 
 
-def rows_by_kind(scene: Scene, errors: dict[str, Array]) -> dict[str, Array]:
+def residuals_by_kind(scene: Scene, errors: dict[str, Array]) -> dict[str, Array]:
     """Errors in standard deviations, whitened; 0 where the reference was not seen."""
     seen, sigmas = scene.reference.seen, scene.sigmas
     calm = seen[2:] & seen[1:-1] & seen[:-2]
@@ -94,10 +94,10 @@ def rows_by_kind(scene: Scene, errors: dict[str, Array]) -> dict[str, Array]:
     return rows
 
 
-def rows_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " rows"]:
+def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " rows"]:
     """Residuals of one clip in standard deviations, one kind after another."""
     result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
-    rows = rows_by_kind(scene, errors_of(scene, result))
+    rows = residuals_by_kind(scene, errors_by_kind(scene, result))
     return jnp.concatenate([row.ravel() for row in rows.values()])
 
 
@@ -117,6 +117,6 @@ def whitened(
     return jnp.where(both[wide], apart, rows)
 
 
-def rows_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " rows"]:
+def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " rows"]:
     """Residuals of several clips, one after another."""
-    return jnp.concatenate([rows_of_scene(ik, scene) for scene in scenes])
+    return jnp.concatenate([residuals_of_scene(ik, scene) for scene in scenes])

@@ -35,7 +35,7 @@ EDGE = 1e-6  # share of the range that `pack` keeps from a bound, where u is inf
 
 
 @dataclasses.dataclass(frozen=True)
-class Free:
+class FreeParameter:
     """One free parameter: a leaf of the system, or one leg's element of it."""
 
     name: str  # dotted, with [leg] for one element
@@ -59,7 +59,7 @@ class Free:
         return int(index[:-1]) if index else None
 
 
-def free(ik: eqx.Module, name: str, **overrides: Any) -> Free:
+def free(ik: eqx.Module, name: str, **overrides: Any) -> FreeParameter:
     """The parameter of this name, made free as its rule declares it.
 
     A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
@@ -96,7 +96,7 @@ def free(ik: eqx.Module, name: str, **overrides: Any) -> Free:
         above = f"{leaf.rpartition('.')[0]}.{above}"
     low = float(overrides.get("low", declaration.low))
     high = float(overrides.get("high", declaration.high))
-    made = Free(
+    made = FreeParameter(
         name=name,
         low=low,
         high=high,
@@ -120,7 +120,7 @@ def _one_of(name: str, what: str, given: Any, words: Any) -> Any:
     return given
 
 
-def _check(one: Free) -> None:
+def _check(one: FreeParameter) -> None:
     """Raises ValueError where bounds or prior make no sense."""
     allowed = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (0.0, 1.0)}
     least, most = allowed[one.scale]
@@ -167,7 +167,7 @@ class Space(eqx.Module):
     prior_sd: Float[Array, " free"]  # in u
     low: Float[Array, " free"]
     high: Float[Array, " free"]
-    frees: tuple[Free, ...] = eqx.field(static=True)
+    frees: tuple[FreeParameter, ...] = eqx.field(static=True)
     order: tuple[int, ...] = eqx.field(static=True)  # what is above another comes after it
 
     @property
@@ -231,7 +231,7 @@ class Space(eqx.Module):
             leaves[one.leaf] = _put(leaf, one.leg, value)
         return jnp.stack(u)
 
-    def prior_rows(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
+    def prior_residuals(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
         """Distance from the prior's centre in prior standard deviations."""
         return (u - self.u0) / self.prior_sd
 
@@ -271,7 +271,7 @@ def _put(leaf: Array, leg: int | None, value: Array) -> Array:
     return jnp.broadcast_to(value, leaf.shape) if leg is None else leaf.at[leg].set(value)
 
 
-def make_space(ik: eqx.Module, frees: Sequence[Free]) -> Space:
+def make_space(ik: eqx.Module, frees: Sequence[FreeParameter]) -> Space:
     """The space of these free parameters around a system.
 
     Raises:
@@ -312,7 +312,7 @@ def make_space(ik: eqx.Module, frees: Sequence[Free]) -> Space:
     return eqx.tree_at(lambda s: s.u0, space, middle)
 
 
-def _order(frees: Sequence[Free]) -> tuple[int, ...]:
+def _order(frees: Sequence[FreeParameter]) -> tuple[int, ...]:
     """Indices such that what a parameter stays above comes before it."""
     done: list[int] = []
     while len(done) < len(frees):

@@ -13,7 +13,7 @@ Table = list[list[str]]  # the first row is the head
 
 
 def fit_table(rows: Sequence[Mapping[str, Any]], truth: Truth) -> Table:
-    """Free parameters: value, interval, range, truth and error where known, remarks.
+    """FreeParameter parameters: value, interval, range, truth and error where known, remarks.
 
     Args:
         rows: `parameters` of `store.describe_fit`.
@@ -55,7 +55,7 @@ def recovered(rows: Sequence[Mapping[str, Any]], truth: Mapping[str, float]) -> 
 
 
 def contraction_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Free parameters by how much the clips say of them, the least first."""
+    """FreeParameter parameters by how much the clips say of them, the least first."""
     table = [["parameter", "kind", "contraction", "verdict"]]
     for row in sorted(rows, key=lambda row: row["contraction"]):
         verdict = "determined" if row["determined"] else "undetermined"

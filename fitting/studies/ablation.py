@@ -20,7 +20,7 @@ import numpy as np
 
 import jaxik
 from fitting.analysis.accuracy import Agreement, Errors, agreement, errors_of_clips
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import edit
 from fitting.datasets.clips.clip import Clip
 from fitting.experiments.ablations import WHOLE, Variant
@@ -135,7 +135,7 @@ def contribution(
 def changed(experiment: Experiment, variant: Variant) -> Experiment:
     """The experiment as this variant has it.
 
-    Free and fixed parameters whose leaf its rules do not have are left out, and so are free ones
+    FreeParameter and fixed parameters whose leaf its rules do not have are left out, and so are free ones
     that the variant fixes; its own free ones are added.
     """
     rules = {**experiment.rules, **variant.rules}
@@ -162,7 +162,7 @@ def split(entries: Sequence[ClipEntry], pairs: Sequence[Pair], folds: int) -> It
     for entry, (captured, _, _) in each:
         for part in range(folds):
             held = _part(captured, part, folds)
-            stands = captured.at(held).standing().any(axis=0)
+            stands = captured.at(held).stance_labels().any(axis=0)
             if not stands.all():
                 foot = captured.rig.names[int(np.argmin(stands))]
                 start, end = (frame / captured.fps for frame in (held.start, held.stop))
@@ -181,13 +181,13 @@ def split(entries: Sequence[ClipEntry], pairs: Sequence[Pair], folds: int) -> It
 
 def _part(clip: Clip, part: int, folds: int) -> slice:
     """Frames of a part; parts are as long as one another but for a frame."""
-    return slice(*(clip.frames * one // folds for one in (part, part + 1)))
+    return slice(*(clip.frame_count * one // folds for one in (part, part + 1)))
 
 
 def _without(pair: Pair, held: slice) -> Pair:
     """The clips with a part of what was captured out of sight."""
     captured, base, ground = pair
-    mask = np.ones(captured.frames, bool) if captured.mask is None else captured.mask.copy()
+    mask = np.ones(captured.frame_count, bool) if captured.mask is None else captured.mask.copy()
     mask[held] = False
     return replace(captured, mask=mask), base, ground
 
@@ -219,7 +219,7 @@ def _at_rate(pair: Pair, fps: float | None) -> Pair:
 def _errors(ik: jaxik.FootIK, pair: Pair, part: slice) -> Errors:
     """How far the system is from the captured motion in these frames, at the rate of the clip."""
     captured, base, ground = pair
-    motion = frames.frames_of(base)
+    motion = clip_frames.frames_from_clip(base)
     check_shapes(ik, base.rig, ground, motion)
     _, solved = solve(ik, base, ground, motion, 0.0)
     return errors_of_clips(*(clip.at(part) for clip in (solved, captured, base)))

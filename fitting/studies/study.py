@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 import jaxik
 from fitting.experiments.experiment import Experiment, load_experiment, make_problem
-from fitting.inference.identifiability import Identification, identify
+from fitting.inference.identifiability import Identifiability, identify
 from fitting.inference.optimisation.search import solve
 from fitting.inference.optimisation.solution import Progress, Solution
-from fitting.inference.sampling.posterior import Posterior, SamplingProgress, sample_problem
+from fitting.inference.sampling.posterior import Posterior, SamplingProgress, sample_posterior
 from fitting.problem.problem import Problem
 
 THRESHOLD_SD = 0.05  # of u, around the fit: a Laplace ball at a threshold has the prior's width
@@ -27,7 +27,7 @@ class Fit:
     experiment: Experiment
     problem: Problem
     solution: Solution
-    identification: Identification
+    identification: Identifiability
 
     @property
     def ik(self) -> jaxik.FootIK:
@@ -110,7 +110,7 @@ def sample_start(
 ) -> Posterior:
     """Samples from a start that was stored."""
     options = experiment.sample
-    return sample_problem(
+    return sample_posterior(
         problem,
         start_u,
         start_sd,

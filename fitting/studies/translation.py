@@ -21,9 +21,9 @@ import numpy as np
 
 import jaxik
 from fitting.analysis import difference
-from fitting.datasets import clips, frames
+from fitting.datasets import clip_frames, clips
 from fitting.datasets.clips import edit
-from fitting.datasets.flat_animation import load_base
+from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import experiment, parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
@@ -91,7 +91,7 @@ def read_system(given: str, option: str) -> System:
 
 
 def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
-    """Free parameters by name: `name,name`, or the [free] table of a TOML file as experiments have.
+    """FreeParameter parameters by name: `name,name`, or the [free] table of a TOML file as experiments have.
 
     Raises:
         ValueError: for no name, an unknown one, or what it cannot be.
@@ -157,7 +157,7 @@ def plan(
     for i, (path, terrain) in enumerate(zip(paths, terrains, strict=True)):
         name = f"source_{i + 1}.npz" if len(paths) > 1 else "source.npz"
         ground = mesh_files.load_terrain(terrain, file_up=file_up)
-        base = load_base(path)
+        base = load_flat_animation(path)
         base = base if fps is None else edit.resample(base, fps)
         pairs.append((_solved(source, base, ground), base, ground))
         entries.append(
@@ -193,7 +193,7 @@ def plan(
 
 def _solved(source: System, base: clips.Clip, ground: Any) -> clips.Clip:
     """What the source makes of a clip."""
-    motion = frames.frames_of(base)
+    motion = clip_frames.frames_from_clip(base)
     with validation.error_context(source.name):
         experiment.check_shapes(source.ik, base.rig, ground, motion)
         _, solved = solve(source.ik, base, ground, motion, 0.0)
@@ -239,5 +239,5 @@ def save_source(run: Path, made: Translation) -> None:
     """Begins the folder of the run with the source's motion and parameters."""
     run.mkdir(parents=True, exist_ok=True)
     for entry, motion in zip(made.experiment.clips, made.motions, strict=True):
-        clips.save_clip(entry.reference, motion, joints=frames.named_joints(motion))
+        clips.save_clip(entry.reference, motion, joints=clip_frames.positions_by_role(motion))
     files.write_text(run / SOURCE, parameter_files.to_toml(made.source.ik, made.source.preset))

@@ -18,7 +18,7 @@ from fitting.problem.space import free, make_space
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
-from support.quick import TARGETS, rows_of_scenes
+from support.quick import TARGETS, residuals_of_scenes
 
 SMALL = Sizes(
     repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2,
@@ -170,7 +170,7 @@ def quickly(monkeypatch):
 
     def problem(count: int, names: tuple[str, ...] = ()) -> Problem:
         ik = presets.record()
-        return Problem(make_space(ik, [free(ik, n) for n in TARGETS]), (), rows_of_scenes)
+        return Problem(make_space(ik, [free(ik, n) for n in TARGETS]), (), residuals_of_scenes)
 
     monkeypatch.setattr(setup, "TRUTH", TARGETS)
     monkeypatch.setattr(setup, "problem", problem)

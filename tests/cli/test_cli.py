@@ -24,9 +24,9 @@ from fitting.inference.sampling.chain import journal_path
 from fitting.studies import run_folder
 from jaxik import record
 from support import quick
-from support.clips_made import BVH
 from support.experiments import CLIP, ROOT, write
 from support.records import ADULT, packed
+from support.sample_clips import BVH
 
 DATA = ROOT / "data"
 COMMANDS = [
@@ -55,7 +55,7 @@ def cache(tmp_path_factory):
 @pytest.fixture
 def quickly(monkeypatch):
     """Fits and samplings of residuals that compile at once; reports play the real pipeline."""
-    monkeypatch.setattr(experiment, "rows_of_scenes", quick.rows_of_scenes)
+    monkeypatch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def run(asked, tmp_path_factory) -> Path:
     """A finished fit; not to be written to."""
     folder = tmp_path_factory.mktemp("runs") / "hill"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "rows_of_scenes", quick.rows_of_scenes)
+        patch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
         assert main.main(["fit", str(asked), "-o", str(folder)]) == 0
     return folder
 

@@ -25,7 +25,7 @@ def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, search.
 
 
 @pytest.fixture(scope="module")
-def report() -> identifiability.Identification:
+def report() -> identifiability.Identifiability:
     return identifiability.identify(*toy.solved(SEED))
 
 

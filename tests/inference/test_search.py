@@ -217,7 +217,7 @@ def test_the_steps_are_those_of_optimistix_on_the_rows_themselves():
 def test_slopes_are_made_only_where_the_cost_is_low_enough():
     problem = curve_problem()
     u, cost = problem.space.u0, problem.cost(problem.space.u0)
-    made = eqx.filter_jit(lambda below: problem.rows_and_jacobian(u, below)[1])
+    made = eqx.filter_jit(lambda below: problem.residuals_and_jacobian(u, below)[1])
     np.testing.assert_allclose(made(cost), problem.jacobian(u), rtol=1e-12)
     assert np.abs(made(cost)).max() > 1
     assert not np.asarray(made(0.99 * cost)).any()

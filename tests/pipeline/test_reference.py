@@ -241,7 +241,7 @@ def test_a_foot_locks_again_only_below_the_threshold():
     changes = {"lock.lock_half_life": 0.0, "lock.unlock_half_life": 0.1}
     output = run(Parameters(changes | {"lock.relock_threshold": 0.3}), rig, ground, frames)
     first = 4 + int(np.argmax(output["locked"][4:, 0]))
-    # Free since frame 1 with a factor of 2^(-frames / 6).
+    # FreeParameter since frame 1 with a factor of 2^(-frames / 6).
     assert 2 ** (-(first - 1) / 6) <= 0.3 < 2 ** (-(first - 2) / 6)
     assert not output["locked"][1:first].any() and output["locked"][first:].all()
 

@@ -53,7 +53,9 @@ hurried = functools.partial(jax.jit, compiler_options={"xla_backend_optimization
 
 @hurried
 def rows_and_result(ik, scene):
-    return residuals.rows_of_scene(ik, scene), jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    return residuals.residuals_of_scene(ik, scene), jaxik.run(
+        ik, scene.rig, scene.terrain, scene.frames
+    )
 
 
 def rows_of(scene) -> np.ndarray:
@@ -177,9 +179,9 @@ def test_a_leg_that_is_not_there_gives_no_rows(scene, rows):
 
 
 def test_several_clips_follow_one_another(scene, monkeypatch):
-    monkeypatch.setattr(residuals, "rows_of_scene", lambda ik, scene: scene.rig.shin)
+    monkeypatch.setattr(residuals, "residuals_of_scene", lambda ik, scene: scene.rig.shin)
     other = eqx.tree_at(lambda scene: scene.rig.shin, scene, jnp.array([3.0]))
-    found = residuals.rows_of_scenes(jaxik.presets.record(), (other, scene))
+    found = residuals.residuals_of_scenes(jaxik.presets.record(), (other, scene))
     np.testing.assert_array_equal(found, [3.0, *scene.rig.shin])
 
 
@@ -209,12 +211,12 @@ def test_the_turn_between_rotations_is_that_of_the_nearer_sign():
     both = (a, a * Rotation.from_rotvec(step))
     start, end = (jnp.asarray(one.as_quat(scalar_first=True)) for one in both)
     for sign in (1.0, -1.0):
-        np.testing.assert_allclose(residuals.turn_between(start, sign * end), step, atol=1e-5)
+        np.testing.assert_allclose(residuals.rotation_between(start, sign * end), step, atol=1e-5)
 
 
 @jax.jit
-def rows_and_jacobian(problem, u):
-    return problem.rows_and_jacobian(u)
+def residuals_and_jacobian(problem, u):
+    return problem.residuals_and_jacobian(u)
 
 
 @hurried
@@ -230,7 +232,7 @@ def reverse_mode(problem, u, weights):
 @pytest.fixture(scope="module")
 def jacobian(embedded, truth) -> np.ndarray:
     """Slopes beside the truth."""
-    return np.asarray(rows_and_jacobian(embedded, truth + BESIDE)[1])
+    return np.asarray(residuals_and_jacobian(embedded, truth + BESIDE)[1])
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +291,7 @@ def test_another_clip_of_the_same_shape_compiles_nothing(embedded, truth, jacobi
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        found = np.asarray(rows_and_jacobian(again, truth)[1])
+        found = np.asarray(residuals_and_jacobian(again, truth)[1])
         assert not compiled
         assert np.isfinite(found).all() and np.abs(found - jacobian).max() > 1.0
         jax.jit(lambda x: x + 2)(1.0)  # the listener does hear a compilation

@@ -83,8 +83,8 @@ def test_a_value_stays_above_a_fixed_partner_too():
 def test_the_prior_is_centred_at_the_present_values():
     made = make(*NAMES)
     np.testing.assert_allclose(made.pack({}), made.u0, rtol=TOLERANCE)
-    np.testing.assert_array_equal(made.prior_rows(made.u0), 0)
-    np.testing.assert_allclose(made.prior_rows(made.u0 + 1.6), 1, rtol=TOLERANCE)
+    np.testing.assert_array_equal(made.prior_residuals(made.u0), 0)
+    np.testing.assert_allclose(made.prior_residuals(made.u0 + 1.6), 1, rtol=TOLERANCE)
 
 
 def test_a_prior_at_a_bound_is_moved_inside_where_u_is_finite():
@@ -168,7 +168,7 @@ ROWS = jnp.asarray([0.0, 1e-200, 1e-30, 1e-9, 1e-3, 0.5, 1.0, 1.345, 3.0, 1e3, 1
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_the_square_of_a_robust_row_is_the_loss(loss):
-    rows = loss.robustify(ROWS, loss)
+    rows = loss.apply_loss(ROWS, loss)
     np.testing.assert_allclose(rows**2, LOSSES[loss](np.asarray(ROWS) ** 2), rtol=1e-9)
     np.testing.assert_array_equal(jnp.sign(rows), jnp.sign(ROWS))
 
@@ -177,7 +177,7 @@ def test_the_square_of_a_robust_row_is_the_loss(loss):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_slope_of_a_robust_row_is_one_at_zero_and_finite_everywhere(loss, dtype):
     rows = ROWS.astype(dtype)
-    slopes = jax.vmap(jax.grad(lambda row: loss.robustify(row[None], loss)[0]))(rows)
+    slopes = jax.vmap(jax.grad(lambda row: loss.apply_loss(row[None], loss)[0]))(rows)
     assert slopes.dtype == dtype
     assert jnp.isfinite(slopes).all()
     np.testing.assert_allclose(slopes[:4], 1, rtol=1e-6)
@@ -185,7 +185,7 @@ def test_the_slope_of_a_robust_row_is_one_at_zero_and_finite_everywhere(loss, dt
 
 def test_an_unknown_loss_is_refused():
     with pytest.raises(ValueError, match="loss is 'absolute', wanted one of"):
-        loss.robustify.__wrapped__(ROWS, "absolute")  # the tests' type check would come first
+        loss.apply_loss.__wrapped__(ROWS, "absolute")  # the tests' type check would come first
 
 
 def residuals(ik: toy.Toy, data: jax.Array) -> jax.Array:
@@ -197,7 +197,7 @@ def test_the_log_probability_is_minus_half_the_losses_and_prior(loss):
     problem = Problem(make("foot.share"), jnp.asarray([-9.0, 0.1]), residuals, loss)
     u = jnp.asarray([0.7])
     z = np.asarray(problem.space.values(u)[0] - problem.data)
-    prior = float(problem.space.prior_rows(u)[0])
+    prior = float(problem.space.prior_residuals(u)[0])
     expected = -0.5 * (LOSSES[loss](z).sum() + prior**2)
     np.testing.assert_allclose(problem.log_probability(u), expected, rtol=TOLERANCE)
     np.testing.assert_allclose(problem.cost(u), -expected, rtol=TOLERANCE)

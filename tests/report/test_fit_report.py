@@ -19,7 +19,7 @@ from fitting.experiments.experiment import (
     make_scene,
     system,
 )
-from fitting.inference.identifiability import Identification, Profile
+from fitting.inference.identifiability import Identifiability, Profile
 from fitting.inference.optimisation import search
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem import residuals
@@ -64,7 +64,7 @@ def fitted(experiment) -> study.Fit:
     ik = system(experiment)
     space = make_space(ik, free_parameters(experiment, ik))
     scene = make_scene(clip, clip, ground, SIGMAS)
-    problem = Problem(space, (scene,), residuals.rows_of_scenes)
+    problem = Problem(space, (scene,), residuals.residuals_of_scenes)
     u = np.asarray(space.pack(VALUES))
     history = [search.Progress("start", 0, 0, 900.0, 900.0, 1.0)]
     history += [search.Progress("blocks", 0, i, 800.0 / i, 800.0 / i, 1.0 + i) for i in range(1, 9)]
@@ -83,7 +83,7 @@ def fitted(experiment) -> study.Fit:
     )
     sides = np.array([0.0, 0.4])
     profile = Profile(sides, sides, (0.10, 0.12), (7.5, -0.25))
-    identification = Identification(
+    identification = Identifiability(
         names=space.names,
         contraction=np.array([0.99, 0.97, 0.1]),
         interval=np.array([[0.10, 0.12], [0.2, 0.4], [0.81, 0.99]]),
@@ -224,7 +224,7 @@ def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
     played = playback.play(fitted.ik, scene)
     assert played.used == list(playback.KINDS)
     rows = np.concatenate([np.ravel(played.rows[kind]) for kind in playback.KINDS])
-    np.testing.assert_allclose(rows, residuals.rows_of_scene(fitted.ik, scene), atol=1e-9)
+    np.testing.assert_allclose(rows, residuals.residuals_of_scene(fitted.ik, scene), atol=1e-9)
 
 
 def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
@@ -271,7 +271,7 @@ def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
     scene, space = fitted.problem.data[0], fitted.problem.space
     base = parameter_tree.replace(space.base, {"lock.enabled": False})
     unlocked = make_space(base, space.frees)
-    problem = Problem(unlocked, (scene,), residuals.rows_of_scenes)
+    problem = Problem(unlocked, (scene,), residuals.residuals_of_scenes)
     (down, up) = limit_activity.flipped_decisions(problem, np.asarray(unlocked.pack(VALUES)))[
         "contact.planted_height"
     ]

@@ -9,7 +9,7 @@ import pytest
 import jaxik
 from fitting.cli import main
 from fitting.experiments import ablations, experiment, parameter_files, systems
-from fitting.inference.identifiability import Identification
+from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Solution
 from fitting.report import fit_report
 from fitting.studies import run_folder, translation
@@ -162,7 +162,7 @@ def test_rules_are_kept_through_a_run(tmp_path):
     values = np.asarray(problem.space.values(problem.space.u0 * 0 + u))
     names = problem.space.names
     solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
-    found = Identification(
+    found = Identifiability(
         names, np.ones(2), np.array([[0.1, 0.2]] * 2), np.ones(2), ("", ""), np.ones(2), (), (),
         {}, 0.0,
     )  # fmt: skip

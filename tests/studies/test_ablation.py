@@ -92,7 +92,9 @@ def without_pipeline(monkeypatch) -> None:
     monkeypatch.setattr(experiment, "make_scene", made)
     monkeypatch.setattr(ablation, "solve", lifted)
     monkeypatch.setattr(ablation, "check_shapes", lambda *_: None)
-    monkeypatch.setattr(ablation, "frames", SimpleNamespace(frames_of=lambda base: None))
+    monkeypatch.setattr(
+        ablation, "clip_frames", SimpleNamespace(frames_from_clip=lambda base: None)
+    )
 
 
 def asked(folder: Path, rest: str = WITHOUT, clips: str = SIX, **parts: str):
@@ -151,19 +153,19 @@ def test_what_is_held_out_is_not_fitted_and_all_else_is(tmp_path, folds):
     captured, base, _ = pair
     splits = list(ablation.split(read.clips, [pair], folds))
     assert [one.name for one in splits[:-1]] == [f"part {i + 1} of {folds}" for i in range(folds)]
-    seen = captured.mask if captured.mask is not None else np.ones(captured.frames, bool)
-    counted = np.zeros(captured.frames, int)
+    seen = captured.mask if captured.mask is not None else np.ones(captured.frame_count, bool)
+    counted = np.zeros(captured.frame_count, int)
     for one in splits[:-1]:
         ((measured, part),) = one.measured
         assert measured is pair
-        held = np.zeros(captured.frames, bool)
+        held = np.zeros(captured.frame_count, bool)
         held[part] = True
         counted += held
         ((entry, (fitted, below, _)),) = one.fitted
         assert entry is read.clips[0] and below is base, "the animation is played as a whole"
         np.testing.assert_array_equal(fitted.mask, seen & ~held)
         np.testing.assert_array_equal(fitted.positions_ws, captured.positions_ws)
-        assert held.sum() == pytest.approx(captured.frames / folds, abs=1.0)
+        assert held.sum() == pytest.approx(captured.frame_count / folds, abs=1.0)
     np.testing.assert_array_equal(counted, 1)
     assert splits[-1].name == EVERYTHING
     assert splits[-1].fitted == [(read.clips[0], pair)]
@@ -376,7 +378,7 @@ def test_the_picture_has_a_bar_a_variant_and_a_point_a_part():
 def test_the_command_goes_on_after_an_interrupt_and_then_leaves_its_tables(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(experiment, "rows_of_scenes", quick.rows_of_scenes)
+    monkeypatch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
     without_pipeline(monkeypatch)
     path = write(tmp_path, rest=WITHOUT, clips=SIX)
     words = ["contribution", str(path), "-o", str(tmp_path / "out")]

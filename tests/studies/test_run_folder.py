@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fitting.experiments import experiment, parameter_files
-from fitting.inference.identifiability import Identification
+from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.search import Progress, Solution
 from fitting.studies import run_folder, study
 from jaxik.maths import parameter_tree
@@ -40,7 +40,7 @@ def fitted(tmp_path_factory) -> study.Fit:
         steps=8,
         seconds=9.0,
     )
-    identification = Identification(
+    identification = Identifiability(
         names=NAMES,
         contraction=np.array([0.9, 0.2]),
         interval=np.array([[0.1, 0.5], [0.2, 0.9]]),
@@ -93,7 +93,7 @@ def test_the_ball_of_a_threshold_is_small_and_no_ball_is_flat(fitted):
     sd = np.array([np.nan, 9.0])
     wide = study.Fit(
         fitted.experiment, fitted.problem, fitted.solution,
-        Identification(**(vars(fitted.identification) | {"sd": sd})),
+        Identifiability(**(vars(fitted.identification) | {"sd": sd})),
     )  # fmt: skip
     np.testing.assert_array_equal(wide.start_sd, [study.THRESHOLD_SD, study.MOST_SD])
 

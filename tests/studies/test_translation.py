@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.analysis import difference
 from fitting.cli import main, progress
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import load_clip, save_clip
-from fitting.datasets.flat_animation import load_base
+from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import experiment, parameter_files
 from fitting.inference import sensitivity
@@ -72,7 +72,7 @@ def run(source, clip, tmp_path_factory) -> Path:
 @pytest.fixture
 def quickly(monkeypatch):
     """Fits of residuals that compile at once."""
-    monkeypatch.setattr(experiment, "rows_of_scenes", quick.rows_of_scenes)
+    monkeypatch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
 
 
 def refused(capsys, *words: object) -> str:
@@ -94,10 +94,12 @@ def test_the_parameters_behind_a_motion_are_found_again(run):
 
 
 def test_what_is_said_to_be_reproduced_is_so_by_another_count(run, clip):
-    base, reference = load_base(clip), load_clip(run / "source.npz")
+    base, reference = load_flat_animation(clip), load_clip(run / "source.npz")
     ik, _ = parameter_files.from_toml(run / "record.toml")
     ground = mesh_files.load_terrain(GROUND)
-    solved = frames.solved_clip(base, jaxik.run(ik, base.rig, ground, frames.frames_of(base)))
+    solved = clip_frames.clip_from_result(
+        base, jaxik.run(ik, base.rig, ground, clip_frames.frames_from_clip(base))
+    )
 
     def places(one, joints):
         apart = one.positions_ws[:, joints] - reference.positions_ws[:, joints]

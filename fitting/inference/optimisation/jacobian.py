@@ -22,7 +22,7 @@ def hard(u: Array, problem: Problem, pivot: Array, below: Array) -> tuple[Array,
     One row more for each threshold keeps its column from being all zero.
     """
     frozen = jnp.asarray(problem.space.thresholds)
-    rows, slopes = problem.rows_and_jacobian(jnp.where(frozen, pivot, u), below)
+    rows, slopes = problem.residuals_and_jacobian(jnp.where(frozen, pivot, u), below)
     rows = jnp.concatenate([rows, jnp.where(frozen, u - pivot, 0)])
     return rows, jnp.concatenate([jnp.where(frozen, 0, slopes), jnp.diag(frozen.astype(u.dtype))])
 
@@ -38,7 +38,7 @@ def ensemble(u: Array, problem: Problem, shifts: Array, _: Array) -> tuple[Array
     The mean over shifts has a slope where one hard program has none. The smooth columns are those
     of the thresholds in the middle: a slope steers a step, and the cost judges it.
     """
-    _, slopes = problem.rows_and_jacobian(u)
+    _, slopes = problem.residuals_and_jacobian(u)
     every = jax.vmap(problem.rows)(u + shifts)
     mean = jnp.mean(every, axis=0)
     regressed = (jnp.linalg.pinv(shifts) @ (every - mean)).T

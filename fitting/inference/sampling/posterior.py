@@ -66,7 +66,7 @@ class Posterior:
         )
 
 
-def sample_problem(
+def sample_posterior(
     problem: Problem,
     start_u: Float[Array | np.ndarray, " _"],
     start_sd: Float[Array | np.ndarray, " _"],
