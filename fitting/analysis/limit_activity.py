@@ -102,7 +102,7 @@ def flipped_decisions(
         )
 
     here, found = decisions({}), {}
-    for one in space.frees:
+    for one in space.parameters:
         if one.kind == "threshold":
             sides = values[one.name] + np.array([-NUDGE, NUDGE]) * (one.high - one.low)
             down, up = (

@@ -17,7 +17,7 @@ from fitting.datasets.synthetic.speed_profile import Slide, Slip
 from fitting.experiments.experiment import make_scene
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
-from fitting.problem.space import free, make_space
+from fitting.problem.space import free_parameter, make_space
 from jaxik.maths import parameter_tree, quat
 from jaxik.world import terrain
 from jaxik.world.frame import Sensed
@@ -281,7 +281,7 @@ def problem_of(
     scene = make_scene(reference, base, uneven, SIGMAS)
     ik = jaxik.presets.record()
     return Problem(
-        make_space(ik, [free(ik, name) for name in names]), (scene,), residuals_of_scenes
+        make_space(ik, [free_parameter(ik, name) for name in names]), (scene,), residuals_of_scenes
     )
 
 

@@ -35,7 +35,7 @@ from fitting.inference.sampling import posterior
 from fitting.problem.loss import Loss
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import Reference, Scene, Sigmas, residuals_of_scenes
-from fitting.problem.space import FreeParameter, free, make_space
+from fitting.problem.space import FreeParameter, free_parameter, make_space
 from fitting.runtime import validation
 from fitting.runtime.validation import check_table, flat
 from jaxik.world.skeleton import Transform
@@ -192,7 +192,7 @@ def system(experiment: Experiment) -> jaxik.FootIK:
 def free_parameters(experiment: Experiment, ik: jaxik.FootIK) -> list[FreeParameter]:
     """The free parameters as the experiment and the rules declare them."""
     with validation.error_context(f"{experiment.path} [free]"):
-        return [free(ik, name, **options) for name, options in experiment.free.items()]
+        return [free_parameter(ik, name, **options) for name, options in experiment.free.items()]
 
 
 def load_pair(entry: ClipEntry, fps: float | None) -> tuple[clips.Clip, clips.Clip, Terrain]:

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 import jaxik
 from fitting.problem.residuals import Scene, residuals_of_scenes
-from fitting.problem.space import PRIOR_SD, Space, free, make_space
+from fitting.problem.space import PRIOR_SD, Space, free_parameter, make_space
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
@@ -49,7 +49,7 @@ def moving(
         scenes: the clips; what their references are does not matter, their sigmas do.
         seed: of the draws.
     """
-    space = make_space(ik, [free(ik, name, **options) for name, options in named.items()])
+    space = make_space(ik, [free_parameter(ik, name, **options) for name, options in named.items()])
     random = np.random.default_rng(seed)
     draws = PRIOR_SD * random.normal(size=(DRAWS, space.size))
     places = [np.asarray(space.pack({})), *draws]

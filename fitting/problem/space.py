@@ -59,7 +59,7 @@ class FreeParameter:
         return int(index[:-1]) if index else None
 
 
-def free(ik: eqx.Module, name: str, **overrides: Any) -> FreeParameter:
+def free_parameter(ik: eqx.Module, name: str, **overrides: Any) -> FreeParameter:
     """The parameter of this name, made free as its rule declares it.
 
     A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
@@ -173,22 +173,22 @@ class Space(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """Of the free parameters, in the order of `u`."""
-        return tuple(one.name for one in self.frees)
+        return tuple(one.name for one in self.parameters)
 
     @property
     def size(self) -> int:
         """How many are free."""
-        return len(self.frees)
+        return len(self.parameters)
 
     @property
     def smooth(self) -> tuple[bool, ...]:
         """Which parameters have a slope."""
-        return tuple(one.kind == "smooth" for one in self.frees)
+        return tuple(one.kind == "smooth" for one in self.parameters)
 
     @property
     def thresholds(self) -> tuple[bool, ...]:
         """Which parameters only move hard decisions."""
-        return tuple(one.kind == "threshold" for one in self.frees)
+        return tuple(one.kind == "threshold" for one in self.parameters)
 
     def unpack(self, u: Float[Array, " free"]) -> Any:
         """The system with these free parameters."""
@@ -219,7 +219,7 @@ class Space(eqx.Module):
         leaves = self._leaves(tree)
         u = [jnp.zeros(())] * self.size
         for i in self.order:
-            one = self.frees[i]
+            one = self.parameters[i]
             leaf = leaves[one.leaf]
             present = jnp.mean(leaf if one.leg is None else leaf[one.leg])
             value = jnp.asarray(named.get(one.name, present), leaf.dtype)
@@ -237,12 +237,14 @@ class Space(eqx.Module):
 
     def _leaves(self, tree: eqx.Module) -> dict[str, Array]:
         """The leaves that are free or that a free one stays above."""
-        wanted = [one.leaf for one in self.frees] + [one.above for one in self.frees if one.above]
+        wanted = [one.leaf for one in self.parameters] + [
+            one.above for one in self.parameters if one.above
+        ]
         return {name: parameter_tree.get(tree, name) for name in wanted}
 
     def _floor(self, i: int, leaves: dict[str, Array]) -> Array:
         """Least value of the i-th parameter, given the leaf that it stays above."""
-        one = self.frees[i]
+        one = self.parameters[i]
         if one.above is None:
             return self.low[i]
         partner = leaves[one.above]
@@ -257,7 +259,7 @@ class Space(eqx.Module):
         leaves = self._leaves(self.base)
         values = [u[0]] * self.size
         for i in self.order:
-            one = self.frees[i]
+            one = self.parameters[i]
             start = _straighten(self._floor(i, leaves), one.scale)
             end = _straighten(self.high[i], one.scale)
             values[i] = _bend(start + (end - start) * jax.nn.sigmoid(u[i]), one.scale)

@@ -213,7 +213,7 @@ def _health(posterior: Posterior) -> list[str]:
 def _fit_summary(
     fitted: Fit, pictures: Pictures, opening: Sequence[str], details: Sequence[str]
 ) -> str:
-    experiment, found = fitted.experiment, fitted.identification
+    experiment, found = fitted.experiment, fitted.identifiability
     told, truth = run_folder.describe_fit(fitted), truth_of(experiment)
     rows = told["parameters"]
     parts = [f"# {experiment.name}", f"{told['message']} {_cost(told)}"]

@@ -73,7 +73,7 @@ def _opening(made: Translation, fitted: Fit, found: Sequence[Difference]) -> lis
         parts += [f"{phase.capitalize()}:", tables.markdown(difference.table(row, source))]
     if said := difference.shortcomings(found, source, target):
         parts += [f"What {target} does not do as {source} does:", _listed(said)]
-    pairs = zip(fitted.identification.names, fitted.identification.at_bound, strict=True)
+    pairs = zip(fitted.identifiability.names, fitted.identifiability.at_bound, strict=True)
     if ends := [f"`{name}`" for name, end in pairs if end]:
         parts.append(f"At an end of their range, which may be too narrow: {', '.join(ends)}.")
     still = [n for n in sensitivity.declared(made.target.ik) if n not in made.experiment.free]

@@ -27,7 +27,7 @@ class Fit:
     experiment: Experiment
     problem: Problem
     solution: Solution
-    identification: Identifiability
+    identifiability: Identifiability
 
     @property
     def ik(self) -> jaxik.FootIK:
@@ -37,7 +37,7 @@ class Fit:
     @property
     def start_sd(self) -> Float[np.ndarray, " free"]:
         """Width, in u, of the ball in which walkers start."""
-        sd = np.where(np.isfinite(self.identification.sd), self.identification.sd, THRESHOLD_SD)
+        sd = np.where(np.isfinite(self.identifiability.sd), self.identifiability.sd, THRESHOLD_SD)
         return np.clip(sd, LEAST_SD, MOST_SD)
 
 

@@ -30,7 +30,7 @@ from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.inference import sensitivity
 from fitting.inference.optimisation.population import evaluate, offsets, sweep
 from fitting.problem.problem import Problem
-from fitting.problem.space import free
+from fitting.problem.space import free_parameter
 from fitting.runtime import files, validation
 from jaxik.maths import parameter_tree
 
@@ -108,7 +108,7 @@ def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
         raise ValueError(f"--free {given}: names no parameter")
     with validation.error_context("--free"):
         for name, options in named.items():
-            free(ik, name, **options)
+            free_parameter(ik, name, **options)
     return named
 
 

@@ -14,7 +14,7 @@ from fitting.bench import tasks as bench_tasks
 from fitting.bench.setup import Sizes
 from fitting.inference.optimisation.search import solve
 from fitting.problem.problem import Problem
-from fitting.problem.space import free, make_space
+from fitting.problem.space import free_parameter, make_space
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
@@ -170,7 +170,9 @@ def quickly(monkeypatch):
 
     def problem(count: int, names: tuple[str, ...] = ()) -> Problem:
         ik = presets.record()
-        return Problem(make_space(ik, [free(ik, n) for n in TARGETS]), (), residuals_of_scenes)
+        return Problem(
+            make_space(ik, [free_parameter(ik, n) for n in TARGETS]), (), residuals_of_scenes
+        )
 
     monkeypatch.setattr(setup, "TRUTH", TARGETS)
     monkeypatch.setattr(setup, "problem", problem)

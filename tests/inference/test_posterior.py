@@ -21,7 +21,7 @@ from fitting.inference.sampling import diagnostics, posterior, sampler
 from fitting.inference.sampling.chain import Chain, Identity, journal_path
 from fitting.inference.sampling.posterior import sample_posterior
 from fitting.problem.problem import Problem
-from fitting.problem.space import PRIOR_SD, free, make_space
+from fitting.problem.space import PRIOR_SD, free_parameter, make_space
 from jaxik.maths import parameter_tree
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,7 +67,9 @@ def two_islands(ik, data):
 
 def toy(size, residuals, data):
     ik = Toy(x=jnp.full(size, 0.5))
-    return Problem(make_space(ik, [free(ik, f"x[{i}]") for i in range(size)]), data, residuals)
+    return Problem(
+        make_space(ik, [free_parameter(ik, f"x[{i}]") for i in range(size)]), data, residuals
+    )
 
 
 def normal(size, seed=0):
@@ -145,7 +147,7 @@ def test_a_threshold_is_sampled_as_integrated_on_a_grid():
     random = np.random.default_rng(3)
     moments = jnp.linspace(0.02, 0.98, 25)
     seen = jnp.where(moments > 0.43, 0.7, 0.0) + 0.3 * random.normal(size=25)
-    space = make_space(ik, [free(ik, "height"), free(ik, "moment")])
+    space = make_space(ik, [free_parameter(ik, "height"), free_parameter(ik, "moment")])
     problem = Problem(space, (moments, seen), step_minus_seen)
     start = space.pack({"height": 0.7, "moment": 0.43})
     found = sample_posterior(problem, start, np.array([0.3, 0.05]), walkers=32)

@@ -56,7 +56,7 @@ def curve_problem(
     clean = curve(Curve(**{name: jnp.asarray(value) for name, value in CURVE_TRUTH.items()}))
     gross = (random.random(TIME.size) < outliers) * random.uniform(1, 3, TIME.size)
     data = clean + random.normal(0, 0.02, TIME.size) + gross
-    made = space.make_space(base, [space.free(base, name) for name in names])
+    made = space.make_space(base, [space.free_parameter(base, name) for name in names])
     return Problem(made, (data, jnp.asarray(walls)), curve_residuals, **options)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from fitting.problem.problem import Problem
-from fitting.problem.space import free, make_space
+from fitting.problem.space import free_parameter, make_space
 from support import toy
 
 ROWS, CLIPS = 400, 400
@@ -31,7 +31,7 @@ def covered(independent: float) -> float:
     The rows are linear in the parameter's value, so that estimate and width follow from the slope.
     """
     ik = toy.Toy()
-    space = make_space(ik, [free(ik, "foot.share", prior_sd=50.0)])
+    space = make_space(ik, [free_parameter(ik, "foot.share", prior_sd=50.0)])
     problem = Problem(space, jnp.zeros(ROWS), residuals, independent=jnp.asarray(independent))
     u = jnp.zeros(1)
     of_u = jax.jacfwd(lambda u: space.values(u)[0])(u)[0]

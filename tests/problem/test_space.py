@@ -28,7 +28,9 @@ def unpack_and_pack(made: space.Space, u: jax.Array) -> tuple[jax.Array, jax.Arr
 
 
 def make(*names: str, **overrides) -> space.Space:
-    return space.make_space(toy.Toy(), [space.free(toy.Toy(), n, **overrides) for n in names])
+    return space.make_space(
+        toy.Toy(), [space.free_parameter(toy.Toy(), n, **overrides) for n in names]
+    )
 
 
 SPACE = make(*NAMES)
@@ -93,7 +95,7 @@ def test_a_prior_at_a_bound_is_moved_inside_where_u_is_finite():
 
 
 def test_a_default_outside_the_given_bounds_is_taken_to_the_nearest_one():
-    assert space.free(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
+    assert space.free_parameter(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
 
 
 def test_smooth_and_thresholds_share_the_parameters_out():
@@ -122,7 +124,7 @@ def test_smooth_and_thresholds_share_the_parameters_out():
 )
 def test_what_cannot_be_free_is_answered_with_what_can(name, overrides, said):
     with pytest.raises(ValueError, match=said):
-        space.free(toy.Toy(), name, **overrides)
+        space.free_parameter(toy.Toy(), name, **overrides)
 
 
 @pytest.mark.parametrize(
@@ -139,14 +141,20 @@ def test_a_space_of_nothing_or_of_doubles_is_refused(names, said):
 
 
 def test_a_partner_that_leaves_no_room_is_refused():
-    frees = [space.free(toy.Toy(), "lock.height_on"), space.free(toy.Toy(), "lock.height_off")]
+    frees = [
+        space.free_parameter(toy.Toy(), "lock.height_on"),
+        space.free_parameter(toy.Toy(), "lock.height_off"),
+    ]
     frees[1] = dataclasses.replace(frees[1], high=0.11)
     with pytest.raises(ValueError, match="stays above lock.height_on, which reaches 0.12"):
         space.make_space(toy.Toy(), frees)
 
 
 def test_two_that_stay_above_each_other_are_refused():
-    frees = [space.free(toy.Toy(), "lock.height_on"), space.free(toy.Toy(), "lock.height_off")]
+    frees = [
+        space.free_parameter(toy.Toy(), "lock.height_on"),
+        space.free_parameter(toy.Toy(), "lock.height_off"),
+    ]
     frees[0] = dataclasses.replace(frees[0], above="lock.height_off", high=0.3)
     frees[1] = dataclasses.replace(frees[1], high=0.4)
     with pytest.raises(ValueError, match="above"):

@@ -93,7 +93,7 @@ def test_the_ball_of_a_threshold_is_small_and_no_ball_is_flat(fitted):
     sd = np.array([np.nan, 9.0])
     wide = study.Fit(
         fitted.experiment, fitted.problem, fitted.solution,
-        Identifiability(**(vars(fitted.identification) | {"sd": sd})),
+        Identifiability(**(vars(fitted.identifiability) | {"sd": sd})),
     )  # fmt: skip
     np.testing.assert_array_equal(wide.start_sd, [study.THRESHOLD_SD, study.MOST_SD])
 

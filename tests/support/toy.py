@@ -200,7 +200,7 @@ def make_problem(
     loss: loss.Loss = "squares",
 ) -> Problem:
     """The defaults as a start, the truth in the data."""
-    made = space.make_space(Toy(), [space.free(Toy(), name) for name in names])
-    held = space.make_space(Toy(), [space.free(Toy(), name) for name in TRUTH])
+    made = space.make_space(Toy(), [space.free_parameter(Toy(), name) for name in names])
+    held = space.make_space(Toy(), [space.free_parameter(Toy(), name) for name in TRUTH])
     clean = held.unpack(held.pack(truth))
     return Problem(made, make_data(clean, seed, frames, outliers), residuals, loss)
