@@ -206,7 +206,7 @@ def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
 def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(fit_report, "_keep", lambda run, name, caption, figure: {name: caption})
     problem = fitted.problem
-    twice = Problem(problem.space, problem.data * 2, problem.residuals, problem.loss)
+    twice = Problem(problem.space, problem.data * 2, problem.residual_function, problem.loss)
     played = playback.play(fitted.ik, problem.data[0])
     pictures = fit_report._draw_clip(tmp_path, replace(fitted, problem=twice), 1, played)
     assert set(pictures) == {

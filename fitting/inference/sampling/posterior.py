@@ -157,7 +157,7 @@ def sample_posterior(
 def digest(problem: Problem) -> str:
     """64 characters that change with any number or name on which the log-probability depends."""
     hashed = hashlib.sha256()
-    residuals = problem.residuals
+    residuals = problem.residual_function
     kind = (residuals.__module__, residuals.__qualname__, problem.loss, problem.space.parameters)
     hashed.update(repr(kind).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(problem, eqx.is_array_like)):
