@@ -28,9 +28,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import Clip, save_clip
-from fitting.datasets.synthetic import course, crawlers, walker
+from fitting.datasets.synthetic import multi_limb, terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip, Stop
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import experiment
@@ -39,13 +39,13 @@ from jaxik.world.terrain import Terrain
 
 HERE = Path(__file__).resolve().parent
 TERRAINS = {
-    "slope": course.slope,
-    "steps": course.steps,
-    "rubble": course.stones,
-    "uneven_walk": course.uneven,
-    "stop_and_go": course.stop_and_go,
-    "meadow": course.meadow,
-    "wall": course.wall,
+    "slope": terrain_meshes.slope,
+    "steps": terrain_meshes.steps,
+    "rubble": terrain_meshes.stones,
+    "uneven_walk": terrain_meshes.uneven,
+    "stop_and_go": terrain_meshes.stop_and_go,
+    "meadow": terrain_meshes.meadow,
+    "wall": terrain_meshes.wall,
 }
 SECONDS, FPS, NOISE_SEED = 12.0, 30.0, 11
 SLIPS = (Slip(0.6, 4.4, 0.06), Slip(5.6, 8.6, -0.06))
@@ -67,12 +67,12 @@ def stop_and_go() -> Clip:
 
 def quadruped() -> Clip:
     """A quadruped's walk."""
-    return crawlers.crawl(crawlers.QUADRUPED, 5.0, FPS, 3)
+    return multi_limb.crawl(multi_limb.QUADRUPED, 5.0, FPS, 3)
 
 
 def climber() -> Clip:
     """A climb."""
-    return crawlers.climb(6.0, FPS, 5)
+    return multi_limb.climb(6.0, FPS, 5)
 
 
 BASES: Mapping[str, Callable[[], Clip]] = {
@@ -166,8 +166,10 @@ def base(name: str) -> Clip:
 def reference(made: Made, flat: Clip, terrain: Terrain) -> Clip:
     """The flat base as the pipeline with the true parameters has it, without noise."""
     ik = parameter_tree.replace(experiment.name_preset(made.preset), made.truth)
-    result = jaxik.run(ik, flat.rig, terrain, frames.frames_of(flat))
-    return dataclasses.replace(frames.solved_clip(flat, result), source=made.name.replace("_", " "))
+    result = jaxik.run(ik, flat.rig, terrain, clip_frames.frames_from_clip(flat))
+    return dataclasses.replace(
+        clip_frames.clip_from_result(flat, result), source=made.name.replace("_", " ")
+    )
 
 
 def noisy(clip: Clip, seed: int) -> Clip:

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts, load_clip, save_clip
-from fitting.datasets.synthetic import course
+from fitting.datasets.synthetic import terrain_meshes
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import experiment
 from jaxik.maths import parameter_tree
@@ -176,7 +176,7 @@ def test_the_course_is_under_every_foot_within_reach_of_the_rays():
 def test_the_walk_that_stops_stands_still_on_three_uneven_places():
     base = load_clip(DATA / "clips" / "stop_and_go_base.npz")
     ground = mesh_files.load_terrain(DATA / "terrains" / "stop_and_go.ply")
-    still = np.asarray(frames.frames_of(base).speed) == 0.0
+    still = np.asarray(clip_frames.frames_from_clip(base).speed) == 0.0
     stands = contacts.runs(still)
     assert base.fps == 30.0 and len(stands) == 3
     apart, slopes = [], []
@@ -196,7 +196,7 @@ def test_the_walk_that_stops_stands_still_on_three_uneven_places():
 )
 def test_terrain_is_under_every_foot(walk, mesh):
     base = load_clip(DATA / "clips" / f"{walk}_base.npz")
-    up = course.WALL_UP if mesh == "wall" else (0.0, 1.0, 0.0)
+    up = terrain_meshes.WALL_UP if mesh == "wall" else (0.0, 1.0, 0.0)
     ground = mesh_files.load_terrain(DATA / "terrains" / f"{mesh}.ply", up=up)
     for role in (2, 3):
         points = base.joints_ws(role).reshape(-1, 3) + 0.5 * np.array(up)
@@ -206,7 +206,7 @@ def test_terrain_is_under_every_foot(walk, mesh):
 
 
 def test_the_wall_has_holds_of_two_to_six_centimetres():
-    mesh = course.wall()
+    mesh = terrain_meshes.wall()
     proud = -mesh.vertices[:, 2]
     holds = proud[proud > 0]
     assert 0.02 <= holds.min() and holds.max() <= 0.06
@@ -215,7 +215,7 @@ def test_the_wall_has_holds_of_two_to_six_centimetres():
 
 @pytest.mark.parametrize("name", ["slope", "steps", "stones", "uneven", "stop_and_go", "meadow"])
 def test_a_course_has_no_hole_and_faces_up(tmp_path, name):
-    mesh = getattr(course, name)()
+    mesh = getattr(terrain_meshes, name)()
     mesh_files.save_mesh(tmp_path / "ground.ply", *mesh)
     ground = mesh_files.load_terrain(tmp_path / "ground.ply")
     rng = np.random.default_rng(0)
@@ -227,13 +227,13 @@ def test_a_course_has_no_hole_and_faces_up(tmp_path, name):
 
 
 def test_steps_are_as_high_as_they_say_and_the_slope_as_steep(tmp_path):
-    mesh_files.save_mesh(tmp_path / "steps.ply", *course.steps())
+    mesh_files.save_mesh(tmp_path / "steps.ply", *terrain_meshes.steps())
     ground = mesh_files.load_terrain(tmp_path / "steps.ply")
-    middles = 1.0 + course.TREAD * (np.arange(-1, len(course.STEP_HEIGHTS)) + 0.5)
+    middles = 1.0 + terrain_meshes.TREAD * (np.arange(-1, len(terrain_meshes.STEP_HEIGHTS)) + 0.5)
     points = np.stack([0 * middles, 0 * middles, middles], axis=-1)
     rises = np.diff(np.array(under(ground, points).point[:, 1], np.float64))
-    np.testing.assert_allclose(rises, course.STEP_HEIGHTS, rtol=0, atol=1e-4)
-    mesh_files.save_mesh(tmp_path / "slope.ply", *course.slope())
+    np.testing.assert_allclose(rises, terrain_meshes.STEP_HEIGHTS, rtol=0, atol=1e-4)
+    mesh_files.save_mesh(tmp_path / "slope.ply", *terrain_meshes.slope())
     ground = mesh_files.load_terrain(tmp_path / "slope.ply")
     normal = np.asarray(under(ground, np.array([[0.0, 0.0, 2.3]])).normal[0])
     assert np.degrees(np.arctan2(-normal[2], normal[1])) == pytest.approx(12.0, abs=0.1)

@@ -1,146 +1,105 @@
-"""How far a solved clip is from a captured one, in the figures of the blocks benchmark.
+"""How far a solved motion is from the captured one, in the figures of the blocks benchmark.
 
-The definitions are those of the benchmark's `score.py`. NumPy; world space, y up.
+The definitions are those of the benchmark's own scoring script, against which the tests check
+them. NumPy; world space, y up.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.frames import named_joints
-from fitting.report.tables import Table
 
-from .measures import Column
-
-STRAIGHT = 0.999  # share of a leg's length between hip and ankle from which on it is straight
+STRAIGHT_REACH = 0.999  # hip to ankle over leg length, from which a leg counts as straight
 JOINTS = ("pelvis", "hip", "knee", "ankle")
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """A solved motion against a captured one, as `COLUMNS` explains; NaN without such frames."""
+class Accuracy:
+    """How far a solved motion is from the captured one; NaN where no frame counts."""
 
-    pelvis: float  # m
-    ankle: float  # m
-    ankle_stance: float  # m
-    knee: float  # m
-    knee_stance: float  # m
-    knee_angle: float  # rad
-    knee_angle_stance: float  # rad
-    straight: float  # share of 1
-    pop: float  # m a frame
-    added_slip: float  # m a frame
-    bone_length: float  # m
-
-
-COLUMNS = {
-    "pelvis": Column(
-        "pelvis", "cm", 100.0, 2, "Height of the pelvis against the captured one; rms over frames."
-    ),
-    "ankle": Column(
-        "ankle", "cm", 100.0, 2, "Distance of the ankles from the captured ones; rms."
-    ),
-    "ankle_stance": Column(
-        "ankle in stance", "cm", 100.0, 2, "The same over the frames in which the foot stands."
-    ),
-    "knee": Column("knee", "cm", 100.0, 2, "Distance of the knees from the captured ones; rms."),
-    "knee_stance": Column(
-        "knee in stance", "cm", 100.0, 2, "The same over the frames in which the foot stands."
-    ),
-    "knee_angle": Column(
-        "knee angle", "°", np.degrees(1.0), 2, "Difference of the angles at the knees; rms."
-    ),
-    "knee_angle_stance": Column(
-        "knee angle in stance", "°", np.degrees(1.0), 2,
-        "The same over the frames in which the foot stands.",
-    ),
-    "straight": Column(
-        "straight", "%", 100.0, 2,
-        "Share of frames and legs with at least 99.9 % of the leg's length from hip to ankle.",
-    ),
-    "pop": Column(
-        "pop", "cm a frame", 100.0, 2,
-        "The largest change from a frame to the next of how far an ankle is over where the "
-        "animation has it. It grows with the length of a frame.",
-    ),
-    "added_slip": Column(
-        "added slip", "mm a frame", 1000.0, 3,
-        "How much further over the ground plan than the captured one a standing ankle comes from a "
-        "frame to the next; mean, and 0 where it comes less far.",
-    ),
-    "bone_length": Column(
-        "bone length", "mm", 1000.0, 3, "The largest error of the length of a thigh or a shin."
-    ),
-}  # fmt: skip
+    pelvis: float  # m, height, rms
+    ankle: float  # m, rms
+    ankle_stance: float  # m, rms over the frames in which the captured foot stands
+    knee: float  # m, rms
+    knee_stance: float  # m, likewise
+    knee_angle: float  # rad, rms
+    knee_angle_stance: float  # rad, likewise
+    straight: float  # fraction of frames and legs
+    pop: float  # m per frame, largest
+    added_slip: float  # m per frame, mean
+    bone_length: float  # m, largest error
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What `Agreement` is the summary of; frames, or changes from one to the next, first."""
+    """Frame by frame what `Accuracy` summarises; `changes` run from one frame to the next."""
 
-    pelvis: Float[np.ndarray, " frames"]  # m
+    pelvis: Float[np.ndarray, " frames"]  # m, height
     ankle: Float[np.ndarray, "frames legs"]  # m
     knee: Float[np.ndarray, "frames legs"]  # m
     knee_angle: Float[np.ndarray, "frames legs"]  # rad
     stance: Bool[np.ndarray, "frames legs"]
     straight: Bool[np.ndarray, "frames legs"]
-    lift: Float[np.ndarray, "changes legs"]  # m, of the ankle's height over the animated one
-    slip: Float[np.ndarray, " standing"]  # m, further than captured, of feet that go on standing
+    lift: Float[np.ndarray, "changes legs"]  # m, change of the ankle's height over the animated one
+    slip: Float[np.ndarray, " standing"]  # m, horizontal, beyond the captured, of standing feet
     bones: Float[np.ndarray, "frames legs 2"]  # m, of thigh and shin
 
 
 def errors(
     solved: Mapping[str, np.ndarray],
     captured: Mapping[str, np.ndarray],
-    base_ankle_ws: Float[np.ndarray, "frames legs 3"],
+    animated_ankle_ws: Float[np.ndarray, "frames legs 3"],
     stance: Bool[np.ndarray, "frames legs"],
     lengths: Float[np.ndarray, "legs 2"],
 ) -> Errors:
-    """Differences of two motions over the same frames.
+    """Differences between two motions over the same frames.
 
     Args:
         solved: `pelvis` (frames, 3); `hip`, `knee` and `ankle` (frames, legs, 3), m.
         captured: the same joints.
-        base_ankle_ws: of the animation from which the solved motion was made, m.
+        animated_ankle_ws: of the flat animation from which the solved motion was made, m.
         stance: where a captured foot stands.
         lengths: of thigh and shin, m.
     """
-    made, real = (
-        {name: one[name].astype(np.float64) for name in JOINTS} for one in (solved, captured)
+    ours, theirs = (
+        {name: joints[name].astype(np.float64) for name in JOINTS} for joints in (solved, captured)
     )
-    ways = [np.diff(one["ankle"][..., [0, 2]], axis=0) for one in (made, real)]
-    further = np.linalg.norm(ways[0], axis=-1) - np.linalg.norm(ways[1], axis=-1)
-    thigh, shin = made["knee"] - made["hip"], made["ankle"] - made["knee"]
-    reach = np.linalg.norm(made["ankle"] - made["hip"], axis=-1)
+    our_steps, their_steps = (
+        np.linalg.norm(np.diff(joints["ankle"][..., [0, 2]], axis=0), axis=-1)
+        for joints in (ours, theirs)
+    )
+    thigh, shin = ours["knee"] - ours["hip"], ours["ankle"] - ours["knee"]
+    reach = np.linalg.norm(ours["ankle"] - ours["hip"], axis=-1)
     return Errors(
-        pelvis=made["pelvis"][:, 1] - real["pelvis"][:, 1],
-        ankle=np.linalg.norm(made["ankle"] - real["ankle"], axis=-1),
-        knee=np.linalg.norm(made["knee"] - real["knee"], axis=-1),
-        knee_angle=knee_angle(made) - knee_angle(real),
+        pelvis=ours["pelvis"][:, 1] - theirs["pelvis"][:, 1],
+        ankle=np.linalg.norm(ours["ankle"] - theirs["ankle"], axis=-1),
+        knee=np.linalg.norm(ours["knee"] - theirs["knee"], axis=-1),
+        knee_angle=knee_angle(ours) - knee_angle(theirs),
         stance=stance,
-        straight=reach / np.sum(lengths, axis=-1) >= STRAIGHT,
-        lift=np.diff((made["ankle"] - base_ankle_ws)[..., 1], axis=0),
-        slip=further[stance[1:] & stance[:-1]],
+        straight=reach / np.sum(lengths, axis=-1) >= STRAIGHT_REACH,
+        lift=np.diff((ours["ankle"] - animated_ankle_ws)[..., 1], axis=0),
+        slip=(our_steps - their_steps)[stance[1:] & stance[:-1]],
         bones=np.linalg.norm(np.stack([thigh, shin], axis=2), axis=-1) - lengths,
     )
 
 
-def errors_of_clips(solved: Clip, captured: Clip, base: Clip) -> Errors:
-    """Differences of a solved clip from a captured one, over the same frames.
+def clip_errors(solved: Clip, captured: Clip, animation: Clip) -> Errors:
+    """Differences between a solved clip and the captured one, over the same frames.
 
     Args:
-        solved: what foot IK made of `base`.
-        captured: its contact labels, or those found from its motion, say when a foot stands.
-        base: the animation, whose bones have the lengths of its rig.
+        solved: what foot IK made of the animation.
+        captured: says when a foot stands, by its contact labels or else by its motion.
+        animation: the flat animation, whose bones have the lengths of its rig.
     """
-    rig = base.rig
+    rig = animation.rig
     return errors(
-        named_joints(solved),
-        named_joints(captured),
-        base.joints_ws(2),
+        positions_by_role(solved),
+        positions_by_role(captured),
+        animation.joints_ws(2),
         captured.standing(),
         np.stack([np.asarray(rig.thigh), np.asarray(rig.shin)], axis=-1),
     )
@@ -153,14 +112,14 @@ def knee_angle(joints: Mapping[str, np.ndarray]) -> Float[np.ndarray, "frames le
     return np.arctan2(across, np.sum(thigh * shin, axis=-1))
 
 
-def agreement(clips: Sequence[Errors]) -> Agreement:
-    """The figures over all frames of all clips."""
+def summarise(clips: Sequence[Errors]) -> Accuracy:
+    """The figures over all frames of all clips; no change is taken across a cut."""
     joined = {
-        one.name: np.concatenate([getattr(clip, one.name).ravel() for clip in clips])
-        for one in fields(Errors)
+        field.name: np.concatenate([getattr(clip, field.name).ravel() for clip in clips])
+        for field in fields(Errors)
     }
     stance = joined["stance"]
-    return Agreement(
+    return Accuracy(
         pelvis=_rms(joined["pelvis"]),
         ankle=_rms(joined["ankle"]),
         ankle_stance=_rms(joined["ankle"][stance]),
@@ -173,23 +132,6 @@ def agreement(clips: Sequence[Errors]) -> Agreement:
         added_slip=_mean(np.maximum(joined["slip"], 0.0)),
         bone_length=_largest(joined["bones"]),
     )
-
-
-def worded(key: str, value: float) -> str:
-    """A figure in the unit of its column; a dash where there is none."""
-    column = COLUMNS[key]
-    return "–" if np.isnan(value) else f"{column.factor * value:.{column.digits}f}"
-
-
-def heads() -> list[str]:
-    """Figures with their units, in the order of the columns."""
-    return [f"{column.head}, {column.unit}" for column in COLUMNS.values()]
-
-
-def table(found: Agreement) -> Table:
-    """A row a figure."""
-    cells = [worded(key, value) for key, value in zip(COLUMNS, astuple(found), strict=True)]
-    return [["against the captured motion", ""], *map(list, zip(heads(), cells, strict=True))]
 
 
 def _rms(values: np.ndarray) -> float:

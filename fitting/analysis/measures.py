@@ -148,7 +148,7 @@ def sole_depths(clip: Clip, floor: float = 0.0) -> Float64[np.ndarray, "legs 2"]
         clip: the animation on its flat floor.
         floor: its height, m.
     """
-    stance, joints = clip.standing(), np.stack([clip.joints_ws(2), clip.joints_ws(3)], axis=2)
+    stance, joints = clip.stance_labels(), np.stack([clip.joints_ws(2), clip.joints_ws(3)], axis=2)
     depths = []
     for leg in range(stance.shape[1]):
         flat = flat_frames(joints[:, leg, 0], joints[:, leg, 1], stance[:, leg])

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxik
-from fitting.datasets.frames import frames_of
+from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.terrain import mesh_files
 from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
 from jaxik.stages.effector import Effector
@@ -211,7 +211,7 @@ def rays(row: Row, sizes: Sizes) -> None:
     calls: dict[str, Callable[[], Any]] = {
         "ours": _shared_out(row, met, ground, given, axis=0, sparse=ground)
     }
-    tracer = mesh_files.embree(mesh.vertices, mesh.faces)
+    tracer = mesh_files.embree_tracer(mesh.vertices, mesh.faces)
     down = np.tile([0.0, -1.0, 0.0], (len(origins), 1))
     wide = origins.astype(np.float64)
     if tracer is not None:
@@ -254,7 +254,7 @@ def _agreement(hit: Any, theirs: tuple) -> str:
 def step(row: Row, sizes: Sizes) -> None:
     """One frame of one character, as a game calls it."""
     clip = setup.walk(60)
-    rig, motion = (setup.single(one) for one in (clip.rig, frames_of(clip)))
+    rig, motion = (setup.single(one) for one in (clip.rig, frames_from_clip(clip)))
     frame = jax.tree.map(lambda leaf: leaf[30], motion)
     ik = setup.single(jaxik.presets.record())
     state = jaxik.init(ik, rig)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxik
-from fitting.datasets.frames import frames_of
+from fitting.datasets.clip_frames import frames_from_clip
 from jaxik.world.terrain import Terrain, plane
 
 from . import fits, rows, setup
@@ -24,7 +24,7 @@ Measured = Callable[[Row, Any], dict[str, float]]
 def scaling(row: Row, sizes: Sizes) -> None:
     """Time against batch, frames, triangles, parameters and legs."""
     clip = setup.walk(sizes.frames)
-    rig, motion = setup.single(clip.rig), setup.single(frames_of(clip))
+    rig, motion = setup.single(clip.rig), setup.single(frames_from_clip(clip))
     ik, flat = setup.single(jaxik.presets.record()), setup.single(plane())
 
     def batch(legs: int) -> dict[str, float]:

@@ -14,10 +14,10 @@ from fitting.analysis import accuracy
 from fitting.bench import measure as bench
 from fitting.bench import report as bench_report
 from fitting.bench import tasks as bench_tasks
-from fitting.datasets import clips, frames
-from fitting.datasets.clips import inspect as inspection
-from fitting.datasets.clips.formats.npz import is_blocks
-from fitting.datasets.flat_animation import load_base
+from fitting.datasets import clip_frames, clips
+from fitting.datasets.clips import summary
+from fitting.datasets.clips.formats.npz import is_blocks_file
+from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.datasets.terrain.reconstruction import reconstruct
 from fitting.experiments import experiment, parameter_files, record_files, systems
@@ -116,7 +116,7 @@ def compare(options: argparse.Namespace) -> int:
     _prepare_jax()
     systems = comparing.name_systems(options.systems, grounded=options.roots == "ground")
     run_folder.check_place(options.output)
-    base = load_base(options.clip)
+    base = load_flat_animation(options.clip)
     ground = mesh_files.load_terrain(options.terrain, file_up=options.file_up)
     title = f"{options.clip.name} on {options.terrain.name}"
     compared = comparing.compare(
@@ -153,8 +153,8 @@ def translation(options: argparse.Namespace) -> int:
 def inspect(options: argparse.Namespace) -> int:
     """Prints what a loader understood of a clip."""
     clip = clips.load_clip(options.clip, asf=options.asf, scale=options.scale)
-    told = inspection.describe(clip)
-    print(inspection.to_json(told) if options.json else inspection.render(told))
+    told = summary.describe(clip)
+    print(summary.as_json(told) if options.json else summary.as_text(told))
     return 0
 
 
@@ -268,20 +268,20 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
     if options.output.suffix.lower() != ".npz":
         raise ValueError(f"{options.output}: wanted a name that ends in .npz")
     files.check_output_file(options.output)
-    base = load_base(options.clip)
+    base = load_flat_animation(options.clip)
     ground = mesh_files.load_terrain(options.terrain, file_up=options.file_up)
-    motion = frames.frames_of(base, floor=options.floor)
+    motion = clip_frames.frames_from_clip(base, floor=options.floor)
     experiment.check_shapes(ik, base.rig, ground, motion)
     began = time.perf_counter()
     result, solved = comparing.solve(ik, base, ground, motion, options.floor)
-    clips.save_clip(options.output, solved, joints=frames.named_joints(solved))
+    clips.save_clip(options.output, solved, joints=clip_frames.positions_by_role(solved))
     reached = float(np.mean(result.reached))
     found = float(np.mean(result.trace.sensed.foothold.found))
     print(
-        f"{base.frames} frames in {time.perf_counter() - began:.1f} s: ground under {found:.1%} of "
+        f"{base.frame_count} frames in {time.perf_counter() - began:.1f} s: ground under {found:.1%} of "
         f"the feet, {reached:.1%} of the targets reached; written to {options.output}"
     )
-    if is_blocks(options.clip):
+    if is_blocks_file(options.clip):
         captured = clips.load_clip(options.clip)
         found = accuracy.agreement([accuracy.errors_of_clips(solved, captured, base)])
         print("\n" + tables.aligned(accuracy.table(found)))

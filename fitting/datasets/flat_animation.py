@@ -18,15 +18,15 @@ from fitting.runtime.validation import error_context
 
 from .clips import contacts, load_clip
 from .clips.clip import Clip
-from .clips.formats.npz import is_blocks
-from .clips.recording import localise, place
+from .clips.formats.npz import is_blocks_file
+from .clips.recording import local_from_world, place
 from .clips.rigs import hinges, unit
 
 STRETCH = 1e-4  # m, change of a bone's length that counts as stretching
 LONGEST = 0.9995  # share of a leg's length that it may be stretched to
 
 
-def flat_base(
+def flatten_clip(
     clip: Clip,
     height_under: Callable[[np.ndarray], np.ndarray],
     *,
@@ -47,7 +47,7 @@ def flat_base(
     Errors: ValueError when a foot never stands or the ground is not finite under a stance.
     """
     rig = clip.rig
-    stance = clip.standing()
+    stance = clip.stance_labels()
     ground = ground_under(clip, stance, height_under)
     pelvis = clip.positions_ws[:, rig.pelvis]
     if pelvis_height is None:
@@ -63,7 +63,7 @@ def flat_base(
     return replace(clip.with_motion(positions_ws, rotations_ws), stance=stance)
 
 
-def rigid_legs(clip: Clip) -> Clip:
+def with_rigid_legs(clip: Clip) -> Clip:
     """The clip with thighs and shins of the rig's lengths in every frame.
 
     Where an animation stretches a leg its foot is drawn along the line to its hip until the leg
@@ -80,15 +80,15 @@ def rigid_legs(clip: Clip) -> Clip:
     positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
     for leg, joints in enumerate(rig.joints):
         lengths = float(rig.thigh[leg]), float(rig.shin[leg])
-        _rebuild(clip, joints, lengths, np.zeros(clip.frames), positions_ws, rotations_ws)
+        _rebuild(clip, joints, lengths, np.zeros(clip.frame_count), positions_ws, rotations_ws)
     return clip.with_motion(*_hang_children(clip, positions_ws, rotations_ws))
 
 
-def load_base(path: Path) -> Clip:
+def load_flat_animation(path: Path) -> Clip:
     """The animation in a file as foot IK takes it: a blocks file's base, with rigid legs."""
-    clip = load_clip(path, variant="base" if is_blocks(path) else "captured")
+    clip = load_clip(path, variant="base" if is_blocks_file(path) else "captured")
     with error_context(path):
-        return rigid_legs(clip)
+        return with_rigid_legs(clip)
 
 
 def ground_under(
@@ -190,8 +190,10 @@ def _hang_children(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Joints on the legs but not of them (end sites, helpers) as they hung on their parents."""
     own = {joint for leg in clip.rig.joints for joint in leg}
-    positions_ls, rotations_ls = localise(clip.parents, clip.positions_ws, clip.rotations_ws)
-    kept_pos, kept_rot = localise(clip.parents, positions_ws, rotations_ws)
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, clip.positions_ws, clip.rotations_ws
+    )
+    kept_pos, kept_rot = local_from_world(clip.parents, positions_ws, rotations_ws)
     below: set[int] = set()
     for joint, parent in enumerate(clip.parents):
         if joint not in own and (parent in own or parent in below):

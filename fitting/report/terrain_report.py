@@ -8,8 +8,8 @@ import numpy as np
 
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.terrain import mesh_files
-from fitting.datasets.terrain.reconstruction import KINDS, Ground
-from fitting.datasets.terrain.surfaces import Blocks, Plane, Smooth
+from fitting.datasets.terrain.reconstruction import SURFACE_KINDS, Reconstruction
+from fitting.datasets.terrain.surfaces import LevelBlocks, Plane, ThinPlate
 from fitting.runtime import files
 
 from .plots import style, terrain_plots
@@ -25,7 +25,7 @@ def check_places(mesh: Path) -> None:
         files.check_output_file(path)
 
 
-def write(mesh: Path, found: Ground, clip: Clip, sole: float, margin: float) -> None:
+def write(mesh: Path, found: Reconstruction, clip: Clip, sole: float, margin: float) -> None:
     """Writes the chosen ground as a mesh, and beside it the numbers and a picture.
 
     Args:
@@ -44,12 +44,12 @@ def write(mesh: Path, found: Ground, clip: Clip, sole: float, margin: float) -> 
     files.write(mesh, lambda temporary: mesh_files.save_mesh(temporary, vertices, faces))
 
 
-def table(found: Ground) -> Table:
+def table(found: Reconstruction) -> Table:
     """How well each kind of ground predicts a stance from the others."""
     head = ["ground", "error, cm rms", "median", "alone on a block", "error without those"]
     rows = [head]
-    for kind in KINDS:
-        one = found.tested[kind]
+    for kind in SURFACE_KINDS:
+        one = found.predictions[kind]
         alone = int(one.alone.sum())
         without = f"{100 * one.rms_shared:.2f}" if 0 < alone < len(one.errors) else ""
         size = np.median(np.abs(one.errors))
@@ -59,7 +59,7 @@ def table(found: Ground) -> Table:
     return rows
 
 
-def counted(found: Ground) -> str:
+def counted(found: Reconstruction) -> str:
     """How many stances there are, and how many were used."""
     stances = found.stances
     text = f"{len(stances.leg)} stances"
@@ -69,11 +69,11 @@ def counted(found: Ground) -> str:
     return text
 
 
-def sentence(found: Ground) -> str:
+def sentence(found: Reconstruction) -> str:
     """The chosen ground in words."""
-    surface, ranked = found.surface, found.ranked
+    surface, ranked = found.surface, found.grids
     match surface:
-        case Blocks():
+        case LevelBlocks():
             grid, count = surface.grid, len(surface.tops)
             low, high = np.degrees(ranked.headings)
             return (
@@ -83,14 +83,14 @@ def sentence(found: Ground) -> str:
             )
         case Plane():
             return f"a plane that rises by {np.degrees(np.arctan(np.hypot(*surface.slope))):.2f}°"
-        case Smooth():
+        case ThinPlate():
             low, high = 100 * surface.lowest, 100 * surface.highest
             return f"a smooth surface from {low:.1f} to {high:.1f} cm"
         case _:
             raise TypeError(f"no words for {surface}")
 
 
-def numbers(found: Ground, clip: Clip, sole: float) -> dict[str, Any]:
+def numbers(found: Reconstruction, clip: Clip, sole: float) -> dict[str, Any]:
     """What JSON holds: metres, radians, frames; null where nothing is known."""
     stances, used = found.stances, np.cumsum(found.stances.used) - 1
     rows = []
@@ -106,12 +106,14 @@ def numbers(found: Ground, clip: Clip, sole: float) -> dict[str, Any]:
             "used": bool(stances.used[i]),
         }
         if stances.used[i]:
-            errors = {kind: _tidy(float(one.errors[used[i]])) for kind, one in found.tested.items()}
-            row |= {"errors": errors, "alone": bool(found.tested["blocks"].alone[used[i]])}
+            errors = {
+                kind: _tidy(float(one.errors[used[i]])) for kind, one in found.predictions.items()
+            }
+            row |= {"errors": errors, "alone": bool(found.predictions["blocks"].alone[used[i]])}
         rows.append(row)
     return {
         "clip": clip.source,
-        "frames": clip.frames,
+        "frames": clip.frame_count,
         "fps": clip.fps,
         "ball_over_sole": sole,
         "chosen": found.chosen,
@@ -123,17 +125,17 @@ def numbers(found: Ground, clip: Clip, sole: float) -> dict[str, Any]:
                 "alone": int(one.alone.sum()),
                 "rms_without_alone": _tidy(one.rms_shared),
             }
-            for kind, one in found.tested.items()
+            for kind, one in found.predictions.items()
         },
-        "grounds": {kind: _describe(found, kind) for kind in KINDS},
+        "grounds": {kind: _describe(found, kind) for kind in SURFACE_KINDS},
         "stances": rows,
     }
 
 
-def _describe(found: Ground, kind: str) -> dict[str, Any]:
-    surface, ranked = found.surfaces[kind], found.ranked
+def _describe(found: Reconstruction, kind: str) -> dict[str, Any]:
+    surface, ranked = found.surfaces[kind], found.grids
     match surface:
-        case Blocks():
+        case LevelBlocks():
             return {
                 "pitch": _tidy(surface.grid.pitch),
                 "pitches_about_as_likely": [_tidy(one) for one in ranked.pitches],
@@ -154,7 +156,7 @@ def _describe(found: Ground, kind: str) -> dict[str, Any]:
                 "level_at_origin": _tidy(surface.level),
                 "slope": [_tidy(one) for one in surface.slope],
             }
-        case Smooth():
+        case ThinPlate():
             return {"smoothing": surface.smoothing}
         case _:
             raise TypeError(f"no words for {surface}")

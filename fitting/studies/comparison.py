@@ -14,7 +14,7 @@ import jaxik
 from fitting.analysis import measures
 from fitting.analysis.measures import COLUMNS, Measures
 from fitting.analysis.playback import ABOVE, Motion
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips.clip import Clip
 from fitting.experiments import parameter_files
 from fitting.experiments.experiment import check_shapes
@@ -83,14 +83,14 @@ def solve(
         ik: the system.
         clip: the animation.
         ground: the terrain.
-        motion: the clip as `frames.frames_of` gives it.
+        motion: the clip as `clip_frames.frames_from_clip` gives it.
         floor: of the clip, m.
 
     Raises:
         ValueError: for poses that are not finite.
     """
     result = program_cache.run(ik, clip.rig, ground, motion)
-    solved = frames.solved_clip(clip, result, floor=floor)
+    solved = clip_frames.clip_from_result(clip, result, floor=floor)
     if not np.isfinite(solved.positions_ws).all():
         raise ValueError("these parameters give poses that are not finite; nothing was written")
     return result, solved
@@ -111,7 +111,7 @@ def compare(
 
     Args:
         systems: by name.
-        clip: the flat animation, its bones of the rig's lengths (`base.load_base`).
+        clip: the flat animation, its bones of the rig's lengths (`base.load_flat_animation`).
         ground: the terrain, y up.
         floor: height of the floor on which the clip was animated, m.
         title: of tables and figures.
@@ -120,12 +120,12 @@ def compare(
     Raises:
         ValueError: parameters that do not fit the legs, or that give poses that are not finite.
     """
-    motion = frames.frames_of(clip, floor=floor)
+    motion = clip_frames.frames_from_clip(clip, floor=floor)
     for name, ik in systems.items():
         with error_context(name):
             check_shapes(ik, clip.rig, ground, motion)
     clips = {ANIMATED: clip}
-    reached = {ANIMATED: np.full((clip.frames, len(clip.rig.joints)), np.nan)}
+    reached = {ANIMATED: np.full((clip.frame_count, len(clip.rig.joints)), np.nan)}
     for name, ik in systems.items():
         with error_context(name), during(name):
             result, clips[name] = solve(ik, clip, ground, motion, floor)
@@ -141,7 +141,7 @@ def compare(
             motions[name],
             motions[ANIMATED],
             measures.gaps(soles_ws[index], under[index]),
-            clip.standing(),
+            clip.stance_labels(),
             reached[name],
             clip.fps,
         )
@@ -194,7 +194,7 @@ def write(folder: Path, compared: Comparison) -> None:
 
 
 def _motion(clip: Clip) -> Motion:
-    named = frames.named_joints(clip)
+    named = clip_frames.positions_by_role(clip)
     return Motion(**{"toe" if part == "ball" else part: at for part, at in named.items()})
 
 

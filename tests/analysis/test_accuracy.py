@@ -10,7 +10,7 @@ import pytest
 
 from fitting.analysis import accuracy
 from fitting.analysis.accuracy import COLUMNS, Agreement
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import load_clip
 
 KEYS = {  # of score.py, in the units of our columns
@@ -135,7 +135,7 @@ def test_figures_of_the_benchmark_s_base_are_those_of_its_program(score, mocap):
     path = mocap / "blocks" / "03_03.npz"
     captured, base = (load_clip(path, variant=name) for name in ("captured", "base"))
     found = accuracy.agreement([accuracy.errors_of_clips(base, captured, base)])
-    told = score(dict(np.load(path)), frames.named_joints(base))
+    told = score(dict(np.load(path)), clip_frames.positions_by_role(base))
     assert told["pelvis_height_cm"] > 9, "without foot IK"
     # The file holds single precision, and the rig's lengths are measured.
     assert_scored(found, told, rtol=1e-4, atol=1e-3)

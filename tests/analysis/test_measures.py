@@ -10,7 +10,7 @@ from fitting.analysis import measures
 from fitting.analysis.measures import COLUMNS, Measures
 from fitting.analysis.playback import Motion
 from fitting.datasets.clips.clip import Clip
-from support.clips_made import walker
+from support.sample_clips import walker
 
 
 def flat(points: np.ndarray) -> np.ndarray:
@@ -86,8 +86,8 @@ def test_a_gap_is_that_of_the_lower_point_of_a_sole_over_the_ground_under_it():
 def over_flat_ground(clip: Clip, walk: Clip) -> Measures:
     """A clip measured on the floor of the walk from which it comes."""
     soles = measures.soles(clip, measures.sole_depths(walk))
-    still = standing(walk.frames)
-    return measured(still, gap=measures.gaps(soles, 0 * soles[..., 1]), stance=walk.standing())
+    still = standing(walk.frame_count)
+    return measured(still, gap=measures.gaps(soles, 0 * soles[..., 1]), stance=walk.stance_labels())
 
 
 def test_a_walk_on_its_own_floor_neither_sinks_nor_floats():

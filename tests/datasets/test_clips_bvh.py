@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import load_clip
 from fitting.datasets.clips.formats.bvh import read_bvh
-from support.clips_made import BVH
+from support.sample_clips import BVH
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def test_zero_length_feet_get_axes_from_the_pelvis(written):
 
 def test_more_rows_than_declared_are_left_out_with_a_remark(written):
     clip = load_clip(written(BVH.replace("Frames: 3", "Frames: 2")))
-    assert clip.frames == 2
+    assert clip.frame_count == 2
     assert any("2 frames are declared and 3 found" in remark for remark in clip.remarks)
 
 

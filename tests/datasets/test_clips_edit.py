@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fitting.datasets.clips import edit, load_clip
-from fitting.datasets.clips.contacts import standing
-from fitting.datasets.clips.inspect import describe, render, to_json
+from fitting.datasets.clips.contacts import stance_labels
 from fitting.datasets.clips.joint_roles import find_roles
 from fitting.datasets.clips.rigs import measure_rig
-from support.clips_made import BVH, walker
+from fitting.datasets.clips.summary import as_json, as_text, describe
+from support.sample_clips import BVH, walker
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +31,9 @@ def test_the_same_rate_gives_the_same_clip(walk):
 
 def test_half_the_rate_takes_every_second_frame(walk):
     half = edit.resample(walk, 30.0)
-    assert half.fps == 30.0 and half.frames == (walk.frames + 1) // 2
+    assert half.fps == 30.0 and half.frame_count == (walk.frame_count + 1) // 2
     assert np.allclose(half.positions_ws, walk.positions_ws[::2], atol=1e-12)
-    assert np.array_equal(half.standing(), walk.standing()[::2])
+    assert np.array_equal(half.stance_labels(), walk.stance_labels()[::2])
 
 
 @pytest.mark.parametrize("fps", [120.0, 50.0, 24.0, 144.0])
@@ -41,14 +41,14 @@ def test_resampling_keeps_time_and_bones(walk, fps):
     other = edit.resample(walk, fps)
     assert 0 <= walk.seconds - other.seconds < 1 / fps
     assert np.allclose(bones(other)[:, [1, 2, 5, 6]], bones(walk)[0, [1, 2, 5, 6]], atol=1e-12)
-    at = np.arange(other.frames) * walk.fps / fps
+    at = np.arange(other.frame_count) * walk.fps / fps
     for axis in range(3):
-        wanted = np.interp(at, np.arange(walk.frames), walk.positions_ws[:, 4, axis])
+        wanted = np.interp(at, np.arange(walk.frame_count), walk.positions_ws[:, 4, axis])
         assert np.abs(other.positions_ws[:, 4, axis] - wanted).max() < 2e-3
 
 
 def test_frames_made_from_a_masked_one_are_masked(walk):
-    mask = np.ones(walk.frames, bool)
+    mask = np.ones(walk.frame_count, bool)
     mask[7] = False
     fine = edit.resample(replace(walk, mask=mask), 120.0)
     assert np.flatnonzero(fine.mask == 0).tolist() == [13, 14, 15]
@@ -61,10 +61,10 @@ def test_rates_that_are_none_are_refused(walk):
 
 def test_trim_keeps_both_ends(walk):
     cut = edit.trim(walk, 0.5, 1.0)
-    assert cut.frames == 31
+    assert cut.frame_count == 31
     assert np.array_equal(cut.positions_ws, walk.positions_ws[30:61])
-    assert np.array_equal(cut.standing(), walk.standing()[30:61])
-    assert edit.trim(walk).frames == walk.frames
+    assert np.array_equal(cut.stance_labels(), walk.stance_labels()[30:61])
+    assert edit.trim(walk).frame_count == walk.frame_count
     for start, end in ((-0.1, 1.0), (1.0, 0.5), (0.0, 99.0)):
         with pytest.raises(ValueError, match="wanted 0 <= start <= end <="):
             edit.trim(walk, start, end)
@@ -93,7 +93,7 @@ def test_a_t_pose_its_ramp_and_repeated_last_frames_go(tmp_path, ramp):
     clip = with_t_pose(tmp_path, ramp)
     assert edit.motion_span(clip) == (1 + ramp, ramp + 40)
     moving = edit.drop_t_pose(clip)
-    assert moving.frames == 40
+    assert moving.frame_count == 40
     assert edit.drop_t_pose(moving) is moving
     told = describe(clip)
     assert f"starts with a T-pose; the motion begins at frame {1 + ramp}" in told["warnings"]
@@ -125,7 +125,7 @@ def test_a_clip_mirrored_twice_is_the_clip(walk):
     once = edit.mirror(uneven)
     assert np.allclose(once.joints_ws(2)[:, 0], uneven.joints_ws(2)[:, 1] * [-1, 1, 1])
     assert np.allclose(once.rig.thigh, uneven.rig.thigh[::-1])
-    assert np.array_equal(once.standing(), uneven.standing()[:, ::-1])
+    assert np.array_equal(once.stance_labels(), uneven.stance_labels()[:, ::-1])
     assert once.rig.side.tolist() == [1, -1]
     twice = edit.mirror(once)
     assert np.array_equal(twice.positions_ws, uneven.positions_ws)
@@ -138,7 +138,7 @@ def test_a_mirrored_clip_measures_as_its_mirrored_rig(mocap):
     once = edit.mirror(clip)
     roles = find_roles(once.joint_names, once.parents)
     positions, rotations = np.array(once.positions_ws), np.array(once.rotations_ws)
-    again = measure_rig(roles, positions, rotations, standing(once.joints_ws(3), once.fps))
+    again = measure_rig(roles, positions, rotations, stance_labels(once.joints_ws(3), once.fps))
     for name in ("knee_axis_ls", "thigh", "shin", "foot"):
         assert np.allclose(getattr(again, name), getattr(once.rig, name), atol=1e-6)
     gap = np.abs(np.sum(np.asarray(again.ankle_from_foot * once.rig.ankle_from_foot), axis=-1))
@@ -168,16 +168,16 @@ def test_marker_pops_and_t_poses_of_the_reference_files(mocap):
 
 def test_a_clip_is_described_as_data_and_text(walk):
     told = describe(walk)
-    assert json.loads(to_json(told)) == told
+    assert json.loads(as_json(told)) == told
     assert told["joint_map"]["knee_left"] == "left_knee"
     assert told["legs"]["left"]["contacts"] == 3 and told["legs"]["left"]["contacts_from"] == "file"
     assert told["legs"]["right"]["thigh"] == pytest.approx(0.5)
-    text = render(told)
+    text = as_text(told)
     for part in ("walker: 162 frames", "60 Hz", "y up", "hip left_hip", "stands 3 times"):
         assert part in text
 
 
 def test_a_clip_without_legs_is_described_too(walk):
-    text = render(describe(replace(walk, measured=None, remarks=("no legs recognised",))))
+    text = as_text(describe(replace(walk, measured=None, remarks=("no legs recognised",))))
     assert "no legs recognised" in text and "hip" in text
     assert describe(replace(walk, measured=None))["legs"] == {}

@@ -62,7 +62,7 @@ def test_positions_and_rotations_are_those_of_the_reference(case):
 
 def test_frames_rate_scale_and_up_axis_are_recognised(case):
     clip, fact = case
-    assert clip.frames == fact["n_frames"]
+    assert clip.frame_count == fact["n_frames"]
     assert clip.fps == fact.get("fps", fact.get("fps_nominal"))
     assert clip.raw_frame_time == pytest.approx(fact.get("frame_time", 1 / 120), rel=1e-12)
     assert clip.up_axis == fact["up_axis"]

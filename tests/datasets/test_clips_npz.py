@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.clips.edit import mask_pops
-from support.clips_made import walker
+from support.sample_clips import walker
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_blocks_files_load_captured_and_base(walk, tmp_path):
         clip = load_clip(path, variant=variant)
         assert np.allclose(clip.positions_ws, walk.positions_ws - [0, lower, 0], atol=1e-12)
         assert np.abs(np.sum(clip.rotations_ws * walk.rotations_ws, axis=-1)).min() > 1 - 1e-12
-        assert np.array_equal(clip.standing(), walk.standing())
+        assert np.array_equal(clip.stance_labels(), walk.stance_labels())
         assert np.allclose(clip.rig.knee_axis_ls, [-1, 0, 0], atol=1e-9)
 
 

@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import load_clip
-from fitting.datasets.clips.contacts import runs, standing
+from fitting.datasets.clips.contacts import runs, stance_labels
 from fitting.datasets.clips.formats.bvh import read_bvh
 from fitting.datasets.clips.joint_roles import find_roles, partners
-from fitting.datasets.clips.recording import localise, place
+from fitting.datasets.clips.recording import local_from_world, place
 from fitting.datasets.clips.rigs import knee_axis
 from jaxik.maths import quat
 from jaxik.world.skeleton import Transform, forward_kinematics
-from support.clips_made import BVH, walker
+from support.sample_clips import BVH, walker
 
 PARTS = ("pelvis", "hip", "knee", "ankle", "toe")
 
@@ -119,7 +119,7 @@ def test_placing_agrees_with_the_jax_kinematics_and_localising_undoes_it(tmp_pat
     assert np.abs(world.pos - positions_ws).max() < 1e-12
     assert np.abs(quat.angle(world.rot, jnp.asarray(rotations_ws))).max() < 1e-7
     assert np.array_equal(clip.positions_ws, positions_ws)
-    back_pos, back_rot = localise(recording.parents, positions_ws, rotations_ws)
+    back_pos, back_rot = local_from_world(recording.parents, positions_ws, rotations_ws)
     assert np.abs(back_pos - recording.positions_ls).max() < 1e-12
     assert np.abs(np.abs(np.sum(back_rot * recording.rotations_ls, axis=-1)) - 1).max() < 1e-14
 
@@ -161,7 +161,7 @@ def test_turning_about_the_knee_axis_opens_the_knee(walk):
 
 
 def test_leg_poses_have_the_session_precision(walk):
-    assert walk.leg_pose_ws().knee.pos.shape == (walk.frames, 2, 3)
+    assert walk.leg_pose_ws().knee.pos.shape == (walk.frame_count, 2, 3)
     assert walk.leg_pose_ws().knee.pos.dtype == jnp.float64
     with jax.enable_x64(False):
         assert walk.leg_pose_ws().knee.rot.dtype == jnp.float32
@@ -177,7 +177,7 @@ def test_the_model_root_is_on_the_floor_under_the_pelvis_and_faces_ahead(walk):
 
 
 def test_the_heading_turns_on_smoothly_past_half_a_turn(walk):
-    yaw = np.linspace(0.0, 3 * np.pi, walk.frames)
+    yaw = np.linspace(0.0, 3 * np.pi, walk.frame_count)
     spin = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
     positions = np.stack(
         [spin.apply(np.array(walk.positions_ws[:, joint])) for joint in range(9)], axis=1
@@ -196,7 +196,7 @@ def test_a_lying_character_keeps_its_last_heading(walk):
 
 
 def test_contacts_of_a_made_walker_are_its_stances(walk):
-    found = standing(walk.joints_ws(3), walk.fps)
+    found = stance_labels(walk.joints_ws(3), walk.fps)
     assert (found == walk.stance).mean() > 0.9
     assert len(runs(found[:, 0])) == len(runs(walk.stance[:, 0]))
 
@@ -204,7 +204,7 @@ def test_contacts_of_a_made_walker_are_its_stances(walk):
 def test_a_foot_hanging_still_in_the_air_does_not_stand():
     height = np.interp(np.arange(120), [0, 40, 50, 70, 80, 120], [0, 0, 0.3, 0.3, 0, 0])
     ball = np.stack([0 * height, height, 0 * height], axis=-1)[:, None]
-    found = standing(ball, 60.0)[:, 0]
+    found = stance_labels(ball, 60.0)[:, 0]
     assert found[:35].all() and found[85:].all() and not found[42:78].any()
 
 
@@ -213,11 +213,11 @@ def test_contacts_agree_with_the_labels_of_the_blocks(mocap):
     rows = np.genfromtxt(
         mocap / "blocks/stances_03_03.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
     )
-    labels = np.zeros((clip.frames, 2), bool)
+    labels = np.zeros((clip.frame_count, 2), bool)
     for row in rows:
         labels[row["first_frame"] : row["last_frame"] + 1, "lr".index(row["side"])] = True
-    assert np.array_equal(labels, clip.standing())
-    found = standing(clip.joints_ws(3), clip.fps)
+    assert np.array_equal(labels, clip.stance_labels())
+    found = stance_labels(clip.joints_ws(3), clip.fps)
     assert (found == labels).mean() > 0.99  # 0.9954 when written
     assert [len(runs(found[:, leg])) for leg in (0, 1)] == [28, 26]
 
@@ -226,7 +226,7 @@ def test_a_character_that_always_lies_on_its_side_looks_along_z(walk):
     positions = np.array(walk.positions_ws)
     positions[:, [1, 5]] = positions[:, [0]] + [[0, 0.1, 0], [0, -0.1, 0]]
     root = walk.with_motion(positions, walk.rotations_ws).world_from_model()
-    assert np.array_equal(root.rot, np.tile([1.0, 0.0, 0.0, 0.0], (walk.frames, 1)))
+    assert np.array_equal(root.rot, np.tile([1.0, 0.0, 0.0, 0.0], (walk.frame_count, 1)))
 
 
 def test_a_clip_made_without_legs_says_so(walk):

@@ -8,8 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.clips.contacts import runs
-from fitting.datasets.flat_animation import LONGEST, flat_base, ground_under, load_base, rigid_legs
-from support.clips_made import stairs, walker
+from fitting.datasets.flat_animation import (
+    LONGEST,
+    flatten_clip,
+    ground_under,
+    load_flat_animation,
+    with_rigid_legs,
+)
+from support.sample_clips import stairs, walker
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +25,7 @@ def walk():
 
 @pytest.fixture(scope="module")
 def base(walk):
-    return flat_base(walk, stairs)
+    return flatten_clip(walk, stairs)
 
 
 def test_standing_feet_are_on_the_flat_floor_and_nothing_else_of_them_changes(walk, base):
@@ -36,12 +42,12 @@ def test_the_pelvis_keeps_one_height_and_its_way_over_the_plan(walk, base):
     pelvis = base.positions_ws[:, 0]
     assert np.ptp(pelvis[:, 1]) < 1e-12
     assert np.allclose(pelvis[:, [0, 2]], walk.positions_ws[:, 0][:, [0, 2]])
-    assert flat_base(walk, stairs, pelvis_height=0.8).positions_ws[0, 0, 1] == pytest.approx(0.8)
+    assert flatten_clip(walk, stairs, pelvis_height=0.8).positions_ws[0, 0, 1] == pytest.approx(0.8)
 
 
 def test_bones_keep_their_lengths_even_out_of_reach(walk):
     for height in (0.7, 0.85, 1.2):
-        base = flat_base(walk, stairs, pelvis_height=height)
+        base = flatten_clip(walk, stairs, pelvis_height=height)
         hip, knee, ankle = (base.joints_ws(role) for role in range(3))
         assert np.allclose(np.linalg.norm(knee - hip, axis=-1), 0.5, atol=1e-9)
         assert np.allclose(np.linalg.norm(ankle - knee, axis=-1), 0.48, atol=1e-9)
@@ -58,10 +64,10 @@ def test_thigh_and_shin_turn_with_their_bones(base):
 
 def test_a_walk_on_a_flat_floor_is_its_own_base():
     walk = walker(lambda points: np.zeros(len(points)))
-    base = flat_base(walk, lambda points: np.zeros(len(points)))
+    base = flatten_clip(walk, lambda points: np.zeros(len(points)))
     assert np.abs(base.positions_ws - walk.positions_ws)[:, [3, 4, 7, 8]].max() < 1e-9
-    level = flat_base(walk, lambda points: np.zeros(len(points)), pelvis_height=0.8)
-    again = flat_base(level, lambda points: np.zeros(len(points)), pelvis_height=0.8)
+    level = flatten_clip(walk, lambda points: np.zeros(len(points)), pelvis_height=0.8)
+    again = flatten_clip(level, lambda points: np.zeros(len(points)), pelvis_height=0.8)
     assert np.abs(again.positions_ws - level.positions_ws).max() < 1e-9
 
 
@@ -77,13 +83,13 @@ def test_ground_that_is_not_known_is_refused(walk):
     with pytest.raises(
         ValueError, match="finite ground heights under the stances of the left foot"
     ):
-        flat_base(walk, lambda points: np.full(len(points), np.nan))
+        flatten_clip(walk, lambda points: np.full(len(points), np.nan))
     with pytest.raises(ValueError, match="the left foot never stands"):
-        flat_base(replace(walk, stance=np.zeros_like(walk.stance)), stairs)
+        flatten_clip(replace(walk, stance=np.zeros_like(walk.stance)), stairs)
 
 
 def test_labels_are_found_where_the_clip_has_none(walk, base):
-    found = flat_base(replace(walk, stance=None), stairs)
+    found = flatten_clip(replace(walk, stance=None), stairs)
     assert (found.stance == walk.stance).mean() > 0.9
     assert np.abs(found.joints_ws(3) - base.joints_ws(3)).max() < 0.05
 
@@ -96,7 +102,7 @@ def test_the_base_of_the_blocks_is_the_one_that_comes_with_them(mocap):
     """
     captured = load_clip(mocap / "blocks/03_03.npz")
     wanted = load_clip(mocap / "blocks/03_03.npz", variant="base")
-    base = flat_base(
+    base = flatten_clip(
         captured,
         lambda points: points[:, 1] - 0.055,
         pelvis_height=float(wanted.positions_ws[0, 0, 1]),
@@ -107,13 +113,13 @@ def test_the_base_of_the_blocks_is_the_one_that_comes_with_them(mocap):
     assert (gaps[:, [7, 8]] < 1e-6).mean() > 0.97 and gaps[:, [7, 8]].max() < 0.04
     assert (gaps[:, [2, 6]] < 1e-3).mean() > 0.97
     assert np.sqrt(np.mean(gaps[:, [3, 7]] ** 2)) < 0.002 and np.median(gaps[:, [2, 6]]) < 1e-6
-    free = flat_base(captured, lambda points: points[:, 1] - 0.055)
+    free = flatten_clip(captured, lambda points: points[:, 1] - 0.055)
     assert abs(free.positions_ws[0, 0, 1] - wanted.positions_ws[0, 0, 1]) < 0.003
 
 
 def test_what_hangs_on_a_foot_goes_with_it(mocap):
     clip = load_clip(mocap / "clips/cmu_asfamc/02_01.amc")
-    base = flat_base(clip, lambda points: points[:, 1] - 0.05)
+    base = flatten_clip(clip, lambda points: points[:, 1] - 0.05)
     for toe, tip in (("ltoes", "ltoes_end"), ("rtoes", "rtoes_end")):
         ends = [clip.joint_names.index(toe), clip.joint_names.index(tip)]
         before, after = (np.diff(c.positions_ws[:, ends], axis=1) for c in (clip, base))
@@ -131,7 +137,7 @@ def stretched(walk):
 
 
 def test_legs_that_stretch_are_made_rigid_and_the_rest_is_left_alone(walk):
-    rigid = rigid_legs(stretched(walk))
+    rigid = with_rigid_legs(stretched(walk))
     hip, knee, ankle = (rigid.joints_ws(role) for role in range(3))
     thigh, shin = (np.asarray(length) for length in (walk.rig.thigh, walk.rig.shin))
     assert np.allclose(np.linalg.norm(knee - hip, axis=-1), thigh, atol=1e-9)
@@ -145,14 +151,16 @@ def test_legs_that_stretch_are_made_rigid_and_the_rest_is_left_alone(walk):
 
 
 def test_a_clip_whose_bones_keep_their_lengths_is_returned_as_it_is(walk, base):
-    assert rigid_legs(walk) is walk and rigid_legs(base) is base
+    assert with_rigid_legs(walk) is walk and with_rigid_legs(base) is base
 
 
 def test_a_base_is_loaded_from_any_clip_and_of_the_blocks_the_flat_one(walk, tmp_path, mocap):
     save_clip(tmp_path / "walk.npz", walk)
-    assert np.array_equal(load_base(tmp_path / "walk.npz").positions_ws, walk.positions_ws)
+    assert np.array_equal(
+        load_flat_animation(tmp_path / "walk.npz").positions_ws, walk.positions_ws
+    )
     blocks = mocap / "blocks" / "03_03.npz"
-    wanted, loaded = load_clip(blocks, variant="base"), load_base(blocks)
+    wanted, loaded = load_clip(blocks, variant="base"), load_flat_animation(blocks)
     hips = [0, 1, 5]
     assert np.allclose(loaded.positions_ws[:, hips], wanted.positions_ws[:, hips], atol=1e-12)
     hip, knee, ankle = (loaded.joints_ws(role) for role in range(3))
@@ -164,4 +172,4 @@ def test_a_base_without_legs_is_refused_with_its_file(walk, tmp_path):
     names = tuple(f"joint {i}" for i in range(len(walk.joint_names)))
     save_clip(tmp_path / "odd.npz", replace(walk, joint_names=names, measured=None))
     with pytest.raises(ValueError, match=r"odd\.npz: no pair of legs recognised"):
-        load_base(tmp_path / "odd.npz")
+        load_flat_animation(tmp_path / "odd.npz")

@@ -13,13 +13,13 @@ from fitting.cli import main
 from fitting.datasets import clips
 from fitting.datasets.clips import contacts
 from fitting.datasets.synthetic import gait
-from fitting.datasets.terrain import blocks, mesh_files, reconstruction, surfaces
-from fitting.datasets.terrain.blocks import Footprints, Grid
+from fitting.datasets.terrain import block_grids, mesh_files, reconstruction, surfaces
+from fitting.datasets.terrain.block_grids import Footprints, Grid
 from fitting.datasets.terrain.reconstruction import Prediction
 from fitting.report.plots import style
 from jaxik.world import terrain
-from support.clips_made import walker
 from support.experiments import ROOT
+from support.sample_clips import walker
 
 UNEVEN = ROOT / "data" / "clips" / "uneven_walk.npz"
 TILTED = Grid(0.45, np.radians(20.0), (0.1, 0.3))
@@ -59,16 +59,16 @@ def plate(count: int = 30) -> Footprints:
 @pytest.fixture
 def hurried(monkeypatch):
     """A search for grids in large steps, where no grid is wanted."""
-    monkeypatch.setattr(blocks, "PITCH_STEP", 0.15)
-    monkeypatch.setattr(blocks, "HEADING_STEP", np.radians(15.0))
-    monkeypatch.setattr(blocks, "WIDE", (-1, 0, 1))
+    monkeypatch.setattr(block_grids, "PITCH_STEP", 0.15)
+    monkeypatch.setattr(block_grids, "HEADING_STEP", np.radians(15.0))
+    monkeypatch.setattr(block_grids, "WIDE", (-1, 0, 1))
 
 
 @pytest.fixture
 def nearby(monkeypatch):
     """A search among fewer grids."""
-    monkeypatch.setattr(blocks, "PITCHES", (0.35, 1.0))
-    monkeypatch.setattr(blocks, "PROMISING", 8)
+    monkeypatch.setattr(block_grids, "PITCHES", (0.35, 1.0))
+    monkeypatch.setattr(block_grids, "PROMISING", 8)
 
 
 # Grids
@@ -87,8 +87,8 @@ def test_cells_are_where_their_corners_say():
 def test_a_grid_turned_by_quarters_is_written_in_one_way(quarters):
     points = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
     heading = TILTED.heading + quarters * np.pi / 2
-    corner = TILTED.places(np.zeros((1, 2))) @ blocks._turn(heading).T
-    grid = blocks._grid(TILTED.pitch, heading, corner[0])
+    corner = TILTED.places(np.zeros((1, 2))) @ block_grids._turn(heading).T
+    grid = block_grids._grid(TILTED.pitch, heading, corner[0])
     assert grid.heading == pytest.approx(TILTED.heading)
     np.testing.assert_allclose(grid.origin, TILTED.origin, atol=1e-9)
     np.testing.assert_array_equal(grid.cells(points), TILTED.cells(points))
@@ -97,8 +97,8 @@ def test_a_grid_turned_by_quarters_is_written_in_one_way(quarters):
 @pytest.mark.parametrize("grid", [TILTED, WIDE], ids=["45 cm", "80 cm"])
 def test_a_grid_that_nobody_told_of_is_found(grid, nearby):
     feet = footprints(grid)
-    ranked = blocks.search(feet)
-    found = surfaces.level_blocks(ranked, feet)
+    ranked = block_grids.search(feet)
+    found = surfaces.fit_blocks(ranked, feet)
     assert found.grid.pitch == pytest.approx(grid.pitch, rel=0.02)
     assert found.grid.heading == pytest.approx(grid.heading, abs=np.radians(2.0))
     assert ranked.pitches[0] <= grid.pitch <= ranked.pitches[1]
@@ -110,18 +110,18 @@ def test_a_grid_that_nobody_told_of_is_found(grid, nearby):
 
 def test_a_grid_found_in_turned_and_shifted_feet_is_the_grid_turned_and_shifted(nearby):
     feet, angle, shift = footprints(TILTED), np.radians(-13.0), np.array([4.0, -7.0])
-    turn = blocks._turn(angle)  # by -angle
+    turn = block_grids._turn(angle)  # by -angle
     moved = Footprints(
         feet.balls @ turn.T + shift, feet.heights + 1.0, feet.ankles @ turn.T + shift
     )
-    found = surfaces.level_blocks(blocks.search(moved), moved)
+    found = surfaces.fit_blocks(block_grids.search(moved), moved)
     assert found.grid.pitch == pytest.approx(TILTED.pitch, rel=0.02)
     assert found.grid.heading == pytest.approx(TILTED.heading - angle, abs=np.radians(2.0))
 
 
 def test_the_same_feet_always_make_the_same_grid(hurried):
     feet = footprints(TILTED, count=20)
-    assert blocks.search(feet).grids == blocks.search(feet).grids
+    assert block_grids.search(feet).grids == block_grids.search(feet).grids
 
 
 # Surfaces
@@ -130,7 +130,7 @@ def test_the_same_feet_always_make_the_same_grid(hurried):
 def test_a_block_nobody_stepped_on_has_the_mean_of_those_next_to_it():
     square = Grid(1.0, 0.0, (0.0, 0.0))
     cells, tops = np.array([[0, 0], [1, 0], [4, 0]]), np.array([0.1, 0.3, 0.5])
-    found = surfaces.Blocks(square, cells, tops, np.array([1, 2, 1]))
+    found = surfaces.LevelBlocks(square, cells, tops, np.array([1, 2, 1]))
     points = np.array([[0.5, 0.5], [0.5, 1.5], [2.5, 0.5], [3.5, 0.5], [9.5, 0.5]])
     np.testing.assert_allclose(found.heights(points), [0.1, 0.2, 0.3, 0.5, 0.5])
     np.testing.assert_array_equal(found.shared(points), [True, False, False, False, False])
@@ -140,14 +140,14 @@ def test_a_plane_is_not_pulled_by_a_foot_on_a_stool():
     feet = plate()
     heights = 0.2 + feet.balls @ [0.1, -0.05]
     heights[3] += 0.4
-    found = surfaces.plane(replace(feet, heights=heights))
+    found = surfaces.fit_plane(replace(feet, heights=heights))
     assert found.slope == pytest.approx((0.1, -0.05), abs=1e-3)
     assert found.level == pytest.approx(0.2, abs=2e-3)
 
 
 def test_a_plane_below_feet_in_a_line_is_level_across():
     balls = np.stack([np.zeros(8), np.linspace(0.0, 5.0, 8)], axis=-1)
-    found = surfaces.plane(Footprints(balls, 0.1 * balls[:, 1], balls))
+    found = surfaces.fit_plane(Footprints(balls, 0.1 * balls[:, 1], balls))
     assert found.slope == pytest.approx((0.0, 0.1), abs=1e-4)
 
 
@@ -166,20 +166,20 @@ def test_errors_of_a_plate_are_those_of_plates_through_all_the_others():
 def test_a_plate_is_smoothed_as_much_as_its_heights_are_noisy():
     feet = plate(60)
     noisy = replace(feet, heights=np.random.default_rng(2).normal(0.0, 0.01, 60))
-    assert surfaces.smooth(feet).smoothing < 0.01 < surfaces.smooth(noisy).smoothing
+    assert surfaces.fit_thin_plate(feet).smoothing < 0.01 < surfaces.fit_thin_plate(noisy).smoothing
     with pytest.raises(ValueError, match="all stances are in a line"):
-        surfaces.smooth(Footprints(feet.balls * [1.0, 0.0], feet.heights, feet.balls))
+        surfaces.fit_thin_plate(Footprints(feet.balls * [1.0, 0.0], feet.heights, feet.balls))
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
-@pytest.mark.parametrize("kind", reconstruction.KINDS)
+@pytest.mark.parametrize("kind", reconstruction.SURFACE_KINDS)
 def test_a_mesh_has_the_heights_of_its_surface(kind, suffix, tmp_path):
     feet = footprints(TILTED)
     found: surfaces.Surface = {
-        "plane": surfaces.plane(feet),
-        "smooth": surfaces.smooth(plate()),
-        "blocks": surfaces.level_blocks(
-            blocks.Ranked((TILTED,), np.zeros(1), (0.4, 0.5), (0.3, 0.4)), feet
+        "plane": surfaces.fit_plane(feet),
+        "smooth": surfaces.fit_thin_plate(plate()),
+        "blocks": surfaces.fit_blocks(
+            block_grids.RankedGrids((TILTED,), np.zeros(1), (0.4, 0.5), (0.3, 0.4)), feet
         ),
     }[kind]
     low, high = np.array([-2.0, -1.5]), np.array([2.0, 2.5])
@@ -201,8 +201,8 @@ def test_a_mesh_has_the_heights_of_its_surface(kind, suffix, tmp_path):
 
 def test_blocks_have_upright_risers_that_close_the_steps_between_them():
     feet = footprints(TILTED)
-    ranked = blocks.Ranked((TILTED,), np.zeros(1), (0.4, 0.5), (0.3, 0.4))
-    mesh = surfaces.level_blocks(ranked, feet).mesh(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
+    ranked = block_grids.RankedGrids((TILTED,), np.zeros(1), (0.4, 0.5), (0.3, 0.4))
+    mesh = surfaces.fit_blocks(ranked, feet).mesh(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
     corners = np.round(mesh.vertices, 6)[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = np.abs(normals[:, 1]) > 1e-9
@@ -211,7 +211,7 @@ def test_blocks_have_upright_risers_that_close_the_steps_between_them():
     # A riser looks to its lower side: a little that way the ground is at its foot.
     middle = corners[~flat].mean(axis=1)
     away = normals[~flat] / np.linalg.norm(normals[~flat], axis=-1, keepdims=True)
-    found = surfaces.level_blocks(ranked, feet)
+    found = surfaces.fit_blocks(ranked, feet)
     lower = found.heights((middle + 0.01 * away)[:, [0, 2]])
     upper = found.heights((middle - 0.01 * away)[:, [0, 2]])
     np.testing.assert_allclose(lower, corners[~flat, :, 1].min(axis=1), atol=1e-5)
@@ -233,7 +233,7 @@ def test_stances_are_where_balls_stood_with_the_ground_a_sole_below():
 def lifted(heel: float, leg: int = 0) -> clips.Clip:
     """A walk on a floor; in its third stance a foot has its heel and its ball in the air."""
     clip = walker(lambda points: 0.0 * points[:, 0], strides=6)
-    ((first, last),) = [contacts.runs(clip.standing()[:, leg])[2]]
+    ((first, last),) = [contacts.runs(clip.stance_labels()[:, leg])[2]]
     positions = clip.positions_ws.copy()
     _, _, ankle, toe = clip.rig.joints[leg]
     positions[first : last + 1, ankle, 1] += heel
@@ -255,7 +255,7 @@ def test_a_foot_on_its_toes_is_used_only_where_no_flat_one_is_near(monkeypatch):
 
 def test_frames_with_a_marker_pop_do_not_move_a_stance():
     clip = walker(slope)
-    ((first, last), *_) = contacts.runs(clip.standing()[:, 0])
+    ((first, last), *_) = contacts.runs(clip.stance_labels()[:, 0])
     positions = clip.positions_ws.copy()
     toe = clip.rig.joints[0][3]
     positions[first + 2 : last - 2 : 3, toe] += [0.0, 0.2, 0.0]
@@ -275,7 +275,7 @@ def test_the_simplest_kind_that_is_not_clearly_worse_is_chosen():
         none = np.zeros(40, bool)
         return {
             kind: Prediction(rng.normal(0.0, sizes[kind], 40), none)
-            for kind in reconstruction.KINDS
+            for kind in reconstruction.SURFACE_KINDS
         }
 
     assert reconstruction.choose(with_errors(plane=0.01, smooth=0.0098, blocks=0.0099)) == "plane"
@@ -286,16 +286,18 @@ def test_the_simplest_kind_that_is_not_clearly_worse_is_chosen():
 def test_a_stance_is_predicted_without_itself():
     feet = plate()
     odd = replace(feet, heights=np.where(np.arange(30) == 7, 1.0, 0.0))
-    tested = reconstruction.leave_one_out(surfaces.plane, odd)
+    tested = reconstruction.leave_one_out(surfaces.fit_plane, odd)
     assert tested.errors[7] == pytest.approx(-1.0, abs=1e-6) and not tested.alone.any()
-    grid = blocks.Ranked((Grid(1e-3, 0.0, (0.0, 0.0)),), np.zeros(1), (0.0, 1.0), (0.0, 1.0))
-    alone = reconstruction.leave_one_out(lambda feet: surfaces.level_blocks(grid, feet), feet)
+    grid = block_grids.RankedGrids(
+        (Grid(1e-3, 0.0, (0.0, 0.0)),), np.zeros(1), (0.0, 1.0), (0.0, 1.0)
+    )
+    alone = reconstruction.leave_one_out(lambda feet: surfaces.fit_blocks(grid, feet), feet)
     assert alone.alone.all() and np.isnan(alone.rms_shared) and alone.rms > 0.0
 
 
 def test_a_made_slope_comes_out_as_a_plane(hurried):
     found = reconstruction.reconstruct(walker(slope, strides=6), sole=0.0)
-    assert found.chosen == "plane" and found.tested["plane"].rms < 0.003
+    assert found.chosen == "plane" and found.predictions["plane"].rms < 0.003
     assert isinstance(found.surface, surfaces.Plane)
     assert found.surface.slope == pytest.approx((0.0, -0.1), abs=0.003)
     assert reconstruction.reconstruct(walker(slope), kind="smooth").chosen == "smooth"
@@ -305,7 +307,7 @@ def test_a_made_walk_on_uneven_ground_comes_out_smooth_and_near_it(hurried):
     found = reconstruction.reconstruct(clips.load_clip(UNEVEN), sole=gait.BALL_HEIGHT)
     assert found.chosen == "smooth"
     points = found.stances.points
-    true = mesh_files.heights(
+    true = mesh_files.height_function(
         mesh_files.load_terrain(ROOT / "data" / "terrains" / "uneven_walk.ply")
     )(np.insert(points, 1, 0.0, axis=1))
     error = found.surface.heights(points) - true
@@ -331,18 +333,18 @@ def test_the_blocks_of_subject_03_come_out_within_a_centimetre(mocap):
     found = reconstruction.reconstruct(
         clips.load_clip(mocap / "clips" / "cmu_asfamc" / "03_03.amc")
     )
-    assert found.chosen == "blocks" and isinstance(found.surface, surfaces.Blocks)
+    assert found.chosen == "blocks" and isinstance(found.surface, surfaces.LevelBlocks)
     error = found.surface.heights(known.places(cells + 0.5)) - heights
     assert np.sqrt(np.mean(error**2)) < 0.01
     assert np.sqrt(np.mean(error[clean] ** 2)) < 0.006
     grid = found.surface.grid
     assert grid.pitch == pytest.approx(0.60, abs=0.02)
     assert grid.heading == pytest.approx(known.heading, abs=np.radians(2.0))
-    assert found.ranked.pitches[0] < 0.60 < found.ranked.pitches[1]
+    assert found.grids.pitches[0] < 0.60 < found.grids.pitches[1]
     assert len(found.surface.tops) == 23
-    tested = found.tested["blocks"]
+    tested = found.predictions["blocks"]
     assert tested.rms_shared < 0.012 and tested.alone.sum() <= 10
-    assert tested.rms < min(found.tested[kind].rms for kind in ("plane", "smooth"))
+    assert tested.rms < min(found.predictions[kind].rms for kind in ("plane", "smooth"))
 
 
 @pytest.mark.parametrize("name", ["01_01", "02_01", "02_03"])
@@ -350,7 +352,7 @@ def test_a_captured_floor_is_a_plane(mocap, name, hurried):
     found = reconstruction.reconstruct(
         clips.load_clip(mocap / "clips" / "cmu_asfamc" / f"{name}.amc")
     )
-    assert found.chosen == "plane" and found.tested["plane"].rms < 0.008
+    assert found.chosen == "plane" and found.predictions["plane"].rms < 0.008
 
 
 # The command
@@ -370,10 +372,10 @@ def test_the_command_leaves_a_mesh_its_numbers_and_a_picture(clip, tmp_path, cap
     assert {path.name for path in tmp_path.iterdir()} == {"hill.obj", "hill.json", "hill.png"}
     told, text = json.loads((tmp_path / "hill.json").read_text()), capsys.readouterr().out
     assert (told["chosen"], told["ball_over_sole"]) == ("blocks", 0.01)
-    assert set(told["tested"]) == set(told["grounds"]) == set(reconstruction.KINDS)
+    assert set(told["tested"]) == set(told["grounds"]) == set(reconstruction.SURFACE_KINDS)
     for row in told["stances"]:
         assert row["height"] == pytest.approx(0.29 - 0.1 * row["z"], abs=0.003)
-        assert set(row["errors"]) == set(reconstruction.KINDS)
+        assert set(row["errors"]) == set(reconstruction.SURFACE_KINDS)
     for kind, one in told["tested"].items():
         rms = np.sqrt(np.mean([row["errors"][kind] ** 2 for row in told["stances"]]))
         assert one["rms"] == pytest.approx(rms, abs=2e-4)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts, load_clip, save_clip
-from fitting.datasets.clips.recording import localise
+from fitting.datasets.clips.recording import local_from_world
 from fitting.datasets.synthetic import gait, speed_profile, walker
 
 FPS = 60.0
@@ -24,7 +24,7 @@ def stances(clip, leg):
     return [
         (first, last)
         for first, last in contacts.runs(clip.stance[:, leg])
-        if first > 0 and last < clip.frames - 1
+        if first > 0 and last < clip.frame_count - 1
     ]
 
 
@@ -73,7 +73,7 @@ def test_bones_keep_their_lengths_and_joints_their_places_on_each_other(clip):
         lengths = [np.linalg.norm(b - a, axis=-1) for a, b in zip(places, places[1:], strict=False)]
         for length, wanted in zip(lengths, (gait.THIGH, gait.SHIN, gait.FOOT), strict=True):
             np.testing.assert_allclose(length, wanted, rtol=0, atol=EXACT)
-    positions_ls, _ = localise(clip.parents, clip.positions_ws, clip.rotations_ws)
+    positions_ls, _ = local_from_world(clip.parents, clip.positions_ws, clip.rotations_ws)
     assert np.ptp(positions_ls[:, 1:], axis=0).max() < EXACT
 
 
@@ -148,7 +148,7 @@ def stopping():
 
 
 def test_a_stop_stands_exactly_still_on_two_flat_feet_and_walks_on(stopping):
-    speed = np.asarray(frames.frames_of(stopping).speed)
+    speed = np.asarray(clip_frames.frames_from_clip(stopping).speed)
     stands = contacts.runs(speed == 0.0)
     assert len(stands) == 2
     for (first, last), end in zip(stands, (3.7, 7.2), strict=True):
@@ -176,7 +176,7 @@ def test_the_foot_in_front_stays_flat_as_the_walk_goes_on(stopping):
 
 
 def test_the_pelvis_of_a_standing_body_breathes_up_and_down_only(stopping):
-    speed = np.asarray(frames.frames_of(stopping).speed)
+    speed = np.asarray(clip_frames.frames_from_clip(stopping).speed)
     for first, last in contacts.runs(speed == 0.0):
         range_of = np.ptp(stopping.positions_ws[first : last + 1, 0], axis=0)
         assert range_of[0] == range_of[2] == 0.0

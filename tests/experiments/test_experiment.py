@@ -145,7 +145,7 @@ def test_a_scene_holds_the_clips_cut_and_resampled_alike(tmp_path):
     frames = slice(30, 61, 2)
     ankles = reference.joints_ws(2)[frames]
     np.testing.assert_allclose(scene.reference.ankle.pos, ankles, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(scene.reference.contact, reference.standing()[frames])
+    np.testing.assert_array_equal(scene.reference.contact, reference.stance_labels()[frames])
     world = scene.frames.world_from_model
     np.testing.assert_allclose(
         (world @ scene.pelvis).pos, base.positions_ws[frames, base.rig.pelvis], atol=1e-9
@@ -181,10 +181,10 @@ def test_without_a_base_a_flat_one_is_made(tmp_path):
     clips = "\n".join(line for line in CLIP.splitlines() if not line.startswith("base")) + "\n"
     read = experiment.load_experiment(write(tmp_path, clips=clips + SECOND))
     reference, base, _ = experiment.load_pair(read.clips[0], None)
-    stands = base.standing() & reference.standing()
+    stands = base.stance_labels() & reference.stance_labels()
     assert np.abs(base.joints_ws(3)[..., 1][stands]).max() < 0.2
     assert np.ptp(base.positions_ws[:, base.rig.pelvis, 1]) < 1e-9
-    assert base.frames == reference.frames
+    assert base.frame_count == reference.frame_count
 
 
 @pytest.mark.parametrize(

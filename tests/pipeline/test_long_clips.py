@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets.frames import frames_of
+from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.synthetic import walker
 from jaxik import presets
 from jaxik.world import terrain
@@ -22,7 +22,7 @@ PLACE = 1e-4  # m, that single precision may cost
 @functools.cache
 def walk() -> tuple[jaxik.Rig, jaxik.Frame]:
     clip = walker.walk(3.0, FPS, seed=4)
-    return clip.rig, frames_of(clip)
+    return clip.rig, frames_from_clip(clip)
 
 
 def repeated(count: int) -> jaxik.Frame:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets.frames import frames_of
+from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.synthetic import walker
 from jaxik import Smooth, Transform
 from jaxik.maths import parameter_tree, quat
@@ -144,7 +144,7 @@ def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
     while they stand, so a lock holds them: there the ankle goes by the lock's offset, no more.
     """
     clip = walker.walk(FRAMES / HZ, HZ, seed=3)
-    rig, frames = clip.rig, frames_of(clip)
+    rig, frames = clip.rig, frames_from_clip(clip)
     # Names and joints are part of the program: ours save compiling another.
     names = {name: getattr(to_rig(make_rig()), name) for name in ("names", "joints", "pelvis")}
     rig = dataclasses.replace(rig, **names)

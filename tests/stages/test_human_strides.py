@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets import flat_animation, frames
+from fitting.datasets import clip_frames, flat_animation
 from fitting.datasets.clips import Clip, load_clip
 from fitting.datasets.clips.edit import resample
 from fitting.datasets.terrain import mesh_files
@@ -42,16 +42,19 @@ def scoring(mocap: Path) -> ModuleType:
 
 
 def solved(clip: Clip, ground: terrain.Terrain) -> Clip:
-    return comparison.solve(jaxik.presets.stride(), clip, ground, frames.frames_of(clip), 0.0)[1]
+    return comparison.solve(
+        jaxik.presets.stride(), clip, ground, clip_frames.frames_from_clip(clip), 0.0
+    )[1]
 
 
 def test_the_preset_meets_the_benchmark_on_the_clip_that_it_was_found_on(mocap, scoring):
     path = mocap / "blocks" / "03_03.npz"
     after = solved(
-        flat_animation.load_base(path), mesh_files.load_terrain(mocap / "blocks" / "terrain.ply")
+        flat_animation.load_flat_animation(path),
+        mesh_files.load_terrain(mocap / "blocks" / "terrain.ply"),
     )
     clip = dict(np.load(path))
-    score = scoring.score(clip, frames.named_joints(after))
+    score = scoring.score(clip, clip_frames.positions_by_role(after))
     assert not {name: score[name] for name, most in BOUNDS.items() if score[name] > most}
     assert score["ankle_stance_cm"] <= CALIBRATION + 0.5
     # The base itself slides as captured: foot IK adds less than a tenth of a millimetre a frame.
@@ -60,7 +63,7 @@ def test_the_preset_meets_the_benchmark_on_the_clip_that_it_was_found_on(mocap, 
 
 def flat_floor(clip: Clip) -> np.ndarray:
     """The plane, y = a x + b z + c, through the soles of standing feet: least absolute distance."""
-    balls = clip.joints_ws(3)[clip.standing()]
+    balls = clip.joints_ws(3)[clip.stance_labels()]
     known = np.column_stack([balls[:, [0, 2]], np.ones(len(balls))])
     weight = np.ones(len(balls))
     for _ in range(20):
@@ -73,7 +76,9 @@ def flat_floor(clip: Clip) -> np.ndarray:
 def test_on_the_floor_for_which_it_was_animated_no_foot_moves(mocap, name):
     clip = load_clip(mocap / "clips" / name)
     plane = flat_floor(clip)
-    level = flat_animation.flat_base(clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2])
+    level = flat_animation.flatten_clip(
+        clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2]
+    )
     level = resample(level, (FRAMES - 1) / level.seconds)  # one shape compiles once
     after = solved(level, terrain.plane())
     for joint in (1, 2, 3):
@@ -87,10 +92,12 @@ def test_a_floor_that_is_tilted_as_captured_moves_no_stance_by_more_than_its_own
     """02_01 walks on a floor that the capture tilted: the base is level, the terrain is not."""
     clip = load_clip(mocap / "clips" / "cmu_asfamc" / "02_01.amc")
     plane = flat_floor(clip)
-    level = flat_animation.flat_base(clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2])
+    level = flat_animation.flatten_clip(
+        clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2]
+    )
     tilted = terrain.plane((0.0, float(plane[2]), 0.0), (-plane[0], 1.0, -plane[1]))
     after = solved(level, tilted)
-    balls, stance = level.joints_ws(3), level.standing()
+    balls, stance = level.joints_ws(3), level.stance_labels()
     wanted = balls[..., [0, 2]] @ plane[:2] + plane[2]
     risen = after.joints_ws(2)[..., 1] - level.joints_ws(2)[..., 1]
     assert np.abs(risen - wanted)[stance].max() < 0.005

@@ -14,7 +14,7 @@ from fitting.analysis.playback import Motion
 from fitting.cli import main
 from fitting.datasets import clips
 from fitting.datasets.clips import edit
-from fitting.datasets.flat_animation import load_base
+from fitting.datasets.flat_animation import load_flat_animation
 from fitting.report.plots import comparison_plots, style
 from fitting.runtime import program_cache
 from fitting.studies import comparison
@@ -40,7 +40,7 @@ def cache(tmp_path_factory):
 def folder(tmp_path_factory) -> Path:
     """Two seconds of a walk, and parameters."""
     path = tmp_path_factory.mktemp("given")
-    clips.save_clip(path / "walk.npz", edit.trim(load_base(BASE), 3.0, 5.0))
+    clips.save_clip(path / "walk.npz", edit.trim(load_flat_animation(BASE), 3.0, 5.0))
     (path / "still.toml").write_text(STILL)
     return path
 
@@ -123,7 +123,7 @@ def test_what_is_measured_is_what_run_writes(compared, folder):
     words = ["run", folder / "walk.npz", "--terrain", GROUND, "-o", out, "--preset", "record"]
     assert main.main([str(word) for word in words]) == 0
     solved, walk = clips.load_clip(out), clips.load_clip(folder / "walk.npz")
-    told, stance = numbers(compared)["record"], walk.standing()
+    told, stance = numbers(compared)["record"], walk.stance_labels()
     way = measures.slide_per_stance(solved.joints_ws(3), stance)
     assert told["slide"] == pytest.approx(way, rel=1e-6)
     jerk = measures.jerk(solved.positions_ws[:, solved.rig.pelvis, 1], solved.fps)

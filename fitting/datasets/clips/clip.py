@@ -46,14 +46,14 @@ class Clip:
                 object.__setattr__(self, name, view)
 
     @property
-    def frames(self) -> int:
+    def frame_count(self) -> int:
         """Number of frames."""
         return len(self.positions_ws)
 
     @property
     def seconds(self) -> float:
         """Time from the first frame to the last."""
-        return (self.frames - 1) / self.fps
+        return (self.frame_count - 1) / self.fps
 
     @cached_property
     def body_height(self) -> float:
@@ -77,10 +77,12 @@ class Clip:
         """Where a joint of each leg is: `role` 0 hip, 1 knee, 2 ankle, 3 toe."""
         return self.positions_ws[:, [joints[role] for joints in self.rig.joints]]
 
-    def standing(self) -> Bool[np.ndarray, "frames legs"]:
+    def stance_labels(self) -> Bool[np.ndarray, "frames legs"]:
         """The contact labels that came with the clip, or those found from its motion."""
         return (
-            contacts.standing(self.joints_ws(3), self.fps) if self.stance is None else self.stance
+            contacts.stance_labels(self.joints_ws(3), self.fps)
+            if self.stance is None
+            else self.stance
         )
 
     def leg_pose_ws(self) -> LegPose:

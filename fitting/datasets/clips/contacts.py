@@ -18,7 +18,7 @@ AROUND = 0.2  # s before and after a slow spell, in which a hanging foot shows
 HANG = 0.03  # m by which a hanging foot is above both its sides
 
 
-def standing(
+def stance_labels(
     ball_ws: Float64[np.ndarray, "frames legs 3"], fps: float
 ) -> Bool[np.ndarray, "frames legs"]:
     """True where a foot stands.
@@ -30,7 +30,7 @@ def standing(
     slow = speeds(ball_ws, fps) < SLOW
     stance = np.zeros_like(slow)
     for leg in range(slow.shape[1]):
-        spells = merged(runs(slow[:, leg]), round(GAP * fps))
+        spells = merge_runs(runs(slow[:, leg]), round(GAP * fps))
         for first, last in spells:
             long = last - first + 1 >= SHORTEST * fps
             if long and not _hangs(ball_ws[:, leg, 1], first, last, round(AROUND * fps)):
@@ -53,7 +53,7 @@ def runs(labels: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:
     return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
 
 
-def merged(spells: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
+def merge_runs(spells: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
     """The spells with breaks of at most `gap` frames closed."""
     joined: list[tuple[int, int]] = []
     for first, last in spells:

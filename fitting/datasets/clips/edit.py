@@ -13,7 +13,7 @@ from jaxik.world.skeleton import Rig
 from . import contacts
 from .clip import Clip
 from .joint_roles import partners
-from .recording import localise, place
+from .recording import local_from_world, place
 
 POP = 0.02  # m: second difference of a joint at 120 Hz that no body makes
 POP_RATE = 120.0  # Hz
@@ -39,12 +39,14 @@ def resample(clip: Clip, fps: float) -> Clip:
     if fps == clip.fps:
         return clip
     count = int(np.floor(clip.seconds * fps + 1e-9)) + 1
-    at = np.minimum(np.arange(count) * (clip.fps / fps), clip.frames - 1)
+    at = np.minimum(np.arange(count) * (clip.fps / fps), clip.frame_count - 1)
     at = np.where(np.abs(at - np.round(at)) < 1e-9, np.round(at), at)
-    before = np.minimum(at.astype(int), max(clip.frames - 2, 0))
-    after = np.minimum(before + 1, clip.frames - 1)
+    before = np.minimum(at.astype(int), max(clip.frame_count - 2, 0))
+    after = np.minimum(before + 1, clip.frame_count - 1)
     share = (at - before)[:, None, None]
-    positions_ls, rotations_ls = localise(clip.parents, clip.positions_ws, clip.rotations_ws)
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, clip.positions_ws, clip.rotations_ws
+    )
     first = _rotation(rotations_ls[before])
     step = (first.inv() * _rotation(rotations_ls[after])).as_rotvec()
     step = step.reshape(count, len(clip.parents), 3) * share
@@ -75,7 +77,7 @@ def trim(clip: Clip, start: float = 0.0, end: float | None = None) -> Clip:
 def drop_t_pose(clip: Clip) -> Clip:
     """The clip without a T-pose at its start, the ramp out of it, and repeats of its last frame."""
     first, last = motion_span(clip)
-    return clip if (first, last) == (0, clip.frames - 1) else clip.at(slice(first, last + 1))
+    return clip if (first, last) == (0, clip.frame_count - 1) else clip.at(slice(first, last + 1))
 
 
 def motion_span(clip: Clip) -> tuple[int, int]:
@@ -87,18 +89,22 @@ def motion_span(clip: Clip) -> tuple[int, int]:
     """
     steps = np.linalg.norm(np.diff(clip.positions_ws, axis=0), axis=-1).max(axis=1, initial=0.0)
     if not steps.any():
-        return 0, clip.frames - 1
+        return 0, clip.frame_count - 1
     last = int(np.flatnonzero(steps > 1e-9)[-1]) + 1
     about_root = clip.positions_ws - clip.positions_ws[:, :1]
     steps = np.linalg.norm(np.diff(about_root, axis=0), axis=-1).max(axis=1)
     leap = int(np.flatnonzero(np.append(steps, 1.0) > 1e-9)[0])  # a T-pose may be held
-    rotations_ls = localise(clip.parents, clip.positions_ws[:1], clip.rotations_ws[:1])[1][0, 1:]
+    rotations_ls = local_from_world(clip.parents, clip.positions_ws[:1], clip.rotations_ws[:1])[1][
+        0, 1:
+    ]
     at_rest = 2 * np.arccos(np.clip(np.abs(rotations_ls[:, 0]), 0.0, 1.0)) < REST
     usual = np.median(steps)
     if leap >= len(steps) or at_rest.mean() < REST_SHARE or steps[leap] <= JUMP * usual:
         return 0, last
     ramp = leap + 1 + round(RAMP_SECONDS * clip.fps)
-    fast = contacts.merged(contacts.runs(steps[leap:ramp] > RAMP * usual), round(GAP * clip.fps))
+    fast = contacts.merge_runs(
+        contacts.runs(steps[leap:ramp] > RAMP * usual), round(GAP * clip.fps)
+    )
     return leap + fast[0][1] + 1, last
 
 
@@ -110,8 +116,8 @@ def pops(clip: Clip) -> Bool[np.ndarray, " frames"]:
     rig = clip.rig
     joints = [rig.pelvis, *(joint for leg in rig.joints for joint in leg[1:])]
     jerk = np.linalg.norm(np.diff(clip.positions_ws[:, joints], n=2, axis=0), axis=-1)
-    popped = np.zeros(clip.frames, bool)
-    if clip.frames > 2:
+    popped = np.zeros(clip.frame_count, bool)
+    if clip.frame_count > 2:
         popped[1:-1] = (jerk > POP * (POP_RATE / clip.fps) ** 2).any(axis=1)
     return popped
 

@@ -102,7 +102,7 @@ def understand(
     rig = None
     if roles is not None:
         toes = [leg.joints[3] for leg in roles.legs]
-        stance = contacts.standing(positions_ws[:, toes], rate)
+        stance = contacts.stance_labels(positions_ws[:, toes], rate)
         for leg, stands in zip(roles.legs, stance.T, strict=True):
             if not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")

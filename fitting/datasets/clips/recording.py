@@ -69,7 +69,7 @@ def place(
     return positions_ws, continuous(rotations_ws)
 
 
-def localise(
+def local_from_world(
     parents: tuple[int, ...],
     positions_ws: Float64[np.ndarray, "frames joints 3"],
     rotations_ws: Float64[np.ndarray, "frames joints 4"],

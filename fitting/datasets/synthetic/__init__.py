@@ -1,1 +1,1 @@
-"""Synthetic walkers, crawlers and the ground they walk on."""
+"""Synthetic walkers, multi_limb and the ground they walk on."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from . import gait
-from .curves import hermite, smoothstep
+from .trajectories import hermite, smoothstep
 
 HALF_TRACK = 0.08  # m from the path to a foot
 ALONG_SD, ASIDE_SD, LIFT_SD = 0.015, 0.008, 0.01  # m, of steps and of the height of swings

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from . import gait
-from .curves import smoothstep
+from .trajectories import smoothstep
 
 GLIDE = 0.43  # phase of the rear foot, the heel of the front one just down, in which a walk freezes
 EASE = 0.4  # s, shortest change between walking and freezing, and of a slip

@@ -13,13 +13,13 @@ from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.formats.npz import leg_rotations, positions_clip
+from fitting.datasets.clips.formats.npz import clip_from_joints, leg_rotations
 from fitting.datasets.clips.rigs import unit
 
 from . import gait
-from .curves import smoothstep
 from .footsteps import Path, Steps, forward_ws
 from .speed_profile import Slide, Slip, Stop, pace
+from .trajectories import smoothstep
 
 REACH = 0.992  # share of a leg's length to which it stretches: its knee keeps 15 degrees
 SETTLE = 0.1  # s, before and after the pelvis gives way to a leg
@@ -99,7 +99,7 @@ def walk(
         knee = bent_knee(hip, foot.ankle, left_ws, gait.THIGH, gait.SHIN)
         positions += [hip, knee, foot.ankle, foot.ball]
         turns += [*leg_rotations(hip, knee, foot.ankle, left_ws), foot.rot, foot.rot]
-    clip = positions_clip(
+    clip = clip_from_joints(
         JOINTS,
         PARENTS,
         np.stack(positions, axis=1) + carried[:, None],

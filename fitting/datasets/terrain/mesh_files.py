@@ -101,7 +101,9 @@ def save_mesh(
     Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
 
 
-def embree(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> Any:
+def embree_tracer(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Any:
     """Embree over these triangles, a tracer of `trimesh.ray`; None where it is not installed."""
     if not trimesh.ray.has_embree:
         return None
@@ -130,7 +132,9 @@ def _read(
     return np.array(whole.vertices, np.float64), np.array(whole.faces, np.int64)
 
 
-def heights(ground: terrain.Terrain, above: float = 100.0) -> Callable[[np.ndarray], np.ndarray]:
+def height_function(
+    ground: terrain.Terrain, above: float = 100.0
+) -> Callable[[np.ndarray], np.ndarray]:
     """Height of the highest ground under points (points, 3), m; NaN where there is none.
 
     Args:

@@ -1,4 +1,4 @@
-"""Ground from motion: what a captured clip's stances say of a ground that nobody measured.
+"""Reconstruction from motion: what a captured clip's stances say of a ground that nobody measured.
 
 Three kinds of ground are put through the stances: a plane, a smooth surface and level blocks on a
 grid. Each is asked for the height of every stance when it knows the others only, and the simplest
@@ -16,8 +16,8 @@ from fitting.datasets.clips import contacts, edit
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.rigs import flat_frames
 
-from . import blocks, surfaces
-from .blocks import Footprints
+from . import block_grids, surfaces
+from .block_grids import Footprints
 from .surfaces import Surface
 
 SOLE = 0.055  # m, ball joint over the sole: subject 03 of the CMU database in his shoes
@@ -26,7 +26,7 @@ SOLE = 0.055  # m, ball joint over the sole: subject 03 of the CMU database in h
 TOES, DEVIATIONS = np.radians(5.0), 3.0 * 1.4826
 NEAR = 0.3  # m, about a foot's length: a stance on toes is not asked where a flat one is as near
 FEWEST = 4  # stances: three make a plane, and one tests it
-KINDS = ("plane", "smooth", "blocks")  # the simplest first
+SURFACE_KINDS = ("plane", "smooth", "blocks")  # the simplest first
 Fit = Callable[[Footprints], Surface]
 
 
@@ -69,13 +69,13 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Ground:
+class Reconstruction:
     """The grounds that a clip's stances make, and which of them was chosen."""
 
     stances: Stances
     surfaces: Mapping[str, Surface]  # by kind
-    tested: Mapping[str, Prediction]
-    ranked: blocks.Ranked
+    predictions: Mapping[str, Prediction]
+    grids: block_grids.RankedGrids
     chosen: str
 
     @property
@@ -89,34 +89,34 @@ class Ground:
         return points.min(axis=0) - margin, points.max(axis=0) + margin
 
 
-def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> Ground:
+def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> Reconstruction:
     """The ground below a captured clip.
 
     Args:
         clip: over ground of any shape, y up. A stance is where its labels or its motion say so.
         sole: m, height of the ball joint over the sole. It shifts the whole ground.
-        kind: of ground, of `KINDS`; None chooses by the error of prediction.
+        kind: of ground, of `SURFACE_KINDS`; None chooses by the error of prediction.
 
     Raises:
         ValueError: another kind, a clip without legs, too few stances.
     """
-    if kind not in (None, *KINDS):
-        raise ValueError(f"no kind of ground named {kind!r}; there are {list(KINDS)}")
+    if kind not in (None, *SURFACE_KINDS):
+        raise ValueError(f"no kind of ground named {kind!r}; there are {list(SURFACE_KINDS)}")
     stances = find_stances(clip, sole)
     feet = stances.footprints
     if len(feet.balls) < FEWEST:
         raise ValueError(
             f"{clip.source}: {len(feet.balls)} stances; wanted {FEWEST} or more to tell a ground"
         )
-    ranked = blocks.search(feet)
+    ranked = block_grids.search(feet)
     fits: dict[str, Fit] = {
-        "plane": surfaces.plane,
-        "smooth": surfaces.smooth,
-        "blocks": partial(surfaces.level_blocks, ranked),
+        "plane": surfaces.fit_plane,
+        "smooth": surfaces.fit_thin_plate,
+        "blocks": partial(surfaces.fit_blocks, ranked),
     }
     tested = {name: leave_one_out(fit, feet) for name, fit in fits.items()}
     found = {name: fit(feet) for name, fit in fits.items()}
-    return Ground(stances, found, tested, ranked, choose(tested) if kind is None else kind)
+    return Reconstruction(stances, found, tested, ranked, choose(tested) if kind is None else kind)
 
 
 def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
@@ -127,8 +127,8 @@ def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
     only where no flat stance is near. ValueError where no foot ever stands.
     """
     clip = edit.mask_pops(clip)
-    good = np.ones(clip.frames, bool) if clip.mask is None else clip.mask
-    standing, ankles, balls = clip.standing(), clip.joints_ws(2), clip.joints_ws(3)
+    good = np.ones(clip.frame_count, bool) if clip.mask is None else clip.mask
+    standing, ankles, balls = clip.stance_labels(), clip.joints_ws(2), clip.joints_ws(3)
     rows = []
     for leg in range(standing.shape[1]):
         for first, last in contacts.runs(standing[:, leg]):
@@ -172,9 +172,9 @@ def choose(tested: Mapping[str, Prediction]) -> str:
     The standard error is that of the mean difference, stance by stance, to the best kind: the rule
     of Breiman, Friedman, Olshen and Stone (1984), for errors of the same stances.
     """
-    squares = {kind: tested[kind].errors ** 2 for kind in KINDS}
-    best = min(KINDS, key=lambda kind: squares[kind].mean())
-    for kind in KINDS:
+    squares = {kind: tested[kind].errors ** 2 for kind in SURFACE_KINDS}
+    best = min(SURFACE_KINDS, key=lambda kind: squares[kind].mean())
+    for kind in SURFACE_KINDS:
         more = squares[kind] - squares[best]
         if more.mean() <= more.std() / np.sqrt(len(more)):
             return kind

@@ -10,9 +10,9 @@ from scipy.interpolate import RBFInterpolator
 from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
-from fitting.datasets.synthetic.course import Mesh, quads
+from fitting.datasets.synthetic.terrain_meshes import Mesh, quads
 
-from . import blocks
+from . import block_grids
 
 PLANE_NOISE = 0.01  # m: a stance farther from the plane is trusted less (soft L1)
 SLOPE = 0.05  # m per m, prior deviation: across a straight walk nothing else holds the plane
@@ -54,7 +54,7 @@ class Plane(Surface):
 
 
 @dataclass(frozen=True)
-class Smooth(Surface):
+class ThinPlate(Surface):
     """A thin plate that bends as little as the stances let it (Duchon 1977; Wahba 1990)."""
 
     plate: RBFInterpolator
@@ -74,10 +74,10 @@ class Smooth(Surface):
 
 
 @dataclass(frozen=True)
-class Blocks(Surface):
+class LevelBlocks(Surface):
     """Level blocks; one that nobody stepped on has the mean height of those next to it."""
 
-    grid: blocks.Grid
+    grid: block_grids.Grid
     cells: Int64[np.ndarray, "blocks 2"]  # that somebody stepped on
     tops: Float64[np.ndarray, " blocks"]  # m
     stances: Int64[np.ndarray, " blocks"]  # how many told each
@@ -121,7 +121,7 @@ class Blocks(Surface):
         return np.abs(cells[:, None] - self.cells).max(axis=-1)
 
 
-def plane(feet: blocks.Footprints) -> Plane:
+def fit_plane(feet: block_grids.Footprints) -> Plane:
     """The plane through heights that a few odd ones cannot pull far.
 
     Least squares under a soft L1 loss; where points do not tell the slope, it is level.
@@ -138,7 +138,7 @@ def plane(feet: blocks.Footprints) -> Plane:
     return Plane(float(level + found[0] - middle @ found[1:]), slope)
 
 
-def smooth(feet: blocks.Footprints) -> Smooth:
+def fit_thin_plate(feet: block_grids.Footprints) -> ThinPlate:
     """The thin plate whose smoothing predicts each height best from the others.
 
     Points in a line bend a plate along it only, and leave it level across.
@@ -150,7 +150,7 @@ def smooth(feet: blocks.Footprints) -> Smooth:
         raise ValueError("all stances are in a line; wanted some beside it for a smooth surface")
     smoothing = min(SMOOTHING, key=_errors_of_plates(points - middle, heights))
     plate = RBFInterpolator(points, heights, smoothing=smoothing)
-    return Smooth(plate, float(smoothing), float(heights.min()), float(heights.max()))
+    return ThinPlate(plate, float(smoothing), float(heights.min()), float(heights.max()))
 
 
 def _errors_of_plates(points: np.ndarray, heights: np.ndarray) -> Callable[[float], float]:
@@ -172,13 +172,13 @@ def _errors_of_plates(points: np.ndarray, heights: np.ndarray) -> Callable[[floa
     return error
 
 
-def level_blocks(ranked: blocks.Ranked, feet: blocks.Footprints) -> Blocks:
+def fit_blocks(ranked: block_grids.RankedGrids, feet: block_grids.Footprints) -> LevelBlocks:
     """Blocks of the likeliest of these grids, each as high as the median of the heights on it."""
-    grid = blocks.likeliest(ranked, feet)
+    grid = block_grids.likeliest(ranked, feet)
     cells, which = np.unique(grid.cells(feet.balls), axis=0, return_inverse=True)
     which = which.reshape(-1)
     tops = np.array([np.median(feet.heights[which == one]) for one in range(len(cells))])
-    return Blocks(grid, cells, tops, np.bincount(which).astype(np.int64))
+    return LevelBlocks(grid, cells, tops, np.bincount(which).astype(np.int64))
 
 
 def _sheet(surface: Surface, x: np.ndarray, z: np.ndarray) -> Mesh:

@@ -11,18 +11,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from fitting.datasets.terrain.reconstruction import KINDS, Ground, Prediction
-from fitting.datasets.terrain.surfaces import Blocks
+from fitting.datasets.terrain.reconstruction import SURFACE_KINDS, Prediction, Reconstruction
+from fitting.datasets.terrain.surfaces import LevelBlocks
 
 from .style import BEFORE, GROUND, STAGES, legend, styled
 
-COLOURS: dict[str, str] = dict(zip(KINDS, (STAGES[1], STAGES[2], STAGES[0]), strict=True))
+COLOURS: dict[str, str] = dict(zip(SURFACE_KINDS, (STAGES[1], STAGES[2], STAGES[0]), strict=True))
 PIXELS = 300  # along the longer side of the plan
 LEGS = "o^sDvP*X"  # marks of the legs
 
 
 @styled
-def plan(ground: Ground, margin: float, legs: tuple[str, ...], title: str) -> Figure:
+def plan(ground: Reconstruction, margin: float, legs: tuple[str, ...], title: str) -> Figure:
     """The chosen ground from above with the stances on it, and how well each kind predicts them.
 
     Args:
@@ -36,8 +36,8 @@ def plan(ground: Ground, margin: float, legs: tuple[str, ...], title: str) -> Fi
     ((left, right),) = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.15, 1.0])
     _draw_plan(left.subplots(), ground, margin, legs)
     (upper,), (lower,) = right.subplots(2, 1, squeeze=False)
-    _draw_errors(upper, ground.tested)
-    _draw_shares(lower, ground.tested)
+    _draw_errors(upper, ground.predictions)
+    _draw_shares(lower, ground.predictions)
     marks = [
         Line2D([], [], color="black", marker=mark, linestyle="", markerfacecolor="white", label=leg)
         for leg, mark in zip(legs, _marks(len(legs)), strict=True)
@@ -47,17 +47,17 @@ def plan(ground: Ground, margin: float, legs: tuple[str, ...], title: str) -> Fi
         entries.append(
             Line2D([], [], color="black", marker="x", linestyle="", label="on toes, not used")
         )
-    if isinstance(ground.surface, Blocks):
+    if isinstance(ground.surface, LevelBlocks):
         entries.append(Patch(facecolor="white", edgecolor=BEFORE, hatch="///", label="not visited"))
     entries += [
         Line2D([], [], color=COLOURS[kind], linewidth=3, label=f"predicted by {kind}")
-        for kind in KINDS
+        for kind in SURFACE_KINDS
     ]
     legend(figure, *entries, columns=7)
     return figure
 
 
-def _draw_plan(axes: Axes, ground: Ground, margin: float, legs: tuple[str, ...]) -> None:
+def _draw_plan(axes: Axes, ground: Reconstruction, margin: float, legs: tuple[str, ...]) -> None:
     """Heights in colour, blocks with their edges, stances in the colour of what they measured."""
     low, high = ground.extent(margin)
     count = np.ceil(PIXELS * (high - low) / np.max(high - low)).astype(int)
@@ -72,7 +72,7 @@ def _draw_plan(axes: Axes, ground: Ground, margin: float, legs: tuple[str, ...])
     image = axes.pcolormesh(x, z, heights, shading="nearest", rasterized=True, **colours)
     axes.figure.colorbar(image, ax=axes, label="height, cm", shrink=0.8)
     axes.grid(False)
-    if isinstance(ground.surface, Blocks):
+    if isinstance(ground.surface, LevelBlocks):
         _draw_blocks(axes, ground.surface, points)
     for leg, mark in zip(range(len(legs)), _marks(len(legs)), strict=True):
         here = (stances.leg == leg) & stances.used
@@ -89,7 +89,7 @@ def _draw_plan(axes: Axes, ground: Ground, margin: float, legs: tuple[str, ...])
     axes.set_title(f"{ground.chosen.capitalize()} from above, and what each stance measured")
 
 
-def _draw_blocks(axes: Axes, found: Blocks, points: np.ndarray) -> None:
+def _draw_blocks(axes: Axes, found: LevelBlocks, points: np.ndarray) -> None:
     """Edges of blocks, and hatches over those that nobody stepped on."""
     cells = found.grid.cells(points.reshape(-1, 2))
     low, high = cells.min(axis=0), cells.max(axis=0) + 1

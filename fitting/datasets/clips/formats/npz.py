@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.joint_roles import find_roles
-from fitting.datasets.clips.recording import continuous, localise
+from fitting.datasets.clips.recording import continuous, local_from_world
 from fitting.datasets.clips.rigs import hinges, measure_rig, unit
 from fitting.runtime.files import write
 from jaxik.world.skeleton import Rig
@@ -79,7 +79,7 @@ def read_npz(path: Path, variant: str) -> Clip:
     )
 
 
-def is_blocks(path: str | Path) -> bool:
+def is_blocks_file(path: str | Path) -> bool:
     """Whether a file is of the blocks benchmark, which holds a captured clip and its base."""
     if Path(path).suffix.lower() != ".npz" or not Path(path).is_file():
         return False
@@ -159,7 +159,7 @@ def _blocks(path: Path, content: dict[str, np.ndarray], variant: str) -> Clip:
         positions += [part[:, leg] for part in (hip, knee, ankle, ball)]
         rotations += leg_rotations(hip[:, leg], knee[:, leg], ankle[:, leg], left_ws)
         rotations += [foot_rot[:, leg], foot_rot[:, leg]]
-    return positions_clip(
+    return clip_from_joints(
         tuple(names), tuple(parents), np.stack(positions, axis=1), np.stack(rotations, axis=1),
         float(content["fps"]), path.name, content["stance"].astype(bool),
     )  # fmt: skip
@@ -189,7 +189,7 @@ def leg_rotations(
     return turns
 
 
-def positions_clip(
+def clip_from_joints(
     names: tuple[str, ...],
     parents: tuple[int, ...],
     positions_ws: np.ndarray,
@@ -204,7 +204,7 @@ def positions_clip(
     Its legs are named as in the dialect "jaxik", or by `joints`, see `find_roles`.
     """
     rotations_ws = continuous(rotations_ws)
-    positions_ls, _ = localise(parents, positions_ws, rotations_ws)
+    positions_ls, _ = local_from_world(parents, positions_ws, rotations_ws)
     roles = find_roles(names, parents, joints)
     rig = measure_rig(roles, positions_ws, rotations_ws, stance)
     return Clip(

@@ -14,7 +14,7 @@ def describe(clip: Clip) -> dict:
     """What is known of a clip, as plain numbers, texts, lists and dicts; lengths in metres."""
     told: dict = {
         "file": clip.source,
-        "frames": clip.frames,
+        "frames": clip.frame_count,
         "seconds": clip.seconds,
         "fps": clip.fps,
         "raw_frame_time": clip.raw_frame_time,
@@ -31,8 +31,8 @@ def describe(clip: Clip) -> dict:
     first, last = edit.motion_span(clip)
     if first:
         told["warnings"].append(f"starts with a T-pose; the motion begins at frame {first}")
-    if last < clip.frames - 1:
-        told["warnings"].append(f"the last frame is repeated {clip.frames - 1 - last} times")
+    if last < clip.frame_count - 1:
+        told["warnings"].append(f"the last frame is repeated {clip.frame_count - 1 - last} times")
     if clip.measured is not None:
         told |= _describe_legs(clip)
         if popped := int(edit.pops(clip).sum()):
@@ -43,7 +43,7 @@ def describe(clip: Clip) -> dict:
 def _describe_legs(clip: Clip) -> dict:
     rig = clip.rig
     own = clip.stance is not None
-    stance = clip.standing()
+    stance = clip.stance_labels()
     joint_map = {"pelvis": clip.joint_names[rig.pelvis]}
     legs = {}
     for index, name in enumerate(rig.names):
@@ -63,7 +63,7 @@ def _describe_legs(clip: Clip) -> dict:
     return {"joint_map": joint_map, "legs": legs}
 
 
-def render(told: dict) -> str:
+def as_text(told: dict) -> str:
     """The answer of `describe` as text for a terminal."""
     lines = [
         f"{told['file']}: {told['frames']} frames, {told['seconds']:.2f} s at {told['fps']:g} Hz "
@@ -88,6 +88,6 @@ def render(told: dict) -> str:
     return "\n".join(lines)
 
 
-def to_json(told: dict) -> str:
+def as_json(told: dict) -> str:
     """The answer of `describe` as JSON."""
     return json.dumps(told, indent=2)

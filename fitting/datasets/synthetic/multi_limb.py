@@ -13,12 +13,12 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.formats.npz import leg_rotations, positions_clip
+from fitting.datasets.clips.formats.npz import clip_from_joints, leg_rotations
 from fitting.datasets.clips.rigs import unit
 
-from . import course
-from .curves import smoothstep
+from . import terrain_meshes
 from .footsteps import Path
+from .trajectories import smoothstep
 from .walker import bent_knee
 
 Point = tuple[float, float, float]  # left, up, ahead, m
@@ -151,7 +151,7 @@ def crawl(
         turns += [*leg_rotations(hip, knee, ankle, hinge), rot, rot]
         stance.append(stands)
     roles = {f"{part}_{limb.name}": f"{limb.name}_{part}" for limb in body.limbs for part in PARTS}
-    return positions_clip(
+    return clip_from_joints(
         tuple(joints),
         tuple(parents),
         np.stack(positions, axis=1),
@@ -164,7 +164,7 @@ def crawl(
 
 
 def climb(seconds: float = 6.0, fps: float = 30.0, seed: int = 0, *, start: float = 1.3) -> Clip:
-    """A climber on the wall z = 0, whose normal is `course.WALL_UP`; straight up from `start`, m.
+    """A climber on the wall z = 0, whose normal is `terrain_meshes.WALL_UP`; straight up from `start`, m.
 
     Pass that normal as `up_ws` to whatever asks where the character's root is.
 
@@ -172,7 +172,7 @@ def climb(seconds: float = 6.0, fps: float = 30.0, seed: int = 0, *, start: floa
         ValueError: as `crawl`.
     """
     flat = crawl(CLIMBER, seconds, fps, seed, start=start, turn=0.0)
-    upright = course.WALL_FROM_FLOOR
+    upright = terrain_meshes.WALL_FROM_FLOOR
     turned = upright * Rotation.from_quat(flat.rotations_ws.reshape(-1, 4), scalar_first=True)
     rotations = turned.as_quat(scalar_first=True).reshape(flat.rotations_ws.shape)
     return flat.with_motion(flat.positions_ws @ upright.as_matrix().T, rotations)

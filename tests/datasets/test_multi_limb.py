@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 
 import jaxik
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts, load_clip, save_clip
-from fitting.datasets.clips.recording import localise
-from fitting.datasets.synthetic import course, crawlers
+from fitting.datasets.clips.recording import local_from_world
+from fitting.datasets.synthetic import multi_limb, terrain_meshes
 from fitting.datasets.terrain import mesh_files
 
 EXACT = 1e-9  # m
-WALL = course.WALL_FROM_FLOOR.as_matrix()  # columns: a floor's left, up and ahead, on the wall
-BODIES = {"quadruped": crawlers.QUADRUPED, "climber": crawlers.CLIMBER}
+WALL = (
+    terrain_meshes.WALL_FROM_FLOOR.as_matrix()
+)  # columns: a floor's left, up and ahead, on the wall
+BODIES = {"quadruped": multi_limb.QUADRUPED, "climber": multi_limb.CLIMBER}
 
 
 @pytest.fixture(scope="module", params=["quadruped", "climber"])
@@ -25,8 +27,8 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def clip(name):
-    made = {"quadruped": crawlers.crawl(crawlers.QUADRUPED, 5.0, 60.0, 1)}
-    return made[name] if name in made else crawlers.climb(6.0, 60.0, 1)
+    made = {"quadruped": multi_limb.crawl(multi_limb.QUADRUPED, 5.0, 60.0, 1)}
+    return made[name] if name in made else multi_limb.climb(6.0, 60.0, 1)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,7 @@ def test_bones_keep_their_lengths_and_limbs_hang_rigidly_on_the_trunk(name, clip
         for a, b, length in zip(places, places[1:], wanted, strict=False):
             distance = np.linalg.norm(b - a, axis=-1)
             np.testing.assert_allclose(distance, length, rtol=0, atol=EXACT)
-    positions_ls, _ = localise(clip.parents, clip.positions_ws, clip.rotations_ws)
+    positions_ls, _ = local_from_world(clip.parents, clip.positions_ws, clip.rotations_ws)
     assert np.ptp(positions_ls[:, 1:], axis=0).max() < EXACT
 
 
@@ -85,7 +87,7 @@ def test_limbs_stay_bent_the_way_that_they_bend(name, clip, on_floor):
 
 
 def test_the_quadruped_walks_in_lateral_sequence_with_two_feet_or_more_down():
-    clip = crawlers.crawl(crawlers.QUADRUPED, 5.0, 60.0, 1)
+    clip = multi_limb.crawl(multi_limb.QUADRUPED, 5.0, 60.0, 1)
     assert clip.stance is not None
     landings = {
         name: [first for first, _ in contacts.runs(clip.stance[:, leg]) if first > 0]
@@ -103,7 +105,7 @@ def test_the_quadruped_walks_in_lateral_sequence_with_two_feet_or_more_down():
 
 
 def test_the_climber_moves_one_limb_at_a_time_and_goes_straight_up_the_wall():
-    clip = crawlers.climb(6.0, 60.0, 1)
+    clip = multi_limb.climb(6.0, 60.0, 1)
     assert clip.stance is not None
     assert clip.stance.sum(axis=1).min() == 3
     moved = clip.positions_ws[-1, 0] - clip.positions_ws[0, 0]
@@ -114,23 +116,23 @@ def test_the_climber_moves_one_limb_at_a_time_and_goes_straight_up_the_wall():
 
 
 def test_on_a_wall_the_root_lies_on_it_with_the_normal_as_its_up():
-    clip = crawlers.climb(2.0, 30.0)
-    made = frames.frames_of(clip, up_ws=course.WALL_UP)
+    clip = multi_limb.climb(2.0, 30.0)
+    made = clip_frames.frames_from_clip(clip, up_ws=terrain_meshes.WALL_UP)
     root = made.world_from_model
     trunk = clip.positions_ws[:, 0]
     np.testing.assert_allclose(root.pos, trunk * [1.0, 1.0, 0.0], rtol=0, atol=1e-12)
-    for axis, wanted in ((0, (1, 0, 0)), (1, course.WALL_UP), (2, (0, 1, 0))):
+    for axis, wanted in ((0, (1, 0, 0)), (1, terrain_meshes.WALL_UP), (2, (0, 1, 0))):
         ends = root.apply(jnp.eye(3)[axis]) - root.pos
         np.testing.assert_allclose(ends, np.tile(wanted, (60, 1)), rtol=0, atol=1e-12)
-    speed = crawlers.CLIMBER.stride / crawlers.CLIMBER.period
+    speed = multi_limb.CLIMBER.stride / multi_limb.CLIMBER.period
     np.testing.assert_allclose(made.speed, speed, rtol=1e-9)
 
 
 def test_an_animal_may_start_elsewhere_and_a_seed_gives_the_same_steps():
-    first, same, other = (crawlers.crawl(crawlers.QUADRUPED, 2.0, 30.0, s) for s in (4, 4, 5))
+    first, same, other = (multi_limb.crawl(multi_limb.QUADRUPED, 2.0, 30.0, s) for s in (4, 4, 5))
     np.testing.assert_array_equal(first.positions_ws, same.positions_ws)
     assert np.abs(first.positions_ws - other.positions_ws).max() > 0.005
-    ahead = crawlers.crawl(crawlers.QUADRUPED, 2.0, 30.0, 4, start=3.0)
+    ahead = multi_limb.crawl(multi_limb.QUADRUPED, 2.0, 30.0, 4, start=3.0)
     assert ahead.positions_ws[0, 0, 2] == pytest.approx(3.0)
 
 
@@ -143,16 +145,19 @@ def test_a_clip_of_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
 
 @pytest.mark.parametrize(("animal", "mesh"), [("quadruped", "meadow"), ("climber", "wall")])
 def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh):
-    up = course.WALL_UP if animal == "climber" else (0.0, 1.0, 0.0)
-    clip = {"quadruped": crawlers.crawl(crawlers.QUADRUPED, 1.0), "climber": crawlers.climb(1.0)}
+    up = terrain_meshes.WALL_UP if animal == "climber" else (0.0, 1.0, 0.0)
+    clip = {
+        "quadruped": multi_limb.crawl(multi_limb.QUADRUPED, 1.0),
+        "climber": multi_limb.climb(1.0),
+    }
     clip = clip[animal]
-    mesh_files.save_mesh(tmp_path / "ground.ply", *getattr(course, mesh)())
+    mesh_files.save_mesh(tmp_path / "ground.ply", *getattr(terrain_meshes, mesh)())
     ground = mesh_files.load_terrain(tmp_path / "ground.ply", up=up)
-    made = frames.frames_of(clip, up_ws=up)
+    made = clip_frames.frames_from_clip(clip, up_ws=up)
     result = jaxik.run(jaxik.presets.record(), clip.rig, ground, made)
     assert np.asarray(result.trace.sensed.ground.ankle.found).min() == 1.0
     assert np.asarray(result.reached).mean() > 0.95
-    solved = frames.solved_clip(clip, result, up_ws=up)
+    solved = clip_frames.clip_from_result(clip, result, up_ws=up)
     assert np.isfinite(solved.positions_ws).all()
     raised = (solved.positions_ws - clip.positions_ws) @ np.array(up)
     assert 0.01 < np.abs(raised).max() < 0.25
@@ -161,10 +166,14 @@ def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh
 @pytest.mark.parametrize(
     "body, seconds, said",
     [
-        (crawlers.QUADRUPED, 0.0, "above 0, got 0.0 s"),
-        (replace(crawlers.QUADRUPED, stride=3.0), 2.0, "fore_left limb of the quadruped does not"),
+        (multi_limb.QUADRUPED, 0.0, "above 0, got 0.0 s"),
+        (
+            replace(multi_limb.QUADRUPED, stride=3.0),
+            2.0,
+            "fore_left limb of the quadruped does not",
+        ),
     ],
 )
 def test_impossible_crawls_are_refused(body, seconds, said):
     with pytest.raises(ValueError, match=said):
-        crawlers.crawl(body, seconds)
+        multi_limb.crawl(body, seconds)

@@ -72,7 +72,7 @@ class Footprints:
 
 
 @dataclass(frozen=True)
-class Ranked:
+class RankedGrids:
     """Grids that divide the stances differently, the likeliest first."""
 
     grids: tuple[Grid, ...]
@@ -81,7 +81,7 @@ class Ranked:
     headings: tuple[float, float]  # rad, likewise
 
 
-def search(feet: Footprints) -> Ranked:
+def search(feet: Footprints) -> RankedGrids:
     """The grids that explain heights best; the same for the same heights, always.
 
     Every pitch and heading is tried with the offset that has most pairs of like height in common
@@ -115,7 +115,7 @@ def search(feet: Footprints) -> Ranked:
     }
     kept = sorted(together, key=lambda index: -together[index])[:KEPT]
     alike = [grids[index] for index in np.flatnonzero(evidence >= evidence.max() - AS_LIKELY)]
-    return Ranked(
+    return RankedGrids(
         tuple(grids[index] for index in kept),
         np.array([together[index] - evidence[index] for index in kept]),
         _extent([grid.pitch for grid in alike]),
@@ -123,7 +123,7 @@ def search(feet: Footprints) -> Ranked:
     )
 
 
-def likeliest(ranked: Ranked, feet: Footprints) -> Grid:
+def likeliest(ranked: RankedGrids, feet: Footprints) -> Grid:
     """The grid whose division of the stances has the most evidence."""
     judge = _Judge(feet)
     evidence = [judge.evidence(grid) for grid in ranked.grids]

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.datasets import frames
+from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts
 from fitting.datasets.synthetic import gait, speed_profile, walker
 from jaxik.maths import parameter_tree
@@ -28,11 +28,11 @@ def clip():
 def result(clip):
     ground = terrain.plane(normal=(0.0, 1.0, -SLOPE))
     ik = parameter_tree.replace(jaxik.presets.record(), {"lean.forward_rate": 0.5})
-    return jaxik.run(ik, clip.rig, ground, frames.frames_of(clip))
+    return jaxik.run(ik, clip.rig, ground, clip_frames.frames_from_clip(clip))
 
 
 def test_frames_hold_the_clip_in_model_space_over_the_floor(clip):
-    made = frames.frames_of(clip, floor=-0.1)
+    made = clip_frames.frames_from_clip(clip, floor=-0.1)
     pose = made.pose
     for role, joint in enumerate((pose.hip, pose.knee, pose.ankle, pose.toe)):
         back = made.world_from_model
@@ -44,20 +44,20 @@ def test_frames_hold_the_clip_in_model_space_over_the_floor(clip):
                 placed + back.pos, clip.joints_ws(role)[:, leg], rtol=0, atol=1e-9
             )
     assert float(pose.ankle.pos[..., 1].min()) == pytest.approx(gait.ANKLE_HEIGHT + 0.1)
-    assert made.weight.shape == (clip.frames, 2)
+    assert made.weight.shape == (clip.frame_count, 2)
     np.testing.assert_allclose(made.dt, 1 / FPS)
     np.testing.assert_array_equal(made.slide, clip.slide)
     np.testing.assert_allclose(made.speed, gait.STRIDE / gait.PERIOD, rtol=0.02)
 
 
 def test_a_single_frame_stands_and_does_not_slide(clip):
-    made = frames.frames_of(dataclasses.replace(clip, slide=None).at(slice(0, 1)))
+    made = clip_frames.frames_from_clip(dataclasses.replace(clip, slide=None).at(slice(0, 1)))
     np.testing.assert_array_equal(made.speed, [0.0])
     np.testing.assert_array_equal(made.slide, [0.0])
 
 
 def test_the_solved_clip_has_the_solved_legs_and_carries_the_rest_with_the_body(clip, result):
-    solved = frames.solved_clip(clip, result)
+    solved = clip_frames.clip_from_result(clip, result)
     world = clip.world_from_model()
     for leg, joints in enumerate(clip.rig.joints):
         parts = (result.pose.hip, result.pose.knee, result.pose.ankle, result.pose.toe)
@@ -91,7 +91,7 @@ def test_joints_above_the_pelvis_and_below_a_foot_keep_their_places_on_their_par
             [clip.rotations_ws, clip.rotations_ws[:, [4, 0]]], axis=1
         ),
     )  # fmt: skip
-    solved = frames.solved_clip(longer, result)
+    solved = clip_frames.clip_from_result(longer, result)
     for joint, parent, offset in ((9, 4, [0.01, -0.02, 0.05]), (10, 0, [0.0, 0.6, 0.0])):
         holder = Rotation.from_quat(solved.rotations_ws[:, parent], scalar_first=True)
         hung = solved.positions_ws[:, parent] + holder.apply(offset)
@@ -103,15 +103,15 @@ def test_joints_above_the_pelvis_and_below_a_foot_keep_their_places_on_their_par
 def test_on_flat_ground_the_solved_clip_is_the_clip_away_from_its_limits(clip):
     quiet = {"lock.enabled": jnp.array(False), "leg.max_knee_angle": 3.1415, "leg.soften": 1.0}
     ik = parameter_tree.replace(jaxik.presets.record(), quiet)
-    result = jaxik.run(ik, clip.rig, terrain.plane(), frames.frames_of(clip))
-    solved = frames.solved_clip(clip, result)
+    result = jaxik.run(ik, clip.rig, terrain.plane(), clip_frames.frames_from_clip(clip))
+    solved = clip_frames.clip_from_result(clip, result)
     np.testing.assert_allclose(solved.positions_ws, clip.positions_ws, rtol=0, atol=1e-4)
     same = np.abs(np.sum(solved.rotations_ws * clip.rotations_ws, axis=-1))
     assert same.min() > np.cos(0.5e-3)
 
 
 def test_strides_lead_from_stance_to_stance(clip):
-    made, stance = frames.frames_of(clip).stride, clip.standing()
+    made, stance = clip_frames.frames_from_clip(clip).stride, clip.stance_labels()
     np.testing.assert_array_equal(made.standing, stance)
     np.testing.assert_array_equal(made.known, 1.0)
     balls = clip.joints_ws(3)
@@ -130,14 +130,14 @@ def test_strides_lead_from_stance_to_stance(clip):
 
 
 def test_a_foot_that_never_stands_knows_no_stride(clip):
-    stance = clip.standing().copy()
+    stance = clip.stance_labels().copy()
     stance[:, 1] = False
-    made = frames.frames_of(dataclasses.replace(clip, stance=stance)).stride
+    made = clip_frames.frames_from_clip(dataclasses.replace(clip, stance=stance)).stride
     np.testing.assert_array_equal(made.known, np.broadcast_to([1.0, 0.0], stance.shape))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(made))
 
 
 def test_toes_are_as_fast_as_they_move(clip):
-    made = frames.frames_of(clip)
+    made = clip_frames.frames_from_clip(clip)
     steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
     np.testing.assert_allclose(made.toe_speed[1:], steps, rtol=1e-9)

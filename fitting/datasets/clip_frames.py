@@ -12,12 +12,12 @@ from jaxik.world.frame import UP, Stride
 
 from .clips import contacts
 from .clips.clip import Clip
-from .clips.recording import localise
+from .clips.recording import local_from_world
 
 Direction = Sequence[float] | np.ndarray
 
 
-def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik.Frame:
+def frames_from_clip(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik.Frame:
     """The clip as the pipeline's input, its leaves leading with frames, in JAX's default precision.
 
     Foot IK has its whole weight, the ground does not move, and the character slides where the clip
@@ -36,22 +36,22 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
         _velocity(places, clip.fps)
         for places in (np.asarray(world.pos), clip.joints_ws(2), clip.joints_ws(3))
     )
-    slide = np.zeros(clip.frames) if clip.slide is None else clip.slide
+    slide = np.zeros(clip.frame_count) if clip.slide is None else clip.slide
 
     def told(numbers: np.ndarray) -> Array:
         return jax.device_put(numbers.astype(dtype))  # in JAX the conversion would be a program
 
-    upright = np.tile([1.0, 0.0, 0.0, 0.0], (clip.frames, 1))
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (clip.frame_count, 1))
     return jaxik.Frame(
         world_from_model=world,
         pose=pose,
-        weight=told(np.ones((clip.frames, legs))),
+        weight=told(np.ones((clip.frame_count, legs))),
         slide=told(slide),
         velocity_ws=told(velocity),
         foot_speed=told(np.linalg.norm(foot, axis=-1)),
         toe_speed=told(np.linalg.norm(toe, axis=-1)),
         stride=Stride(*map(told, _stride(clip))),
-        dt=told(np.full(clip.frames, 1.0 / clip.fps)),
+        dt=told(np.full(clip.frame_count, 1.0 / clip.fps)),
         platform=jaxik.Transform(told(np.zeros(world.pos.shape)), told(upright)),
     )
 
@@ -60,7 +60,7 @@ def frames_of(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik
 @jax.vmap
 def _into(world: jaxik.Transform, pose_ws: jaxik.LegPose) -> jaxik.LegPose:
     """Legs of each frame in model space."""
-    return pose_ws.moved(world.inverse())
+    return pose_ws.transformed(world.inverse())
 
 
 @jax.jit
@@ -80,7 +80,7 @@ def _velocity(places: np.ndarray, fps: float) -> np.ndarray:
 
 def _stride(clip: Clip) -> tuple[np.ndarray, ...]:
     """A `Stride`: where each foot stood last and will stand next, if it ever stands."""
-    stance, balls = clip.standing(), clip.joints_ws(3)
+    stance, balls = clip.stance_labels(), clip.joints_ws(3)
     known = np.broadcast_to(stance.any(axis=0), stance.shape)
     last_ws, next_ws, share = np.zeros(balls.shape), np.zeros(balls.shape), np.zeros(stance.shape)
     for leg in np.flatnonzero(known[0]):
@@ -90,7 +90,7 @@ def _stride(clip: Clip) -> tuple[np.ndarray, ...]:
     return stance, last_ws, next_ws, share, known
 
 
-def solved_clip(
+def clip_from_result(
     clip: Clip, result: jaxik.Result, *, floor: float = 0.0, up_ws: Direction = UP
 ) -> Clip:
     """The clip as the pipeline left it.
@@ -99,9 +99,9 @@ def solved_clip(
     them; all other joints go with the body.
 
     Args:
-        clip: the input, from which `frames_of` made the frames.
+        clip: the input, from which `frames_from_clip` made the frames.
         result: of all its frames.
-        floor, up_ws: as given to `frames_of`.
+        floor, up_ws: as given to `frames_from_clip`.
     """
     world = clip.world_from_model(floor, up_ws)
     body, solved = _out_of(world, result.body, result.pose)
@@ -115,7 +115,9 @@ def solved_clip(
             joints, (solved.hip, solved.knee, solved.ankle, solved.toe), strict=True
         )
     }
-    positions_ls, rotations_ls = localise(clip.parents, clip.positions_ws, clip.rotations_ws)
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, clip.positions_ws, clip.rotations_ws
+    )
     hanging: set[int] = set(on_leg)
     for joint, parent in enumerate(clip.parents):
         if joint in on_leg:
@@ -139,7 +141,7 @@ def _wxyz(rotation: Rotation) -> np.ndarray:
     return rotation.as_quat(scalar_first=True)
 
 
-def named_joints(clip: Clip) -> dict[str, np.ndarray]:
+def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:
     """World positions, m, as the blocks benchmark's scoring reads them.
 
     `pelvis` is (frames, 3); `hip`, `knee`, `ankle` and `ball` are (frames, legs, 3).
