@@ -1,10 +1,12 @@
-"""Smoothing laws: how far a value moves move_towards its goal in `dt` seconds.
+"""Smoothing laws: how far a value moves towards its goal in `dt` seconds.
 
-A law gives a `share` 0..1 of the gap, and `lerp` goes that share of the way. Gain and half-life
-are the same exponential in two notations and exact at any `dt`; the clamped speed is not, and is
-kept as its engine has it; the critically damped spring is exact and also carries a velocity. A
-weight that moves at one pace (`move_towards`) closes its gap in steps.
+A law gives the `fraction` 0..1 of the gap that it closes, and `lerp` closes it. Gain per tick and
+half-life are two notations of the same exponential, exact at any `dt`. Unreal's clamped speed
+depends on the frame rate and is kept that way. The critically damped spring is exact and also has
+a velocity. A weight that moves at constant speed closes its gap in steps (`move_towards`).
 """
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,19 +14,26 @@ from jaxtyping import Array, Float
 from . import vec
 
 LN2 = 0.6931471805599453
-JUMP_GAP = 1e-4  # m: gaps below it are closed at once by the clamped speed
+JUMP_GAP = 1e-4  # m: the clamped speed closes smaller gaps at once
 
 
-def lerp(value: Array, goal: Array, share: Array) -> Array:
-    """`value` moved by `share` (0..1) of the way to `goal`."""
-    return value + share * (goal - value)
+class Motion(NamedTuple):
+    """A smoothed value and its velocity."""
+
+    value: Float[Array, "*b"]
+    velocity: Float[Array, "*#b"]  # per second
+
+
+def lerp(value: Array, goal: Array, fraction: Array) -> Array:
+    """`value` moved by `fraction` (0..1) of the way to `goal`."""
+    return value + fraction * (goal - value)
 
 
 @vec.remat
 def fraction_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
-    """Share of the gap that a gain per tick of 1/`tick_hz` s closes in `dt` s; gain 1 jumps.
+    """Fraction of the gap closed in `dt` s by a gain per tick of 1/`tick_hz` s.
 
-    `1 - (1 - gain)^(dt tick_hz)`; at gain 1 the slope with respect to the gain is zero.
+    `1 - (1 - gain)^(dt tick_hz)`. A gain of 1 jumps; its gradient is zero there.
     """
     damped = gain < 1
     return jnp.where(damped, -jnp.expm1(dt * tick_hz * jnp.log1p(-jnp.where(damped, gain, 0))), 1.0)
@@ -32,98 +41,95 @@ def fraction_of_gain(gain: Array, dt: Array, tick_hz: Array) -> Array:
 
 @vec.remat
 def fraction_of_half_life(half_life: Array, dt: Array) -> Array:
-    """Share of the gap closed in `dt` s when half of it takes `half_life` s; 0 or less jumps."""
+    """Fraction of the gap closed in `dt` s if half of it takes `half_life` s; 0 or less jumps."""
     damped = half_life > 0
     return jnp.where(damped, -jnp.expm1(-LN2 * dt / jnp.where(damped, half_life, 1.0)), 1.0)
 
 
 def fraction_of_speed(speed: Array, dt: Array, gap: Array) -> Array:
-    """Unreal's interp-to: `clamp(dt speed, 0, 1)`; jumps at speed 0 or less, or a gap under 0.1 mm.
+    """Fraction of the gap closed in `dt` s by Unreal's `FInterpTo`: `clamp(dt speed, 0, 1)`.
 
-    Depends on the frame rate: its half-life is -ln 2 dt / ln(1 - dt speed).
+    Jumps at a speed of 0 or less and over gaps below 0.1 mm. Depends on the frame rate: the
+    half-life is -ln 2 dt / ln(1 - dt speed).
     """
-    share = jnp.clip(dt * speed, 0.0, 1.0)
-    return jnp.where((speed > 0) & (jnp.abs(gap) > JUMP_GAP), share, 1.0)
+    fraction = jnp.clip(dt * speed, 0.0, 1.0)
+    return jnp.where((speed > 0) & (jnp.abs(gap) > JUMP_GAP), fraction, 1.0)
 
 
 def move_towards(value: Array, goal: Array, step: Array) -> Array:
-    """`value` moved move_towards `goal` by `step` (0 or more), or as far as the goal."""
+    """`value` moved towards `goal` by `step` (0 or more), but not past it."""
     gap = goal - value
     return value + jnp.where(gap > step, step, jnp.where(gap < -step, -step, gap))
 
 
 def step_of_time(time: Array, dt: Array) -> Array:
-    """Step in `dt` s of a weight that goes from 0 to 1 in `time` s; all of it at 0 or less."""
-    lasting = time > 0
-    return jnp.where(lasting, dt / jnp.where(lasting, time, 1.0), 1.0)
+    """Step in `dt` s of a weight that goes from 0 to 1 in `time` s; 1 where `time` is 0 or less."""
+    gradual = time > 0
+    return jnp.where(gradual, dt / jnp.where(gradual, time, 1.0), 1.0)
 
 
 def step_of_speed(speed: Array, dt: Array) -> Array:
-    """Step in `dt` s of a weight that moves by `speed` a second; all of it at an endless speed."""
-    endless = jnp.isinf(speed)
-    return jnp.where(endless, 1.0, jnp.where(endless, 0.0, speed) * dt)
+    """Step in `dt` s of a weight that moves by `speed` per second; 1 at an infinite speed."""
+    infinite = jnp.isinf(speed)
+    return jnp.where(infinite, 1.0, jnp.where(infinite, 0.0, speed) * dt)
 
 
-def spring(
-    value: Float[Array, "*b"],
-    velocity: Float[Array, "*b"],
-    goal: Array,
-    half_life: Array,
-    dt: Array,
-) -> tuple[Array, Array]:
-    """Value and velocity after `dt` s of a critically damped spring move_towards a still `goal`.
+def spring(before: Motion, goal: Array, half_life: Array, dt: Array) -> Motion:
+    """Critically damped spring towards a fixed goal, after `dt` s.
 
-    `x'' = -w² (x - goal) - 2 w x'` solved exactly, with `w = 2 ln 2 / half_life`; a half-life of
-    0 or less jumps and stops.
+    `x'' = -w² (x - goal) - 2 w x'` solved exactly, with `w = 2 ln 2 / half_life`. A half-life of
+    0 or less jumps to the goal and stops there.
     """
-    return _sprung(value, velocity, goal, fraction_of_half_life(half_life, dt), dt)
+    return _spring(before, goal, fraction_of_half_life(half_life, dt), dt)
 
 
 @vec.remat
-def follow(
-    value: Array, velocity: Array, goal: Array, share: Array, dt: Array, springy: Array
-) -> tuple[Array, Array]:
-    """Value and velocity after `dt` s on the way to `goal`, by an exponential or a `spring`.
+def follow(before: Motion, goal: Array, fraction: Array, dt: Array, use_spring: Array) -> Motion:
+    """Exponential or, where `use_spring`, spring towards a goal, after `dt` s.
 
-    The exponential closes `share` of the gap and has no velocity; the spring, where `springy`, has
-    the half-life of that exponential. A share of 1 jumps and stops.
+    The exponential closes `fraction` of the gap and has no velocity; the spring has the half-life
+    of that exponential. A fraction of 1 jumps to the goal and stops there.
     """
-    sprung, speed = _sprung(value, velocity, goal, share, dt)
-    eased = lerp(value, goal, share)
-    return jnp.where(springy, sprung, eased), jnp.where(springy, speed, jnp.zeros_like(speed))
+    sprung = _spring(before, goal, fraction, dt)
+    eased = lerp(before.value, goal, fraction)
+    return Motion(
+        jnp.where(use_spring, sprung.value, eased),
+        jnp.where(use_spring, sprung.velocity, jnp.zeros_like(sprung.velocity)),
+    )
 
 
-def _sprung(
-    value: Array, velocity: Array, goal: Array, share: Array, dt: Array
-) -> tuple[Array, Array]:
-    """The spring whose exponential closes `share` of a gap in `dt` s: `w dt = -2 ln(1 - share)`."""
-    damped = share < 1
-    turned = -2.0 * jnp.log1p(-jnp.where(damped, share, 0.0))
-    lasting = dt > 0
-    rate = jnp.where(lasting, turned, 0.0) / jnp.where(lasting, dt, 1.0)
-    gap = value - goal
-    pushed = velocity * dt + turned * gap
-    decay = jnp.exp(-turned)
-    moved = goal + decay * (gap + pushed)
-    speed = decay * (velocity - rate * pushed)
-    return jnp.where(damped, moved, goal), jnp.where(damped, speed, 0.0)
+def _spring(before: Motion, goal: Array, fraction: Array, dt: Array) -> Motion:
+    """The spring whose exponential closes `fraction` of a gap in `dt` s.
+
+    Its phase is `w dt = -2 ln(1 - fraction)`.
+    """
+    damped = fraction < 1
+    phase = -2.0 * jnp.log1p(-jnp.where(damped, fraction, 0.0))
+    advancing = dt > 0
+    rate = jnp.where(advancing, phase, 0.0) / jnp.where(advancing, dt, 1.0)
+    gap = before.value - goal
+    pushed = before.velocity * dt + phase * gap
+    decay = jnp.exp(-phase)
+    value = goal + decay * (gap + pushed)
+    velocity = decay * (before.velocity - rate * pushed)
+    return Motion(jnp.where(damped, value, goal), jnp.where(damped, velocity, 0.0))
 
 
 def half_life_of_gain(gain: Array, tick_hz: Array) -> Array:
-    """Half-life, s, of a gain per tick; 0, with zero slope, for gain 1; infinite for gain 0."""
+    """Half-life, s, of a gain per tick; 0, with zero gradient, at gain 1; infinite at gain 0."""
     damped = gain < 1
-    safe = -LN2 / (tick_hz * jnp.log1p(-jnp.where(damped, gain, 0.5)))
-    return jnp.where(damped, safe, 0.0)
+    half_life = -LN2 / (tick_hz * jnp.log1p(-jnp.where(damped, gain, 0.5)))
+    return jnp.where(damped, half_life, 0.0)
 
 
 def gain_of_half_life(half_life: Array, tick_hz: Array) -> Array:
-    """Gain per tick of 1/`tick_hz` s with this half-life, s; 0 or less gives 1."""
+    """Gain per tick of 1/`tick_hz` s with this half-life, s; 1 where it is 0 or less."""
     return fraction_of_half_life(half_life, 1.0 / tick_hz)
 
 
 def half_life_of_speed(speed: Array, dt: Array) -> Array:
-    """Half-life, s, that Unreal's interp-to has at this frame time; 0 where it jumps."""
-    share = jnp.clip(dt * speed, 0.0, 1.0)
-    damped = (share > 0) & (share < 1)
-    safe = -LN2 * dt / jnp.log1p(-jnp.where(damped, share, 0.5))
-    return jnp.where(damped, safe, 0.0)
+    """Half-life, s, of Unreal's `FInterpTo` at this frame time; 0 where it jumps."""
+    fraction = jnp.clip(dt * speed, 0.0, 1.0)
+    damped = (fraction > 0) & (fraction < 1)
+    half_life = -LN2 * dt / jnp.log1p(-jnp.where(damped, fraction, 0.5))
+    return jnp.where(damped, half_life, 0.0)

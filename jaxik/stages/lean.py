@@ -117,10 +117,14 @@ class SlopeLean(AbstractLean):
         gain = smoothing.lerp(self.gain, self.gain_slide, sliding)
         share = jnp.where(started, smoothing.fraction_of_gain(gain, dt, self.tick_hz), 1.0)
         forward, forward_speed = smoothing.follow(
-            state.forward, state.forward_speed, slope.forward, share, dt, self.spring
+            smoothing.Motion(state.forward, state.forward_speed),
+            slope.forward,
+            share,
+            dt,
+            self.spring,
         )
         side, side_speed = smoothing.follow(
-            state.side, state.side_speed, slope.side, share, dt, self.spring
+            smoothing.Motion(state.side, state.side_speed), slope.side, share, dt, self.spring
         )
 
         lean_forward = forward * smoothing.lerp(self.forward_rate, self.forward_rate_slide, sliding)

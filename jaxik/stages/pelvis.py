@@ -219,7 +219,7 @@ class AbstractFollowingPelvis(AbstractPelvis):
         )
         share = jnp.where(started, share, 1.0)
         height, velocity = smoothing.follow(
-            state.height, state.velocity, goal, share, sensed.dt, self.spring
+            smoothing.Motion(state.height, state.velocity), goal, share, sensed.dt, self.spring
         )
         height = smoothing.lerp(state.height, height, awake)
         after = PelvisState.at(height, goal, sensed.up_ws)

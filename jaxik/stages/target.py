@@ -108,8 +108,7 @@ class SlopeTarget(AbstractTarget):
             smoothing.fraction_of_half_life(self.fall_half_life, dt),
         )
         height, velocity = smoothing.follow(
-            state.height,
-            state.velocity,
+            smoothing.Motion(state.height, state.velocity),
             foothold.height,
             jnp.where(started, share, 1.0),
             dt,
