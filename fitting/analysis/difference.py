@@ -1,48 +1,28 @@
-"""How far a system's motion is from its reference, and how much of the reference's way it goes.
+"""How far a system's motion is from its reference, and how much of the reference it reproduces.
 
-The reference is what another system made of the same animation. What it changed of the animation
-is its own correction; a system that reproduces a share of it leaves the rest.
+The reference is what another system made of the same animation. What that system changed in the
+animation is its correction; what the fitted system does not reproduce of it remains.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 import jaxik
-from fitting.problem.residuals import Scene, legs_ws, pelvis_ws, rotation_between
-from fitting.report.tables import Table, number, share
-from fitting.runtime import program_cache
+from fitting.problem.residuals import rotation_between
+from fitting.problem.scene import Scene, legs_ws, pelvis_ws
 from jaxik.world.skeleton import Transform
 
-STANDING = 0.02  # m/s, speed of a character that stands
-LEAST = 1e-4  # m, rad: a correction below it (rms) is none, and has no share
-FAITHFUL = 0.95  # share of a correction from which on nothing is said of what is missing
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What is compared, in words and in the unit that is shown."""
-
-    words: str
-    unit: str
-    factor: float  # from m or rad
-
-
-KINDS = {
-    "ankle": Kind("ankles", "mm", 1000.0),
-    "knee": Kind("knees", "mm", 1000.0),
-    "pelvis": Kind("pelvis", "mm", 1000.0),
-    "foot": Kind("orientation of the feet", "°", 180.0 / np.pi),
-    "body": Kind("orientation of the pelvis", "°", 180.0 / np.pi),
-}
+STANDING_SPEED = 0.02  # m/s; a slower character stands
+NEGLIGIBLE = 1e-4  # m or rad, rms; a smaller correction counts as none
+QUANTITIES = ("ankle", "knee", "pelvis", "foot", "body")  # positions, then orientations
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Of one clip; a column a leg, or one of the body."""
+    """Differences in one clip, by quantity; a column for each leg, or one for the body."""
 
     legs: tuple[str, ...]
     time: Float[np.ndarray, " frames"]  # s
@@ -51,35 +31,52 @@ class Difference:
     remaining: Mapping[str, Float[np.ndarray, "frames columns"]]  # reference - system, m or rad
 
 
-def measure(ik: jaxik.FootIK, scene: Scene) -> Difference:
-    """How far this system is from the scene's reference in each frame, and how far it had to go."""
-    result = program_cache.run(ik, scene.rig, scene.terrain, scene.frames)
+@dataclass(frozen=True)
+class Remainder:
+    """What remains of the correction of one quantity, m or rad."""
+
+    correction: float  # rms
+    rms: float
+    p95: float  # 95th percentile
+    max: float
+
+    @property
+    def reproduced(self) -> float | None:
+        """1 - rms / correction: 1 for the same motion, 0 for one no better than the animation.
+
+        None where the reference corrects nothing.
+        """
+        return 1.0 - self.rms / self.correction if self.correction > NEGLIGIBLE else None
+
+
+def measure(scene: Scene, result: jaxik.Result) -> Difference:
+    """How far a system's result is from the scene's reference in each frame."""
     present = np.asarray(scene.rig.present)
     dt = np.asarray(scene.frames.dt)
     return Difference(
         legs=tuple(n for n, here in zip(scene.rig.names, present, strict=True) if here),
         time=np.cumsum(dt) - dt[0],
-        standing=np.asarray(scene.frames.speed) <= STANDING,
-        correction=correction_of(scene),
-        remaining=_apart(scene, pelvis_ws(scene, result), legs_ws(scene, result)),
+        standing=np.asarray(scene.frames.speed) <= STANDING_SPEED,
+        correction=correction(scene),
+        remaining=_distances(scene, pelvis_ws(scene, result), legs_ws(scene, result)),
     )
 
 
-def correction_of(scene: Scene) -> dict[str, np.ndarray]:
-    """How far the scene's reference is from its animation, by kind, m or rad."""
+def correction(scene: Scene) -> dict[str, Float[np.ndarray, "frames columns"]]:
+    """How far the scene's reference is from its animation, by quantity, m or rad."""
     world = scene.frames.world_from_model
-    animated = scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
-    return _apart(scene, world @ scene.pelvis, animated)
+    legs = scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
+    return _distances(scene, world @ scene.pelvis, legs)
 
 
-def _apart(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str, np.ndarray]:
+def _distances(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str, np.ndarray]:
     """Distances of a motion from the scene's reference, m or rad."""
     reference, present = scene.reference, np.asarray(scene.rig.present)
 
-    def length(apart: Any) -> np.ndarray:
-        return np.linalg.norm(np.asarray(apart), axis=-1)
+    def length(vectors: Array) -> np.ndarray:
+        return np.linalg.norm(np.asarray(vectors), axis=-1)
 
-    def angle(a: Any, b: Any) -> np.ndarray:
+    def angle(a: Array, b: Array) -> np.ndarray:
         return 2.0 * np.arcsin(np.minimum(0.5 * length(rotation_between(a, b)), 1.0))
 
     return {
@@ -91,86 +88,37 @@ def _apart(scene: Scene, pelvis: Transform, legs: jaxik.LegPose) -> dict[str, np
     }
 
 
-def numbers(clips: Sequence[Difference]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Figures of each kind over all frames of all clips, and apart where both occur, over those in
-    which the character stands and in which it moves.
+def summarise(clips: Sequence[Difference]) -> dict[str, dict[str, Remainder]]:
+    """What remains of each quantity, by phase: "all frames" of all clips.
 
-    `correction` (rms), `rms`, `p95` and `max` of what remains in the kind's unit, and `reproduced`,
-    1 - rms / correction: 1 is the same motion, 0 no better than the animation; None where the
-    reference corrects nothing.
+    Where the character stands in some frames and moves in others, these are also the phases
+    "standing" and "moving".
     """
-    found = {"all frames": _numbers(clips, [np.ones_like(one.standing) for one in clips])}
-    standing = [one.standing for one in clips]
-    if any(one.any() for one in standing) and not all(one.all() for one in standing):
-        found["standing"] = _numbers(clips, standing)
-        found["moving"] = _numbers(clips, [~one for one in standing])
-    return found
+    phases = {"all frames": _remainders(clips, [np.ones_like(clip.standing) for clip in clips])}
+    standing = [clip.standing for clip in clips]
+    if any(frames.any() for frames in standing) and not all(frames.all() for frames in standing):
+        phases["standing"] = _remainders(clips, standing)
+        phases["moving"] = _remainders(clips, [~frames for frames in standing])
+    return phases
 
 
-def _numbers(clips: Sequence[Difference], chosen: Sequence[np.ndarray]) -> dict[str, Any]:
-    found = {}
-    for name, kind in KINDS.items():
-        pairs = list(zip(clips, chosen, strict=True))
-        correction = np.concatenate([one.correction[name][some].ravel() for one, some in pairs])
-        remaining = np.concatenate([one.remaining[name][some].ravel() for one, some in pairs])
-        had, left = (float(np.sqrt(np.mean(one**2))) for one in (correction, remaining))
-        found[name] = {
-            "correction": kind.factor * had,
-            "rms": kind.factor * left,
-            "p95": kind.factor * float(np.percentile(remaining, 95)),
-            "max": kind.factor * float(remaining.max()),
-            "reproduced": 1.0 - left / had if had > LEAST else None,
-        }
-    return found
+def _remainders(
+    clips: Sequence[Difference], chosen: Sequence[Bool[np.ndarray, " frames"]]
+) -> dict[str, Remainder]:
+    """What remains of each quantity over the chosen frames of each clip."""
 
+    def over_clips(series: Sequence[np.ndarray]) -> np.ndarray:
+        pairs = zip(series, chosen, strict=True)
+        return np.concatenate([values[frames].ravel() for values, frames in pairs])
 
-def table(phase: Mapping[str, Mapping[str, Any]], source: str) -> Table:
-    """One of the tables of `numbers`."""
-    rows = [["", f"correction by {source}, rms", "remaining, rms", "95 %", "max", "reproduced"]]
-    for name, row in phase.items():
-        kind, reproduced = KINDS[name], row["reproduced"]
-        shown = [f"{row[key]:.2f} {kind.unit}" for key in ("correction", "rms", "p95", "max")]
-        rows.append([kind.words, *shown, "–" if reproduced is None else share(reproduced)])
-    return rows
-
-
-def headline(phase: Mapping[str, Mapping[str, Any]], source: str, target: str) -> str:
-    """How much of the source's correction the target reproduces, in a sentence."""
-    parts = [
-        f"{share(row['reproduced'])} of that of the {KINDS[name].words}"
-        for name, row in phase.items()
-        if row["reproduced"] is not None
-    ]
-    return f"Of the correction that {source} makes, {target} reproduces {', '.join(parts)}."
-
-
-def shortcomings(clips: Sequence[Difference], source: str, target: str) -> list[str]:
-    """What the target does not do as the source does, a sentence each, with where it is worst."""
-    said = []
-    for name, row in numbers(clips)["all frames"].items():
-        kind, reproduced = KINDS[name], row["reproduced"]
-        left = f"{number(row['rms'])} {kind.unit}"
-        if reproduced is None:
-            if row["rms"] > kind.factor * LEAST:
-                said.append(
-                    f"{source} leaves the {kind.words} as animated; {target} is {left} (rms) off, "
-                    f"{_worst(clips, name)}."
-                )
-        elif reproduced < FAITHFUL:
-            had = f"{number(row['correction'])} {kind.unit}"
-            said.append(
-                f"{kind.words.capitalize()}: {left} (rms) remain of {had}, {_worst(clips, name)}."
-            )
-    return said
-
-
-def _worst(clips: Sequence[Difference], name: str) -> str:
-    """Where what remains of a kind is largest."""
-    kind = KINDS[name]
-    i = int(np.argmax([one.remaining[name].max() for one in clips]))
-    clip = clips[i]
-    frame, column = np.unravel_index(np.argmax(clip.remaining[name]), clip.remaining[name].shape)
-    side = f" ({clip.legs[column]})" if clip.remaining[name].shape[1] > 1 else ""
-    where = f" of clip {i + 1}" if len(clips) > 1 else ""
-    largest = number(kind.factor * float(clip.remaining[name][frame, column]))
-    return f"at most {largest} {kind.unit} at {clip.time[frame]:.2f} s{where}{side}"
+    remainders = {}
+    for quantity in QUANTITIES:
+        before = over_clips([clip.correction[quantity] for clip in clips])
+        after = over_clips([clip.remaining[quantity] for clip in clips])
+        remainders[quantity] = Remainder(
+            correction=float(np.sqrt(np.mean(before**2))),
+            rms=float(np.sqrt(np.mean(after**2))),
+            p95=float(np.percentile(after, 95)),
+            max=float(after.max()),
+        )
+    return remainders

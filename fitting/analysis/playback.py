@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxik
-from fitting.problem.residuals import Scene, errors_by_kind, legs_ws, pelvis_ws, residuals_by_kind
+from fitting.problem.residuals import errors_by_kind, residuals_by_kind
+from fitting.problem.scene import Scene, legs_ws, pelvis_ws
 from fitting.runtime.program_cache import cached
 from jaxik.maths import vec
 from jaxik.world import frame
@@ -134,7 +135,7 @@ def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
         reached=result.reached,
         stance=reference.contact,
         slide=scene.frames.slide,
-        seen=reference.seen,
+        seen=reference.observed,
         errors=errors,
         rows=residuals_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},

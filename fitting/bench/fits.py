@@ -38,7 +38,7 @@ CLIPS, GROUND = ("reference.npz", "base.npz"), "ground.ply"  # of a cold fit
 
 
 def _rows(problem: Problem, u: jax.Array) -> jax.Array:
-    return problem.rows(u)
+    return problem.residuals(u)
 
 
 def slopes_of(problem: Problem, u: jax.Array) -> tuple[jax.Array, jax.Array]:

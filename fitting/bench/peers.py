@@ -119,7 +119,7 @@ def with_scipy(problem: Problem, *, our_slopes: bool) -> Callable[[], Descent]:
     The rows are ours and compiled in both cases; it stops at the solver's own tolerance.
     """
     start = np.asarray(problem.space.u0, float)
-    rows = jax.jit(lambda problem, u: problem.rows(u))
+    rows = jax.jit(lambda problem, u: problem.residuals(u))
     slopes = jax.jit(lambda problem, u: problem.jacobian(u))
 
     def fun(u: np.ndarray) -> np.ndarray:

@@ -15,9 +15,10 @@ from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip
 from fitting.experiments.experiment import make_scene
+from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
-from fitting.problem.space import free_parameter, make_space
+from fitting.problem.space import make_space
 from jaxik.maths import parameter_tree, quat
 from jaxik.world import terrain
 from jaxik.world.frame import Sensed

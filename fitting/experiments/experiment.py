@@ -32,10 +32,12 @@ from fitting.datasets.clips import edit
 from fitting.datasets.flat_animation import flatten_clip, load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.inference.sampling import posterior
+from fitting.problem.free_parameters import FreeParameter, free_parameter
 from fitting.problem.loss import Loss
 from fitting.problem.problem import Problem
-from fitting.problem.residuals import Reference, Scene, Sigmas, residuals_of_scenes
-from fitting.problem.space import FreeParameter, free_parameter, make_space
+from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.scene import Reference, Scene, Sigmas
+from fitting.problem.space import make_space
 from fitting.runtime import validation
 from fitting.runtime.validation import check_table, flat
 from jaxik.world.skeleton import Transform
@@ -248,7 +250,7 @@ def make_scene(
             knee_ws=legs.knee.pos,
             ankle=legs.ankle,
             contact=jax.device_put(labels),
-            seen=jax.device_put(seen),
+            observed=jax.device_put(seen),
             label=label,
         ),
         sigmas=Sigmas(**{name: jax.device_put(np.float64(value)) for name, value in given.items()}),

@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxik
-from fitting.problem.residuals import Scene, residuals_of_scenes
-from fitting.problem.space import PRIOR_SD, Space, free_parameter, make_space
+from fitting.problem.free_parameters import PRIOR_SD, free_parameter
+from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.scene import Scene
+from fitting.problem.space import Space, make_space
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 

@@ -1,1 +1,9 @@
-"""What a fit minimises: free parameters, residuals, loss."""
+"""What a fit minimises and a sampler draws from.
+
+A `Problem` joins three things: the `Space` of free parameters, the data, and the function that
+gives residuals in standard deviations. It knows nothing of how the minimum is found or the
+posterior is sampled (`fitting.inference`), nor of files (`fitting.experiments`).
+
+Start with `problem.py`. `free_parameters.py` and `space.py` describe the parameters, `scene.py` and
+`residuals.py` the data of foot IK, `loss.py` the robust losses.
+"""

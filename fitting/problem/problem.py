@@ -1,7 +1,7 @@
-"""What a fit minimises and a sampler draws from: a space of systems, held against data."""
+"""A space of systems together with the data they are fitted to."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Generic
 
 import equinox as eqx
 import jax
@@ -11,57 +11,62 @@ from jaxtyping import Array, Float, PyTree
 from jaxik import lanes
 
 from .loss import Loss, apply_loss
-from .space import Space
+from .space import Space, System
 
 
-class Problem(eqx.Module):
-    """A space and what its systems are held against.
+class Problem(eqx.Module, Generic[System]):
+    """The free parameters of a system, the data, and how far one is from the other.
 
-    `residuals(ik, data)` gives the residuals in sigmas, a masked row being 0. It is static, so it
-    must be a function of a module: a new lambda per call would compile anew.
+    `residual_function(system, data)` returns residuals in standard deviations, 0 where a value is
+    masked. It is static, so it must be a function of a module: a new lambda per call would compile
+    anew.
 
-    Residuals of frames near in time repeat one another. `independent` takes that much of their
-    log-likelihood, so that intervals are as wide as what is told anew (the magnitude adjustment of
-    composite likelihoods; Pauli, Racugno and Ventura 2011).
+    Residuals of neighbouring frames are correlated. `independent_fraction` scales their
+    log-likelihood by the fraction of them that carries new information, so that intervals get their
+    nominal coverage (the magnitude adjustment of composite likelihoods; Pauli, Racugno and Ventura
+    2011).
     """
 
-    space: Space
+    space: Space[System]
     data: PyTree
-    residuals: Callable[[Any, Any], Array] = eqx.field(static=True)
+    residual_function: Callable[[System, PyTree], Array] = eqx.field(static=True)
     loss: Loss = eqx.field(static=True, default="squares")
-    independent: Float[Array, ""] = eqx.field(  # share of the residuals that tell something new
-        converter=jnp.asarray, default=1.0
-    )
+    independent_fraction: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
 
     @eqx.filter_jit  # traced once for all programs around it
-    def rows(self, u: Float[Array, " free"]) -> Float[Array, " rows"]:
-        """Robust residuals and prior rows; half their sum of squares is the cost."""
-        residuals = apply_loss(self.residuals(self.space.unpack(u), self.data), self.loss)
-        residuals *= jnp.sqrt(self.independent.astype(residuals.dtype))
+    def residuals(self, u: Float[Array, " free"]) -> Float[Array, " residuals"]:
+        """Residuals after the loss, then those of the prior; half their squares' sum is the cost.
+
+        The last `space.size` of them belong to the prior.
+        """
+        residuals = apply_loss(self.residual_function(self.space.unpack(u), self.data), self.loss)
+        residuals *= jnp.sqrt(self.independent_fraction.astype(residuals.dtype))
         return jnp.concatenate([residuals, self.space.prior_residuals(u)])
 
     def cost(self, u: Float[Array, " free"]) -> Float[Array, ""]:
-        """Minus the log-probability where that is finite, NaN or infinite where residuals are."""
-        return 0.5 * jnp.sum(self.rows(u) ** 2)
+        """Minus the log-probability, up to a constant; not finite where a residual is not."""
+        return 0.5 * jnp.sum(self.residuals(u) ** 2)
 
-    def jacobian(self, u: Float[Array, " free"]) -> Float[Array, "rows free"]:
-        """Slopes of the rows, by forward mode; zero where a threshold moves hard decisions only.
+    def jacobian(self, u: Float[Array, " free"]) -> Float[Array, "residuals free"]:
+        """Derivatives of the residuals, by forward mode.
 
-        Not `jax.jacfwd`, which took the wrong branch of a minimum in a pipeline-sized program.
+        The column of a threshold holds only its prior: the residuals jump with it, and between two
+        jumps they do not change. Not `jax.jacfwd`, which took the wrong branch of a minimum in a
+        program of the pipeline's size.
         """
         return self.residuals_and_jacobian(u)[1]
 
     def residuals_and_jacobian(
-        self, u: Float[Array, " free"], below: Float[Array, ""] | float = jnp.inf
-    ) -> tuple[Array, Array]:
-        """Both from one linearisation; the slopes are 0 where the cost is not at most `below`."""
-        rows, slope = jax.linearize(lambda u: self.rows(u), u)
+        self, u: Float[Array, " free"], max_cost: Float[Array, ""] | float = jnp.inf
+    ) -> tuple[Float[Array, " residuals"], Float[Array, "residuals free"]]:
+        """Both from one linearisation; the Jacobian is all 0 where the cost exceeds `max_cost`."""
+        residuals, tangent = jax.linearize(lambda u: self.residuals(u), u)
         basis = jnp.eye(u.size, dtype=u.dtype)
-        rounding = 1.0 + 64 * jnp.finfo(rows.dtype).eps
-        return rows, jax.lax.cond(
-            0.5 * jnp.sum(rows**2) <= below * rounding,
-            lambda: lanes(slope, out_axes=-1)(basis),
-            lambda: jnp.zeros((rows.size, u.size), rows.dtype),
+        rounding = 1.0 + 64 * jnp.finfo(residuals.dtype).eps
+        return residuals, jax.lax.cond(
+            0.5 * jnp.sum(residuals**2) <= max_cost * rounding,
+            lambda: lanes(tangent, out_axes=-1)(basis),
+            lambda: jnp.zeros((residuals.size, u.size), residuals.dtype),
         )
 
     def log_probability(self, u: Float[Array, " free"]) -> Float[Array, ""]:

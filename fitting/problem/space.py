@@ -1,144 +1,150 @@
-"""What a fit may change, as one unbounded vector.
+"""The free parameters of a system as one unbounded vector `u`, for solvers and samplers.
 
-`u` is the vector of the free parameters in coordinates without bounds. Per parameter
+Per parameter
 
     value = g⁻¹( g(floor) + (g(high) - g(floor)) sigmoid(u) )
 
 with `g` the identity, the logarithm, or for a gain `log(-log(1 - gain))`, which is minus the
-logarithm of its half-life but for a constant, so that the tick rate cancels. `floor` is the lower
+logarithm of its half-life up to a constant, so that the tick rate cancels. `floor` is the lower
 bound, or, for a parameter declared above another one, the larger of that bound and the other one's
 value: the order holds for every `u`.
 
-The prior is a normal in `u`, not in the value: the solver's prior rows and the sampler's
-log-probability are then the same function and no Jacobian of the transform enters. With its default
-width and centre it is nearly flat over the range (within a factor of two between 7 % and 93 %).
+The prior is a normal in `u`, not in the value: the solver's prior residuals and the sampler's
+log-probability are then the same function, and no Jacobian of the transform enters. With its
+default width and centre it is nearly flat over the range (within a factor of two between 7 % and
+93 % of it).
 """
 
-import dataclasses
-import difflib
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
-PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
+from .free_parameters import FreeParameter
+
 CENTRE_LIMIT = 3.0  # of u: a prior centred at a bound would hide the rest of the range
-EDGE = 1e-6  # share of the range that `pack` keeps from a bound, where u is infinite
+EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
+
+System = TypeVar("System", bound=eqx.Module)
 
 
-@dataclasses.dataclass(frozen=True)
-class FreeParameter:
-    """One free parameter: a leaf of the system, or one leg's element of it."""
+class Space(eqx.Module, Generic[System]):
+    """The free parameters of a system as one unbounded vector `u`; `make_space` builds it."""
 
-    name: str  # dotted, with [leg] for one element
-    low: float
-    high: float
-    prior_mean: float  # value
-    prior_sd: float  # in u
-    kind: parameter_tree.Kind
-    scale: parameter_tree.Scale
-    above: str | None  # dotted name of the leaf that the value stays above
-
-    @property
-    def leaf(self) -> str:
-        """Dotted name without the leg."""
-        return self.name.partition("[")[0]
+    system: System  # what is not free keeps the values it has here
+    u0: Float[Array, " free"]  # centre of the prior, and where a fit starts
+    prior_sd: Float[Array, " free"]  # in u
+    low: Float[Array, " free"]  # in the parameters' units, like high
+    high: Float[Array, " free"]
+    parameters: tuple[FreeParameter, ...] = eqx.field(static=True)
+    order: tuple[int, ...] = eqx.field(static=True)  # a parameter comes after the one it is above
 
     @property
-    def leg(self) -> int | None:
-        """Which leg's element, or None for the whole leaf."""
-        index = self.name.partition("[")[2]
-        return int(index[:-1]) if index else None
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the order of `u`."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters."""
+        return len(self.parameters)
+
+    @property
+    def smooth(self) -> tuple[bool, ...]:
+        """Which parameters have a derivative."""
+        return tuple(parameter.kind == "smooth" for parameter in self.parameters)
+
+    @property
+    def thresholds(self) -> tuple[bool, ...]:
+        """Which parameters only move hard decisions, so that their derivative is zero."""
+        return tuple(parameter.kind == "threshold" for parameter in self.parameters)
+
+    def unpack(self, u: Float[Array, " free"]) -> System:
+        """The system with the parameters that `u` stands for."""
+        return parameter_tree.replace(self.system, self._leaves_and_values(u)[0])
+
+    @eqx.filter_jit
+    def values(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
+        """The free parameters in their own units."""
+        return self._leaves_and_values(u)[1]
+
+    def pack(self, source: System | Mapping[str, ArrayLike]) -> Float[Array, " free"]:
+        """`u` of a system, or of values by name; names left out keep this system's values.
+
+        Values outside their bounds are clipped. Where the legs of a leaf differ but share one free
+        parameter, it takes their mean.
+
+        Raises:
+            ValueError: for a name that is not free.
+        """
+        if not isinstance(source, Mapping):
+            return self._pack(source, {})
+        if unknown := sorted(set(source) - set(self.names)):
+            raise ValueError(f"not free: {unknown}; free are {list(self.names)}")
+        return self._pack(self.system, {k: jnp.asarray(value) for k, value in source.items()})
+
+    @cached  # one program; otherwise every operation would be one
+    def _pack(self, system: eqx.Module, values: Mapping[str, Array]) -> Array:
+        leaves = self._leaves(system)
+        u = [jnp.zeros(())] * self.size
+        for i in self.order:
+            parameter = self.parameters[i]
+            leaf = leaves[parameter.leaf]
+            present = jnp.mean(leaf if parameter.leg is None else leaf[parameter.leg])
+            value = jnp.asarray(values.get(parameter.name, present), leaf.dtype)
+            bounds = jnp.stack([self._floor(i, leaves), self.high[i]])
+            start, end = _to_scale(bounds, parameter.scale)
+            coordinate = _to_scale(jnp.clip(value, *bounds), parameter.scale)
+            fraction = jnp.clip((coordinate - start) / (end - start), EDGE, 1 - EDGE)
+            u[i] = jnp.log(fraction) - jnp.log1p(-fraction)
+            leaves[parameter.leaf] = _with_value(leaf, parameter.leg, value)
+        return jnp.stack(u)
+
+    def prior_residuals(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
+        """Distance from the prior's centre in prior standard deviations."""
+        return (u - self.u0) / self.prior_sd
+
+    def _leaves(self, system: eqx.Module) -> dict[str, Array]:
+        """The leaves that are free, and those that a free one stays above."""
+        names = [parameter.leaf for parameter in self.parameters]
+        names += [parameter.above for parameter in self.parameters if parameter.above]
+        return {name: parameter_tree.get(system, name) for name in names}
+
+    def _floor(self, i: int, leaves: dict[str, Array]) -> Array:
+        """Minimum of the i-th parameter, which depends on the leaf that it stays above."""
+        parameter = self.parameters[i]
+        if parameter.above is None:
+            return self.low[i]
+        below = leaves[parameter.above]
+        if below.ndim and parameter.leg is not None:
+            below = below[parameter.leg]
+        elif below.ndim:
+            below = below[jnp.argmax(below)]
+        return jnp.where(below > self.low[i], below, self.low[i])
+
+    def _leaves_and_values(self, u: Array) -> tuple[dict[str, Array], Array]:
+        """The system's leaves with the free values in them, and those values."""
+        leaves = self._leaves(self.system)
+        values = [u[0]] * self.size
+        for i in self.order:
+            parameter = self.parameters[i]
+            start = _to_scale(self._floor(i, leaves), parameter.scale)
+            end = _to_scale(self.high[i], parameter.scale)
+            coordinate = start + (end - start) * jax.nn.sigmoid(u[i])
+            values[i] = _from_scale(coordinate, parameter.scale)
+            leaves[parameter.leaf] = _with_value(leaves[parameter.leaf], parameter.leg, values[i])
+        return leaves, jnp.stack(values)
 
 
-def free_parameter(ik: eqx.Module, name: str, **overrides: Any) -> FreeParameter:
-    """The parameter of this name, made free as its rule declares it.
-
-    A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
-    per leg frees one value that all legs share. The prior is centred at the present value, taken
-    into the bounds.
-
-    Args:
-        ik: tree of rules.
-        name: dotted name.
-        overrides: any of `low`, `high`, `prior_mean`, `prior_sd`, `kind`, `scale`.
-
-    Raises:
-        ValueError: for an unknown name or override, a leg that is not there, or impossible bounds.
-    """
-    leaf, bracket, rest = name.partition("[")
-    declared = parameter_tree.declarations(ik)
-    if leaf not in declared:
-        nearest = difflib.get_close_matches(leaf, declared, n=1, cutoff=0.0)
-        hint = f"; nearest is {nearest[0]!r}" if nearest else ""
-        raise ValueError(f"no parameter named {leaf!r}{hint}; there are {sorted(declared)}")
-    known = {"low", "high", "prior_mean", "prior_sd", "kind", "scale"}
-    if unknown := sorted(set(overrides) - known):
-        raise ValueError(f"{name}: unknown {unknown}; a free parameter takes {sorted(known)}")
-    value = parameter_tree.get(ik, leaf)
-    if bracket:
-        legs = [f"{leaf}[{i}]" for i in range(value.shape[0])] if value.ndim else []
-        if name not in legs:
-            there = f"there are {legs}" if legs else "it is shared by the legs"
-            raise ValueError(f"no element {name!r}: {there}")
-        value = value[int(rest[:-1])]
-    declaration = declared[leaf]
-    above = declaration.above
-    if above is not None and "." in leaf:
-        above = f"{leaf.rpartition('.')[0]}.{above}"
-    low = float(overrides.get("low", declaration.low))
-    high = float(overrides.get("high", declaration.high))
-    made = FreeParameter(
-        name=name,
-        low=low,
-        high=high,
-        prior_mean=float(
-            overrides.get("prior_mean", min(max(float(np.asarray(value).mean()), low), high))
-        ),
-        prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
-        kind=_one_of(name, "kind", overrides.get("kind", declaration.kind), parameter_tree.Kind),
-        scale=_one_of(
-            name, "scale", overrides.get("scale", declaration.scale), parameter_tree.Scale
-        ),
-        above=above,
-    )
-    _check(made)
-    return made
-
-
-def _one_of(name: str, what: str, given: Any, words: Any) -> Any:
-    if given not in get_args(words):
-        raise ValueError(f"{name}: {what} is {given!r}, wanted one of {get_args(words)}")
-    return given
-
-
-def _check(one: FreeParameter) -> None:
-    """Raises ValueError where bounds or prior make no sense."""
-    allowed = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (0.0, 1.0)}
-    least, most = allowed[one.scale]
-    if not least < one.low < one.high < most:
-        raise ValueError(
-            f"{one.name}: bounds are {one.low} to {one.high}, wanted low < high"
-            f" strictly between {least} and {most} for the scale {one.scale!r}"
-        )
-    if not one.low <= one.prior_mean <= one.high:
-        raise ValueError(
-            f"{one.name}: prior_mean is {one.prior_mean}, wanted from {one.low} to {one.high}"
-        )
-    if not 0 < one.prior_sd < math.inf:
-        raise ValueError(f"{one.name}: prior_sd is {one.prior_sd}, wanted more than 0")
-
-
-def _straighten(value: Array, scale: parameter_tree.Scale) -> Array:
-    """The coordinate in which a range is divided evenly."""
+def _to_scale(value: Array, scale: parameter_tree.Scale) -> Array:
+    """The coordinate in which a range is divided evenly: `g` of the module's docstring."""
     match scale:
         case "log":
             return jnp.log(value)
@@ -148,180 +154,83 @@ def _straighten(value: Array, scale: parameter_tree.Scale) -> Array:
             return value
 
 
-def _bend(straight: Array, scale: parameter_tree.Scale) -> Array:
-    """Inverse of `_straighten`."""
+def _from_scale(coordinate: Array, scale: parameter_tree.Scale) -> Array:
+    """Inverse of `_to_scale`."""
     match scale:
         case "log":
-            return jnp.exp(straight)
+            return jnp.exp(coordinate)
         case "gain":
-            return -jnp.expm1(-jnp.exp(straight))
+            return -jnp.expm1(-jnp.exp(coordinate))
         case _:
-            return straight
+            return coordinate
 
 
-class Space(eqx.Module):
-    """The free parameters of a system as one unbounded vector `u`."""
-
-    base: eqx.Module  # the system; what is not free keeps its values
-    u0: Float[Array, " free"]  # centre of the prior, and where a fit starts
-    prior_sd: Float[Array, " free"]  # in u
-    low: Float[Array, " free"]
-    high: Float[Array, " free"]
-    frees: tuple[FreeParameter, ...] = eqx.field(static=True)
-    order: tuple[int, ...] = eqx.field(static=True)  # what is above another comes after it
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the free parameters, in the order of `u`."""
-        return tuple(one.name for one in self.parameters)
-
-    @property
-    def size(self) -> int:
-        """How many are free."""
-        return len(self.parameters)
-
-    @property
-    def smooth(self) -> tuple[bool, ...]:
-        """Which parameters have a slope."""
-        return tuple(one.kind == "smooth" for one in self.parameters)
-
-    @property
-    def thresholds(self) -> tuple[bool, ...]:
-        """Which parameters only move hard decisions."""
-        return tuple(one.kind == "threshold" for one in self.parameters)
-
-    def unpack(self, u: Float[Array, " free"]) -> Any:
-        """The system with these free parameters."""
-        return parameter_tree.replace(self.base, self._write(u)[0])  # type: ignore[type-var]
-
-    @eqx.filter_jit
-    def values(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
-        """The free parameters in their own units."""
-        return self._write(u)[1]
-
-    def pack(self, given: Any) -> Float[Array, " free"]:
-        """`u` of a system, or of values by name; names left out keep the base's values.
-
-        A value outside its bounds is taken to the nearest one. Of a leaf that holds one value per
-        leg but is freed as one, the legs' mean counts.
-
-        Raises:
-            ValueError: for a name that is not free.
-        """
-        named = dict(given) if isinstance(given, Mapping) else {}
-        if unknown := sorted(set(named) - set(self.names)):
-            raise ValueError(f"not free: {unknown}; free are {list(self.names)}")
-        tree = self.base if isinstance(given, Mapping) else given
-        return self._pack(tree, {name: jnp.asarray(value) for name, value in named.items()})
-
-    @cached  # apart, every line would be a program
-    def _pack(self, tree: Any, named: dict[str, Array]) -> Array:
-        leaves = self._leaves(tree)
-        u = [jnp.zeros(())] * self.size
-        for i in self.order:
-            one = self.parameters[i]
-            leaf = leaves[one.leaf]
-            present = jnp.mean(leaf if one.leg is None else leaf[one.leg])
-            value = jnp.asarray(named.get(one.name, present), leaf.dtype)
-            ends = jnp.stack([self._floor(i, leaves), self.high[i]])
-            start, end = _straighten(ends, one.scale)
-            share = (_straighten(jnp.clip(value, *ends), one.scale) - start) / (end - start)
-            share = jnp.clip(share, EDGE, 1 - EDGE)
-            u[i] = jnp.log(share) - jnp.log1p(-share)
-            leaves[one.leaf] = _put(leaf, one.leg, value)
-        return jnp.stack(u)
-
-    def prior_residuals(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
-        """Distance from the prior's centre in prior standard deviations."""
-        return (u - self.u0) / self.prior_sd
-
-    def _leaves(self, tree: eqx.Module) -> dict[str, Array]:
-        """The leaves that are free or that a free one stays above."""
-        wanted = [one.leaf for one in self.parameters] + [
-            one.above for one in self.parameters if one.above
-        ]
-        return {name: parameter_tree.get(tree, name) for name in wanted}
-
-    def _floor(self, i: int, leaves: dict[str, Array]) -> Array:
-        """Least value of the i-th parameter, given the leaf that it stays above."""
-        one = self.parameters[i]
-        if one.above is None:
-            return self.low[i]
-        partner = leaves[one.above]
-        if partner.ndim and one.leg is not None:
-            partner = partner[one.leg]
-        elif partner.ndim:
-            partner = partner[jnp.argmax(partner)]
-        return jnp.where(partner > self.low[i], partner, self.low[i])
-
-    def _write(self, u: Array) -> tuple[dict[str, Array], Array]:
-        """The leaves with the free values in them, and those values."""
-        leaves = self._leaves(self.base)
-        values = [u[0]] * self.size
-        for i in self.order:
-            one = self.parameters[i]
-            start = _straighten(self._floor(i, leaves), one.scale)
-            end = _straighten(self.high[i], one.scale)
-            values[i] = _bend(start + (end - start) * jax.nn.sigmoid(u[i]), one.scale)
-            leaves[one.leaf] = _put(leaves[one.leaf], one.leg, values[i])
-        return leaves, jnp.stack(values)
-
-
-def _put(leaf: Array, leg: int | None, value: Array) -> Array:
-    """The leaf with this value at one leg or at all."""
+def _with_value(leaf: Array, leg: int | None, value: Array) -> Array:
+    """The leaf with this value for one leg, or for all."""
     value = value.astype(leaf.dtype)
     return jnp.broadcast_to(value, leaf.shape) if leg is None else leaf.at[leg].set(value)
 
 
-def make_space(ik: eqx.Module, frees: Sequence[FreeParameter]) -> Space:
-    """The space of these free parameters around a system.
+def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]:
+    """The space of these free parameters of a system.
 
     Raises:
-        ValueError: for none, one named twice, or one whose partner leaves it no room.
+        ValueError: for no parameter, one named twice, or one that has no room left above another.
     """
-    if not frees:
+    if not parameters:
         raise ValueError("nothing is free; name at least one parameter")
-    for one in frees:
-        same = [other for other in frees if other.leaf == one.leaf and other is not one]
-        if any(other.leg is None or one.leg is None or other.leg == one.leg for other in same):
-            raise ValueError(f"{one.name!r} is free twice: {[o.name for o in [one, *same]]}")
-        if one.above is None:
-            continue
-        partners = [other for other in frees if other.leaf == one.above]
-        fixed = (
-            []
-            if any(other.leg is None for other in partners)
-            else [parameter_tree.get(ik, one.above)]
-        )
-        most = max([other.high for other in partners] + [float(leaf.max()) for leaf in fixed])
-        if not most < one.high:
-            raise ValueError(
-                f"{one.name} stays above {one.above}, which reaches {most},"
-                f" but its own upper bound is {one.high}"
-            )
-    dtype = parameter_tree.get(ik, frees[0].leaf).dtype
+    for parameter in parameters:
+        _check_free_once(parameter, parameters)
+        _check_room(ik, parameter, parameters)
+    dtype = parameter_tree.get(ik, parameters[0].leaf).dtype
     space = Space(
-        base=ik,
-        u0=jax.device_put(np.zeros(len(frees), dtype)),
-        prior_sd=jax.device_put(np.asarray([one.prior_sd for one in frees], dtype)),
-        low=jax.device_put(np.asarray([one.low for one in frees], dtype)),
-        high=jax.device_put(np.asarray([one.high for one in frees], dtype)),
-        frees=tuple(frees),
-        order=_order(frees),
+        system=ik,
+        u0=jax.device_put(np.zeros(len(parameters), dtype)),
+        prior_sd=jax.device_put(np.asarray([p.prior_sd for p in parameters], dtype)),
+        low=jax.device_put(np.asarray([p.low for p in parameters], dtype)),
+        high=jax.device_put(np.asarray([p.high for p in parameters], dtype)),
+        parameters=tuple(parameters),
+        order=_order(parameters),
     )
-    centre = np.asarray(space.pack({one.name: one.prior_mean for one in frees}))
-    middle = jax.device_put(np.clip(centre, -CENTRE_LIMIT, CENTRE_LIMIT))
-    return eqx.tree_at(lambda s: s.u0, space, middle)
+    centre = np.asarray(space.pack({p.name: p.prior_mean for p in parameters}))
+    limited = jax.device_put(np.clip(centre, -CENTRE_LIMIT, CENTRE_LIMIT))
+    return eqx.tree_at(lambda space: space.u0, space, limited)
 
 
-def _order(frees: Sequence[FreeParameter]) -> tuple[int, ...]:
-    """Indices such that what a parameter stays above comes before it."""
+def _check_free_once(parameter: FreeParameter, parameters: Sequence[FreeParameter]) -> None:
+    """Raises ValueError where another parameter is the same leaf, or an element of it."""
+    others = [p for p in parameters if p.leaf == parameter.leaf and p is not parameter]
+    if any(p.leg is None or parameter.leg is None or p.leg == parameter.leg for p in others):
+        names = [p.name for p in (parameter, *others)]
+        raise ValueError(f"{parameter.name!r} is free twice: {names}")
+
+
+def _check_room(
+    ik: eqx.Module, parameter: FreeParameter, parameters: Sequence[FreeParameter]
+) -> None:
+    """Raises ValueError where the leaf that a parameter stays above may exceed its upper bound."""
+    if parameter.above is None:
+        return
+    free = [p for p in parameters if p.leaf == parameter.above]
+    reached = [p.high for p in free]
+    if all(p.leg is not None for p in free):  # some of its elements keep their values
+        reached.append(float(parameter_tree.get(ik, parameter.above).max()))
+    if not max(reached) < parameter.high:
+        raise ValueError(
+            f"{parameter.name} stays above {parameter.above}, which reaches {max(reached)},"
+            f" but its own upper bound is {parameter.high}"
+        )
+
+
+def _order(parameters: Sequence[FreeParameter]) -> tuple[int, ...]:
+    """Indices sorted so that each parameter comes after the one it stays above."""
     done: list[int] = []
-    while len(done) < len(frees):
-        waiting = [i for i in range(len(frees)) if i not in done]
-        leaves = {frees[i].leaf for i in waiting}
-        ready = [i for i in waiting if frees[i].above not in leaves]
+    while len(done) < len(parameters):
+        waiting = [i for i in range(len(parameters)) if i not in done]
+        leaves = {parameters[i].leaf for i in waiting}
+        ready = [i for i in waiting if parameters[i].above not in leaves]
         if not ready:
-            raise ValueError(f"these stay above one another: {[frees[i].name for i in waiting]}")
+            names = [parameters[i].name for i in waiting]
+            raise ValueError(f"these stay above one another: {names}")
         done += ready
     return tuple(done)

@@ -88,7 +88,7 @@ def _plain(value: Any, run: Path | None) -> Any:
 def describe_fit(fitted: Fit) -> dict[str, Any]:
     """The numbers of a fit as JSON holds them."""
     solution, found = fitted.solution, fitted.identifiability
-    declared = parameter_tree.declarations(fitted.problem.space.base)
+    declared = parameter_tree.declarations(fitted.problem.space.system)
     rows = []
     for i, one in enumerate(fitted.problem.space.parameters):
         row: dict[str, Any] = {

@@ -29,8 +29,8 @@ from fitting.experiments import experiment, parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.inference import sensitivity
 from fitting.inference.optimisation.population import evaluate, offsets, sweep
+from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
-from fitting.problem.space import free_parameter
 from fitting.runtime import files, validation
 from jaxik.maths import parameter_tree
 

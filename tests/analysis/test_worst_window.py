@@ -9,7 +9,7 @@ import pytest
 from fitting.analysis import worst_window
 from fitting.analysis.playback import KINDS, Motion, Playback
 from fitting.analysis.worst_window import find_worst
-from fitting.problem.residuals import Sigmas
+from fitting.problem.scene import Sigmas
 from fitting.report.plots import worst_window_plots
 from fitting.report.plots.style import save
 

@@ -13,8 +13,9 @@ from fitting.bench import report as bench_report
 from fitting.bench import tasks as bench_tasks
 from fitting.bench.setup import Sizes
 from fitting.inference.optimisation.search import solve
+from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
-from fitting.problem.space import free_parameter, make_space
+from fitting.problem.space import make_space
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close

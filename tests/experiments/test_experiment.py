@@ -125,7 +125,7 @@ def test_paths_are_meant_from_beside_the_file_wherever_it_is_called_from(tmp_pat
 def test_the_fixed_parameters_are_in_the_system_and_the_free_ones_start_at_its_values(tmp_path):
     parts = {"rest": "[parameters]\nlock.enabled = false\nfoot.max_pitch = [0.3, 0.5]"}
     problem = experiment.make_problem(experiment.load_experiment(write(tmp_path, **parts)))
-    base = problem.space.base
+    base = problem.space.system
     assert not parameter_tree.get(base, "lock.enabled")
     np.testing.assert_array_equal(parameter_tree.get(base, "foot.max_pitch"), [0.3, 0.5])
     start = dict(zip(problem.space.names, problem.space.values(problem.space.u0), strict=True))
@@ -150,7 +150,7 @@ def test_a_scene_holds_the_clips_cut_and_resampled_alike(tmp_path):
     np.testing.assert_allclose(
         (world @ scene.pelvis).pos, base.positions_ws[frames, base.rig.pelvis], atol=1e-9
     )
-    assert scene.reference.seen.all()
+    assert scene.reference.observed.all()
 
 
 def test_a_marker_pop_is_not_seen(tmp_path):
@@ -161,9 +161,12 @@ def test_a_marker_pop_is_not_seen(tmp_path):
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk.npz", "popped.npz") + SECOND
     read = experiment.load_experiment(write(tmp_path, clips=clips))
     (scene,) = experiment.make_problem(read).data
-    assert not scene.reference.seen[15] and np.asarray(scene.reference.seen)[[0, 12, 18, 30]].all()
+    assert (
+        not scene.reference.observed[15]
+        and np.asarray(scene.reference.observed)[[0, 12, 18, 30]].all()
+    )
     resampled = dataclasses.replace(read, fps=15.0)
-    assert not experiment.make_problem(resampled).data[0].reference.seen[7]
+    assert not experiment.make_problem(resampled).data[0].reference.observed[7]
 
 
 def test_contacts_are_held_against_labels_only(tmp_path):
@@ -219,4 +222,4 @@ def test_the_blocks_experiment_makes_a_problem(mocap):
     problem = experiment.make_problem(experiment.load_experiment(path))
     (scene,) = problem.data
     assert scene.frames.dt.shape == (1141,)  # 38 s
-    assert 0.9 < float(scene.reference.seen.mean()) < 1.0
+    assert 0.9 < float(scene.reference.observed.mean()) < 1.0

@@ -8,7 +8,7 @@ import pytest
 
 from fitting.inference import identifiability
 from fitting.inference.optimisation import population, search
-from fitting.problem import space
+from fitting.problem import free_parameters
 from fitting.problem.problem import Problem
 from support import toy
 
@@ -33,7 +33,7 @@ def test_a_parameter_that_does_nothing_is_named_undetermined(report):
     assert report.undetermined == ("foot.idle",)
     idle = report.names.index("foot.idle")
     assert report.contraction[idle] == pytest.approx(0, abs=1e-9)
-    assert report.sd[idle] == pytest.approx(space.PRIOR_SD)
+    assert report.sd[idle] == pytest.approx(free_parameters.PRIOR_SD)
     assert report.eigenvalues[0] == pytest.approx(0, abs=1e-6)
     assert report.weakest == ("foot.idle",)
 

@@ -20,8 +20,9 @@ from jaxtyping import Array, Float
 from fitting.inference.sampling import diagnostics, posterior, sampler
 from fitting.inference.sampling.chain import Chain, Identity, journal_path
 from fitting.inference.sampling.posterior import sample_posterior
+from fitting.problem.free_parameters import PRIOR_SD, free_parameter
 from fitting.problem.problem import Problem
-from fitting.problem.space import PRIOR_SD, free_parameter, make_space
+from fitting.problem.space import make_space
 from jaxik.maths import parameter_tree
 
 ROOT = Path(__file__).resolve().parents[2]

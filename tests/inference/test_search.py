@@ -11,7 +11,7 @@ import optimistix as optx
 import pytest
 
 from fitting.inference.optimisation import jacobian, levenberg_marquardt, population, search
-from fitting.problem import space
+from fitting.problem import free_parameters, space
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree
 from support import toy
@@ -56,7 +56,7 @@ def curve_problem(
     clean = curve(Curve(**{name: jnp.asarray(value) for name, value in CURVE_TRUTH.items()}))
     gross = (random.random(TIME.size) < outliers) * random.uniform(1, 3, TIME.size)
     data = clean + random.normal(0, 0.02, TIME.size) + gross
-    made = space.make_space(base, [space.free_parameter(base, name) for name in names])
+    made = space.make_space(base, [free_parameters.free_parameter(base, name) for name in names])
     return Problem(made, (data, jnp.asarray(walls)), curve_residuals, **options)
 
 
@@ -86,7 +86,7 @@ def test_the_jacobian_agrees_with_finite_differences(seed):
     problem, solution = toy.solved(seed)
     step = 1e-6
     moves = step * np.eye(problem.space.size)
-    rows = eqx.filter_jit(lambda problem, u: jax.vmap(problem.rows)(u))
+    rows = eqx.filter_jit(lambda problem, u: jax.vmap(problem.residuals)(u))
     sides = [np.asarray(rows(problem, jnp.asarray(solution.u + sign * moves))) for sign in (1, -1)]
     differences = (sides[0] - sides[1]).T / (2 * step)
     for i, smooth in enumerate(problem.space.smooth):
@@ -178,7 +178,7 @@ def test_residuals_that_are_nowhere_finite_are_told_in_a_sentence():
 
 def test_a_fit_may_be_of_thresholds_alone():
     base = Curve(height=jnp.asarray(2.0), rate=jnp.asarray(3.0))
-    problem = eqx.tree_at(lambda p: p.space.base, curve_problem(("turn",)), base)
+    problem = eqx.tree_at(lambda p: p.space.system, curve_problem(("turn",)), base)
     solution = search.solve(problem)
     assert solution.converged, solution.message
     assert errors(problem, solution.values, CURVE_TRUTH).max() < SHARE
@@ -201,7 +201,7 @@ def test_the_steps_are_those_of_optimistix_on_the_rows_themselves():
     u, args = problem.space.u0, (problem, problem.space.u0)
     at = levenberg_marquardt.begin(jacobian.hard, u, args)
     solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
-    plain, rows = u, lambda u, _: (problem.rows(u), None)
+    plain, rows = u, lambda u, _: (problem.residuals(u), None)
     shape = jax.eval_shape(rows, u, None)[0]
     common = {"options": {"jac": "fwd"}, "tags": frozenset()}
     state = solver.init(rows, u, None, f_struct=shape, aux_struct=None, **common)

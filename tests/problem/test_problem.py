@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
-from fitting.problem.space import free_parameter, make_space
+from fitting.problem.space import make_space
 from support import toy
 
 ROWS, CLIPS = 400, 400
@@ -32,7 +33,9 @@ def covered(independent: float) -> float:
     """
     ik = toy.Toy()
     space = make_space(ik, [free_parameter(ik, "foot.share", prior_sd=50.0)])
-    problem = Problem(space, jnp.zeros(ROWS), residuals, independent=jnp.asarray(independent))
+    problem = Problem(
+        space, jnp.zeros(ROWS), residuals, independent_fraction=jnp.asarray(independent)
+    )
     u = jnp.zeros(1)
     of_u = jax.jacfwd(lambda u: space.values(u)[0])(u)[0]
     slopes = np.asarray(problem.jacobian(u))[:-1, 0] / float(of_u)  # of the rows, by value

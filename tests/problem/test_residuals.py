@@ -14,6 +14,7 @@ import jaxik
 from fitting.experiments import experiment
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
+from fitting.problem.scene import Scene
 from fitting.report.fit_report import truth_of
 from support.experiments import CLIP, UNEVEN_WALK, write
 
@@ -63,15 +64,15 @@ def rows_of(scene) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> residuals.Scene:
+def scene(tmp_path_factory) -> Scene:
     """Two thirds of a second with every kind of residual and a frame that was not seen."""
     path = write(
         tmp_path_factory.mktemp("scene"), clips=CLIP, clip="start = 2.0\nend = 2.67",
         rest=EVERY_KIND,
     )  # fmt: skip
     (made,) = experiment.make_problem(experiment.load_experiment(path)).data
-    seen = jnp.ones_like(made.reference.seen).at[9].set(False)
-    return eqx.tree_at(lambda scene: scene.reference.seen, made, seen)
+    seen = jnp.ones_like(made.reference.observed).at[9].set(False)
+    return eqx.tree_at(lambda scene: scene.reference.observed, made, seen)
 
 
 @pytest.fixture(scope="module")
@@ -118,13 +119,13 @@ def expected_rows(scene) -> dict[str, np.ndarray]:
     for kind, error in errors.items():
         scaled = error / getattr(sigmas, kind)
         made = np.zeros_like(scaled)
-        for t in np.flatnonzero(reference.seen):
-            follows = t > 0 and reference.seen[t - 1]
+        for t in np.flatnonzero(reference.observed):
+            follows = t > 0 and reference.observed[t - 1]
             told = rho * scaled[t - 1] if follows else 0.0
             made[t] = (scaled[t] - told) / (np.sqrt(1 - rho**2) if follows else 1.0)
         rows[kind] = made
     bend = np.diff(ankle, n=2, axis=0) / scene.frames.dt[1:-1, None, None] ** 2 / sigmas.smooth
-    whole = np.convolve(reference.seen, [1, 1, 1], "valid") == 3
+    whole = np.convolve(reference.observed, [1, 1, 1], "valid") == 3
     rows["smooth"] = np.where(whole[:, None, None], bend, 0.0)
     return rows
 
@@ -149,7 +150,7 @@ def test_rows_are_what_numpy_makes_of_the_poses(scene, rows):
 
 
 def test_a_frame_that_was_not_seen_gives_no_row_and_spoils_none(scene, rows):
-    frames = scene.reference.seen.size
+    frames = scene.reference.observed.size
     (ankle,) = np.split(rows[: frames * 6], 1)
     assert not ankle.reshape(frames, 6)[9].any() and ankle.reshape(frames, 6)[[8, 10]].all()
     smooth = rows[-(frames - 2) * 6 :].reshape(frames - 2, 6)
@@ -221,12 +222,12 @@ def residuals_and_jacobian(problem, u):
 
 @hurried
 def rows_at(problem, points):
-    return jax.vmap(problem.rows)(points)
+    return jax.vmap(problem.residuals)(points)
 
 
 @hurried
 def reverse_mode(problem, u, weights):
-    return jax.vjp(problem.rows, u)[1](weights)[0]
+    return jax.vjp(problem.residuals, u)[1](weights)[0]
 
 
 @pytest.fixture(scope="module")

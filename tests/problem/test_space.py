@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fitting.problem import loss, space
+from fitting.problem import free_parameters, loss, space
 from fitting.problem.problem import Problem
 from jaxik.maths import smoothing
 from support import toy
@@ -29,7 +29,7 @@ def unpack_and_pack(made: space.Space, u: jax.Array) -> tuple[jax.Array, jax.Arr
 
 def make(*names: str, **overrides) -> space.Space:
     return space.make_space(
-        toy.Toy(), [space.free_parameter(toy.Toy(), n, **overrides) for n in names]
+        toy.Toy(), [free_parameters.free_parameter(toy.Toy(), n, **overrides) for n in names]
     )
 
 
@@ -95,7 +95,7 @@ def test_a_prior_at_a_bound_is_moved_inside_where_u_is_finite():
 
 
 def test_a_default_outside_the_given_bounds_is_taken_to_the_nearest_one():
-    assert space.free_parameter(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
+    assert free_parameters.free_parameter(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
 
 
 def test_smooth_and_thresholds_share_the_parameters_out():
@@ -124,7 +124,7 @@ def test_smooth_and_thresholds_share_the_parameters_out():
 )
 def test_what_cannot_be_free_is_answered_with_what_can(name, overrides, said):
     with pytest.raises(ValueError, match=said):
-        space.free_parameter(toy.Toy(), name, **overrides)
+        free_parameters.free_parameter(toy.Toy(), name, **overrides)
 
 
 @pytest.mark.parametrize(
@@ -142,8 +142,8 @@ def test_a_space_of_nothing_or_of_doubles_is_refused(names, said):
 
 def test_a_partner_that_leaves_no_room_is_refused():
     frees = [
-        space.free_parameter(toy.Toy(), "lock.height_on"),
-        space.free_parameter(toy.Toy(), "lock.height_off"),
+        free_parameters.free_parameter(toy.Toy(), "lock.height_on"),
+        free_parameters.free_parameter(toy.Toy(), "lock.height_off"),
     ]
     frees[1] = dataclasses.replace(frees[1], high=0.11)
     with pytest.raises(ValueError, match="stays above lock.height_on, which reaches 0.12"):
@@ -152,8 +152,8 @@ def test_a_partner_that_leaves_no_room_is_refused():
 
 def test_two_that_stay_above_each_other_are_refused():
     frees = [
-        space.free_parameter(toy.Toy(), "lock.height_on"),
-        space.free_parameter(toy.Toy(), "lock.height_off"),
+        free_parameters.free_parameter(toy.Toy(), "lock.height_on"),
+        free_parameters.free_parameter(toy.Toy(), "lock.height_off"),
     ]
     frees[0] = dataclasses.replace(frees[0], above="lock.height_off", high=0.3)
     frees[1] = dataclasses.replace(frees[1], high=0.4)

@@ -269,7 +269,7 @@ def test_counters_count_feet_that_lock_release_and_find_ground(fitted):
 
 def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
     scene, space = fitted.problem.data[0], fitted.problem.space
-    base = parameter_tree.replace(space.base, {"lock.enabled": False})
+    base = parameter_tree.replace(space.system, {"lock.enabled": False})
     unlocked = make_space(base, space.parameters)
     problem = Problem(unlocked, (scene,), residuals.residuals_of_scenes)
     (down, up) = limit_activity.flipped_decisions(problem, np.asarray(unlocked.pack(VALUES)))[

@@ -57,7 +57,7 @@ class Search:
         if progress is not None:
             progress(Progress("polish", 0, 1, 2.0, 1.0, 0.5))
         names = problem.space.names
-        frames = sum(int(scene.reference.seen.sum()) for scene in problem.data)
+        frames = sum(int(scene.reference.observed.sum()) for scene in problem.data)
         found = {name: 0.3 if name != "pelvis.on_gain" else frames / 1000 for name in names}
         u = np.asarray(problem.space.pack(found))
         values = np.asarray(problem.space.values(jnp.asarray(u)))
@@ -207,7 +207,7 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
     ]  # fmt: skip
     frames = [len(problem.data[0].frames.dt) for problem, _ in search.asked]
     assert frames == [91] * 6, "at the rate of the fit, and not where nothing is free"
-    seen = [problem.data[0].reference.seen for problem, _ in search.asked]
+    seen = [problem.data[0].reference.observed for problem, _ in search.asked]
     assert not seen[0][:45].any() and not seen[1][46:].any()
     assert seen[0][46:].mean() > 0.9 and seen[1][:45].mean() > 0.9 and seen[2].mean() > 0.9
     (captured, base, _) = pairs_of(read)[0]
@@ -225,7 +225,7 @@ def test_the_problem_of_a_variant_has_its_fixed_values_and_the_sigmas(tmp_path, 
     rest = WITHOUT + "[sigmas]\nankle = 0.05\n"
     ablation.contribution(asked(tmp_path, rest), 2, tmp_path / "out")
     problem, other = search.asked[3]
-    assert float(parameter_tree.get(problem.space.base, "foot.max_pitch")) == 0.2
+    assert float(parameter_tree.get(problem.space.system, "foot.max_pitch")) == 0.2
     assert float(problem.data[0].sigmas.ankle) == 0.05
     assert other.free == {"pelvis.on_gain": {}}
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.inference.optimisation import search
-from fitting.problem import loss, space
+from fitting.problem import free_parameters, loss, space
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree, smoothing
 from jaxik.maths.gate import HARD
@@ -200,7 +200,7 @@ def make_problem(
     loss: loss.Loss = "squares",
 ) -> Problem:
     """The defaults as a start, the truth in the data."""
-    made = space.make_space(Toy(), [space.free_parameter(Toy(), name) for name in names])
-    held = space.make_space(Toy(), [space.free_parameter(Toy(), name) for name in TRUTH])
+    made = space.make_space(Toy(), [free_parameters.free_parameter(Toy(), name) for name in names])
+    held = space.make_space(Toy(), [free_parameters.free_parameter(Toy(), name) for name in TRUTH])
     clean = held.unpack(held.pack(truth))
     return Problem(made, make_data(clean, seed, frames, outliers), residuals, loss)

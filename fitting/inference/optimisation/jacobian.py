@@ -39,7 +39,7 @@ def ensemble(u: Array, problem: Problem, shifts: Array, _: Array) -> tuple[Array
     of the thresholds in the middle: a slope steers a step, and the cost judges it.
     """
     _, slopes = problem.residuals_and_jacobian(u)
-    every = jax.vmap(problem.rows)(u + shifts)
+    every = jax.vmap(problem.residuals)(u + shifts)
     mean = jnp.mean(every, axis=0)
     regressed = (jnp.linalg.pinv(shifts) @ (every - mean)).T
     decides = jnp.asarray(problem.space.thresholds)

@@ -58,7 +58,7 @@ def _in_parts(
 
 @cached
 def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
-    rows = jax.vmap(problem.rows)(candidates)
+    rows = jax.vmap(problem.residuals)(candidates)
     return 0.5 * jnp.sum(rows**2, axis=1), rows
 
 

@@ -1,0 +1,131 @@
+"""Which numbers of a system a fit may change: range, scale and prior of each."""
+
+import dataclasses
+import difflib
+import math
+from typing import cast, get_args
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from jaxik.maths import parameter_tree
+
+PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeParameter:
+    """One free parameter: a leaf of the system, or one leg's element of it."""
+
+    name: str  # dotted, with [leg] for one element
+    low: float
+    high: float
+    prior_mean: float  # in the parameter's unit
+    prior_sd: float  # in u
+    kind: parameter_tree.Kind
+    scale: parameter_tree.Scale
+    above: str | None  # dotted name of the leaf that the value stays above
+
+    @property
+    def leaf(self) -> str:
+        """Dotted name without the leg."""
+        return self.name.partition("[")[0]
+
+    @property
+    def leg(self) -> int | None:
+        """Index of the leg whose element is free, or None for the whole leaf."""
+        index = self.name.partition("[")[2]
+        return int(index[:-1]) if index else None
+
+
+OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
+
+
+def free_parameter(ik: eqx.Module, name: str, **overrides: float | str) -> FreeParameter:
+    """The parameter of this name as its rule declares it, with overrides.
+
+    A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
+    per leg frees a single value that all legs share. The prior is centred at the present value,
+    clipped to the bounds.
+
+    Args:
+        ik: system, a tree of rules.
+        name: dotted name.
+        overrides: any of `low`, `high`, `prior_mean`, `prior_sd`, `kind`, `scale`.
+
+    Raises:
+        ValueError: for an unknown name or override, a leg that does not exist, or bounds that are
+            out of order or outside the scale's domain.
+    """
+    declared = parameter_tree.declarations(ik)
+    leaf = name.partition("[")[0]
+    if leaf not in declared:
+        nearest = difflib.get_close_matches(leaf, declared, n=1, cutoff=0.0)
+        hint = f"; nearest is {nearest[0]!r}" if nearest else ""
+        raise ValueError(f"no parameter named {leaf!r}{hint}; there are {sorted(declared)}")
+    if unknown := sorted(set(overrides) - set(OVERRIDES)):
+        raise ValueError(f"{name}: unknown {unknown}; a free parameter takes {sorted(OVERRIDES)}")
+    declaration = declared[leaf]
+    kind = overrides.get("kind", declaration.kind)
+    scale = overrides.get("scale", declaration.scale)
+    _check_choice(name, "kind", kind, get_args(parameter_tree.Kind))
+    _check_choice(name, "scale", scale, get_args(parameter_tree.Scale))
+    low = float(overrides.get("low", declaration.low))
+    high = float(overrides.get("high", declaration.high))
+    present = float(np.asarray(_value(ik, name)).mean())
+    parameter = FreeParameter(
+        name=name,
+        low=low,
+        high=high,
+        prior_mean=float(overrides.get("prior_mean", min(max(present, low), high))),
+        prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
+        kind=cast(parameter_tree.Kind, kind),
+        scale=cast(parameter_tree.Scale, scale),
+        above=_absolute(declaration.above, leaf),
+    )
+    _check(parameter)
+    return parameter
+
+
+def _value(ik: eqx.Module, name: str) -> Array:
+    """The present value of a leaf, or of one leg's element of it."""
+    leaf, bracket, rest = name.partition("[")
+    value = parameter_tree.get(ik, leaf)
+    if not bracket:
+        return value
+    elements = [f"{leaf}[{i}]" for i in range(value.shape[0])] if value.ndim else []
+    if name not in elements:
+        hint = f"there are {elements}" if elements else "it is shared by the legs"
+        raise ValueError(f"no element {name!r}: {hint}")
+    return value[int(rest[:-1])]
+
+
+def _absolute(above: str | None, leaf: str) -> str | None:
+    """Dotted name of a field that is declared by its name within the rule of `leaf`."""
+    if above is None or "." not in leaf:
+        return above
+    return f"{leaf.rpartition('.')[0]}.{above}"
+
+
+def _check_choice(name: str, key: str, value: float | str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}: {key} is {value!r}, wanted one of {choices}")
+
+
+def _check(parameter: FreeParameter) -> None:
+    """Raises ValueError for bounds or a prior that make no sense."""
+    domains = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (0.0, 1.0)}
+    minimum, maximum = domains[parameter.scale]
+    if not minimum < parameter.low < parameter.high < maximum:
+        raise ValueError(
+            f"{parameter.name}: bounds are {parameter.low} to {parameter.high}, wanted low < high"
+            f" strictly between {minimum} and {maximum} for the scale {parameter.scale!r}"
+        )
+    if not parameter.low <= parameter.prior_mean <= parameter.high:
+        raise ValueError(
+            f"{parameter.name}: prior_mean is {parameter.prior_mean},"
+            f" wanted from {parameter.low} to {parameter.high}"
+        )
+    if not 0 < parameter.prior_sd < math.inf:
+        raise ValueError(f"{parameter.name}: prior_sd is {parameter.prior_sd}, wanted more than 0")

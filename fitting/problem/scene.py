@@ -1,0 +1,54 @@
+"""The data of one clip: the animation a system runs on, and the motion it should reproduce."""
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float
+
+import jaxik
+from jaxik.world.skeleton import Transform
+from jaxik.world.terrain import Terrain
+
+
+class Sigmas(eqx.Module):
+    """Standard deviations of the residuals, by kind; an infinite one switches its kind off."""
+
+    ankle: Float[Array, ""]  # m
+    knee: Float[Array, ""]  # m
+    pelvis: Float[Array, ""]  # m
+    foot: Float[Array, ""]  # rad, orientation of the ankle joint
+    body: Float[Array, ""]  # rad, orientation of the pelvis
+    contact: Float[Array, ""]  # of the contact weight, 0..1
+    smooth: Float[Array, ""]  # m/s², of the ankle's acceleration
+    correlation: Float[Array, ""]  # AR(1) coefficient between frames, 0 if they are independent
+
+
+class Reference(eqx.Module):
+    """The motion that a system should reproduce; world space, frames first."""
+
+    pelvis: Transform  # frames
+    knee_ws: Float[Array, "frames legs 3"]
+    ankle: Transform  # frames legs
+    contact: Float[Array, "frames legs"]  # 0 or 1
+    observed: Bool[Array, " frames"]  # False where a marker jumped or nothing was captured
+    label: str = eqx.field(static=True, default="captured")  # what plots call it
+
+
+class Scene(eqx.Module):
+    """One clip: rig, terrain and animation as inputs, and the reference with its sigmas."""
+
+    rig: jaxik.Rig
+    terrain: Terrain
+    frames: jaxik.Frame
+    pelvis: Transform  # frames, of the flat animation, model space
+    reference: Reference
+    sigmas: Sigmas
+
+
+def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:
+    """The pelvis after the system has moved the body, (frames), world space."""
+    return scene.frames.world_from_model @ (result.body @ scene.pelvis)
+
+
+def legs_ws(scene: Scene, result: jaxik.Result) -> jaxik.LegPose:
+    """The solved legs, (frames legs), world space."""
+    world = scene.frames.world_from_model
+    return result.pose.moved(Transform(world.pos[:, None], world.rot[:, None]))
