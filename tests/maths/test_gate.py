@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from jaxik.maths.gate import HARD, AbstractGate, Hard, Smooth
-from support.slopes import assert_slopes_agree, finite_slopes, numbers
+from support.gradients import assert_gradients_match, finite_jacobian, numbers
 
 few = settings(max_examples=15, derandomize=True, deadline=None)
 BAND = 0.02
@@ -112,10 +112,10 @@ def test_the_hard_gate_chooses_one_or_the_other_and_nothing_between():
 
 def test_the_hard_gate_gives_the_whole_slope_to_one_operand_where_several_are_equal():
     tied = np.array([0.5, 0.2, 0.2])
-    assert_allclose(finite_slopes(least, HARD, tied), [[0, 1, 0]], atol=0)
-    assert_allclose(finite_slopes(largest, HARD, -tied), [[0, 1, 0]], atol=0)
+    assert_allclose(finite_jacobian(least, HARD, tied), [[0, 1, 0]], atol=0)
+    assert_allclose(finite_jacobian(largest, HARD, -tied), [[0, 1, 0]], atol=0)
     for x in (-1.0, 1.0):
-        assert_allclose(finite_slopes(clip, HARD, x, -1.0, 1.0), [[1, 0, 0]], atol=0)
+        assert_allclose(finite_jacobian(clip, HARD, x, -1.0, 1.0), [[1, 0, 0]], atol=0)
 
 
 @pytest.mark.parametrize("at", range(3))
@@ -172,41 +172,41 @@ def test_a_smooth_clip_and_extreme_tend_to_the_hard_ones_in_proportion(x, low, h
 @few
 @given(numbers(-1, 1), apart, st.sampled_from([0.02, 0.5, 1.0]))
 def test_slopes_of_decisions_are_those_of_differences(threshold, gap, softness):
-    assert_slopes_agree(below, HARD, threshold + gap, threshold)
-    assert_slopes_agree(below, Smooth(softness), threshold + gap, threshold)
-    assert_slopes_agree(above, Smooth(softness), threshold + gap, threshold)
-    assert_slopes_agree(below, Smooth(softness), threshold, threshold)
+    assert_gradients_match(below, HARD, threshold + gap, threshold)
+    assert_gradients_match(below, Smooth(softness), threshold + gap, threshold)
+    assert_gradients_match(above, Smooth(softness), threshold + gap, threshold)
+    assert_gradients_match(below, Smooth(softness), threshold, threshold)
 
 
 @few
 @given(st.sampled_from([-0.9, -0.5, 0.1, 0.45, 0.9]), st.sampled_from([0.02, 0.5, 1.0]))
 def test_slopes_of_limits_are_those_of_differences(x, softness):
-    assert_slopes_agree(clip, HARD, x, -0.6, 0.5)
-    assert_slopes_agree(clip, Smooth(softness), x, -0.6, 0.5)
+    assert_gradients_match(clip, HARD, x, -0.6, 0.5)
+    assert_gradients_match(clip, Smooth(softness), x, -0.6, 0.5)
 
 
 @few
 @given(st.permutations(ROW.tolist()), st.sampled_from([0.02, 0.5, 1.0]))
 def test_slopes_of_extremes_are_those_of_differences(row, softness):
-    assert_slopes_agree(least, HARD, np.array(row))
-    assert_slopes_agree(largest, Smooth(softness), np.array(row))
+    assert_gradients_match(least, HARD, np.array(row))
+    assert_gradients_match(largest, Smooth(softness), np.array(row))
 
 
 def test_slopes_of_a_choice_are_those_of_differences():
     for weight in (0.0, 0.3, 1.0):
-        assert_slopes_agree(choose, HARD, weight, 3.0, -1.0)
-        assert_slopes_agree(choose, SOFT, weight, 3.0, -1.0)
+        assert_gradients_match(choose, HARD, weight, 3.0, -1.0)
+        assert_gradients_match(choose, SOFT, weight, 3.0, -1.0)
 
 
 @pytest.mark.parametrize("softness", [1e-3, 1e-6, 1e-12, 1e-60])
 def test_slopes_stay_finite_while_softness_falls_to_zero(softness):
     soft = Smooth(softness)
     for x in (-0.1, 0.1, 0.2, 0.5):
-        finite_slopes(below, soft, x, 0.1)
+        finite_jacobian(below, soft, x, 0.1)
         # Not with respect to the softness itself: there it is a difference of two large numbers.
-        finite_slopes(clip_of_given_softness, soft, x, -0.1, 0.2)
-    finite_slopes(least, soft, ROW)
-    finite_slopes(least, soft, np.zeros(3))
+        finite_jacobian(clip_of_given_softness, soft, x, -0.1, 0.2)
+    finite_jacobian(least, soft, ROW)
+    finite_jacobian(least, soft, np.zeros(3))
 
 
 def test_a_new_softness_is_no_new_program():

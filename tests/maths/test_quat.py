@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxik.maths import quat, vec
-from support.slopes import (
+from support.gradients import (
     TINY,
     angles,
-    assert_slopes_agree,
+    assert_gradients_match,
     directions,
-    finite_slopes,
+    finite_jacobian,
     numbers,
     quaternions,
     vectors,
@@ -173,7 +173,7 @@ def test_small_rotation_vectors_do_not_see_where_the_series_ends(size):
         quat.from_rotvec(jnp.asarray(v)), [np.cos(size / 2), *(v * np.sinc(size / 2 / np.pi) / 2)],
         rtol=1e-14,
     )  # fmt: skip
-    assert jnp.isfinite(jnp.asarray(finite_slopes(quat.from_rotvec, v))).all()
+    assert jnp.isfinite(jnp.asarray(finite_jacobian(quat.from_rotvec, v))).all()
 
 
 @few
@@ -192,7 +192,7 @@ def test_an_arc_carries_one_direction_to_the_other_by_the_shortest_way(pair):
 def test_an_arc_between_opposed_directions_is_half_a_turn_about_the_fallback_and_flat():
     a, axis = np.eye(3)[0], np.eye(3)[1]
     assert_allclose(quat.shortest_arc(*map(jnp.asarray, (a, -a, axis))), [0, *axis], atol=0)
-    assert_allclose(finite_slopes(quat.shortest_arc, a, -a, axis)[:, :6], 0, atol=0)
+    assert_allclose(finite_jacobian(quat.shortest_arc, a, -a, axis)[:, :6], 0, atol=0)
 
 
 @few
@@ -212,7 +212,7 @@ def test_a_unit_quaternion_is_the_same_turn_at_length_one(q, size):
 
 def test_a_quaternion_without_direction_becomes_the_identity_and_is_flat():
     assert_allclose(quat.normalize(jnp.zeros((2, 4))), [[1, 0, 0, 0]] * 2, atol=0)
-    assert_allclose(finite_slopes(quat.normalize, np.zeros(4)), 0, atol=0)
+    assert_allclose(finite_jacobian(quat.normalize, np.zeros(4)), 0, atol=0)
 
 
 @few
@@ -253,46 +253,46 @@ def test_the_axes_of_a_turn_are_the_turned_axes(q):
 @few
 @given(quaternions(), quaternions(), vectors((1.0, TINY, 0.0)))
 def test_slopes_of_products_and_turned_vectors_are_those_of_differences(p, q, v):
-    assert_slopes_agree(turned, p, q, v)
+    assert_gradients_match(turned, p, q, v)
 
 
 @few
 @given(directions(), numbers(-2.9, 2.9))
 def test_slopes_of_turns_about_an_axis_are_those_of_differences(pair, angle):
-    assert_slopes_agree(turns_about, pair[0], angle, np.cos(angle), np.sin(angle))
+    assert_gradients_match(turns_about, pair[0], angle, np.cos(angle), np.sin(angle))
 
 
 @few
 @given(directions(opposed=False))
 def test_slopes_of_arcs_are_those_of_differences(pair):
-    assert_slopes_agree(arc_between, *pair, tolerance=1e-5)
+    assert_gradients_match(arc_between, *pair, tolerance=1e-5)
 
 
 @few
 @given(directions(), numbers(-3, 3))
 def test_slopes_of_the_angle_between_turns_are_those_of_differences(pair, angle):
     q = np.asarray(quat.from_axis_angle(jnp.asarray(pair[0]), jnp.asarray(angle)))
-    assert_slopes_agree(quat.angle, np.array([1.0, 0, 0, 0]), q)
+    assert_gradients_match(quat.angle, np.array([1.0, 0, 0, 0]), q)
 
 
 @few
 @given(quaternions(), quaternions().filter(lambda q: abs(q[0]) > 1e-3), numbers(0, 1))
 def test_slopes_of_blends_are_those_of_differences(p, turn, weight):
     q = np.asarray(quat.multiply(jnp.asarray(p), jnp.asarray(turn)))
-    assert_slopes_agree(quat.nlerp, p, q, weight)
+    assert_gradients_match(quat.nlerp, p, q, weight)
 
 
 @pytest.mark.parametrize("q", [np.array([1.0, 0, 0, 0]), HALF_TURN])
 def test_no_turn_and_half_a_turn_have_finite_slopes_everywhere(q):
     one = np.array([1.0, 0, 0, 0])
     assert_allclose(quat.angle(jnp.asarray(one), jnp.asarray(q)), 0 if q[0] else np.pi)
-    finite_slopes(quat.angle, one, q)
-    finite_slopes(quat.nlerp, one, q, 0.5)
-    finite_slopes(quat.from_cos_sin, q[1:], 2 * q[0] ** 2 - 1, 0.0)
+    finite_jacobian(quat.angle, one, q)
+    finite_jacobian(quat.nlerp, one, q, 0.5)
+    finite_jacobian(quat.from_cos_sin, q[1:], 2 * q[0] ** 2 - 1, 0.0)
 
 
 def test_the_angle_between_equal_turns_is_zero_and_flat():
     for q in (Q[0], -Q[0]):
         assert_allclose(quat.angle(jnp.asarray(Q[0]), jnp.asarray(q)), 0, atol=1e-15)
     one = np.array([1.0, 0, 0, 0])
-    assert_allclose(finite_slopes(quat.angle, one, -one), 0, atol=0)
+    assert_allclose(finite_jacobian(quat.angle, one, -one), 0, atol=0)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from jaxik.maths import vec
-from support.slopes import assert_slopes_agree, directions, finite_slopes, numbers, vectors
+from support.gradients import assert_gradients_match, directions, finite_jacobian, numbers, vectors
 
 few = settings(max_examples=15, derandomize=True, deadline=None)
 ANY_SIZE = (1.0, 1e-5, 1e-12, 0.0)
@@ -162,32 +162,32 @@ def test_safe_functions_are_flat_at_their_limits():
     assert vec.safe_sqrt(jnp.asarray(0.0)) == vec.safe_sqrt(jnp.asarray(-1.0)) == 0
     assert vec.safe_arctan2(jnp.asarray(0.0), jnp.asarray(0.0)) == 0
     for x in (0.0, -1.0):
-        assert_allclose(finite_slopes(vec.safe_sqrt, x), 0, atol=0)
-    assert_allclose(finite_slopes(vec.safe_divide, 1.0, 0.0), 0, atol=0)
-    assert_allclose(finite_slopes(vec.safe_arctan2, 0.0, 0.0), 0, atol=0)
-    assert_allclose(finite_slopes(vec.length, np.zeros(3)), 0, atol=0)
-    assert_allclose(finite_slopes(vec.normalize, np.zeros(3), np.eye(3)[0])[:, :3], 0, atol=0)
+        assert_allclose(finite_jacobian(vec.safe_sqrt, x), 0, atol=0)
+    assert_allclose(finite_jacobian(vec.safe_divide, 1.0, 0.0), 0, atol=0)
+    assert_allclose(finite_jacobian(vec.safe_arctan2, 0.0, 0.0), 0, atol=0)
+    assert_allclose(finite_jacobian(vec.length, np.zeros(3)), 0, atol=0)
+    assert_allclose(finite_jacobian(vec.normalize, np.zeros(3), np.eye(3)[0])[:, :3], 0, atol=0)
 
 
 @few
 @given(vectors((1.0, 1e-5, 0.0)), vectors(), numbers())
 def test_slopes_of_products_and_lengths_are_those_of_differences(a, b, weight):
-    assert_slopes_agree(products, a, b, weight)
+    assert_gradients_match(products, a, b, weight)
 
 
 @few
 @given(vectors(), vectors())
 def test_slopes_of_directions_are_those_of_differences(v, fallback):
-    assert_slopes_agree(vec.normalize, v, fallback)
+    assert_gradients_match(vec.normalize, v, fallback)
 
 
 @few
 @given(numbers(0.1, 2), numbers(0.1, 2), st.sampled_from([1.0, 1e-3]), st.sampled_from([1, -1]))
 def test_slopes_of_safe_functions_are_those_of_differences(x, y, size, sign):
-    assert_slopes_agree(vec.safe_sqrt, size * x)
-    assert_slopes_agree(vec.safe_divide, x, sign * size * y)
-    assert_slopes_agree(vec.safe_arctan2, size * x, sign * y)
-    assert_slopes_agree(vec.cos_sin, sign * x)
+    assert_gradients_match(vec.safe_sqrt, size * x)
+    assert_gradients_match(vec.safe_divide, x, sign * size * y)
+    assert_gradients_match(vec.safe_arctan2, size * x, sign * y)
+    assert_gradients_match(vec.cos_sin, sign * x)
 
 
 def test_slopes_stay_finite_in_single_precision_however_short_the_vector():

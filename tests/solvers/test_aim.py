@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 from jaxik.maths import quat
 from jaxik.maths.gate import HARD, Smooth
 from jaxik.solvers import aim
-from support.slopes import TINY, assert_slopes_agree, finite_slopes, numbers, quaternions, vectors
+from support.gradients import (
+    TINY,
+    assert_gradients_match,
+    finite_jacobian,
+    numbers,
+    quaternions,
+    vectors,
+)
 
 few = settings(max_examples=20, derandomize=True, deadline=None)
 X, Y, Z = np.eye(3)
@@ -156,12 +163,12 @@ def test_slopes_are_those_of_finite_differences(seed):
     rng = np.random.default_rng(seed)
     target, forward, offset, up, pole = rng.normal(size=(5, 3))
     target = rng.uniform(0.7, 2.0) * normed(target)
-    assert_slopes_agree(axes, target, forward, 0.2 * offset, up, pole, rng.uniform(-3, 3))
+    assert_gradients_match(axes, target, forward, 0.2 * offset, up, pole, rng.uniform(-3, 3))
 
 
 @pytest.mark.parametrize("case", SINGULAR.values(), ids=SINGULAR.keys())
 def test_slopes_are_finite_where_a_joint_has_no_single_answer(case):
-    finite_slopes(axes, *case, 0.3)
+    finite_jacobian(axes, *case, 0.3)
 
 
 def test_slopes_are_finite_there_in_single_precision_too():
@@ -181,7 +188,7 @@ def test_slopes_are_finite_through_a_smooth_gate():
         return quat.rotate(turn, jnp.asarray(X)), reached
 
     for case in SINGULAR.values():
-        finite_slopes(smooth, *case, 0.3)
+        finite_jacobian(smooth, *case, 0.3)
 
 
 def test_a_compiled_batch_is_many_singles_in_either_precision():

@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import HARD, Smooth
 from jaxik.solvers import two_bone
-from support.slopes import TINY, assert_slopes_agree, finite_slopes, numbers, quaternions, vectors
+from support.gradients import (
+    TINY,
+    assert_gradients_match,
+    finite_jacobian,
+    numbers,
+    quaternions,
+    vectors,
+)
 
 few = settings(max_examples=20, derandomize=True, deadline=None)
 X, Y, Z = np.eye(3)
@@ -157,7 +164,7 @@ def test_the_soft_curve_passes_its_start_and_rises_to_its_limit():
     assert_allclose(y[-1], 1.4, atol=1e-6)
     assert_allclose((y - x).max(), 0.028 * 0.5, rtol=0.02)
     assert_allclose(
-        finite_slopes(two_bone.quartic_limit, 0.9 + 1e-9, 0.9, 1.4)[0, 0], 4 / 3, atol=1e-6
+        finite_jacobian(two_bone.quartic_limit, 0.9 + 1e-9, 0.9, 1.4)[0, 0], 4 / 3, atol=1e-6
     )
 
 
@@ -266,25 +273,25 @@ def test_slopes_are_those_of_finite_differences(seed, tilt):
     length = np.linalg.norm(to_hip) + np.linalg.norm(to_ankle)
     target = rng.uniform(0.7, 1.2) * length * target / np.linalg.norm(target)
     task = to_hip, to_ankle, hinge + tilt * across, target, pole
-    assert_slopes_agree(ends, *task, rng.uniform(0.5, 0.9), rng.uniform(-3, 3))
+    assert_gradients_match(ends, *task, rng.uniform(0.5, 0.9), rng.uniform(-3, 3))
 
 
 @few
 @given(numbers(0.1, 3.0), numbers(0.1, 1.0), numbers(1.1, 2.0))
 def test_slopes_of_the_soft_curve_are_those_of_finite_differences(x, free, limit):
     if abs(x - free) > 0.01:
-        assert_slopes_agree(two_bone.quartic_limit, x, free, limit)
+        assert_gradients_match(two_bone.quartic_limit, x, free, limit)
 
 
 def test_a_straight_knee_has_the_slope_of_its_sine():
-    slopes = finite_slopes(ends, *STRAIGHT, -0.8 * X, Y, ONE, 0.0)
+    slopes = finite_jacobian(ends, *STRAIGHT, -0.8 * X, Y, ONE, 0.0)
     # Knee and ankle, by the ankle's way sideways: from wherever it starts it ends at one place.
     assert_allclose(slopes[:6, 4], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", SINGULAR.values(), ids=SINGULAR.keys())
 def test_slopes_are_finite_where_a_limb_has_no_single_answer(case):
-    finite_slopes(ends, *case, 0.3)
+    finite_jacobian(ends, *case, 0.3)
 
 
 def test_slopes_are_finite_there_in_single_precision_too():
@@ -303,7 +310,7 @@ def test_slopes_are_finite_through_a_smooth_gate():
         return two_bone.pole_bend(*map(jnp.asarray, case), gate=Smooth(1.0)).reached
 
     for case in SINGULAR.values():
-        finite_slopes(reached, *case, 0.3)
+        finite_jacobian(reached, *case, 0.3)
 
 
 def test_a_compiled_batch_is_many_singles_in_either_precision():
@@ -338,7 +345,7 @@ def test_the_slopes_of_a_swing_agree_with_differences(bent, to_target, hinge, tw
     aims = [v / np.linalg.norm(v) for v in (bent, to_target)]
     assume(aims[0] @ aims[1] > -0.99)
     assume(max(abs(aims[0] @ hinge), abs(aims[1] @ hinge)) < 0.99)
-    assert_slopes_agree(swung, bent, to_target, hinge, twist)
+    assert_gradients_match(swung, bent, to_target, hinge, twist)
 
 
 @few
@@ -347,16 +354,16 @@ def test_the_slopes_of_a_knee_agree_with_differences(drawn, share):
     to_hip, to_ankle, hinge = drawn[:3]
     thigh, shin = np.linalg.norm(to_hip), np.linalg.norm(to_ankle)
     reach = abs(thigh - shin) + share * (thigh + shin - abs(thigh - shin))
-    assert_slopes_agree(two_bone.hinge_rotation, to_hip, to_ankle, hinge, reach)
+    assert_gradients_match(two_bone.hinge_rotation, to_hip, to_ankle, hinge, reach)
 
 
 def test_slopes_are_finite_where_a_swing_or_a_knee_has_no_single_answer():
     swings = ((X, -X, Y), (X, -X, X), (X, Y, X), (X, Y, Y), (X, X, X), (0 * X, Y, Z))
     for bent, target, hinge in swings:
-        finite_slopes(two_bone.swing_rotation, bent, target, hinge, 0.3)
+        finite_jacobian(two_bone.swing_rotation, bent, target, hinge, 0.3)
     for hip, ankle, hinge in ((X, -X, Y), (X, X, Y), (X, Y, X), (0 * X, Y, Z), (X, Y, Z)):
         for reach in (0.0, 1.0, 2.0, 3.0):
-            finite_slopes(two_bone.hinge_rotation, hip, ankle, hinge, reach)
+            finite_jacobian(two_bone.hinge_rotation, hip, ankle, hinge, reach)
 
 
 @few

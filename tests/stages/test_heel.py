@@ -14,7 +14,7 @@ from jaxik.stages import effector
 from reference import maths, poses
 from support.cases import QUICK, RIG
 from support.clips import to_frames, to_ik, to_rig, to_terrain
-from support.slopes import finite_slopes
+from support.gradients import finite_jacobian
 from support.strides import blocks, walk
 
 COUNT = 240  # frames
@@ -74,7 +74,7 @@ def test_the_turn_of_the_heel_is_the_one_that_a_search_finds():
 )
 def test_the_turn_has_finite_slopes_where_it_has_no_answer(to_ball, arm, length):
     one_leg = (np.array(row)[None] for row in (to_ball, arm, -maths.X, length))
-    finite_slopes(effector.heel_angle, *one_leg)
+    finite_jacobian(effector.heel_angle, *one_leg)
 
 
 @functools.cache

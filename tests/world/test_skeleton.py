@@ -18,7 +18,7 @@ from jaxik.world.skeleton import (
     forward_kinematics,
     still,
 )
-from support.slopes import TINY, assert_slopes_agree, quaternions, vectors
+from support.gradients import TINY, assert_gradients_match, quaternions, vectors
 
 few = settings(max_examples=15, derandomize=True, deadline=None)
 RNG = np.random.default_rng(2)
@@ -159,7 +159,7 @@ def test_a_clip_of_poses_is_many_poses_in_either_precision():
 @few
 @given(st.lists(quaternions(), min_size=3, max_size=3))
 def test_slopes_of_forward_kinematics_are_those_of_differences(rotations):
-    assert_slopes_agree(pose_of_fork, OFFSETS[:3], np.array(rotations))
+    assert_gradients_match(pose_of_fork, OFFSETS[:3], np.array(rotations))
 
 
 @pytest.mark.parametrize(
