@@ -279,6 +279,6 @@ class PlantLock(AbstractLock):
             share,
             into_platform.apply(planted_ws),
             clearance,
-            into_platform.turn(kept_rot),
+            into_platform.apply_rot(kept_rot),
         )
         return after, held
