@@ -1,8 +1,9 @@
-"""Every decision of the pipeline is made by a gate.
+"""Gates: how a comparison becomes a decision, sharp as in a game or blurred for gradients.
 
-`Hard` decides as a game does. `Smooth` blurs, for users who want slopes through decisions. Both
-answer with a weight 0..1, so that `a * b` is "and" and `1 - a` is "not" for either. A call names
-its `band`: the width over which a decision turns, in the unit of what is compared.
+Every decision of the pipeline goes through a gate. `Hard` decides as a game does. `Smooth` blurs,
+for users who want gradients through decisions. Both express a decision as a weight 0..1, so that
+`a * b` is "and" and `1 - a` is "not" with either. Each call states its `band`: the width over which
+a blurred decision changes, in the unit of what is compared.
 """
 
 import functools
@@ -17,7 +18,7 @@ from . import vec
 
 
 class AbstractGate(eqx.Module):
-    """How a comparison becomes a weight, and a weight a choice."""
+    """Turns comparisons into weights 0..1, and weights into choices."""
 
     @abstractmethod
     def below(self, x: Array, threshold: Array, *, band: float) -> Array:
@@ -33,19 +34,19 @@ class AbstractGate(eqx.Module):
 
     @abstractmethod
     def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
-        """`x` kept between `low` and `high`."""
+        """`x` limited to `low`..`high`; the limits may be infinite."""
 
     @abstractmethod
     def minimum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        """The smallest along the last axis."""
+        """The minimum over the last axis."""
 
     def maximum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        """The maximum along the last axis."""
+        """The maximum over the last axis."""
         return -self.minimum(-x, band=band)
 
 
 class Hard(AbstractGate):
-    """Decides as a game does: the slope through a decision is zero."""
+    """Decides as a game does: the gradient through a decision is zero."""
 
     def below(self, x: Array, threshold: Array, *, band: float) -> Array:
         del band
@@ -55,14 +56,14 @@ class Hard(AbstractGate):
         return jnp.where(weight > 0.5, yes, no)
 
     def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
-        # Not jnp.minimum: its slope is split where the operands are equal.
+        # Not jnp.minimum: it splits the gradient where the operands are equal.
         del band
         capped = jnp.where(x > high, high, x)
         return jnp.where(capped < low, low, capped)
 
     def minimum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        # Not jnp.min: its slope picks the branch by bitwise equality after fusion. Nor what argmin
-        # points at: in reverse mode that is a loop over the batch. NaN is passed on.
+        # Not jnp.min, whose gradient picks the branch by bitwise equality after fusion. Not
+        # indexing by argmin, which is a loop over the batch in reverse mode. NaN propagates.
         del band
         return functools.reduce(
             lambda a, b: jnp.where((b < a) | jnp.isnan(b), b, a), vec.unstack(x)
@@ -70,36 +71,37 @@ class Hard(AbstractGate):
 
 
 class Smooth(AbstractGate):
-    """Blurs each decision over `softness` bands; tends to `Hard` as softness falls to zero."""
+    """Blurs each decision over `softness` bands; approaches `Hard` as softness falls to zero."""
 
     softness: Float[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def below(self, x: Array, threshold: Array, *, band: float) -> Array:
-        # An endless threshold decides; divided by the width it would have no slope in softness.
+        # An infinite threshold decides outright; divided by the width, it would leave softness
+        # without a gradient.
         gap = threshold - x
-        endless = jnp.isinf(gap)
-        share = jax.nn.sigmoid(jnp.where(endless, 0.0, gap) / (band * self.softness))
-        return jnp.where(endless, jnp.where(gap > 0, 1.0, 0.0), share)
+        infinite = jnp.isinf(gap)
+        weight = jax.nn.sigmoid(jnp.where(infinite, 0.0, gap) / (band * self.softness))
+        return jnp.where(infinite, jnp.where(gap > 0, 1.0, 0.0), weight)
 
     def choose(self, weight: Array, yes: Array, no: Array) -> Array:
         return no + weight * (yes - no)
 
     def clip(self, x: Array, low: Array, high: Array, *, band: float) -> Array:
-        # An endless limit does not bind; counted with, it would make inf - inf.
+        # An infinite limit does not bind; left in the formula, it would give inf - inf.
         width = band * self.softness
-        open_low, open_high = jnp.isinf(low), jnp.isinf(high)
-        floor, roof = jnp.where(open_low, 0.0, low), jnp.where(open_high, 0.0, high)
-        above = jnp.where(open_low, x, floor + width * jax.nn.softplus((x - floor) / width))
-        over = jnp.where(open_high, 0.0, width * jax.nn.softplus((x - roof) / width))
-        return above - over
+        no_low, no_high = jnp.isinf(low), jnp.isinf(high)
+        floor, ceiling = jnp.where(no_low, 0.0, low), jnp.where(no_high, 0.0, high)
+        raised = jnp.where(no_low, x, floor + width * jax.nn.softplus((x - floor) / width))
+        excess = jnp.where(no_high, 0.0, width * jax.nn.softplus((x - ceiling) / width))
+        return raised - excess
 
     def minimum(self, x: Float[Array, "*b n"], *, band: float) -> Float[Array, "*b"]:
-        # Counted from the smallest: at a small width `x / width` is too large for its rounding not
-        # to matter, and a compiled softmax of it is NaN. The answer does not depend on the shift.
+        # Measured from the smallest: with a narrow width `x / width` is so large that its rounding
+        # matters, and a compiled softmax of it is NaN. The result does not depend on the shift.
         smallest = jax.lax.stop_gradient(jnp.min(x, axis=-1, keepdims=True))
         above = x - smallest
-        share = jax.nn.softmax(-above / (band * self.softness), axis=-1)
-        return smallest[..., 0] + jnp.sum(above * share, axis=-1)
+        weights = jax.nn.softmax(-above / (band * self.softness), axis=-1)
+        return smallest[..., 0] + jnp.sum(above * weights, axis=-1)
 
 
 HARD = Hard()

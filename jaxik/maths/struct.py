@@ -1,9 +1,9 @@
-"""What stages hand to each other: data and no rules, so dataclasses and no modules."""
+"""Frozen dataclasses as pytrees, for the data that stages hand to each other."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from operator import attrgetter
-from typing import Any, TypeVar, dataclass_transform
+from typing import TypeVar, cast, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -13,38 +13,40 @@ Data = TypeVar("Data")
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(eqx.field,))
 def struct(cls: type[Data]) -> type[Data]:
-    """A class of fields as a frozen dataclass that JAX takes apart in half a module's time.
+    """Turns a class of fields into a frozen dataclass that JAX flattens quickly.
 
-    To take modules apart and put them together took two thirds as long as the program of one frame
-    of one character. Fields with `static=True` are part of the structure. JAX puts one together
-    past its constructor, as it does a module (but no dataclass registered by JAX's own decorator):
-    what JAX puts in a field while it transforms need not be what the field is declared to hold.
+    Flattening and rebuilding `eqx.Module`s took two thirds as long as the program for one frame of
+    one character; a struct takes half as long as a module. Fields with `static=True` belong to the
+    structure. Unlike a dataclass registered by JAX's own decorator, but like a module, a struct is
+    rebuilt without calling its constructor: while JAX transforms a function, a field may hold
+    something other than its declared type.
     """
-    made: Any = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
-    made.__repr__ = eqx.tree_pformat
-    static = {field.name: field.metadata.get("static", False) for field in dataclasses.fields(made)}
-    leaves = tuple(name for name in static if not static[name])
-    rest = tuple(name for name in static if static[name])
-    names, leaves_of, rest_of = (*leaves, *rest), _values(leaves), _values(rest)
-    keys = [jax.tree_util.GetAttrKey(name) for name in leaves]
+    data = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+    data.__repr__ = lambda self: eqx.tree_pformat(self)
+    fields = dataclasses.fields(cast(type, data))
+    static_names = tuple(field.name for field in fields if field.metadata.get("static", False))
+    leaf_names = tuple(field.name for field in fields if field.name not in static_names)
+    names = (*leaf_names, *static_names)
+    leaves, static = _getter(leaf_names), _getter(static_names)
+    keys = [jax.tree_util.GetAttrKey(name) for name in leaf_names]
 
-    def flat(value: Any) -> tuple[tuple, tuple]:
-        return leaves_of(value), rest_of(value)
+    def flatten(value: Data) -> tuple[tuple, tuple]:
+        return leaves(value), static(value)
 
-    def flat_with_keys(value: Any) -> tuple[list, tuple]:
-        return list(zip(keys, leaves_of(value), strict=True)), rest_of(value)
+    def flatten_with_keys(value: Data) -> tuple[list, tuple]:
+        return list(zip(keys, leaves(value), strict=True)), static(value)
 
-    def whole(rest_values: tuple, leaf_values: Any) -> Any:
-        value = object.__new__(made)
-        value.__dict__.update(zip(names, (*leaf_values, *rest_values), strict=True))
+    def unflatten(static_values: tuple, leaf_values: Iterable) -> Data:
+        value = object.__new__(data)
+        value.__dict__.update(zip(names, (*leaf_values, *static_values), strict=True))
         return value
 
-    jax.tree_util.register_pytree_with_keys(made, flat_with_keys, whole, flat)
-    return made
+    jax.tree_util.register_pytree_with_keys(data, flatten_with_keys, unflatten, flatten)
+    return data
 
 
-def _values(names: tuple[str, ...]) -> Callable[[Any], tuple]:
-    """What tells the values of these fields."""
+def _getter(names: tuple[str, ...]) -> Callable[[object], tuple]:
+    """A function that returns the values of these fields as a tuple."""
     if len(names) > 1:
-        return attrgetter(*names)  # of one alone it would tell no tuple
+        return attrgetter(*names)  # with a single name it would not return a tuple
     return (lambda value: (getattr(value, names[0]),)) if names else (lambda value: ())

@@ -39,9 +39,9 @@ def stack(*values: Array) -> Float[Array, "*b n"]:
     """Values broadcast against each other and stacked on a new last axis; undoes `unstack`."""
     # Not `jnp.stack`: under `vmap` over scalars it puts the mapped axis last, so that mapped
     # arrays are laid out one way here and another way elsewhere.
-    values = jnp.broadcast_arrays(*values)
-    last = values[0].ndim
-    return jax.lax.concatenate([jax.lax.expand_dims(x, (last,)) for x in values], last)
+    arrays = jnp.broadcast_arrays(*values)
+    last = arrays[0].ndim
+    return jax.lax.concatenate([jax.lax.expand_dims(x, (last,)) for x in arrays], last)
 
 
 def sum_last(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
