@@ -1,59 +1,64 @@
-"""Work shared out to the cores of a CPU: a program of XLA's is one function, which runs on one."""
+"""Calls spread over the cores of a CPU, since one compiled XLA program here runs on one core."""
 
 import functools
 import os
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TypeVar
 
 import jax
 
+Output = TypeVar("Output")
+
 
 def usable_cores() -> int:
-    """Cores that programs share: all that this process may use; one where a GPU computes."""
+    """Number of cores to spread work over: all this process may use, or 1 if a GPU computes."""
     if jax.default_backend() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def cpu_block(count: int) -> int | None:
-    """So many at a time on a CPU, whose cache is to hold them; all where a GPU computes."""
-    return count if jax.default_backend() == "cpu" else None
+def cpu_block(size: int) -> int | None:
+    """The block size on a CPU, whose cache a block should fit; None (no blocks) on a GPU."""
+    return size if jax.default_backend() == "cpu" else None
 
 
-def on_all_cores(calls: Sequence[Callable[[], Any]]) -> list:
-    """What these calls give, made as many at once as there are cores.
+def on_all_cores(calls: Sequence[Callable[[], Output]]) -> list[Output]:
+    """The outputs of these calls, in order, computed by as many threads as there are cores.
 
-    The thread that asks computes too: to wake another takes 0.1 ms and more. Where a call fails
-    or is interrupted, none is begun after it.
+    The calling thread computes too, because waking another one takes 0.1 ms or more. After a call
+    that fails or is interrupted, no further call starts.
     """
-    left, made = deque(enumerate(calls)), {}
+    pending = deque(enumerate(calls))
+    outputs: dict[int, Output] = {}
 
-    def compute() -> None:
+    def work() -> None:
         try:
-            for number, call in iter(functools.partial(_taken, left), None):
-                made[number] = jax.block_until_ready(call())
+            while (task := _next_task(pending)) is not None:
+                number, call = task
+                outputs[number] = jax.block_until_ready(call())
         finally:
-            left.clear()
+            pending.clear()
 
     helpers = usable_cores() - 1
-    helping = [_threads(helpers).submit(compute) for _ in range(helpers)]
-    compute()
-    for one in helping:
-        one.result()
-    return [made[number] for number in range(len(calls))]
+    futures = [_thread_pool(helpers).submit(work) for _ in range(helpers)]
+    work()
+    for future in futures:
+        future.result()
+    return [outputs[number] for number in range(len(calls))]
 
 
-def _taken(left: deque) -> Any:
-    """The next one; None where there is none."""
+def _next_task(
+    pending: deque[tuple[int, Callable[[], Output]]],
+) -> tuple[int, Callable[[], Output]] | None:
     try:
-        return left.popleft()
-    except IndexError:
+        return pending.popleft()
+    except IndexError:  # checking for emptiness first would race with the other threads
         return None
 
 
 @functools.cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    """Kept, for it takes 0.4 ms to start one."""
-    return ThreadPoolExecutor(count)
+def _thread_pool(size: int) -> ThreadPoolExecutor:
+    """A pool that stays alive: starting a thread takes 0.4 ms."""
+    return ThreadPoolExecutor(size)

@@ -1,4 +1,4 @@
-"""Work shared out to cores: all of it, in order, and none after a failure."""
+"""Calls spread over cores: all of them run, outputs are in order, none starts after a failure."""
 
 import threading
 
@@ -8,45 +8,49 @@ import pytest
 from fitting.runtime import threads
 
 
-@pytest.mark.parametrize("threads", [1, 2, 5])
+def use_cores(monkeypatch, count):
+    monkeypatch.setattr(threads, "usable_cores", lambda: count)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 5])
 @pytest.mark.parametrize("count", [0, 1, 7])
-def test_results_come_in_order(monkeypatch, threads, count):
-    monkeypatch.setattr(threads, "cores", lambda: threads)
+def test_outputs_are_in_the_order_of_the_calls(monkeypatch, cores, count):
+    use_cores(monkeypatch, cores)
     calls = [lambda number=number: jnp.asarray(number) for number in range(count)]
-    assert [int(one) for one in threads.on_all_cores(calls)] == list(range(count))
+    assert [int(output) for output in threads.on_all_cores(calls)] == list(range(count))
 
 
-def test_two_calls_run_at_once(monkeypatch):
-    monkeypatch.setattr(threads, "cores", lambda: 2)
-    both = threading.Barrier(2, timeout=30)  # breaks unless another thread comes to it too
-    threads.on_all_cores([lambda: jnp.asarray(both.wait())] * 2)
+def test_two_calls_run_at_the_same_time(monkeypatch):
+    use_cores(monkeypatch, 2)
+    meeting = threading.Barrier(2, timeout=30)  # breaks unless two threads wait at it together
+    threads.on_all_cores([lambda: jnp.asarray(meeting.wait())] * 2)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_none_is_begun_after_a_failure(monkeypatch, threads):
-    monkeypatch.setattr(threads, "cores", lambda: threads)
-    begun = []
+@pytest.mark.parametrize("cores", [1, 2])
+def test_no_call_starts_after_a_failure(monkeypatch, cores):
+    use_cores(monkeypatch, cores)
+    started = []
 
-    def fails() -> None:
-        begun.append("fails")
-        raise ValueError("as told")
+    def fail() -> None:
+        started.append("fail")
+        raise ValueError("as intended")
 
-    def works() -> None:
-        begun.append("works")
+    def succeed() -> None:
+        started.append("succeed")
 
-    with pytest.raises(ValueError, match="as told"):
-        threads.on_all_cores([fails] * threads + [works] * 100)
-    assert set(begun) == {"fails"}
+    with pytest.raises(ValueError, match="as intended"):
+        threads.on_all_cores([fail] * cores + [succeed] * 100)
+    assert set(started) == {"fail"}
 
 
-def test_a_failure_in_a_helping_thread_is_told(monkeypatch):
-    monkeypatch.setattr(threads, "cores", lambda: 2)
-    asking, both = threading.get_ident(), threading.Barrier(2, timeout=30)
+def test_a_failure_in_a_helper_thread_is_raised(monkeypatch):
+    use_cores(monkeypatch, 2)
+    caller, meeting = threading.get_ident(), threading.Barrier(2, timeout=30)
 
-    def fails_elsewhere() -> None:
-        both.wait()
-        if threading.get_ident() != asking:
-            raise ValueError("as told")
+    def fail_in_helper() -> None:
+        meeting.wait()
+        if threading.get_ident() != caller:
+            raise ValueError("as intended")
 
-    with pytest.raises(ValueError, match="as told"):
-        threads.on_all_cores([fails_elsewhere] * 2)
+    with pytest.raises(ValueError, match="as intended"):
+        threads.on_all_cores([fail_in_helper] * 2)

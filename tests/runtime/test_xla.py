@@ -1,4 +1,4 @@
-"""Flags of XLA and JAX: set where none are, and they do what they are there for."""
+"""Settings of XLA and JAX: set unless the user has set them, and with the effect they promise."""
 
 import os
 
@@ -8,47 +8,54 @@ import pytest
 
 from fitting.runtime import xla
 
+our_flags = pytest.mark.skipif(
+    os.environ.get("XLA_FLAGS") != xla.FLAGS, reason="XLA has other flags"
+)
+on_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="these flags are for a CPU")
 
-def test_flags_are_set_where_none_are(monkeypatch):
+
+def test_flags_are_set_where_there_are_none(monkeypatch):
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     xla.configure_xla()
-    assert os.environ["XLA_FLAGS"] == xla.XLA
+    assert os.environ["XLA_FLAGS"] == xla.FLAGS
 
 
-def test_flags_of_the_user_stay(monkeypatch):
+def test_flags_of_the_user_are_left_alone(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     xla.configure_xla()
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
 
 
-@pytest.mark.parametrize("user", [None, "true"])
-def test_programs_run_where_they_are_called_unless_the_user_has_said(monkeypatch, user):
-    monkeypatch.delenv(xla.ASYNC, raising=False)
-    if user is not None:
-        monkeypatch.setenv(xla.ASYNC, user)
-    name = xla.ASYNC.lower()
-    before = jax.config.values[name]
-    jax.config.update(name, True)
+@pytest.mark.parametrize("user_setting", [None, "true"])
+def test_programs_run_in_the_calling_thread_unless_the_user_chose_otherwise(
+    monkeypatch, user_setting
+):
+    monkeypatch.delenv(xla.ASYNC_DISPATCH, raising=False)
+    if user_setting is not None:
+        monkeypatch.setenv(xla.ASYNC_DISPATCH, user_setting)
+    option = xla.ASYNC_DISPATCH.lower()
+    before = jax.config.values[option]
+    jax.config.update(option, True)
     try:
         xla.configure_xla()
-        assert jax.config.values[name] == (user is not None)
+        assert jax.config.values[option] == (user_setting is not None)
     finally:
-        jax.config.update(name, before)
+        jax.config.update(option, before)
 
 
-@pytest.mark.skipif(os.environ.get("XLA_FLAGS") != xla.XLA, reason="XLA has other flags")
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is no such library on a GPU")
-def test_sums_are_no_calls_of_a_library():
-    told = jax.ShapeDtypeStruct((2048, 2048), jnp.float32)
-    program = jax.jit(lambda x: jnp.sum(x, 0)).lower(told).compile().as_text()
+@our_flags
+@on_cpu
+def test_sums_do_not_call_a_library():
+    shape = jax.ShapeDtypeStruct((2048, 2048), jnp.float32)
+    program = jax.jit(lambda x: jnp.sum(x, 0)).lower(shape).compile().as_text()
     assert "ynn_fusion" not in program
 
 
-@pytest.mark.skipif(os.environ.get("XLA_FLAGS") != xla.XLA, reason="XLA has other flags")
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is no such loop on a GPU")
-@pytest.mark.parametrize(("numbers", "one"), [(64, True), (100_000_000, False)])
-def test_a_loop_that_moves_little_is_one_function(numbers, one):
-    turns = jax.jit(lambda x: jax.lax.scan(lambda c, x: (c + jnp.sin(x), c * x), x[0], x))
-    told = jax.ShapeDtypeStruct((3, numbers), jnp.float32)
-    program = turns.lower(told).compile().as_text()
-    assert ("xla_cpu_small_call" in program) == one
+@our_flags
+@on_cpu
+@pytest.mark.parametrize(("numbers", "one_function"), [(64, True), (100_000_000, False)])
+def test_a_loop_that_moves_little_becomes_one_function(numbers, one_function):
+    loop = jax.jit(lambda x: jax.lax.scan(lambda c, x: (c + jnp.sin(x), c * x), x[0], x))
+    shape = jax.ShapeDtypeStruct((3, numbers), jnp.float32)
+    program = loop.lower(shape).compile().as_text()
+    assert ("xla_cpu_small_call" in program) == one_function
