@@ -57,7 +57,7 @@ def _read(table: Mapping[str, Any], ik: jaxik.FootIK, where: str) -> Variant:
     name = table.get("name", "")
     if not name.strip():
         raise ValueError(f"{where}: a variant without a name; wanted name = 'what is left out'")
-    parameters = validation.flat(table.get("parameters", {}), 2)
+    parameters = validation.flatten(table.get("parameters", {}), 2)
     free = free_table(table.get("free", {}), f"{where} {name}: free")
     variant = Variant(name, dict(table.get("rules", {})), parameters, free)
     other = with_rules(ik, variant.rules, f"{where} {name}: rules")

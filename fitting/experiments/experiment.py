@@ -39,7 +39,7 @@ from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Reference, Scene, Sigmas
 from fitting.problem.space import make_space
 from fitting.runtime import validation
-from fitting.runtime.validation import check_table, flat
+from fitting.runtime.validation import check_table, flatten
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
@@ -114,24 +114,34 @@ class Experiment:
 
 # What the tables of the file hold.
 FILES = ("reference", "terrain", "base", "truth")
-CLIP: dict[str, validation.Kind] = dict.fromkeys((*FILES, "label"), validation.TEXT)
-CLIP |= {"start": validation.TIME, "end": validation.TIME, "file_up": validation.one_of(("y", "z"))}
-CLIP |= {"mask_pops": validation.SWITCH}
-SIGMA = dict.fromkeys(SIGMAS, validation.POSITIVE) | {"correlation": validation.SHARE}
+CLIP: dict[str, validation.Constraint] = dict.fromkeys((*FILES, "label"), validation.TEXT)
+CLIP |= {
+    "start": validation.SECONDS,
+    "end": validation.SECONDS,
+    "file_up": validation.one_of(("y", "z")),
+}
+CLIP |= {"mask_pops": validation.BOOLEAN}
+SIGMA = dict.fromkeys(SIGMAS, validation.POSITIVE) | {"correlation": validation.FRACTION}
 FIT = {"starts": validation.COUNT, "max_steps": validation.COUNT}
-SAMPLE: dict[str, validation.Kind] = dict.fromkeys(
+SAMPLE: dict[str, validation.Constraint] = dict.fromkeys(
     ("walkers", "max_steps", "thin_by"), validation.COUNT
 )
 SAMPLE |= {"stop_at": validation.POSITIVE}
-TOP: dict[str, validation.Kind] = {
+TOP: dict[str, validation.Constraint] = {
     "name": validation.TEXT,
     "preset": validation.TEXT,
     "loss": validation.one_of(get_args(Loss)),
 }
-TOP |= {"fps": validation.RATE, "seed": validation.SEED, "independent_every": validation.TIME}
+TOP |= {
+    "fps": validation.FINITE_POSITIVE,
+    "seed": validation.SEED,
+    "independent_every": validation.SECONDS,
+}
 TOP |= dict.fromkeys(("free", "rules", "parameters", "sigmas", "fit", "sample"), validation.TABLE)
 TOP |= {
-    name: validation.Kind(f"[[{name}]], one for each {each}", lambda made: isinstance(made, list))
+    name: validation.Constraint(
+        f"[[{name}]], one for each {each}", lambda made: isinstance(made, list)
+    )
     for name, each in (("clips", "clip"), ("without", "variant"))
 }
 
@@ -160,7 +170,7 @@ def parse_experiment(content: Mapping[str, Any], path: Path) -> Experiment:
     made = dict(content)
     made["clips"] = tuple(_entry(entry, path) for entry in content["clips"])
     made["free"] = free_table(content["free"], f"{path} [free]")
-    made["parameters"] = flat(content.get("parameters", {}), 2)
+    made["parameters"] = flatten(content.get("parameters", {}), 2)
     made["without"] = read_variants(content.get("without", []), ik, f"{path} [[without]]")
     made["fit"] = FitOptions(**check_table(content.get("fit", {}), FIT, f"{path} [fit]"))
     sample = check_table(content.get("sample", {}), SAMPLE, f"{path} [sample]")

@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 
 import jaxik
-from fitting.runtime.validation import TABLE, check_keys, check_table, flat, nested, read_toml
+from fitting.runtime.validation import TABLE, check_keys, check_table, flatten, nest, read_toml
 from jaxik.maths import parameter_tree
 
 from .systems import exchanged, leaf_names, name_preset, with_parameters, with_rules
@@ -23,7 +23,7 @@ def to_toml(ik: jaxik.FootIK, preset: str = "record") -> str:
     """Every rule, parameter, convention and switch of a system; units as the rules declare them."""
     values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
     other = exchanged(ik, name_preset(preset))
-    return tomli_w.dumps({"preset": preset} | ({"rules": other} if other else {}) | nested(values))
+    return tomli_w.dumps({"preset": preset} | ({"rules": other} if other else {}) | nest(values))
 
 
 def from_toml(path: str | Path) -> tuple[jaxik.FootIK, str]:
@@ -41,4 +41,4 @@ def from_toml(path: str | Path) -> tuple[jaxik.FootIK, str]:
     check_table({"rules": other}, {"rules": TABLE}, str(path))
     ik = with_rules(ik, other, f"{path} [rules]")
     check_keys(content, list(vars(ik)), str(path))
-    return with_parameters(ik, flat(content, 2), str(path)), preset
+    return with_parameters(ik, flatten(content, 2), str(path)), preset

@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxik
 from fitting.runtime import validation
-from fitting.runtime.validation import check_keys, check_table, flat
+from fitting.runtime.validation import check_keys, check_table, flatten
 from jaxik import presets
 from jaxik.maths import parameter_tree
 
@@ -25,7 +25,9 @@ STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules that each stage 
     for one in fields(jaxik.FootIK)
 }
 
-FREE: dict[str, validation.Kind] = dict.fromkeys(("low", "high", "prior_mean"), validation.NUMBER)
+FREE: dict[str, validation.Constraint] = dict.fromkeys(
+    ("low", "high", "prior_mean"), validation.NUMBER
+)
 FREE |= {"prior_sd": validation.POSITIVE, "kind": validation.TEXT, "scale": validation.TEXT}
 
 
@@ -100,5 +102,5 @@ def leaf_names(ik: jaxik.FootIK) -> list[str]:
 
 def free_table(given: Mapping[str, Any], where: str) -> dict[str, Mapping[str, Any]]:
     """What a [free] table says of each parameter, by dotted name."""
-    named = flat(given, 2)
+    named = flatten(given, 2)
     return {name: check_table(one, FREE, f"{where} {name}") for name, one in named.items()}

@@ -8,20 +8,21 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from fitting.analysis import playback, worst_window
-from fitting.analysis.limit_activity import exercise, flipped_decisions
+import jaxik
+from fitting.analysis import limit_activity, playback, worst_window
 from fitting.analysis.playback import Playback
 from fitting.experiments.experiment import Experiment, bare_system
 from fitting.experiments.systems import with_parameters
 from fitting.inference.sampling.posterior import Posterior
 from fitting.runtime import files
-from fitting.runtime.validation import flat, read_toml
+from fitting.runtime.validation import flatten, read_toml
 from fitting.studies import run_folder
 from fitting.studies.study import Fit
 
-from . import tables
+from . import fit_tables, formatting, posterior_tables, worst_window_report
+from .fit_tables import Truth
+from .formatting import markdown
 from .plots import fit_plots, posterior_plots, style, worst_window_plots
-from .tables import Truth, markdown
 
 HEADING = "## Posterior"  # what follows it in summary.md is of `write_posterior`
 WORST = "## The worst two seconds"
@@ -43,7 +44,7 @@ def truth_of(experiment: Experiment) -> dict[str, float] | None:
         return None
     ik = bare_system(experiment)
     content = read_toml(path, "a truth")
-    values = flat({stage: table for stage, table in content.items() if stage in vars(ik)}, 2)
+    values = flatten({stage: table for stage, table in content.items() if stage in vars(ik)}, 2)
     with_parameters(ik, values, str(path))
     found: dict[str, float] = {}
     for name, value in values.items():
@@ -66,11 +67,16 @@ def fit_text(told: Mapping[str, Any], truth: Truth) -> str:
         truth: known parameters, where there are any.
     """
     rows = told["parameters"]
-    parts = [told["message"], _cost(told), "", tables.aligned(tables.fit_table(rows, truth))]
+    parts = [
+        told["message"],
+        _cost(told),
+        "",
+        formatting.aligned(fit_tables.parameter_table(rows, truth)),
+    ]
     if any("half_life" in row for row in rows):
-        parts += ["", tables.aligned(tables.gain_table(rows, run_folder.TICKS))]
+        parts += ["", formatting.aligned(fit_tables.gain_table(rows))]
     if truth:
-        parts += ["", tables.recovered(rows, truth)]
+        parts += ["", fit_tables.recovered(rows, truth)]
     return "\n".join(parts)
 
 
@@ -83,22 +89,28 @@ def write_fit(
     pictures.
     """
     pictures: Pictures = {}
-    last = [playback.play(fitted.ik, scene) for scene in fitted.problem.data]
+    results = [playback.run(fitted.ik, scene) for scene in fitted.problem.data]
+    last = [
+        playback.play(scene, result)
+        for scene, result in zip(fitted.problem.data, results, strict=True)
+    ]
     for index, play in enumerate(last):
         pictures |= _draw_clip(run, fitted, index, play)
     told = [*_worst(run, fitted, last), *details]
     title = f"{fitted.experiment.name}: cost of the fit over time"
     figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
     pictures |= _keep(run, "cost.png", title, figure)
-    files.write_text(run / run_folder.SUMMARY, _fit_summary(fitted, pictures, opening, told))
+    files.write_text(
+        run / run_folder.SUMMARY, _fit_summary(fitted, results, pictures, opening, told)
+    )
 
 
 def posterior_text(posterior: Posterior, truth: Truth) -> str:
     """What a sampling found, for the terminal."""
-    table = tables.aligned(tables.posterior_table(posterior, truth, {}))
+    table = formatting.aligned(posterior_tables.posterior_table(posterior, truth, {}))
     parts = [*_health(posterior), "", table]
     if truth:
-        covered = tables.covered(posterior, truth, posterior.names)
+        covered = posterior_tables.covered(posterior, truth, posterior.names)
         parts += ["", f"The 95 % intervals cover the truth of {covered} parameters."]
     return "\n".join(parts)
 
@@ -120,11 +132,11 @@ def write_posterior(run: Path, experiment: Experiment, posterior: Posterior) -> 
     pictures |= _keep(run, "chain.png", title, figure)
 
     parts = [HEADING, "\n".join(f"- {line}" for line in _health(posterior))]
-    parts.append(markdown(tables.posterior_table(posterior, truth, units)))
+    parts.append(markdown(posterior_tables.posterior_table(posterior, truth, units)))
     if truth:
         determined = [name for name, row in rows.items() if row["determined"]]
-        covered = tables.covered(posterior, truth, posterior.names)
-        judged = tables.covered(posterior, truth, determined)
+        covered = posterior_tables.covered(posterior, truth, posterior.names)
+        judged = posterior_tables.covered(posterior, truth, determined)
         parts.append(
             f"The 95 % intervals cover the truth of {covered} parameters; of those that the fit "
             f"calls determined, of {judged}."
@@ -147,13 +159,15 @@ def _worst(run: Path, fitted: Fit, plays: Sequence[Playback]) -> list[str]:
     """Draws the worst two seconds of each clip; the section that tells of them."""
     parts = [WORST]
     for index, play in enumerate(plays):
-        legs, found = fitted.problem.data[index].rig.names, worst_window.find_worst(play)
+        legs, found = fitted.problem.data[index].rig.names, worst_window.find_worst_window(play)
         clip, end = _names(fitted, index)
         title = f"{clip}: the worst {play.time[found.end] - play.time[found.start]:.1f} seconds"
         picture = _keep(
             run, f"worst{end}", title, worst_window_plots.worst(play, legs, found, title)
         )
-        parts.append("\n".join(f"- {line}" for line in worst_window.told(play, found, legs)))
+        parts.append(
+            "\n".join(f"- {line}" for line in worst_window_report.describe(play, found, legs))
+        )
         parts.append(_gallery(picture))
     return parts
 
@@ -162,7 +176,8 @@ def _draw_clip(run: Path, fitted: Fit, index: int, last: Playback) -> Pictures:
     """The pictures of one clip, which is played as it was fitted."""
     scene = fitted.problem.data[index]
     clip, end = _names(fitted, index)
-    first = playback.play(fitted.problem.space.unpack(fitted.problem.space.pack({})), scene)
+    preset = fitted.problem.space.unpack(fitted.problem.space.pack({}))
+    first = playback.play(scene, playback.run(preset, scene))
     legs, leg = scene.rig.names, fitted.ik.leg
     limits = [float(np.mean(getattr(leg, name))) for name in KNEE_LIMITS if hasattr(leg, name)]
     found: Pictures = {}
@@ -203,7 +218,7 @@ def _health(posterior: Posterior) -> list[str]:
         posterior.message,
         f"{walkers} walkers, {steps} steps, the first {posterior.burn_in * posterior.thin_by} left "
         f"out as burn-in; {posterior.seconds:.0f} s in the last call.",
-        f"Mean acceptance {tables.share(float(posterior.acceptance.mean()))}; slowest "
+        f"Mean acceptance {formatting.percent(float(posterior.acceptance.mean()))}; slowest "
         f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
         f"Stuck walkers: {stuck}; left out of the summary: "
         f"{', '.join(map(str, posterior.apart)) or 'none'}.",
@@ -211,7 +226,11 @@ def _health(posterior: Posterior) -> list[str]:
 
 
 def _fit_summary(
-    fitted: Fit, pictures: Pictures, opening: Sequence[str], details: Sequence[str]
+    fitted: Fit,
+    results: Sequence[jaxik.Result],
+    pictures: Pictures,
+    opening: Sequence[str],
+    details: Sequence[str],
 ) -> str:
     experiment, found = fitted.experiment, fitted.identifiability
     told, truth = run_folder.describe_fit(fitted), truth_of(experiment)
@@ -221,11 +240,11 @@ def _fit_summary(
     parts.append(
         f"Preset `{experiment.preset}`{other}, loss `{experiment.loss}`, seed {experiment.seed}."
     )
-    parts += [*opening, "## Parameters", markdown(tables.fit_table(rows, truth))]
+    parts += [*opening, "## Parameters", markdown(fit_tables.parameter_table(rows, truth))]
     if truth:
-        parts.append(f"{tables.recovered(rows, truth)}.")
+        parts.append(f"{fit_tables.recovered(rows, truth)}.")
     if any("half_life" in row for row in rows):
-        parts.append(markdown(tables.gain_table(rows, run_folder.TICKS)))
+        parts.append(markdown(fit_tables.gain_table(rows)))
 
     parts.append("## What these clips do not determine")
     names = ", ".join(f"`{name}`" for name in found.undetermined)
@@ -233,7 +252,7 @@ def _fit_summary(
     parts.append(
         "Contraction is 1 where the clips alone decide and 0 where the prior is all that is known."
     )
-    parts.append(markdown(tables.contraction_table(rows)))
+    parts.append(markdown(fit_tables.contraction_table(rows)))
     if found.correlated:
         pairs = (f"- `{a}` and `{b}`: {value:+.3f}" for a, b, value in found.correlated)
         parts.append("Pairs of which these clips mostly determine one combination (correlation):")
@@ -242,17 +261,20 @@ def _fit_summary(
         together = ", ".join(f"`{name}`" for name in found.weakest)
         parts.append(f"The least determined direction moves {together}.")
 
-    clips = [exercise(fitted.ik, scene) for scene in fitted.problem.data]
+    clips = [
+        limit_activity.measure(fitted.ik, scene, result)
+        for scene, result in zip(fitted.problem.data, results, strict=True)
+    ]
     parts += ["## What the clips ask of the fitted system", "Shares of all frames, a foot each:"]
-    parts.append(markdown(tables.exercise_table(clips)))
+    parts.append(markdown(fit_tables.activity_table(clips)))
     parts.append("Share of frames that would look different if the limit were out of the way:")
-    parts.append(markdown(tables.limits_table(clips)))
+    parts.append(markdown(fit_tables.limit_table(clips)))
     if found.profiles:
-        flips = flipped_decisions(fitted.problem, fitted.solution.u)
+        flips = limit_activity.flipped_decisions(fitted.problem, fitted.solution.u)
         parts.append(
             "Share of the feet's decisions (planted, lifted, locked, ground found) that flip when "
             "a threshold moves by 10 % of its range, and by how much the cost rises:"
         )
-        parts.append(markdown(tables.flips_table(flips, found.profiles)))
+        parts.append(markdown(fit_tables.flip_table(flips, found.profiles)))
     parts += [*details, "## Pictures", _gallery(pictures)]
     return "\n\n".join(parts) + "\n"

@@ -24,7 +24,7 @@ from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
-from fitting.runtime.validation import nested
+from fitting.runtime.validation import nest
 from jaxik.maths import parameter_tree, smoothing
 
 from .study import Fit
@@ -68,7 +68,7 @@ def resolved(experiment: Experiment, run: Path | None = None) -> str:
     content = _plain(dataclasses.asdict(experiment), run and run.resolve())
     del content["path"]
     for name in ("free", "parameters"):
-        content[name] = nested(content[name])
+        content[name] = nest(content[name])
     return tomli_w.dumps(content)
 
 
