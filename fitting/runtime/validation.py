@@ -1,4 +1,4 @@
-"""What files of settings may hold: TOML with known keys and values of the right kind."""
+"""Checks on TOML files that users write: known keys, and values of the right type and range."""
 
 import difflib
 import math
@@ -6,56 +6,70 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
+
+Table: TypeAlias = Mapping[str, Any]  # as TOML reads it; values are checked before they are used
 
 
-class Kind(NamedTuple):
-    """A kind of value: in words, and how it is told."""
+class Constraint(NamedTuple):
+    """What a value must be: in words for error messages, and as a test."""
 
-    wanted: str
-    fits: Callable[[Any], bool]
-
-
-def _is_number(value: Any) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and not math.isnan(value)
+    description: str
+    accepts: Callable[[object], bool]
 
 
-def _is_whole(value: Any) -> bool:
-    return _is_number(value) and isinstance(value, int)
+def _number_in(accepts: Callable[[float], bool]) -> Callable[[object], bool]:
+    """A test for numbers that are not NaN and for which `accepts` holds."""
+
+    def test(value: object) -> bool:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return is_number and not math.isnan(value) and accepts(value)
+
+    return test
 
 
-TEXT = Kind("a text", lambda value: isinstance(value, str))
-SWITCH = Kind("true or false", lambda value: isinstance(value, bool))
-TABLE = Kind("a table", lambda value: isinstance(value, Mapping))
-NUMBER = Kind("a number", _is_number)
-POSITIVE = Kind("a number above 0", lambda value: _is_number(value) and value > 0)
-RATE = Kind("a finite number above 0", lambda value: _is_number(value) and 0 < value < math.inf)
-TIME = Kind("a number of seconds, 0 or more", lambda value: _is_number(value) and value >= 0)
-SHARE = Kind("a number from 0 to below 1", lambda value: _is_number(value) and 0 <= value < 1)
-COUNT = Kind("a whole number above 0", lambda value: _is_whole(value) and value > 0)
-SEED = Kind(
-    "a whole number from 0 to 4294967295", lambda value: _is_whole(value) and 0 <= value < 2**32
+def _integer_in(accepts: Callable[[float], bool]) -> Callable[[object], bool]:
+    return lambda value: isinstance(value, int) and _number_in(accepts)(value)
+
+
+TEXT = Constraint("a text", lambda value: isinstance(value, str))
+BOOLEAN = Constraint("true or false", lambda value: isinstance(value, bool))
+TABLE = Constraint("a table", lambda value: isinstance(value, Mapping))
+NUMBER = Constraint("a number", _number_in(lambda value: True))
+POSITIVE = Constraint("a number above 0", _number_in(lambda value: value > 0))
+FINITE_POSITIVE = Constraint(
+    "a finite number above 0", _number_in(lambda value: 0 < value < math.inf)
+)
+SECONDS = Constraint("a number of seconds, 0 or more", _number_in(lambda value: value >= 0))
+FRACTION = Constraint("a number from 0 to below 1", _number_in(lambda value: 0 <= value < 1))
+COUNT = Constraint("a whole number above 0", _integer_in(lambda value: value > 0))
+SEED = Constraint(
+    "a whole number from 0 to 4294967295", _integer_in(lambda value: 0 <= value < 2**32)
 )
 
 
-def one_of(words: Sequence[str]) -> Kind:
+def one_of(words: Sequence[str]) -> Constraint:
     """Any of these texts."""
-    return Kind(f"one of {list(words)}", lambda value: value in words)
+    return Constraint(f"one of {list(words)}", lambda value: value in words)
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
+def list_of(description: str) -> Constraint:
+    """A list, described in these words; its elements are checked elsewhere."""
+    return Constraint(description, lambda value: isinstance(value, list))
+
+
+def read_toml(path: Path, description: str) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Args:
         path: the file.
-        what: it should be, for the error: "an experiment".
+        description: what kind of file it should be, for the error message: "an experiment".
 
     Raises:
-        ValueError: a file that is not there or no TOML.
+        ValueError: the file does not exist or is not TOML.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: {why_missing(path)}, wanted {what} file")
+        raise ValueError(f"{path}: {why_missing(path)}, wanted {description} file")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -63,22 +77,26 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def why_missing(path: Path) -> str:
-    """Why there is nothing to read, in words."""
+    """Why there is no file to read at this path, in words."""
     return "a folder" if path.is_dir() else "no such file"
 
 
 @contextmanager
 def error_context(where: Path | str) -> Iterator[None]:
-    """Says in front of a ValueError from within where it is."""
+    """Prefixes any ValueError raised inside with the place it belongs to."""
     try:
         yield
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def check_keys(given: Mapping[str, Any], known: Sequence[str], where: str) -> None:
-    """ValueError for a key that is not known, with the nearest one that is."""
-    for key in given:
+def check_keys(table: Table, known: Sequence[str], where: str) -> None:
+    """Checks that all keys are known ones.
+
+    Raises:
+        ValueError: a key is unknown; the message names the nearest known one.
+    """
+    for key in table:
         if key not in known:
             nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
             raise ValueError(
@@ -86,34 +104,40 @@ def check_keys(given: Mapping[str, Any], known: Sequence[str], where: str) -> No
             )
 
 
-def check_table(given: Any, kinds: Mapping[str, Kind], where: str) -> Mapping[str, Any]:
-    """The table, which may hold these keys with values of these kinds; else ValueError."""
-    if not TABLE.fits(given):
-        raise ValueError(f"{where} is {given!r}; wanted a table, such as {{}}")
-    check_keys(given, list(kinds), where)
-    for key, value in given.items():
-        if not kinds[key].fits(value):
-            raise ValueError(f"{where}: {key} is {value!r}; wanted {kinds[key].wanted}")
-    return given
+def check_table(value: object, constraints: Mapping[str, Constraint], where: str) -> Table:
+    """Returns the value if it is a table with these keys, each value meeting its constraint.
 
+    Args:
+        value: what was read.
+        constraints: what the value under each known key must be; any key may be absent.
+        where: the table's place in its file, for the error message.
 
-def flat(tables: Mapping[str, Any], depth: int, prefix: str = "") -> dict[str, Any]:
-    """Nested TOML tables as dotted names, `depth` parts each: `lock.enabled`.
-
-    An empty table keeps its place, so that no name goes unread.
+    Raises:
+        ValueError: it is no table, or has an unknown key or a value that is not accepted.
     """
-    found: dict[str, Any] = {}
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where} is {value!r}; wanted a table, such as {{}}")
+    check_keys(value, list(constraints), where)
+    for key, entry in value.items():
+        if not constraints[key].accepts(entry):
+            raise ValueError(f"{where}: {key} is {entry!r}; wanted {constraints[key].description}")
+    return value
+
+
+def flatten(tables: Table, depth: int, prefix: str = "") -> dict[str, Any]:
+    """Nested TOML tables as one with dotted keys of up to `depth` parts: `lock.enabled`."""
+    flat: dict[str, Any] = {}
     for key, value in tables.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping) and value and name.count(".") + 1 < depth:
-            found |= flat(value, depth, f"{name}.")
+            flat |= flatten(value, depth, f"{name}.")
         else:
-            found[name] = value
-    return found
+            flat[name] = value
+    return flat
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Values by `stage.name` as a table a stage: what `flat` made flat."""
+def nest(values: Table) -> dict[str, dict[str, Any]]:
+    """Values by `stage.name` as one table per stage, the reverse of `flatten`."""
     tables: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         stage, _, leaf = name.partition(".")
