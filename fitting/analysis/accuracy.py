@@ -100,7 +100,7 @@ def clip_errors(solved: Clip, captured: Clip, animation: Clip) -> Errors:
         positions_by_role(solved),
         positions_by_role(captured),
         animation.joints_ws(2),
-        captured.standing(),
+        captured.stance_labels(),
         np.stack([np.asarray(rig.thigh), np.asarray(rig.shin)], axis=-1),
     )
 

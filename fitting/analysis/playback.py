@@ -1,4 +1,4 @@
-"""A clip played under given parameters, as the numbers that reports count and pictures draw."""
+"""A clip before and after foot IK, and as captured: the numbers that reports and pictures show."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -13,21 +13,23 @@ from jaxtyping import Array, Bool, Float
 import jaxik
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene, legs_ws, pelvis_ws
-from fitting.runtime.program_cache import cached
+from fitting.runtime import program_cache
 from jaxik.maths import vec
 from jaxik.world import frame
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import cast
 
-ABOVE, REACH = 1.0, 3.0  # m, where the rays that look for the ground start, and their length
+RAY_START = 1.0  # m above a joint, where the ray that looks for the ground under it starts
+RAY_LENGTH = 3.0  # m
 
-KINDS = ("ankle", "knee", "pelvis", "foot", "body", "contact", "smooth")  # in the rows' order
+# In the order of a scene's residuals.
+RESIDUAL_KINDS = ("ankle", "knee", "pelvis", "foot", "body", "contact", "smooth")
 
-Series: TypeAlias = Array | np.ndarray  # NumPy once a playback is made
+Series: TypeAlias = Array | np.ndarray  # NumPy in a finished playback
 
 
 class Motion(eqx.Module):
-    """Where legs and pelvis are; world space, m, frames first."""
+    """Positions of pelvis and leg joints; world space, m."""
 
     pelvis: Float[Series, "frames 3"]
     hip: Float[Series, "frames legs 3"]
@@ -44,7 +46,7 @@ class Motion(eqx.Module):
 
 
 class Playback(eqx.Module):
-    """One clip before and after foot IK, and as captured."""
+    """One clip before and after foot IK, and as captured. Weights are 0..1."""
 
     before: Motion  # the animation on its flat floor
     after: Motion
@@ -53,18 +55,18 @@ class Playback(eqx.Module):
     forward_ws: Float[Series, "frames 3"]
     ground_ws: Float[Series, "frames legs 3"]  # under the captured ankles
     grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
-    ball_ground_ws: Float[Series, "frames legs 3"]  # under the captured toes
+    ball_ground_ws: Float[Series, "frames legs 3"]  # under the captured toe joints
     ball_grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
-    floor: Float[Series, " frames"]  # m, height of the floor of the animation
-    dt: Float[Series, " frames"]
-    contact: Float[Series, "frames legs"]  # weight that the system gives each foot
-    locked: Float[Series, "frames legs"]
+    floor: Float[Series, " frames"]  # m, height of the animation's floor
+    dt: Float[Series, " frames"]  # s
+    contact: Float[Series, "frames legs"]  # contact weight of the system
+    locked: Float[Series, "frames legs"]  # 1 where the foot is locked
     reached: Float[Series, "frames legs"]  # 1 where the ankle is at its target
     stance: Float[Series, "frames legs"]  # captured contact labels; all 0 where there are none
-    slide: Float[Series, " frames"]
-    seen: Bool[Series, " frames"]
-    errors: Mapping[str, Float[Series, "rows ..."]]  # of `after`, by kind of residual, in its unit
-    rows: Mapping[str, Float[Series, "rows ..."]]  # the same as the fit sees them, in sigmas
+    slide: Float[Series, " frames"]  # weight with which the character slides
+    seen: Bool[Series, " frames"]  # False in frames that the fit leaves out
+    errors: Mapping[str, Float[Series, "frames_of_kind ..."]]  # after - captured, m, rad, ...
+    residuals: Mapping[str, Float[Series, "frames_of_kind ..."]]  # as the fit sees them, in sigmas
     sigmas: Mapping[str, Float[Series, ""]]
     label: str = eqx.field(static=True)  # what pictures call the captured motion
 
@@ -75,17 +77,17 @@ class Playback(eqx.Module):
 
     @cached_property
     def travelled(self) -> Float[np.ndarray, " frames"]:
-        """Distance that the captured pelvis has come forward, m; less when it walks backwards."""
+        """Forward distance travelled by the captured pelvis, m; backward steps count negatively."""
         steps = np.diff(np.asarray(self.captured.pelvis), axis=0, prepend=self.captured.pelvis[:1])
         return np.cumsum(np.sum(steps * self.forward_ws, axis=-1))
 
     @property
-    def used(self) -> list[str]:
-        """Kinds of residuals that the fit looks at: those whose sigma is finite."""
-        return [kind for kind in KINDS if np.isfinite(self.sigmas[kind])]
+    def fitted_kinds(self) -> list[str]:
+        """Kinds of residuals that the fit uses: those whose sigma is finite."""
+        return [kind for kind in RESIDUAL_KINDS if np.isfinite(self.sigmas[kind])]
 
     def height(self, points_ws: Float[Series, "*b 3"]) -> Float[np.ndarray, "*b"]:
-        """Heights along up, m."""
+        """Heights of points along the up axis, m."""
         return np.asarray(points_ws) @ np.asarray(self.up_ws)
 
     def ground_height(self) -> Float[np.ndarray, "frames legs"]:
@@ -93,39 +95,44 @@ class Playback(eqx.Module):
         return np.where(np.asarray(self.grounded) > 0, self.height(self.ground_ws), np.nan)
 
     def along(self, points_ws: Float[Series, "frames ... 3"]) -> Float[np.ndarray, "frames ..."]:
-        """How far forward points are on the way that the character comes, m."""
-        wide = (slice(None),) + (None,) * (points_ws.ndim - 2)
-        off = np.asarray(points_ws) - self.captured.pelvis[wide]
-        return self.travelled[wide] + np.sum(off * self.forward_ws[wide], axis=-1)
+        """Positions of points along the distance travelled, m."""
+        per_frame = (slice(None),) + (None,) * (points_ws.ndim - 2)
+        offset = np.asarray(points_ws) - self.captured.pelvis[per_frame]
+        return self.travelled[per_frame] + np.sum(offset * self.forward_ws[per_frame], axis=-1)
 
 
-def play(ik: jaxik.FootIK, scene: Scene) -> Playback:
-    """The scene's clip under these parameters, as NumPy arrays."""
-    return jax.tree.map(np.asarray, _watch(ik, scene))
+def run(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
+    """The result of a system on the scene's clip."""
+    return program_cache.run(ik, scene.rig, scene.terrain, scene.frames)
 
 
-@cached
-def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+def play(scene: Scene, result: jaxik.Result) -> Playback:
+    """The scene's clip with this result, as NumPy arrays."""
+    return jax.tree.map(np.asarray, _play(scene, result))
+
+
+@program_cache.cached
+def _play(scene: Scene, result: jaxik.Result) -> Playback:
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
     animated, solved = scene.frames.pose.transformed(_per_leg(world)), legs_ws(scene, result)
-    base, carried = world @ scene.pelvis, pelvis_ws(scene, result)
-    # The reference knows no hips and toes: they hang on the pelvis and the ankles as in the base.
-    hips = _per_leg(reference.pelvis).apply(_per_leg(base).inverse().apply(animated.hip.pos))
+    animated_pelvis, solved_pelvis = world @ scene.pelvis, pelvis_ws(scene, result)
+    # The reference has no hips and toes: they keep their animated offsets from pelvis and ankles.
+    hip_offset = _per_leg(animated_pelvis).inverse().apply(animated.hip.pos)
+    hips = _per_leg(reference.pelvis).apply(hip_offset)
     toes = reference.ankle.apply(animated.ankle.inverse().apply(animated.toe.pos))
-    under, under_ball = (
-        cast(scene.terrain, joints + vec.scale(up, jnp.asarray(ABOVE)), REACH)
+    under_ankle, under_ball = (
+        cast(scene.terrain, joints + vec.scale(up, jnp.asarray(RAY_START)), RAY_LENGTH)
         for joints in (reference.ankle.pos, toes)
     )
     errors = errors_by_kind(scene, result)
     return Playback(
-        before=Motion(base.pos, *_positions(animated)),
-        after=Motion(carried.pos, *_positions(solved)),
+        before=Motion(animated_pelvis.pos, *_positions(animated)),
+        after=Motion(solved_pelvis.pos, *_positions(solved)),
         captured=Motion(reference.pelvis.pos, hips, reference.knee_ws, reference.ankle.pos, toes),
         up_ws=up,
-        forward_ws=jax.vmap(lambda one: frame.heading(one, up)[0])(world),
-        ground_ws=under.point,
-        grounded=under.found,
+        forward_ws=jax.vmap(lambda root: frame.heading(root, up)[0])(world),
+        ground_ws=under_ankle.point,
+        grounded=under_ankle.found,
         ball_ground_ws=under_ball.point,
         ball_grounded=under_ball.found,
         floor=vec.dot(world.pos, up),
@@ -137,14 +144,14 @@ def _watch(ik: jaxik.FootIK, scene: Scene) -> Playback:
         slide=scene.frames.slide,
         seen=reference.observed,
         errors=errors,
-        rows=residuals_by_kind(scene, errors),
+        residuals=residuals_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},
         label=reference.label,
     )
 
 
-def _per_leg(each: Transform) -> Transform:
-    return Transform(each.pos[:, None], each.rot[:, None])
+def _per_leg(transform: Transform) -> Transform:
+    return Transform(transform.pos[:, None], transform.rot[:, None])
 
 
 def _positions(legs: jaxik.LegPose) -> tuple[Array, Array, Array, Array]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from fitting.report import tables
+from fitting.report import formatting
 from fitting.report.plots import style
 from fitting.runtime import files
 from fitting.runtime.threads import usable_cores
@@ -119,7 +119,7 @@ def text(report: Report) -> str:
         for row in report.rows
         for note in (*_notes(row.figures), *row.notes, *row.failures)
     ]
-    parts = ["\n".join(lines), tables.aligned(table(report))]
+    parts = ["\n".join(lines), formatting.aligned(table(report))]
     if compiled:
         parts.append("Compile time, which is in no figure but cold ones\n" + "\n".join(compiled))
     if notes:
@@ -127,17 +127,17 @@ def text(report: Report) -> str:
     return "\n\n".join(parts)
 
 
-def table(report: Report) -> tables.Table:
+def table(report: Report) -> formatting.Table:
     """A line a figure."""
     made = [["row", "what", "measured", "runs", "CPU", "to reach", "met", "limit", "share"]]
     for row in report.rows:
         for one in row.figures:
             met = {True: "yes", False: "no", None: ""}[one.met]
-            runs = tables.span(*(_short(end) for end in one.spread)) if one.spread else ""
-            busy = "" if one.busy is None else tables.number(one.busy)
+            runs = formatting.interval(*(_short(end) for end in one.spread)) if one.spread else ""
+            busy = "" if one.busy is None else formatting.number(one.busy)
             limit = "" if one.limit is None else f"{_short(one.limit):g}, {one.bound}"
-            close = "" if one.closeness is None else tables.share(one.closeness)
-            measured = f"{tables.number(one.value)} {one.unit}".rstrip()
+            close = "" if one.closeness is None else formatting.percent(one.closeness)
+            measured = f"{formatting.number(one.value)} {one.unit}".rstrip()
             made.append([row.name, one.what, measured, runs, busy, one.reach, met, limit, close])
     return made
 

@@ -24,7 +24,14 @@ from fitting.experiments import experiment, parameter_files, record_files, syste
 from fitting.inference.identifiability import identify
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
-from fitting.report import ablation_report, fit_report, tables, terrain_report, translation_report
+from fitting.report import (
+    ablation_report,
+    fit_report,
+    fit_tables,
+    formatting,
+    terrain_report,
+    translation_report,
+)
 from fitting.runtime import files, validation
 from fitting.studies import ablation as contributing
 from fitting.studies import comparison as comparing
@@ -63,7 +70,7 @@ def contribution(options: argparse.Namespace) -> int:
         )  # fmt: skip
     ablation_report.write(options.output, asked, rows)
     for part, title in ablation_report.titles(rows).items():
-        print(f"\n{title}:\n\n{tables.aligned(ablation_report.group(rows, part))}")
+        print(f"\n{title}:\n\n{formatting.aligned(ablation_report.group(rows, part))}")
     print(f"written to {options.output}; read {options.output / ablation_report.TABLE}")
     return 0
 
@@ -123,7 +130,7 @@ def compare(options: argparse.Namespace) -> int:
         systems, base, ground, floor=options.floor, title=title, during=progress.timed
     )
     comparing.write(options.output, compared)
-    print(tables.aligned([list(row) for row in zip(*comparing.table(compared), strict=True)]))
+    print(formatting.aligned([list(row) for row in zip(*comparing.table(compared), strict=True)]))
     print(f"written to {options.output}; read {options.output / comparing.TABLE}")
     return 0
 
@@ -170,7 +177,7 @@ def terrain(options: argparse.Namespace) -> int:
     found = reconstruct(clip, sole=options.sole, kind=kind)
     terrain_report.write(options.output, found, clip, options.sole, options.margin)
     print(f"{terrain_report.counted(found)}\n")
-    print(tables.aligned(terrain_report.table(found)))
+    print(formatting.aligned(terrain_report.table(found)))
     print(f"\n{terrain_report.sentence(found)}; written to {options.output}")
     return 0
 
@@ -283,6 +290,6 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
     )
     if is_blocks_file(options.clip):
         captured = clips.load_clip(options.clip)
-        found = accuracy.agreement([accuracy.errors_of_clips(solved, captured, base)])
-        print("\n" + tables.aligned(accuracy.table(found)))
+        found = accuracy.summarise([accuracy.clip_errors(solved, captured, base)])
+        print("\n" + formatting.aligned(fit_tables.accuracy_table(found)))
     return 0

@@ -12,16 +12,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from fitting.analysis.accuracy import COLUMNS, heads, worded
 from fitting.experiments.ablations import WHOLE
 from fitting.experiments.experiment import Experiment
 from fitting.runtime import files
 from fitting.studies.ablation import Row
 
-from . import tables
+from . import formatting
+from .formatting import Table, markdown
+from .labels import ACCURACY, explanations, headings
 from .plots import style
 from .plots.style import AFTER, CAPTURED, STAGES, legend, styled
-from .tables import Table, markdown
 
 TABLE, CELLS, FIGURE = "table.md", "table.csv", "contribution.png"
 PANELS = 4  # in a row
@@ -39,7 +39,8 @@ def write(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
 def tell(row: Row) -> None:
     """Prints a line of a row that has just been fitted."""
     shown = ", ".join(
-        f"{COLUMNS[key].head} {worded(key, getattr(row.agreement, key))}" for key in TOLD
+        f"{ACCURACY[key].heading} {ACCURACY[key].format(getattr(row.agreement, key))}"
+        for key in TOLD
     )
     print(f"{_where(row)}: {shown}; {row.seconds:.0f} s", flush=True)
 
@@ -58,12 +59,12 @@ def group(rows: Sequence[Row], part: int) -> Table:
     """A row a variant, with what the figure rises by where the rule is left out."""
     those = [row for row in rows if row.part == part]
     whole = those[0].agreement
-    table = [["", *heads()]]
+    table = [["", *headings(ACCURACY)]]
     for row in those:
         shown = []
-        for key in COLUMNS:
+        for key in ACCURACY:
             value, before = getattr(row.agreement, key), getattr(whole, key)
-            shown.append(worded(key, value) + _rise(key, value - before))
+            shown.append(ACCURACY[key].format(value) + _rise(key, value - before))
         table.append([_name(row.variant), *shown])
     return table
 
@@ -72,12 +73,12 @@ def cells(rows: Sequence[Row]) -> str:
     """All figures as CSV, in the units of their columns."""
     out = io.StringIO()
     sheet = csv.writer(out, lineterminator="\n")
-    units = [f"{key} [{column.unit}]" for key, column in COLUMNS.items()]
+    units = [f"{key} [{column.unit}]" for key, column in ACCURACY.items()]
     sheet.writerow(["variant", "held out", *units, "fitted", "converged", "seconds"])
     for row in rows:
         figures = [
             f"{column.factor * value:.6g}"
-            for column, value in zip(COLUMNS.values(), astuple(row.agreement), strict=True)
+            for column, value in zip(ACCURACY.values(), astuple(row.agreement), strict=True)
         ]
         part = row.part or "nothing"
         ended = [len(row.values), row.converged, f"{row.seconds:.1f}"]
@@ -89,13 +90,13 @@ def cells(rows: Sequence[Row]) -> str:
 def bars(rows: Sequence[Row], title: str) -> Figure:
     """Each figure of all variants: on parts held out, and where everything was fitted."""
     names = list(dict.fromkeys(row.variant for row in rows))
-    count = -(-len(COLUMNS) // PANELS)
+    count = -(-len(ACCURACY) // PANELS)
     figure = Figure(figsize=(17, count * (0.45 * len(names) + 1.2) + 1.8), layout="constrained")
     figure.suptitle(title)
     grid = figure.subplots(count, PANELS, squeeze=False, sharey=True)
-    for axes, key in zip(grid.flat, COLUMNS, strict=False):
+    for axes, key in zip(grid.flat, ACCURACY, strict=False):
         _bars(axes, key, rows, names)
-    for axes in list(grid.flat)[len(COLUMNS) :]:
+    for axes in list(grid.flat)[len(ACCURACY) :]:
         axes.set_axis_off()
     legend(
         figure,
@@ -109,7 +110,7 @@ def bars(rows: Sequence[Row], title: str) -> Figure:
 
 def _bars(axes: Axes, key: str, rows: Sequence[Row], names: Sequence[str]) -> None:
     """One figure of all variants."""
-    column, most = COLUMNS[key], 0.0
+    column, most = ACCURACY[key], 0.0
     for place, name in enumerate(names):
         parts = [getattr(row.agreement, key) for row in rows if row.variant == name and row.part]
         whole = [getattr(r.agreement, key) for r in rows if r.variant == name and not r.part]
@@ -121,7 +122,7 @@ def _bars(axes: Axes, key: str, rows: Sequence[Row], names: Sequence[str]) -> No
         axes.plot(shown[: len(parts)], [place] * len(parts), "o", color="black", markersize=5)
         axes.plot(shown[len(parts) :], [place], "D", color=CAPTURED, markersize=6)
         axes.annotate(
-            worded(key, mean), (np.nan_to_num(shown).max(), place), xytext=(8, 0),
+            ACCURACY[key].format(mean), (np.nan_to_num(shown).max(), place), xytext=(8, 0),
             textcoords="offset points", va="center",
         )  # fmt: skip
         if name == WHOLE and not np.isnan(mean):
@@ -132,7 +133,7 @@ def _bars(axes: Axes, key: str, rows: Sequence[Row], names: Sequence[str]) -> No
     axes.set_yticks(range(len(names)), [_name(name) for name in names])
     axes.tick_params(axis="y", length=0)
     axes.grid(False, axis="y")
-    axes.set_title(f"{column.head.capitalize()}, {column.unit}")
+    axes.set_title(f"{column.heading.capitalize()}, {column.unit}")
 
 
 def _summary(experiment: Experiment, rows: Sequence[Row]) -> str:
@@ -150,9 +151,7 @@ def _summary(experiment: Experiment, rows: Sequence[Row]) -> str:
         parts.append("Fits that did not converge:")
         parts.append("\n".join(f"- {_where(row)}: {row.message}" for row in poor))
     parts.append("## What the columns mean")
-    parts.append(
-        "\n".join(f"- **{one.head}** ({one.unit}): {one.meaning}" for one in COLUMNS.values())
-    )
+    parts.append(explanations(ACCURACY))
     return "\n\n".join(parts) + "\n"
 
 
@@ -173,7 +172,7 @@ def _values(rows: Sequence[Row]) -> Table:
     table = [["parameter", *(_name(row.variant) for row in those)]]
     for name in names:
         values = [row.values.get(name) for row in those]
-        table.append([f"`{name}`", *("–" if v is None else tables.number(v) for v in values)])
+        table.append([f"`{name}`", *("–" if v is None else formatting.number(v) for v in values)])
     return table
 
 
@@ -187,6 +186,6 @@ def _where(row: Row) -> str:
 
 def _rise(key: str, rise: float) -> str:
     """By how much a figure is larger, in brackets; nothing where that rounds to 0 or is unknown."""
-    column = COLUMNS[key]
+    column = ACCURACY[key]
     told = f"{column.factor * rise:+.{column.digits}f}"
     return "" if np.isnan(rise) or float(told) == 0.0 else f" ({told})"

@@ -12,8 +12,8 @@ from fitting.datasets.terrain.reconstruction import SURFACE_KINDS, Reconstructio
 from fitting.datasets.terrain.surfaces import LevelBlocks, Plane, ThinPlate
 from fitting.runtime import files
 
+from .formatting import Table, interval
 from .plots import style, terrain_plots
-from .tables import Table, span
 
 NUMBERS, FIGURE = ".json", ".png"  # beside the mesh, under its name
 
@@ -77,7 +77,7 @@ def sentence(found: Reconstruction) -> str:
             grid, count = surface.grid, len(surface.tops)
             low, high = np.degrees(ranked.headings)
             return (
-                f"level blocks of {grid.pitch:.2f} m ({span(*np.round(ranked.pitches, 2))} m are "
+                f"level blocks of {grid.pitch:.2f} m ({interval(*np.round(ranked.pitches, 2))} m are "
                 f"about as likely), turned by {np.degrees(grid.heading):.1f}° ({low:.1f}° to "
                 f"{high:.1f}°), {count} of them visited"
             )

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.analysis import difference
+from fitting.analysis import difference, playback
 from fitting.analysis.difference import Difference
 from fitting.experiments import parameter_files, systems
 from fitting.inference import sensitivity
@@ -16,7 +16,7 @@ from fitting.studies.study import Fit
 from fitting.studies.translation import Translation
 from jaxik.maths import parameter_tree
 
-from . import fit_report, tables
+from . import difference_report, fit_report, formatting
 from .plots import style
 from .plots.difference_plots import difference as draw
 
@@ -25,23 +25,25 @@ NUMBERS = "translation.json"
 
 def write(run: Path, made: Translation, fitted: Fit) -> str:
     """Writes parameters, numbers, pictures and summary of a translation; what to print of it."""
-    found = [difference.measure(fitted.ik, scene) for scene in fitted.problem.data]
+    found = [
+        difference.measure(scene, playback.run(fitted.ik, scene)) for scene in fitted.problem.data
+    ]
     told = {
         "source": made.source.name,
         "target": made.target.name,
-        "reproduced": difference.numbers(found),
-        "clips": [difference.numbers([one]) for one in found],
-        "shortcomings": difference.shortcomings(found, made.source.name, made.target.name),
+        "reproduced": difference_report.numbers(found),
+        "clips": [difference_report.numbers([one]) for one in found],
+        "shortcomings": difference_report.shortcomings(found, made.source.name, made.target.name),
     }
     files.write_text(run / NUMBERS, json.dumps(told, indent=2))
     text = parameter_files.to_toml(fitted.ik, made.target.preset)
     files.write_text(run / f"{made.target.preset}.toml", text)
     opening = _opening(made, fitted, found) + [_pictures(run, made, found)]
     fit_report.write_fit(run, fitted, opening, _both(made, fitted))
-    phases = told["reproduced"]
-    parts = [difference.headline(phases["all frames"], made.source.name, made.target.name)]
+    phases = difference.summarise(found)
+    parts = [difference_report.headline(phases["all frames"], made.source.name, made.target.name)]
     for phase, row in phases.items():
-        aligned = tables.aligned(difference.table(row, made.source.name))
+        aligned = formatting.aligned(difference_report.table(row, made.source.name))
         parts += ["", f"{phase.capitalize()}:", aligned]
     return "\n".join([*parts, "", *told["shortcomings"]])
 
@@ -62,16 +64,19 @@ def _pictures(run: Path, made: Translation, found: Sequence[Difference]) -> str:
 def _opening(made: Translation, fitted: Fit, found: Sequence[Difference]) -> list[str]:
     """The first section of the summary: how close it came, and what it could not do."""
     source, target = made.names
-    phases = difference.numbers(found)
+    phases = difference.summarise(found)
     parts = [
         f"## How much of {source} {target} reproduces",
-        difference.headline(phases["all frames"], source, target),
+        difference_report.headline(phases["all frames"], source, target),
         "Reproduced is 1 - rms(what remains) / rms(source - animation): 100 % is the same motion, "
         "0 % no better than the animation, less is worse; – where the source corrects nothing.",
     ]
     for phase, row in phases.items():
-        parts += [f"{phase.capitalize()}:", tables.markdown(difference.table(row, source))]
-    if said := difference.shortcomings(found, source, target):
+        parts += [
+            f"{phase.capitalize()}:",
+            formatting.markdown(difference_report.table(row, source)),
+        ]
+    if said := difference_report.shortcomings(found, source, target):
         parts += [f"What {target} does not do as {source} does:", _listed(said)]
     pairs = zip(fitted.identifiability.names, fitted.identifiability.at_bound, strict=True)
     if ends := [f"`{name}`" for name, end in pairs if end]:
@@ -106,13 +111,13 @@ def _both(made: Translation, fitted: Fit) -> list[str]:
         remarks = ["fitted"] if name in free_leaves else []
         remarks += ["of another rule"] if "–" not in shown and len(rules) > 1 else []
         table.append([f"`{name}`", units[0] if units else "", *shown, ", ".join(remarks)])
-    return ["## Parameters of both systems", tables.markdown(table)]
+    return ["## Parameters of both systems", formatting.markdown(table)]
 
 
 def _shown(value: jnp.ndarray) -> str:
     """A parameter's values, a switch's word."""
     one = np.asarray(value)
-    words = {"b": lambda x: "on" if x else "off", "f": lambda x: tables.number(float(x))}
+    words = {"b": lambda x: "on" if x else "off", "f": lambda x: formatting.number(float(x))}
     show = words.get(one.dtype.kind, str)
     return ", ".join(show(x) for x in one.ravel())
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxik
-from fitting.analysis.accuracy import Agreement, Errors, agreement, errors_of_clips
+from fitting.analysis.accuracy import Accuracy, Errors, clip_errors, summarise
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import edit
 from fitting.datasets.clips.clip import Clip
@@ -55,7 +55,7 @@ class Row:
     key: str  # of all that it follows from
     variant: str
     part: int  # that was held out, from 1; 0 where everything was fitted and measured
-    agreement: Agreement
+    agreement: Accuracy
     values: Mapping[str, float]  # fitted, by name
     converged: bool
     message: str  # of the fit
@@ -205,7 +205,7 @@ def _fit(experiment: Experiment, one: Split, progress: Callable[[Progress], None
         ik = problem.space.unpack(jnp.asarray(solution.u))
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
         converged, message, seconds = solution.converged, solution.message, solution.seconds
-    found = agreement([_errors(ik, pair, part) for pair, part in one.measured])
+    found = summarise([_errors(ik, pair, part) for pair, part in one.measured])
     return Row("", "", 0, found, values, converged, message, seconds)
 
 
@@ -222,7 +222,7 @@ def _errors(ik: jaxik.FootIK, pair: Pair, part: slice) -> Errors:
     motion = clip_frames.frames_from_clip(base)
     check_shapes(ik, base.rig, ground, motion)
     _, solved = solve(ik, base, ground, motion, 0.0)
-    return errors_of_clips(*(clip.at(part) for clip in (solved, captured, base)))
+    return clip_errors(*(clip.at(part) for clip in (solved, captured, base)))
 
 
 def _named(
@@ -266,7 +266,7 @@ def read(folder: Path) -> list[Row]:
 
 def _row(told: Mapping[str, Any]) -> Row:
     found = {key: math.nan if value is None else value for key, value in told["agreement"].items()}
-    return Row(**{**told, "agreement": Agreement(**found)})
+    return Row(**{**told, "agreement": Accuracy(**found)})
 
 
 def _write(folder: Path, rows: Sequence[Row]) -> None:

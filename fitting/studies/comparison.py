@@ -12,14 +12,15 @@ from jaxtyping import Float64
 
 import jaxik
 from fitting.analysis import measures
-from fitting.analysis.measures import COLUMNS, Measures
-from fitting.analysis.playback import ABOVE, Motion
+from fitting.analysis.measures import FootStates, Measures
+from fitting.analysis.playback import RAY_START, Motion
 from fitting.datasets import clip_frames
 from fitting.datasets.clips.clip import Clip
 from fitting.experiments import parameter_files
 from fitting.experiments.experiment import check_shapes
 from fitting.experiments.systems import leaf_names, name_preset
-from fitting.report import tables
+from fitting.report import formatting
+from fitting.report.labels import MEASURES, explanations, headings
 from fitting.report.plots import comparison_plots, style
 from fitting.runtime import files, program_cache
 from fitting.runtime.validation import error_context
@@ -140,9 +141,9 @@ def compare(
         name: measures.measure(
             motions[name],
             motions[ANIMATED],
-            measures.gaps(soles_ws[index], under[index]),
-            clip.stance_labels(),
-            reached[name],
+            FootStates(
+                measures.gaps(soles_ws[index], under[index]), clip.stance_labels(), reached[name]
+            ),
             clip.fps,
         )
         for index, name in enumerate(clips)
@@ -161,20 +162,19 @@ def heights_under(
     """
     highest = points_ws[..., 1].max(axis=0)
     origins = points_ws.copy()
-    origins[..., 1] = highest + ABOVE
+    origins[..., 1] = highest + RAY_START
     hit = cast(ground, jnp.asarray(origins), jnp.inf)
     height = np.asarray(vec.dot(hit.point, ground.up_ws), np.float64)
     return np.where(np.asarray(hit.found) > 0, height, np.nan)
 
 
-def table(compared: Comparison) -> tables.Table:
-    """A row a system, the measures in the units of `COLUMNS`."""
-    heads = [f"{column.head}, {column.unit}" for column in COLUMNS.values()]
+def table(compared: Comparison) -> formatting.Table:
+    """A row a system, the measures in the units of `MEASURES`."""
     rows = [
-        [name, *(measures.worded(key, value) for key, value in asdict(measured).items())]
+        [name, *(MEASURES[key].format(value) for key, value in asdict(measured).items())]
         for name, measured in compared.measures.items()
     ]
-    return [["system", *heads], *rows]
+    return [["system", *headings(MEASURES)], *rows]
 
 
 def write(folder: Path, compared: Comparison) -> None:
@@ -219,18 +219,16 @@ def _summary(compared: Comparison) -> str:
         f"# {compared.title}",
         f"{count} frames, {(count - 1) / compared.fps:.2f} s at {compared.fps:g} Hz. "
         f"`{ANIMATED}` is the animation without foot IK, on its flat floor.",
-        tables.markdown(table(compared)),
+        formatting.markdown(table(compared)),
         f"![Feet and pelvis over the ground, and the measures]({FIGURE})",
         "## What the columns mean",
-        "\n".join(
-            f"- **{column.head}** ({column.unit}): {column.meaning}" for column in COLUMNS.values()
-        ),
+        explanations(MEASURES),
         "Presets that leave the character's height to their game (`unreal`, `mec`) have the root "
         "on the ground below it, unless `--roots animated` was given.",
         "A foot stands where the animation says so: by its contact labels or, without them, by its "
         "motion. The ground under a point is what a ray from above meets first.",
     ]
     if compared.unseen:
-        share = tables.share(compared.unseen)
+        share = formatting.percent(compared.unseen)
         parts.append(f"No ground is under {share} of the soles' points; they are left out.")
     return "\n\n".join(parts) + "\n"

@@ -213,8 +213,8 @@ def _changed(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, Any]:
 def _check_moves(source: System, problem: Problem) -> None:
     """ValueError where the source leaves every clip as it is."""
     for scene in problem.data:
-        apart = difference.correction_of(scene)
-        if any(one.max() > difference.LEAST for one in apart.values()):
+        apart = difference.correction(scene)
+        if any(one.max() > difference.NEGLIGIBLE for one in apart.values()):
             return
     raise ValueError(f"{source.name} moves nothing in these clips: there is nothing to reproduce")
 

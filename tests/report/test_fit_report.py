@@ -198,7 +198,7 @@ def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
     assert "| leg.soften | smooth | 0.100 | undetermined |" in text
     assert "+7.5" in line_of(text.split("threshold moves")[1], "contact.planted_height")
     scene = fitted.problem.data[0]
-    asked = limit_activity.exercise(fitted.ik, scene)
+    asked = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
     share = f"{100 * asked.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {share} |"
 
@@ -207,7 +207,7 @@ def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monke
     monkeypatch.setattr(fit_report, "_keep", lambda run, name, caption, figure: {name: caption})
     problem = fitted.problem
     twice = Problem(problem.space, problem.data * 2, problem.residual_function, problem.loss)
-    played = playback.play(fitted.ik, problem.data[0])
+    played = playback.play(problem.data[0], playback.run(fitted.ik, problem.data[0]))
     pictures = fit_report._draw_clip(tmp_path, replace(fitted, problem=twice), 1, played)
     assert set(pictures) == {
         "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png"
@@ -221,16 +221,16 @@ def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monke
 
 def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
     scene = fitted.problem.data[0]
-    played = playback.play(fitted.ik, scene)
-    assert played.used == list(playback.KINDS)
-    rows = np.concatenate([np.ravel(played.rows[kind]) for kind in playback.KINDS])
+    played = playback.play(scene, playback.run(fitted.ik, scene))
+    assert played.fitted_kinds == list(playback.RESIDUAL_KINDS)
+    rows = np.concatenate([np.ravel(played.residuals[kind]) for kind in playback.RESIDUAL_KINDS])
     np.testing.assert_allclose(rows, residuals.residuals_of_scene(fitted.ik, scene), atol=1e-9)
 
 
 def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
     scene = fitted.problem.data[0]
     legs = walker.walk(seconds=2.0, fps=15.0).leg_pose_ws()
-    captured = playback.play(fitted.ik, scene).captured
+    captured = playback.play(scene, playback.run(fitted.ik, scene)).captured
     np.testing.assert_allclose(captured.hip, legs.hip.pos, atol=1e-6)
     np.testing.assert_allclose(captured.toe, legs.toe.pos, atol=1e-6)
     span = np.linalg.norm(np.asarray(legs.hip.pos - legs.ankle.pos), axis=-1)
@@ -242,11 +242,11 @@ def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
 def test_limits_act_where_they_are_tight_and_never_at_the_end_of_their_range(fitted):
     scene = fitted.problem.data[0]
     values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}
-    ends = limit_activity.exercise(parameter_tree.replace(fitted.ik, values), scene).limits
+    ik = parameter_tree.replace(fitted.ik, values)
+    ends = limit_activity.active_limits(ik, scene, playback.run(ik, scene))
     assert [ends[name] for name in values] == [0.0, 0.0, 0.0]
-    tight = limit_activity.exercise(
-        parameter_tree.replace(fitted.ik, {"pelvis.limit": 0.0}), scene
-    ).limits
+    ik = parameter_tree.replace(fitted.ik, {"pelvis.limit": 0.0})
+    tight = limit_activity.active_limits(ik, scene, playback.run(ik, scene))
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
@@ -254,7 +254,7 @@ def test_limits_act_where_they_are_tight_and_never_at_the_end_of_their_range(fit
 
 def test_counters_count_feet_that_lock_release_and_find_ground(fitted):
     scene = fitted.problem.data[0]
-    asked = limit_activity.exercise(fitted.ik, scene)
+    asked = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
     result = jaxik.run(fitted.ik, scene.rig, scene.terrain, scene.frames)
     locked = np.asarray(result.trace.advanced.state.lock.locked)
     assert asked.frames == 30 and asked.seconds == pytest.approx(2.0)
@@ -263,8 +263,8 @@ def test_counters_count_feet_that_lock_release_and_find_ground(fitted):
     np.testing.assert_allclose(asked.locked, locked.mean(axis=0))
     ankle = np.asarray(walker.walk(seconds=2.0, fps=15.0).leg_pose_ws().ankle.pos)
     below = ankle[..., 1] + 0.5 - (0.02 - 0.1 * ankle[..., 0] + 0.3 * ankle[..., 2])
-    np.testing.assert_allclose(asked.found, ((0 <= below) & (below <= 1.3)).mean(axis=0))
-    assert asked.found.max() < 1.0, "the hill rises out of reach of the rays"
+    np.testing.assert_allclose(asked.grounded, ((0 <= below) & (below <= 1.3)).mean(axis=0))
+    assert asked.grounded.max() < 1.0, "the hill rises out of reach of the rays"
 
 
 def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):

@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.analysis.accuracy import COLUMNS, Agreement
+from fitting.analysis.accuracy import Accuracy
 from fitting.cli import main, progress
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.experiments import experiment
 from fitting.experiments.ablations import WHOLE, Variant
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.report import ablation_report
+from fitting.report.labels import ACCURACY
 from fitting.studies import ablation
 from fitting.studies.ablation import Row
 from jaxik.maths import parameter_tree
@@ -313,9 +314,9 @@ def test_a_file_of_something_else_is_refused(tmp_path, text, search):
 
 
 def row(variant: str, part: int, **figures: float) -> Row:
-    given = dict.fromkeys(COLUMNS, 0.02) | figures
+    given = dict.fromkeys(ACCURACY, 0.02) | figures
     values = {"pelvis.on_gain": 0.3} | ({} if variant == PITCH else {"foot.max_pitch": 0.4})
-    return Row("key", variant, part, Agreement(**given), values, part != 2, "Far off.", 1.5)
+    return Row("key", variant, part, Accuracy(**given), values, part != 2, "Far off.", 1.5)
 
 
 ROWS = [
@@ -339,7 +340,7 @@ def test_all_figures_are_in_the_csv_in_the_units_of_their_columns():
     assert [(one["variant"], one["held out"]) for one in lines[:3]] == [
         ("all rules", "1"), ("all rules", "2"), ("all rules", "nothing")
     ]  # fmt: skip
-    for key, column in COLUMNS.items():
+    for key, column in ACCURACY.items():
         cell = float(lines[3][f"{key} [{column.unit}]"])
         assert cell == pytest.approx(column.factor * getattr(ROWS[3].agreement, key), rel=1e-5)
     assert lines[3]["fitted"] == "1" and lines[1]["converged"] == "False"
@@ -352,7 +353,7 @@ def test_the_summary_has_every_group_what_is_left_out_and_what_did_not_converge(
     assert "- **pitch**: `foot.max_pitch` = 0.2\n" in text
     assert "| `foot.max_pitch` | 0.4 | – |" in text
     assert "- without pitch, part 2 held out: Far off." in text
-    assert all(f"- **{column.head}** ({column.unit})" in text for column in COLUMNS.values())
+    assert all(f"- **{column.heading}** ({column.unit})" in text for column in ACCURACY.values())
     head = (tmp_path / ablation_report.FIGURE).read_bytes()[:24]
     wide, high = struct.unpack(">II", head[16:24])
     assert 1000 < wide < 2000 and 400 < high < 2000
@@ -363,8 +364,8 @@ def test_the_picture_has_a_bar_a_variant_and_a_point_a_part():
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     panels = [axes for axes, title in zip(figure.axes, titles, strict=True) if title]
     heads = [title.partition(",")[0].lower() for title in titles if title]
-    assert heads == [column.head for column in COLUMNS.values()]
-    ankle = panels[list(COLUMNS).index("ankle")]
+    assert heads == [column.heading for column in ACCURACY.values()]
+    ankle = panels[list(ACCURACY).index("ankle")]
     ends = [bar.get_window_extent().x1 for bar in ankle.patches]
     wide = [ankle.transData.inverted().transform((end, 0.0))[0] for end in ends]
     np.testing.assert_allclose(wide, [3.1, 3.5])

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from fitting.analysis import measures
-from fitting.analysis.measures import COLUMNS, Measures
+from fitting.analysis.measures import Measures
 from fitting.analysis.playback import Motion
 from fitting.cli import main
 from fitting.datasets import clips
 from fitting.datasets.clips import edit
 from fitting.datasets.flat_animation import load_flat_animation
+from fitting.report.labels import MEASURES
 from fitting.report.plots import comparison_plots, style
 from fitting.runtime import program_cache
 from fitting.studies import comparison
@@ -172,12 +173,12 @@ def test_the_folder_holds_a_table_its_numbers_and_a_figure(compared):
     text, told = (compared / comparison.TABLE).read_text(), numbers(compared)
     assert text.startswith("# walk.npz on uneven_walk.ply\n\n61 frames, 2.00 s at 30 Hz.")
     assert f"]({comparison.FIGURE})" in text and "No ground" not in text
-    for column in COLUMNS.values():
-        assert f"- **{column.head}** ({column.unit}): {column.meaning}" in text
+    for column in MEASURES.values():
+        assert f"- **{column.heading}** ({column.unit}): {column.meaning}" in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     for row, (name, system) in zip(rows[2:], told.items(), strict=True):
         values = [np.nan if value is None else value for value in system.values()]
-        words = [measures.worded(key, one) for key, one in zip(COLUMNS, values, strict=True)]
+        words = [MEASURES[key].format(one) for key, one in zip(MEASURES, values, strict=True)]
         assert row == "| " + " | ".join([name, *words]) + " |"
     assert all(one > 1000 for one in size_of_png(compared / comparison.FIGURE))
 
@@ -219,16 +220,16 @@ def test_a_figure_tells_more_systems_apart_than_there_are_colours():
 def test_a_figure_has_a_panel_a_leg_one_for_the_pelvis_and_one_a_measure(legs):
     still = [np.zeros((300, legs, 3)) for _ in range(4)]
     motion = Motion(np.zeros((300, 3)), *still)
-    unknown = Measures(**{key: float("nan") for key in COLUMNS})
-    zero = Measures(**{key: 0.0 for key in COLUMNS})
+    unknown = Measures(**{key: float("nan") for key in MEASURES})
+    zero = Measures(**{key: 0.0 for key in MEASURES})
     figure = comparison_plots.overview(
         np.arange(300) / 30.0, [f"leg {leg}" for leg in range(legs)], np.full((300, legs), np.nan),
         {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero}, "title",
     )  # fmt: skip
     upper, lower = figure.subfigs
-    assert len(upper.axes) == 2 * (legs + 1) and len(lower.axes) == len(COLUMNS)
+    assert len(upper.axes) == 2 * (legs + 1) and len(lower.axes) == len(MEASURES)
     assert [text.get_text() for text in lower.axes[0].texts] == ["–", "0.00"]
-    for axes, column in zip(lower.axes, COLUMNS.values(), strict=True):
+    for axes, column in zip(lower.axes, MEASURES.values(), strict=True):
         assert axes.get_title(loc="left").endswith(f", {column.unit}")
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.texts] == ["as animated", "other", "ground"]

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
-from fitting.analysis import difference
+from fitting.analysis import difference, playback
 from fitting.cli import main, progress
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import load_clip, save_clip
@@ -19,6 +19,8 @@ from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import experiment, parameter_files
 from fitting.inference import sensitivity
+from fitting.report import difference_report
+from fitting.report.labels import DIFFERENCES
 from fitting.studies import run_folder, translation
 from jaxik import presets
 from jaxik.maths import parameter_tree
@@ -133,7 +135,7 @@ def test_what_is_said_to_be_reproduced_is_so_by_another_count(run, clip):
             continue
         assert told[kind]["reproduced"] == pytest.approx(1 - rms / correction, abs=1e-6)
         share = f"{100 * (1 - rms / correction):.1f} %"
-        assert f"{share} of that of the {difference.KINDS[kind].words}" in summary
+        assert f"{share} of that of the {DIFFERENCES[kind].name}" in summary
     assert 0.9 < told["ankle"]["reproduced"] < 0.999
 
 
@@ -162,10 +164,10 @@ def test_the_summary_puts_both_systems_side_by_side(run):
 def test_a_source_that_another_system_cannot_follow_is_told_honestly(run):
     (scene,) = experiment.make_problem(run_folder.load_fit(run)[0]).data
     still = parameter_tree.replace(presets.record(), {"leg.weight": 0.0, "lock.enabled": False})
-    found = difference.measure(still, scene)
-    told = difference.numbers([found])["all frames"]
+    found = difference.measure(scene, playback.run(still, scene))
+    told = difference_report.numbers([found])["all frames"]
     assert told["ankle"]["reproduced"] < 0.3
-    said = difference.shortcomings([found], "a", "b")
+    said = difference_report.shortcomings([found], "a", "b")
     assert said[0].startswith("Ankles: ") and "(rms) remain of" in said[0]
     worst = 1000 * found.remaining["ankle"].max()
     assert f"at most {worst:.4g} mm" in said[0]
@@ -175,31 +177,31 @@ def test_frames_in_which_the_character_stands_are_counted_apart():
     frames = np.arange(4)
     zero, one = np.zeros((4, 2)), np.ones((4, 2))
     left = np.stack([np.array([0.0, 0.0, 1.0, 1.0])] * 2, axis=1)
-    kinds = dict.fromkeys(difference.KINDS, one)
+    kinds = dict.fromkeys(difference.QUANTITIES, one)
     made = difference.Difference(
         ("left", "right"), frames * 0.1, frames < 2, kinds, kinds | {"ankle": left, "knee": zero}
     )
-    told = difference.numbers([made])
+    told = difference_report.numbers([made])
     assert told["standing"]["ankle"]["reproduced"] == 1.0
     assert told["moving"]["ankle"]["reproduced"] == 0.0
     assert told["all frames"]["ankle"]["rms"] == pytest.approx(1000 * math.sqrt(0.5))
     assert told["all frames"]["knee"]["reproduced"] == 1.0
     never = difference.Difference(made.legs, made.time, frames < 0, kinds, kinds)
-    assert set(difference.numbers([never])) == {"all frames"}
+    assert set(difference_report.numbers([never])) == {"all frames"}
 
 
 def test_what_the_source_leaves_alone_has_no_share():
     zero, some = np.zeros((3, 1)), np.full((3, 1), 0.02)
-    kinds = dict.fromkeys(difference.KINDS, zero)
+    kinds = dict.fromkeys(difference.QUANTITIES, zero)
     made = difference.Difference(
         ("left",), np.arange(3.0), np.zeros(3, bool), kinds, kinds | {"foot": some}
     )
-    told = difference.numbers([made])["all frames"]
+    told = difference_report.numbers([made])["all frames"]
     assert told["foot"]["reproduced"] is None
     assert told["foot"]["rms"] == pytest.approx(np.degrees(0.02))
-    (said,) = difference.shortcomings([made], "a", "b")
+    (said,) = difference_report.shortcomings([made], "a", "b")
     assert said.startswith("a leaves the orientation of the feet as animated; b is 1.146 ° (rms)")
-    assert difference.table(told, "a")[4][-1] == "–"
+    assert difference_report.table(difference.summarise([made])["all frames"], "a")[4][-1] == "–"
 
 
 def test_only_what_moves_the_clip_is_free_unless_it_is_named(run):

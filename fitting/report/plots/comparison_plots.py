@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from fitting.analysis.measures import COLUMNS, Measures, worded
+from fitting.analysis.measures import Measures
 from fitting.analysis.playback import Motion
+from fitting.report.labels import MEASURES
 
 from .style import BEFORE, CAPTURED, EARTH, GROUND, STAGES, earth, legend, styled, whole_and_part
 
@@ -40,7 +41,7 @@ def overview(
         title: of the figure.
     """
     looks = _looks(motions)
-    bars = -(-len(COLUMNS) // BARS)
+    bars = -(-len(MEASURES) // BARS)
     heights = 3.4 * (len(legs) + 1) + 0.6, bars * (0.42 * len(motions) + 1.0)
     figure = Figure(figsize=(17, sum(heights) + 1.6), layout="constrained")
     figure.suptitle(title)
@@ -60,7 +61,7 @@ def overview(
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
     grid = lower.subplots(bars, BARS, squeeze=False, sharey=True)
-    for axes, key in zip(grid.flat, COLUMNS, strict=False):
+    for axes, key in zip(grid.flat, MEASURES, strict=False):
         _bars(axes, key, measures, looks)
     lines = [Line2D([], [], label=name, **look) for name, look in looks.items()]
     legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
@@ -92,14 +93,18 @@ def _bars(
 ) -> None:
     """One measure of all systems, with its value at the end of each bar."""
     values = [getattr(one, key) for one in measures.values()]
-    widths = COLUMNS[key].factor * np.nan_to_num(values)
+    widths = MEASURES[key].factor * np.nan_to_num(values)
     rows = np.arange(len(values))
     axes.barh(rows, widths, color=[looks[name]["color"] for name in measures], height=0.7)
     for row, width, value in zip(rows, widths, values, strict=True):
         axes.annotate(
-            worded(key, value), (width, row), xytext=(4, 0), textcoords="offset points", va="center"
+            MEASURES[key].format(value),
+            (width, row),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
         )
-    smallest = 10.0 ** (1 - COLUMNS[key].digits)  # of a scale: what rounds to 0 looks like 0
+    smallest = 10.0 ** (1 - MEASURES[key].digits)  # of a scale: what rounds to 0 looks like 0
     axes.set_xlim(0.0, 1.35 * max(*widths, smallest))
     axes.xaxis.set_visible(False)  # the values stand at the bars
     axes.spines["bottom"].set_visible(False)
@@ -107,4 +112,4 @@ def _bars(
     axes.set_yticks(rows, list(measures))
     axes.tick_params(axis="y", length=0)
     axes.grid(False)
-    axes.set_title(f"{COLUMNS[key].head.capitalize()}, {COLUMNS[key].unit}")
+    axes.set_title(f"{MEASURES[key].heading.capitalize()}, {MEASURES[key].unit}")

@@ -6,7 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from fitting.analysis.difference import KINDS, LEAST, Difference
+from fitting.analysis.difference import NEGLIGIBLE, Difference
+from fitting.report.labels import DIFFERENCES
 
 from .style import AFTER, BEFORE, EARTH, legend, styled
 
@@ -16,18 +17,18 @@ def difference(clip: Difference, source: str, target: str, title: str) -> Figure
     """Size of the source's correction and of what the target leaves of it, over time."""
     names = [
         name
-        for name in KINDS
-        if max(clip.correction[name].max(), clip.remaining[name].max()) > LEAST
+        for name in DIFFERENCES
+        if max(clip.correction[name].max(), clip.remaining[name].max()) > NEGLIGIBLE
     ]
     figure = Figure(figsize=(17, 2.9 * max(len(names), 1) + 1.8), layout="constrained")
     figure.suptitle(title)
     rows = figure.subplots(max(len(names), 1), 1, sharex=True, squeeze=False)[:, 0]
     for axes, name in zip(rows, names, strict=False):
-        kind = KINDS[name]
+        kind = DIFFERENCES[name]
         several = clip.remaining[name].shape[1] > 1
         for series, colour in ((clip.correction, BEFORE), (clip.remaining, AFTER)):
             axes.plot(clip.time, kind.factor * series[name].max(axis=1), color=colour)
-        axes.set_title(kind.words.capitalize() + (" (of the legs the larger)" if several else ""))
+        axes.set_title(kind.name.capitalize() + (" (of the legs the larger)" if several else ""))
         axes.set_ylabel(kind.unit)
         axes.set_ylim(bottom=0)
         _shade(axes, clip)

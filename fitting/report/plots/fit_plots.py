@@ -12,6 +12,7 @@ from matplotlib.ticker import LogFormatter
 
 from fitting.analysis.playback import Motion, Playback
 from fitting.inference.optimisation.solution import Progress
+from fitting.report.labels import RESIDUALS
 
 from .style import (
     AFTER,
@@ -33,15 +34,6 @@ from .style import (
 from .style import STYLE as STYLE
 
 STRIDE = 0.3  # m, between two drawn legs
-WORDS = {
-    "ankle": ("Ankle position", "cm", 100.0),
-    "knee": ("Knee position", "cm", 100.0),
-    "pelvis": ("Pelvis position", "cm", 100.0),
-    "foot": ("Foot orientation", "degrees", 180 / np.pi),
-    "body": ("Pelvis orientation", "degrees", 180 / np.pi),
-    "contact": ("Contact weight", "of 1", 1.0),
-    "smooth": ("Ankle acceleration", "m/s²", 1.0),
-}
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
 
 
@@ -120,12 +112,12 @@ def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: s
 @styled
 def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
     """Errors of each kind over time, and how they spread against the sigma that was assumed."""
-    kinds = fitted.used
+    kinds = fitted.fitted_kinds
     figure = Figure(figsize=(17, 3.0 * len(kinds) + 1.8), layout="constrained")
     figure.suptitle(title)
     grid = figure.subplots(len(kinds), 2, squeeze=False, width_ratios=[2.4, 1])
     for (axes, side), kind in zip(grid, kinds, strict=True):
-        words, unit, factor = WORDS[kind]
+        words, unit, factor = RESIDUALS[kind]
         for play, colour in ((first, BEFORE), (fitted, AFTER)):
             size = factor * _size(play, kind)
             axes.plot(_times(play, size), size, color=colour, linewidth=1.2)
@@ -135,7 +127,7 @@ def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
         axes.set_ylabel(unit)
         axes.set_xlim(fitted.time[0], fitted.time[-1])
         axes.set_ylim(bottom=0)
-        _spread(side, np.asarray(first.rows[kind]), np.asarray(fitted.rows[kind]))
+        _spread(side, np.asarray(first.residuals[kind]), np.asarray(fitted.residuals[kind]))
         side.set_title(f"{words}: spread of the residuals")
     grid[-1, 0].set_xlabel("time, s")
     grid[-1, 1].set_xlabel("residual as the fit sees it, in sigmas")

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from fitting.analysis.playback import Motion, Playback
-from fitting.analysis.worst_window import Worst
+from fitting.analysis.worst_window import WorstWindow
 
 from .style import AFTER, CAPTURED, EARTH, GROUND, STANDING, earth, legend, styled
 
@@ -17,7 +17,7 @@ STANCE, UNSEEN = 0.22, "#dddddd"
 
 
 @styled
-def worst(play: Playback, legs: Sequence[str], found: Worst, title: str) -> Figure:
+def worst(play: Playback, legs: Sequence[str], found: WorstWindow, title: str) -> Figure:
     """Heights of feet and pelvis, and knee angles, captured and fitted, in the worst window."""
     inside = slice(found.start, found.end + 1)
     time = play.time[inside]

@@ -1,0 +1,137 @@
+"""Tables of a fit: its parameters, how well the clips determine them, and its accuracy."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple
+from typing import Literal, NotRequired, TypeAlias, TypedDict
+
+from fitting.analysis.accuracy import Accuracy
+from fitting.analysis.limit_activity import ClipActivity
+from fitting.inference.identifiability import Profile
+
+from .formatting import Table, interval, number, percent
+from .labels import ACCURACY, headings
+
+CLOSE = 0.05  # fraction of its range within which a parameter counts as recovered
+Truth: TypeAlias = Mapping[str, float] | None  # known parameter values by name
+
+
+class ParameterRow(TypedDict):
+    """A free parameter after a fit, as `fit.json` holds it."""
+
+    name: str
+    kind: str  # smooth or threshold
+    unit: str
+    value: float
+    low: float
+    high: float
+    interval: tuple[float, float] | list[float]  # 95 %
+    contraction: float  # 0 where only the prior is known, 1 where the clips decide
+    determined: bool
+    at_bound: Literal["low", "high"] | None
+    half_life: NotRequired[float]  # s, of a gain
+    gain_at_30_hz: NotRequired[float]
+    gain_at_60_hz: NotRequired[float]
+
+
+def parameter_table(rows: Sequence[ParameterRow], truth: Truth) -> Table:
+    """Free parameters: value, interval, range, remarks; truth and error where they are known."""
+    heading = ["parameter", "value", "unit", "95 % interval", "range"]
+    table = [heading + (["truth", "error"] if truth else []) + ["remarks"]]
+    for row in rows:
+        cells = [row["name"], number(row["value"]), row["unit"]]
+        cells += [interval(*row["interval"]), interval(row["low"], row["high"])]
+        if truth:
+            true = truth.get(row["name"])
+            cells.append("unknown" if true is None else number(true))
+            cells.append("" if true is None else f"{percent(error(row, true))} of range")
+        remarks = [] if row["determined"] else ["undetermined by these clips"]
+        if row["at_bound"]:
+            remarks.append(f"at its {'lower' if row['at_bound'] == 'low' else 'upper'} bound")
+        table.append([*cells, ", ".join(remarks)])
+    return table
+
+
+def gain_table(rows: Sequence[ParameterRow]) -> Table:
+    """Gains: their half-lives, and the gains per tick that these mean at 30 and 60 Hz."""
+    table = [["gain", "half-life", "gain at 30 Hz", "gain at 60 Hz"]]
+    for row in rows:
+        if "half_life" in row and "gain_at_30_hz" in row and "gain_at_60_hz" in row:
+            gains = [number(row["gain_at_30_hz"]), number(row["gain_at_60_hz"])]
+            table.append([row["name"], f"{number(row['half_life'])} s", *gains])
+    return table
+
+
+def recovered(rows: Sequence[ParameterRow], truth: Mapping[str, float]) -> str:
+    """How many of the determined parameters are close to their true values."""
+    known = [row for row in rows if row["determined"] and row["name"] in truth]
+    close = sum(error(row, truth[row["name"]]) <= CLOSE for row in known)
+    return (
+        f"{close} of {len(known)} determined parameters within {100 * CLOSE:.0f} % of their range"
+    )
+
+
+def error(row: ParameterRow, true: float) -> float:
+    """Distance of a fitted value from the true one, as a fraction of the parameter's range."""
+    return abs(row["value"] - true) / (row["high"] - row["low"])
+
+
+def contraction_table(rows: Sequence[ParameterRow]) -> Table:
+    """Free parameters by how well the clips determine them, the worst first."""
+    table = [["parameter", "kind", "contraction", "verdict"]]
+    for row in sorted(rows, key=lambda row: row["contraction"]):
+        verdict = "determined" if row["determined"] else "undetermined"
+        table.append([row["name"], row["kind"], f"{row['contraction']:.3f}", verdict])
+    return table
+
+
+def activity_table(clips: Sequence[ClipActivity]) -> Table:
+    """Ground, contact, reach and locks of each clip, a column for each clip and foot."""
+    feet = [(clip, leg) for clip in range(len(clips)) for leg in range(len(clips[clip].legs))]
+    several = len(clips) > 1
+    names = [f"{clips[i].legs[leg]}{f', clip {i + 1}' if several else ''}" for i, leg in feet]
+    table = [["foot", *names]]
+    for heading, fractions in (
+        ("ground found", [clip.grounded for clip in clips]),
+        ("in contact", [clip.in_contact for clip in clips]),
+        ("target reached", [clip.reached for clip in clips]),
+        ("locked", [clip.locked for clip in clips]),
+    ):
+        table.append([heading, *(percent(fractions[i][leg]) for i, leg in feet)])
+    table.append(["locks", *(str(clips[i].locks[leg]) for i, leg in feet)])
+    table.append(["releases", *(str(clips[i].releases[leg]) for i, leg in feet)])
+    return table
+
+
+def limit_table(clips: Sequence[ClipActivity]) -> Table:
+    """Fraction of frames in which each limit changes the pose, a column for each clip."""
+    names = [f"clip {i + 1}" for i in range(len(clips))] if len(clips) > 1 else ["frames"]
+    table = [["limit", *names]]
+    for name in clips[0].limits:
+        table.append([name, *(percent(clip.limits[name]) for clip in clips)])
+    return table
+
+
+def flip_table(flips: Mapping[str, tuple[float, float]], profiles: Mapping[str, Profile]) -> Table:
+    """Thresholds: decisions that flip, and the rise in cost, when one moves by 10 % of its range.
+
+    Args:
+        flips: `limit_activity.flipped_decisions`.
+        profiles: of the same thresholds.
+    """
+    table = [["threshold", "flips, moved down", "cost", "flips, moved up", "cost"]]
+    for name, fractions in flips.items():
+        cells = [name]
+        for fraction, rise in zip(fractions, profiles[name].nudged, strict=True):
+            cells += [percent(fraction, 2), f"{rise:+.1f}"]
+        table.append(cells)
+    return table
+
+
+def accuracy_table(accuracy: Accuracy) -> Table:
+    """How far a solved motion is from the captured one, a row for each figure."""
+    columns = ACCURACY.values()
+    cells = [column.format(value) for column, value in zip(columns, astuple(accuracy), strict=True)]
+    return [
+        ["against the captured motion", ""],
+        *map(list, zip(headings(ACCURACY), cells, strict=True)),
+    ]
