@@ -76,7 +76,7 @@ def unreal() -> FootIK:
         root=GroundRoot(enabled=False),
         probe=RootProbe(),
         contact=IdleContact(),
-        target=RootTarget(),
+        target=RootTarget(),  # pyright: ignore[reportCallIssue]  # its `foot_height` is a property
         lean=NoLean(),
         lock=NoLock(),
         pelvis=CapsulePelvis(),

@@ -7,15 +7,29 @@ the error messages read it from there.
 
 import dataclasses
 import operator
-from typing import Any, Literal, TypeVar
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
 
 Rule = TypeVar("Rule", bound=eqx.Module)
 Kind = Literal["smooth", "threshold"]
 Scale = Literal["linear", "log", "gain"]
+
+
+if TYPE_CHECKING:
+
+    class Leaf:
+        """Type of a field that reads as an array and may be given as a Python number."""
+
+        def __get__(self, rule: object, owner: type | None = None) -> Array: ...
+        def __set__(self, rule: object, value: ArrayLike | Sequence[float]) -> None: ...
+
+else:
+    Leaf = jax.Array
 
 
 @dataclasses.dataclass(frozen=True)

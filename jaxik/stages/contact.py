@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter
+from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact, Frame
 from jaxik.world.skeleton import Rig
@@ -51,9 +51,9 @@ class AbstractInstantContact(AbstractContact):
 class HeightContact(AbstractInstantContact):
     """By the ankle's height: 1 below `planted_height`, 0 above `raised_height`, linear between."""
 
-    ground_height: Array = parameter(0.0, unit="m", low=-0.5, high=0.5)
-    planted_height: Array = parameter(0.10, unit="m", low=0.0, high=0.4, kind="threshold")
-    raised_height: Array = parameter(
+    ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
+    planted_height: Leaf = parameter(0.10, unit="m", low=0.0, high=0.4, kind="threshold")
+    raised_height: Leaf = parameter(
         0.16, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
     )
 
@@ -80,7 +80,7 @@ class StandingContact(AbstractInstantContact):
 class IdleContact(AbstractInstantContact):
     """All feet stand while the character does, none while it moves (Unreal, seed 001)."""
 
-    idle_speed: Array = parameter(0.0, unit="m/s", low=0.0, high=3.0, kind="threshold")
+    idle_speed: Leaf = parameter(0.0, unit="m/s", low=0.0, high=3.0, kind="threshold")
 
     def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
         lift = frame.pose.ankle.pos[..., 1]
@@ -92,7 +92,7 @@ class IdleContact(AbstractInstantContact):
 class LabelContact(AbstractInstantContact):
     """As the animation is labelled (`Stride.standing`): what its author or a capture says."""
 
-    ground_height: Array = parameter(0.0, unit="m", low=-0.5, high=0.5)
+    ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
 
     def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
         standing = frame.stride.standing
@@ -117,16 +117,16 @@ class SpeedContact(AbstractContact):
     ball is slower than 0.25 m/s, a swinging one's hardly ever.
     """
 
-    ground_height: Array = parameter(0.0, unit="m", low=-0.5, high=0.5)
-    planted_height: Array = parameter(0.075, unit="m", low=0.0, high=0.4, kind="threshold")
-    raised_height: Array = parameter(
+    ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
+    planted_height: Leaf = parameter(0.075, unit="m", low=0.0, high=0.4, kind="threshold")
+    raised_height: Leaf = parameter(
         0.10, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
     )
-    planted_speed: Array = parameter(0.25, unit="m/s", low=0.0, high=1.5, kind="threshold")
-    raised_speed: Array = parameter(
+    planted_speed: Leaf = parameter(0.25, unit="m/s", low=0.0, high=1.5, kind="threshold")
+    raised_speed: Leaf = parameter(
         0.50, unit="m/s", low=0.0, high=3.0, kind="threshold", above="planted_speed"
     )
-    half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
 
     def init(self, rig: Rig, dtype: Any) -> SpeedState:
         each = jnp.zeros(rig.side.shape, dtype)

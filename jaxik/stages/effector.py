@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
@@ -105,8 +105,8 @@ class HeelEffector(AbstractInstantEffector):
     (as the heel lift of locomotion systems after Johansen, 2009).
     """
 
-    extension: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
-    max_lift: Array = parameter(0.60, unit="rad", low=0.0, high=1.2)
+    extension: Leaf = parameter(0.98, unit="1", low=0.8, high=1.0)
+    max_lift: Leaf = parameter(0.60, unit="rad", low=0.0, high=1.2)
 
     def advance(
         self,
@@ -174,10 +174,10 @@ class BodyEffector(AbstractEffector):
     freezes short of its goal, which is the original's trap. Off is recommended.
     """
 
-    speed: Array = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
-    latch: Array = switch(False)
-    latch_distance: Array = parameter(0.01, unit="m", low=0.0, high=0.05, kind="threshold")
-    mesh_scale: Array = parameter(1.0, unit="1", low=0.5, high=2.0)
+    speed: Leaf = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    latch: Leaf = switch(False)
+    latch_distance: Leaf = parameter(0.01, unit="m", low=0.0, high=0.05, kind="threshold")
+    mesh_scale: Leaf = parameter(1.0, unit="1", low=0.5, high=2.0)
 
     def init(self, rig: Rig, dtype: Any) -> BodyState:
         return BodyState(jnp.zeros(rig.side.shape, dtype), jnp.zeros((), dtype))
@@ -233,7 +233,7 @@ class FadeEffector(AbstractEffector):
     animation, and the same turn.
     """
 
-    transition_time: Array = parameter(0.20, unit="s", low=0.0, high=1.0)
+    transition_time: Leaf = parameter(0.20, unit="s", low=0.0, high=1.0)
 
     def init(self, rig: Rig, dtype: Any) -> FadeState:
         upright = jnp.broadcast_to(quat.identity(dtype), (*rig.side.shape, 4))

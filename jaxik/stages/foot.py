@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.aim import aim_rotation
 from jaxik.solvers.two_bone import rotation_about
@@ -78,10 +78,10 @@ class PitchRollFoot(AbstractAnimatedFoot):
     sides, A16). They limit what the ground adds: an animation beyond its limits stays as it is.
     """
 
-    max_pitch: Array = parameter(0.52, unit="rad", low=0.0, high=1.4)
-    min_pitch: Array = parameter(-0.79, unit="rad", low=-1.4, high=0.0)
-    max_roll: Array = parameter(0.26, unit="rad", low=0.0, high=1.0)
-    min_roll: Array = parameter(-0.52, unit="rad", low=-1.0, high=0.0)
+    max_pitch: Leaf = parameter(0.52, unit="rad", low=0.0, high=1.4)
+    min_pitch: Leaf = parameter(-0.79, unit="rad", low=-1.4, high=0.0)
+    max_roll: Leaf = parameter(0.26, unit="rad", low=0.0, high=1.0)
+    min_roll: Leaf = parameter(-0.52, unit="rad", low=-1.0, high=0.0)
 
     def pose(
         self,
@@ -126,10 +126,10 @@ class AimFoot(AbstractAnimatedFoot):
     turned by `twist`. A leg without ground, or with `enabled` off, keeps its foot as carried.
     """
 
-    enabled: Array = switch(True)
-    offset: Array = parameter((0.0, 0.0, 0.0), unit="m", low=-0.2, high=0.2)
-    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+    enabled: Leaf = switch(True)
+    offset: Leaf = parameter((0.0, 0.0, 0.0), unit="m", low=-0.2, high=0.2)
+    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
     def pose(
         self,
@@ -160,7 +160,7 @@ class FlatFoot(AbstractFoot):
     zero. Both tilt a foot that stands upright along its up, by `max_tilt` at most.
     """
 
-    max_tilt: Array = parameter(0.7853981634, unit="rad", low=0.0, high=1.5)
+    max_tilt: Leaf = parameter(0.7853981634, unit="rad", low=0.0, high=1.5)
 
     def sense(
         self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import constant, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact, Frame, GroundHits, Slope, heading
 
@@ -69,16 +69,16 @@ class SlopeLean(AbstractLean):
     half-lives of the same gains.
     """
 
-    forward_rate: Array = parameter(-0.30, unit="1", low=-1.0, high=1.0)
-    side_rate: Array = parameter(-0.10, unit="1", low=-1.0, high=1.0)
-    forward_rate_slide: Array = parameter(0.80, unit="1", low=-1.0, high=1.0)
-    side_rate_slide: Array = parameter(0.60, unit="1", low=-1.0, high=1.0)
-    gain: Array = parameter(0.19, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    gain_slide: Array = parameter(0.294, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    slide_on_gain: Array = parameter(0.226, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    slide_off_gain: Array = parameter(0.135, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    spring: Array = switch(False)
-    tick_hz: Array = constant(30.0)
+    forward_rate: Leaf = parameter(-0.30, unit="1", low=-1.0, high=1.0)
+    side_rate: Leaf = parameter(-0.10, unit="1", low=-1.0, high=1.0)
+    forward_rate_slide: Leaf = parameter(0.80, unit="1", low=-1.0, high=1.0)
+    side_rate_slide: Leaf = parameter(0.60, unit="1", low=-1.0, high=1.0)
+    gain: Leaf = parameter(0.19, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    gain_slide: Leaf = parameter(0.294, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    slide_on_gain: Leaf = parameter(0.226, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    slide_off_gain: Leaf = parameter(0.135, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    spring: Leaf = switch(False)
+    tick_hz: Leaf = constant(30.0)
 
     def init(self, dtype: Any) -> LeanState:
         zero = jnp.zeros((), dtype)

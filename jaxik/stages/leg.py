@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.two_bone import (
     LENGTH_BAND,
@@ -65,12 +65,12 @@ class TwoBone(AbstractLeg):
     leg with a zero bone, or lying along its hinge, does not bend.
     """
 
-    max_knee_angle: Array = parameter(3.0000531803, unit="rad", low=2.0, high=3.1415926536)
-    min_knee_angle: Array = parameter(0.6982008392, unit="rad", low=0.0, high=1.8)
-    soften: Array = parameter(0.98, unit="1", low=0.8, high=1.0)
-    as_animated: Array = switch(False)
-    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+    max_knee_angle: Leaf = parameter(3.0000531803, unit="rad", low=2.0, high=3.1415926536)
+    min_knee_angle: Leaf = parameter(0.6982008392, unit="rad", low=0.0, high=1.8)
+    soften: Leaf = parameter(0.98, unit="1", low=0.8, high=1.0)
+    as_animated: Leaf = switch(False)
+    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
     def pose(
         self,
@@ -129,10 +129,10 @@ class PoleLeg(AbstractLeg):
     bone and whose z is the hinge. With `enabled` off the leg stays as the body carries it.
     """
 
-    enabled: Array = switch(True)
-    soften: Array = parameter(1.0, unit="1", low=0.1, high=1.0)
-    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+    enabled: Leaf = switch(True)
+    soften: Leaf = parameter(1.0, unit="1", low=0.1, high=1.0)
+    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
     def pose(
         self,
@@ -157,10 +157,10 @@ class HintLeg(AbstractLeg):
     `hint_offset`, in the character's axes (x left, y up, z forward).
     """
 
-    hint_offset: Array = parameter((0.0, 0.0, 0.0), unit="m", low=-0.5, high=0.5)
-    soften: Array = parameter(1.0, unit="1", low=0.1, high=1.0)
-    twist: Array = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
+    hint_offset: Leaf = parameter((0.0, 0.0, 0.0), unit="m", low=-0.5, high=0.5)
+    soften: Leaf = parameter(1.0, unit="1", low=0.1, high=1.0)
+    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
+    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
     def pose(
         self,

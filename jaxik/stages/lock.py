@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
@@ -100,24 +100,24 @@ class OffsetLock(AbstractLock):
     is at most `relock_threshold`.
     """
 
-    enabled: Array = switch(True)
-    hold_ball: Array = switch(False)
-    release_min_angle: Array = parameter(
+    enabled: Leaf = switch(True)
+    hold_ball: Leaf = switch(False)
+    release_min_angle: Leaf = parameter(
         0.8726646260, unit="rad", low=0.0, high=1.8, kind="threshold"
     )
-    release_max_angle: Array = parameter(
+    release_max_angle: Leaf = parameter(
         3.0019663134, unit="rad", low=2.0, high=3.1415926536, kind="threshold"
     )
-    release_cone: Array = parameter(0.4363323130, unit="rad", low=0.0, high=1.5, kind="threshold")
-    release_distance: Array = parameter(0.20, unit="m", low=0.0, high=0.5, kind="threshold")
-    release_heading: Array = parameter(
+    release_cone: Leaf = parameter(0.4363323130, unit="rad", low=0.0, high=1.5, kind="threshold")
+    release_distance: Leaf = parameter(0.20, unit="m", low=0.0, high=0.5, kind="threshold")
+    release_heading: Leaf = parameter(
         3.1415926536, unit="rad", low=0.1, high=3.1415926536, kind="threshold"
     )
-    release_speed: Array = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
-    relock_threshold: Array = parameter(0.20, unit="1", low=0.0, high=1.0, kind="threshold")
-    max_speed: Array = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
-    lock_half_life: Array = parameter(0.05, unit="s", low=0.002, high=0.5, scale="log")
-    unlock_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    release_speed: Leaf = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
+    relock_threshold: Leaf = parameter(0.20, unit="1", low=0.0, high=1.0, kind="threshold")
+    max_speed: Leaf = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
+    lock_half_life: Leaf = parameter(0.05, unit="s", low=0.002, high=0.5, scale="log")
+    unlock_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
 
     def init(self, rig: Rig, dtype: Any) -> LockState:
         each = jnp.zeros(rig.side.shape, dtype)
@@ -231,9 +231,9 @@ class PlantLock(AbstractLock):
     enable planting over time, or leave the speed endless to set it at once. Follows a platform.
     """
 
-    plant: Array = switch(True)
-    plant_weight: Array = parameter(1.0, unit="1", low=0.0, high=1.0)
-    plant_speed: Array = parameter(float("inf"), unit="1/s", low=0.1, high=20.0, scale="log")
+    plant: Leaf = switch(True)
+    plant_weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
+    plant_speed: Leaf = parameter(float("inf"), unit="1/s", low=0.1, high=20.0, scale="log")
 
     def init(self, rig: Rig, dtype: Any) -> PlantState:
         each = jnp.zeros(rig.side.shape, dtype)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import constant, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
 
@@ -73,12 +73,12 @@ class LowestPelvis(AbstractPelvis):
     goal is 0. Without a limit and with gains of 1 it is ozz's pelvis correction.
     """
 
-    enabled: Array = switch(True)
-    limit: Array = parameter(0.30, unit="m", low=0.0, high=0.6)
-    on_gain: Array = parameter(0.225, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    off_gain: Array = parameter(0.116, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    vertical_only: Array = switch(True)
-    tick_hz: Array = constant(30.0)
+    enabled: Leaf = switch(True)
+    limit: Leaf = parameter(0.30, unit="m", low=0.0, high=0.6)
+    on_gain: Leaf = parameter(0.225, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    off_gain: Leaf = parameter(0.116, unit="1/tick", low=0.01, high=0.95, scale="gain")
+    vertical_only: Leaf = switch(True)
+    tick_hz: Leaf = constant(30.0)
 
     def advance(
         self,
@@ -118,9 +118,9 @@ class CapsulePelvis(AbstractPelvis):
     law. With `enabled` off both go back.
     """
 
-    enabled: Array = switch(True)
-    speed: Array = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
-    half_height: Array = parameter(0.90, unit="m", low=0.3, high=2.0)
+    enabled: Leaf = switch(True)
+    speed: Leaf = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    half_height: Leaf = parameter(0.90, unit="m", low=0.3, high=2.0)
 
     def advance(
         self,
@@ -156,11 +156,11 @@ class LegLengthPelvis(AbstractPelvis):
     height asks for the one that comes nearest. Damped, the offset follows by the clamped-speed law.
     """
 
-    enabled: Array = switch(True)
-    min_length: Array = parameter(0.50, unit="m", low=0.0, high=1.0)
-    max_length: Array = parameter(0.88, unit="m", low=0.2, high=1.5, above="min_length")
-    damp: Array = switch(True)
-    speed: Array = parameter(10.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    enabled: Leaf = switch(True)
+    min_length: Leaf = parameter(0.50, unit="m", low=0.0, high=1.0)
+    max_length: Leaf = parameter(0.88, unit="m", low=0.2, high=1.5, above="min_length")
+    damp: Leaf = switch(True)
+    speed: Leaf = parameter(10.0, unit="1/s", low=0.5, high=30.0, scale="log")
 
     def advance(
         self,
@@ -235,10 +235,10 @@ class SupportPelvis(AbstractFollowingPelvis):
     before reach was thought of (the blocks benchmark's table).
     """
 
-    lowest_share: Array = parameter(0.30, unit="1", low=0.0, high=1.0)
-    rise_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
-    fall_half_life: Array = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
-    spring: Array = switch(False)
+    lowest_share: Leaf = parameter(0.30, unit="1", low=0.0, high=1.0)
+    rise_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Leaf = switch(False)
 
     def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
         asked = asked_heights(sensed, target_ws)
@@ -260,12 +260,12 @@ class ReachPelvis(AbstractFollowingPelvis):
     Found on the blocks benchmark, where reach explains most of a walker's pelvis height.
     """
 
-    highest_share: Array = parameter(0.75, unit="1", low=0.0, high=1.2)
-    extension: Array = parameter(0.958, unit="1", low=0.85, high=1.0)
-    softness: Array = parameter(0.025, unit="m", low=0.002, high=0.1, scale="log")
-    rise_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    fall_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    spring: Array = switch(False)
+    highest_share: Leaf = parameter(0.75, unit="1", low=0.0, high=1.2)
+    extension: Leaf = parameter(0.958, unit="1", low=0.85, high=1.0)
+    softness: Leaf = parameter(0.025, unit="m", low=0.002, high=0.1, scale="log")
+    rise_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Leaf = switch(False)
 
     def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
         asked = asked_heights(sensed, target_ws)

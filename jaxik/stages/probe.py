@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
@@ -40,11 +40,11 @@ class AbstractProbe(eqx.Module):
 class FootProbe(AbstractProbe):
     """A ray at the ankle and, if wanted, one at the toe (record: useFootEndRay; ozz without it)."""
 
-    ray_up: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
-    ray_down: Array = parameter(0.80, unit="m", low=0.0, high=2.0, kind="threshold")
-    toe_ls: Array = parameter((0.0, -0.07, 0.20), unit="m", low=-0.4, high=0.4)
-    use_toe: Array = switch(True)
-    layers: Array = parameter_tree.layers()
+    ray_up: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_down: Leaf = parameter(0.80, unit="m", low=0.0, high=2.0, kind="threshold")
+    toe_ls: Leaf = parameter((0.0, -0.07, 0.20), unit="m", low=-0.4, high=0.4)
+    use_toe: Leaf = switch(True)
+    layers: Leaf = parameter_tree.layers()
 
     def sense(
         self,
@@ -72,9 +72,9 @@ class RootProbe(AbstractProbe):
     to `ray_down` (the trace distance) under it.
     """
 
-    ray_up: Array = parameter(0.90, unit="m", low=0.0, high=2.0, kind="threshold")
-    ray_down: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
-    layers: Array = parameter_tree.layers()
+    ray_up: Leaf = parameter(0.90, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_down: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    layers: Leaf = parameter_tree.layers()
 
     def sense(
         self,
@@ -101,20 +101,20 @@ class CornerProbe(AbstractProbe):
     stable the foot is: the longer one while it is low, slow, or both, as the switches ask.
     """
 
-    active: Array = switch(True)
-    ray_up: Array = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
-    foot_length: Array = parameter(0.20, unit="m", low=0.02, high=0.5)
-    half_width: Array = parameter(0.05, unit="m", low=0.01, high=0.2)
-    extra: Array = parameter(0.20, unit="m", low=0.0, high=1.0, kind="threshold")
-    by_height: Array = switch(True)
-    by_speed: Array = switch(False)
-    extra_min: Array = parameter(0.0, unit="m", low=0.0, high=1.0, kind="threshold")
-    extra_max: Array = parameter(
+    active: Leaf = switch(True)
+    ray_up: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    foot_length: Leaf = parameter(0.20, unit="m", low=0.02, high=0.5)
+    half_width: Leaf = parameter(0.05, unit="m", low=0.01, high=0.2)
+    extra: Leaf = parameter(0.20, unit="m", low=0.0, high=1.0, kind="threshold")
+    by_height: Leaf = switch(True)
+    by_speed: Leaf = switch(False)
+    extra_min: Leaf = parameter(0.0, unit="m", low=0.0, high=1.0, kind="threshold")
+    extra_max: Leaf = parameter(
         0.30, unit="m", low=0.0, high=1.0, kind="threshold", above="extra_min"
     )
-    stable_height: Array = parameter(0.12, unit="m", low=0.0, high=0.5, kind="threshold")
-    stable_speed: Array = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
-    layers: Array = parameter_tree.layers()
+    stable_height: Leaf = parameter(0.12, unit="m", low=0.0, high=0.5, kind="threshold")
+    stable_speed: Leaf = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
+    layers: Leaf = parameter_tree.layers()
 
     def sense(
         self,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.world.frame import Frame
 from jaxik.world.terrain import LegTerrains, Terrain, cast
 
@@ -33,10 +33,10 @@ class GroundRoot(AbstractRoot):
     Where no ground is found, or with `enabled` off, it stays.
     """
 
-    enabled: Array = switch(True)
-    ray_up: Array = parameter(10.0, unit="m", low=0.0, high=20.0, kind="threshold")
-    ray_down: Array = parameter(float("inf"), unit="m", low=0.0, high=20.0, kind="threshold")
-    layers: Array = parameter_tree.layers()
+    enabled: Leaf = switch(True)
+    ray_up: Leaf = parameter(10.0, unit="m", low=0.0, high=20.0, kind="threshold")
+    ray_down: Leaf = parameter(float("inf"), unit="m", low=0.0, high=20.0, kind="threshold")
+    layers: Leaf = parameter_tree.layers()
 
     def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
         origin, up = frame.world_from_model.pos, terrain.up_ws

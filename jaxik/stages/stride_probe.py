@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter
+from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact, Frame, GroundHits, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
@@ -41,20 +41,20 @@ class StrideProbe(AbstractProbe):
     animation lifts them, less `clearance`.
     """
 
-    ray_up: Array = parameter(1.0, unit="m", low=0.0, high=2.0, kind="threshold")
-    ray_down: Array = parameter(1.0, unit="m", low=0.0, high=2.0, kind="threshold")
-    layers: Array = parameter_tree.layers()
-    rise_start: Array = parameter(0.0, unit="1", low=0.0, high=0.45)
-    rise_end: Array = parameter(1.0, unit="1", low=0.55, high=1.0, above="rise_start")
-    steepness: Array = parameter(1.875, unit="1", low=1.0, high=4.0)
-    max_step: Array = parameter(0.60, unit="m", low=0.1, high=1.0)
-    max_slope: Array = parameter(1.05, unit="rad", low=0.1, high=1.4)
-    clearance: Array = parameter(0.0, unit="m", low=-0.1, high=0.1)
-    way_slope: Array = parameter(1.5, unit="1", low=0.2, high=5.0, scale="log")
-    heel_length: Array = parameter(0.07, unit="m", low=0.0, high=0.2)
-    ball_height: Array = parameter(0.055, unit="m", low=0.0, high=0.15)
-    stance_time: Array = parameter(0.65, unit="s", low=0.2, high=1.5)
-    swing_time: Array = parameter(0.45, unit="s", low=0.1, high=1.0)
+    ray_up: Leaf = parameter(1.0, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_down: Leaf = parameter(1.0, unit="m", low=0.0, high=2.0, kind="threshold")
+    layers: Leaf = parameter_tree.layers()
+    rise_start: Leaf = parameter(0.0, unit="1", low=0.0, high=0.45)
+    rise_end: Leaf = parameter(1.0, unit="1", low=0.55, high=1.0, above="rise_start")
+    steepness: Leaf = parameter(1.875, unit="1", low=1.0, high=4.0)
+    max_step: Leaf = parameter(0.60, unit="m", low=0.1, high=1.0)
+    max_slope: Leaf = parameter(1.05, unit="rad", low=0.1, high=1.4)
+    clearance: Leaf = parameter(0.0, unit="m", low=-0.1, high=0.1)
+    way_slope: Leaf = parameter(1.5, unit="1", low=0.2, high=5.0, scale="log")
+    heel_length: Leaf = parameter(0.07, unit="m", low=0.0, high=0.2)
+    ball_height: Leaf = parameter(0.055, unit="m", low=0.0, high=0.15)
+    stance_time: Leaf = parameter(0.65, unit="s", low=0.2, high=1.5)
+    swing_time: Leaf = parameter(0.45, unit="s", low=0.1, high=1.0)
 
     def sense(
         self,

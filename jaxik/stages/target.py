@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import parameter, switch
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact, Foothold, Frame, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
@@ -69,13 +69,13 @@ class SlopeTarget(AbstractTarget):
     the foothold is the animation's own.
     """
 
-    min_ankle_height: Array = parameter(-0.30, unit="m", low=-1.0, high=0.5)
-    max_ankle_height: Array = parameter(0.55, unit="m", low=0.0, high=1.5)
-    foot_height: Array = parameter(0.08, unit="m", low=0.0, high=0.2)
-    max_slope: Array = parameter(1.0471975512, unit="rad", low=0.1, high=1.5)
-    rise_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    fall_half_life: Array = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    spring: Array = switch(False)
+    min_ankle_height: Leaf = parameter(-0.30, unit="m", low=-1.0, high=0.5)
+    max_ankle_height: Leaf = parameter(0.55, unit="m", low=0.0, high=1.5)
+    foot_height: Leaf = parameter(0.08, unit="m", low=0.0, high=0.2)
+    max_slope: Leaf = parameter(1.0471975512, unit="rad", low=0.1, high=1.5)
+    rise_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    fall_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    spring: Leaf = switch(False)
 
     def init(self, rig: Rig, dtype: Any) -> TargetState:
         each = jnp.zeros(rig.side.shape, dtype)
@@ -126,8 +126,8 @@ class SoleTarget(AbstractInstantTarget):
     Where no ground was found the foothold is the animation's own.
     """
 
-    foot_height: Array = parameter(0.12, unit="m", low=0.0, high=0.2)
-    max_slope: Array = parameter(1.5, unit="rad", low=0.1, high=1.5)
+    foot_height: Leaf = parameter(0.12, unit="m", low=0.0, high=0.2)
+    max_slope: Leaf = parameter(1.5, unit="rad", low=0.1, high=1.5)
 
     def sense(
         self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
@@ -145,7 +145,7 @@ class ContactTarget(AbstractInstantTarget):
     Where no ground was found the foothold is the animation's own.
     """
 
-    foot_height: Array = parameter(0.10, unit="m", low=0.0, high=0.2)
+    foot_height: Leaf = parameter(0.10, unit="m", low=0.0, high=0.2)
 
     def sense(
         self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
@@ -165,7 +165,7 @@ class RootTarget(AbstractInstantTarget):
     stand, stays where it is.
     """
 
-    adjust: Array = parameter(0.0, unit="m", low=-0.1, high=0.1)
+    adjust: Leaf = parameter(0.0, unit="m", low=-0.1, high=0.1)
 
     @property
     def foot_height(self) -> Array:
