@@ -6,12 +6,11 @@ go through the scan (`advance`). Everything is for one character: batch with `la
 
 import dataclasses
 import functools
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import HARD, AbstractGate
@@ -19,10 +18,11 @@ from jaxik.maths.struct import struct
 from jaxik.stages.contact import AbstractContact
 from jaxik.stages.effector import AbstractEffector, Effector
 from jaxik.stages.foot import AbstractFoot
+from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.stages.lean import AbstractLean, Lean
-from jaxik.stages.leg import AbstractLeg
+from jaxik.stages.leg import AbstractLeg, LegGoal
 from jaxik.stages.lock import AbstractLock, Held
-from jaxik.stages.pelvis import AbstractPelvis
+from jaxik.stages.pelvis import AbstractPelvis, PelvisMoment, PelvisState
 from jaxik.stages.probe import AbstractProbe, foot_heading
 from jaxik.stages.root import AbstractRoot
 from jaxik.stages.target import AbstractTarget
@@ -51,12 +51,12 @@ class State:
     """All that the pipeline remembers between frames."""
 
     started: Bool[Array, "*b"]  # False before the first frame, on which memory jumps to its goals
-    contact: Any
-    target: Any
-    lean: Any
-    lock: Any
-    pelvis: Any
-    effector: Any
+    contact: PyTree
+    target: PyTree
+    lean: PyTree
+    lock: PyTree
+    pelvis: PelvisState
+    effector: PyTree
 
 
 @struct
@@ -96,45 +96,39 @@ class Result:
     corrections: Corrections
     reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
     aimed: Float[Array, "*b legs"]  # 1 where the foot is turned as its rule wants, else 0
-    trace: Any  # a Trace; None from a `step` that was not asked for it
+    trace: Trace | None  # None from a `step` that was not asked for it
 
 
 def init(ik: FootIK, rig: Rig) -> State:
     """The memory of a character that has not been seen yet: its first frame starts settled."""
-    dtype = rig.side.dtype
     return State(
         jnp.zeros((), bool),
-        ik.contact.init(rig, dtype),
-        ik.target.init(rig, dtype),
-        ik.lean.init(dtype),
-        ik.lock.init(rig, dtype),
-        ik.pelvis.init(dtype),
-        ik.effector.init(rig, dtype),
+        ik.contact.init(rig),
+        ik.target.init(rig),
+        ik.lean.init(rig),
+        ik.lock.init(rig),
+        ik.pelvis.init(rig),
+        ik.effector.init(rig),
     )
 
 
-def sense(
-    ik: FootIK,
-    rig: Rig,
-    terrain: Terrain | LegTerrains,
-    frame: Frame,
-    contact: Contact,
-    gate: AbstractGate,
-) -> Sensed:
+def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
     """All that the frame shows by itself, once it is known which feet stand."""
+    rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
     up = terrain.leg_up_ws
     weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
     with jax.named_scope("root"):
-        root_ws = vec.scale(terrain.up_ws, ik.root.sense(terrain, frame))
+        root_ws = vec.scale(terrain.up_ws, ik.root.sense(inputs))
         frame = frame.translated(root_ws)
+        inputs = dataclasses.replace(inputs, frame=frame)
     with jax.named_scope("probe"):
-        ground = ik.probe.sense(rig, terrain, frame, contact, ik.target.foot_height, gate)
+        ground = ik.probe.sense(inputs, contact, ik.target.foot_height)
     with jax.named_scope("target"):
-        foothold = ik.target.sense(frame, up, ground, contact, gate)
+        foothold = ik.target.sense(inputs, ground, contact)
     with jax.named_scope("lean"):
-        slope = ik.lean.sense(frame, terrain.up_ws, ground, contact, weight)
+        slope = ik.lean.sense(inputs, ground, contact, weight)
     with jax.named_scope("foot"):
-        rot_ws = ik.foot.sense(rig, frame, up, ground, gate)
+        rot_ws = ik.foot.sense(inputs, ground)
     thigh, shin = bone_lengths(frame.pose)
     ankle = animated_ankles(frame)
     return Sensed(
@@ -150,7 +144,7 @@ def sense(
         ankle_ws=ankle.pos,
         ankle_rot_ws=ankle.rot,
         ball_ws=frame.world_from_model.apply(frame.pose.toe.pos),
-        ahead_ws=foot_heading(rig, frame, up)[0],
+        ahead_ws=foot_heading(inputs, up)[0],
         rot_ws=rot_ws,
         thigh=thigh,
         shin=shin,
@@ -161,79 +155,71 @@ def sense(
     )
 
 
-def advance(
-    ik: FootIK,
-    terrain: Terrain | LegTerrains,
-    sensed: Sensed,
-    state: State,
-    standing: Any,
-    gate: AbstractGate,
-) -> Advanced:
+def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Advanced:
     """Memory: footholds, locks, lean, pelvis and effectors after this frame.
 
-    That of the contact, `standing`, has advanced already: the senses need it.
+    That of the contact has advanced already, to `contact`: the senses need it.
     """
-    up, started = sensed.leg_up_ws, state.started
+    sensed, up = now.sensed, now.sensed.leg_up_ws
     with jax.named_scope("target"):
-        target, rise = ik.target.advance(sensed.foothold, sensed.dt, state.target, started, gate)
+        target, rise = ik.target.advance(now, state.target)
         foothold_ws = sensed.foothold.point_ws + vec.scale(up, rise)
     with jax.named_scope("lean"):
-        leaning, lean = ik.lean.advance(
-            sensed.slope, sensed.up_ws, sensed.slide, sensed.dt, state.lean, started, gate
-        )
+        leaning, lean = ik.lean.advance(now, state.lean)
     with jax.named_scope("lock"):
         # The hip as the frame before left it: this frame's offset follows from the locks.
         hip_ws = sensed.hip_ws + state.pelvis.offset_ws
-        lock, held = ik.lock.advance(
-            terrain, sensed, foothold_ws, hip_ws, state.lock, started, gate
-        )
+        lock, held = ik.lock.advance(now, foothold_ws, hip_ws, state.lock)
         target_ws = foothold_ws + held.offset_ws + vec.scale(up, sensed.foothold.lift)
+        ankle = Transform(target_ws, held.rot_ws)
     with jax.named_scope("pelvis"):
-        awake = ik.effector.awake(sensed, state.effector, gate)
-        pelvis = ik.pelvis.advance(sensed, target_ws, lean, state.pelvis, awake, started, gate)
+        awake = ik.effector.awake(now, state.effector)
+        pelvis_now = PelvisMoment(now.dt, now.started, now.gate, sensed, now.terrain, lean, awake)
+        pelvis = ik.pelvis.advance(pelvis_now, ankle, state.pelvis)
     with jax.named_scope("effector"):
-        following, effector = ik.effector.advance(
-            sensed, target_ws, held, pelvis, state.effector, started, gate
-        )
-    after = State(jnp.ones_like(started), standing, target, leaning, lock, pelvis, following)
+        following, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
+    after = State(jnp.ones_like(now.started), contact, target, leaning, lock, pelvis, following)
     return Advanced(foothold_ws, held, lean, effector, after)
 
 
-def pose(
-    ik: FootIK, rig: Rig, frame: Frame, sensed: Sensed, advanced: Advanced, gate: AbstractGate
-) -> Result:
+def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Result:
     """The solved legs."""
+    rig, frame = inputs.rig, inputs.frame
     offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
     body = carry(rig, frame, advanced.lean.turn_ws, offset_ws)
     effector = advanced.effector
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
         carried = frame.pose.transformed(body.repeat(rig.side.size))
-        bend = ik.leg.pose(rig, frame, sensed, carried, target_ms, effector.weight, gate)
+        bend = ik.leg.pose(inputs, sensed, LegGoal(carried, target_ms, effector.weight))
     with jax.named_scope("foot"):
-        planted = ik.foot.pose(rig, frame, sensed, effector, bend, gate)
+        planted = ik.foot.pose(inputs, sensed, effector, bend)
     corrections = Corrections(bend.hip, bend.knee, planted.ankle)
     trace = Trace(sensed, advanced)
     return Result(planted.pose, body, corrections, bend.reached, planted.reached, trace)
 
 
-def contacts_of(
-    rule: AbstractContact, frames: Frame, state: State, gate: AbstractGate
-) -> tuple[Any, Contact]:
+def contacts_of(rule: AbstractContact, inputs: Inputs, state: State) -> tuple[PyTree, Contact]:
     """Memory after each frame and the contacts, in a scan of their own.
 
-    A rule without memory needs none.
+    A rule without memory needs none. The leaves of `inputs.frame` have a leading axis of frames.
     """
+    frames, gate = inputs.frame, inputs.gate
     with jax.named_scope("contact"):
-        seen = jax.vmap(lambda frame: rule.sense(frame, gate))(frames)
+        sensed = jax.vmap(lambda frame: rule.sense(dataclasses.replace(inputs, frame=frame)))(
+            frames
+        )
         if not jax.tree.leaves(state.contact):
-            return state.contact, seen
+            return state.contact, sensed
 
-        def scanned(memory: tuple[Any, Array], now: tuple[Contact, Array]) -> tuple[Any, Any]:
-            after, contact = rule.advance(*now, *memory, gate)
-            return (after, jnp.ones_like(memory[1])), (after, contact)
+        def scanned(
+            carry: tuple[PyTree, Array], frame: tuple[Contact, Array]
+        ) -> tuple[tuple[PyTree, Array], tuple[PyTree, Contact]]:
+            (memory, started), (contact, dt) = carry, frame
+            after, contact = rule.advance(Moment(dt, started, gate), contact, memory)
+            return (after, jnp.ones_like(started)), (after, contact)
 
-        return jax.lax.scan(scanned, (state.contact, state.started), (seen, frames.dt))[1]
+        return jax.lax.scan(scanned, (state.contact, state.started), (sensed, frames.dt))[1]
 
 
 def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform:
@@ -270,14 +256,15 @@ def step(
         trace: whether the result tells every stage's output. A call spends a third of its time on
             handing these out, one buffer a leaf.
     """
+    inputs = Inputs(rig, terrain, frame, gate)
     with jax.named_scope("contact"):
-        seen = ik.contact.sense(frame, gate)
-        standing, contact = ik.contact.advance(seen, frame.dt, state.contact, state.started, gate)
-    sensed = sense(ik, rig, terrain, frame, contact, gate)
-    advanced = advance(ik, terrain, sensed, state, standing, gate)
-    result = pose(ik, rig, frame, sensed, advanced, gate)
-    told = Trace(sensed, advanced) if trace else None
-    return advanced.state, dataclasses.replace(result, trace=told)
+        now = Moment(frame.dt, state.started, gate)
+        memory, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
+    sensed = sense(ik, inputs, contact)
+    sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, terrain)
+    advanced = advance(ik, sensed_now, state, memory)
+    result = pose(ik, inputs, sensed, advanced)
+    return advanced.state, result if trace else dataclasses.replace(result, trace=None)
 
 
 @jax.jit
@@ -294,20 +281,22 @@ def resume(
     Equal to `step` for each frame in turn. Returns the memory after the last frame, so that a clip
     may be cut anywhere.
     """
-    standing, contacts = contacts_of(ik.contact, frames, state, gate)
-    sensed = jax.vmap(lambda frame, contact: sense(ik, rig, terrain, frame, contact, gate))(
-        frames, contacts
-    )
+    inputs = Inputs(rig, terrain, frames, gate)
 
-    def scanned(state: State, now: tuple[Sensed, Any]) -> tuple[State, Advanced]:
-        sensed, standing = now
-        advanced = advance(ik, terrain, sensed, state, standing, gate)
+    def at(frame: Frame) -> Inputs:
+        return dataclasses.replace(inputs, frame=frame)
+
+    memories, contacts = contacts_of(ik.contact, inputs, state)
+    sensed = jax.vmap(lambda frame, contact: sense(ik, at(frame), contact))(frames, contacts)
+
+    def scanned(state: State, frame: tuple[Sensed, PyTree]) -> tuple[State, Advanced]:
+        sensed, memory = frame
+        now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain)
+        advanced = advance(ik, now, state, memory)
         return advanced.state, advanced
 
-    after, advanced = jax.lax.scan(scanned, state, (sensed, standing))
-    result = jax.vmap(lambda frame, s, a: pose(ik, rig, frame, s, a, gate))(
-        frames, sensed, advanced
-    )
+    after, advanced = jax.lax.scan(scanned, state, (sensed, memories))
+    result = jax.vmap(lambda frame, s, a: pose(ik, at(frame), s, a))(frames, sensed, advanced)
     return after, result
 
 

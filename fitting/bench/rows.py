@@ -17,7 +17,8 @@ from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.terrain import mesh_files
 from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
 from jaxik.stages.effector import Effector
-from jaxik.stages.leg import Bend
+from jaxik.stages.inputs import Inputs
+from jaxik.stages.leg import Bend, LegGoal
 from jaxik.world.terrain import Terrain, cast, plane
 
 from . import peers, setup
@@ -103,12 +104,15 @@ def start(row: Row, sizes: Sizes) -> None:
         row.add(what, np.median(beyond), "s", spread=spread, busy=busy, **reach)
 
 
+def _inputs(batch: setup.Batch) -> Inputs:
+    """What `pose` reads; the terrain counts only before."""
+    return Inputs(batch.rig, plane(), batch.frame, jaxik.HARD)
+
+
 def _bend(batch: setup.Batch) -> Bend:
     """Solved legs."""
-    frame, weight = batch.frame, jnp.ones_like(batch.frame.weight)
-    return batch.ik.leg.pose(
-        batch.rig, frame, batch.sensed, frame.pose, batch.target_ms, weight, jaxik.HARD
-    )
+    goal = LegGoal(batch.frame.pose, batch.target_ms, jnp.ones_like(batch.frame.weight))
+    return batch.ik.leg.pose(_inputs(batch), batch.sensed, goal)
 
 
 def side_by_side(of_one: Callable[[setup.Batch], Any]) -> Callable[[jaxik.FootIK, tuple], Any]:
@@ -134,7 +138,7 @@ def planted(batch: setup.Batch) -> tuple:
     bend, frame, sensed = _bend(batch), batch.frame, batch.sensed
     target_ws = frame.world_from_model.apply(bend.pose.ankle.pos)
     effector = Effector(target_ws, sensed.rot_ws, jnp.ones_like(frame.weight))
-    feet = batch.ik.foot.pose(batch.rig, frame, sensed, effector, bend, jaxik.HARD)
+    feet = batch.ik.foot.pose(_inputs(batch), sensed, effector, bend)
     return feet.pose, bend.hip, bend.knee, feet.ankle
 
 

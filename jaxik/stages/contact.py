@@ -1,18 +1,18 @@
 """Stage 1: how far each foot of the animation stands."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Frame
+from jaxik.world.frame import Contact
 from jaxik.world.skeleton import Rig
+
+from .inputs import Inputs, Moment
 
 HEIGHT_BAND = 0.01  # m over which a softened height decision turns
 SPEED_BAND = 0.05  # m/s, likewise
@@ -22,29 +22,25 @@ class AbstractContact(eqx.Module):
     """Reads contact from the animation."""
 
     @abstractmethod
-    def init(self, rig: Rig, dtype: Any) -> Any:
+    def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame."""
 
     @abstractmethod
-    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+    def sense(self, inputs: Inputs) -> Contact:
         """Lift and contact of each foot as this frame alone shows them."""
 
     @abstractmethod
-    def advance(
-        self, contact: Contact, dt: Array, state: Any, started: Array, gate: AbstractGate
-    ) -> tuple[Any, Contact]:
+    def advance(self, now: Moment, contact: Contact, state: PyTree) -> tuple[PyTree, Contact]:
         """Memory after this frame, and the contact with it."""
 
 
 class AbstractInstantContact(AbstractContact):
     """Reads contact from the present frame alone."""
 
-    def init(self, rig: Rig, dtype: Any) -> None:
+    def init(self, rig: Rig) -> None:
         return None
 
-    def advance(
-        self, contact: Contact, dt: Array, state: None, started: Array, gate: AbstractGate
-    ) -> tuple[None, Contact]:
+    def advance(self, now: Moment, contact: Contact, state: None) -> tuple[None, Contact]:
         return None, contact
 
 
@@ -57,8 +53,9 @@ class HeightContact(AbstractInstantContact):
         0.16, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
     )
 
-    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
-        lift = frame.pose.ankle.pos[..., 1] - self.ground_height
+    def sense(self, inputs: Inputs) -> Contact:
+        gate = inputs.gate
+        lift = inputs.frame.pose.ankle.pos[..., 1] - self.ground_height
         planted = gate.below(lift, self.planted_height, band=HEIGHT_BAND)
         lifted = gate.above(lift, self.raised_height, band=HEIGHT_BAND)
         span = self.raised_height - self.planted_height
@@ -71,8 +68,8 @@ class HeightContact(AbstractInstantContact):
 class StandingContact(AbstractInstantContact):
     """Every foot always stands: where there is ground, foot IK works (ozz and Mec)."""
 
-    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
-        lift = frame.pose.ankle.pos[..., 1]
+    def sense(self, inputs: Inputs) -> Contact:
+        lift = inputs.frame.pose.ankle.pos[..., 1]
         one, zero = jnp.ones_like(lift), jnp.zeros_like(lift)
         return Contact(lift, one, one, zero)
 
@@ -82,9 +79,9 @@ class IdleContact(AbstractInstantContact):
 
     idle_speed: Leaf = parameter(0.0, unit="m/s", low=0.0, high=3.0, kind="threshold")
 
-    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
-        lift = frame.pose.ankle.pos[..., 1]
-        idle = gate.below(frame.speed, self.idle_speed, band=SPEED_BAND)
+    def sense(self, inputs: Inputs) -> Contact:
+        lift = inputs.frame.pose.ankle.pos[..., 1]
+        idle = inputs.gate.below(inputs.frame.speed, self.idle_speed, band=SPEED_BAND)
         idle = jnp.broadcast_to(idle, lift.shape)
         return Contact(lift, idle, idle, 1.0 - idle)
 
@@ -94,9 +91,9 @@ class LabelContact(AbstractInstantContact):
 
     ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
 
-    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
-        standing = frame.stride.standing
-        lift = frame.pose.ankle.pos[..., 1] - self.ground_height
+    def sense(self, inputs: Inputs) -> Contact:
+        standing = inputs.frame.stride.standing
+        lift = inputs.frame.pose.ankle.pos[..., 1] - self.ground_height
         return Contact(lift, standing, standing, 1.0 - standing)
 
 
@@ -128,11 +125,12 @@ class SpeedContact(AbstractContact):
     )
     half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
 
-    def init(self, rig: Rig, dtype: Any) -> SpeedState:
-        each = jnp.zeros(rig.side.shape, dtype)
-        return SpeedState(each, each)
+    def init(self, rig: Rig) -> SpeedState:
+        zero = jnp.zeros_like(rig.side)
+        return SpeedState(zero, zero)
 
-    def sense(self, frame: Frame, gate: AbstractGate) -> Contact:
+    def sense(self, inputs: Inputs) -> Contact:
+        frame, gate = inputs.frame, inputs.gate
         lift = frame.pose.ankle.pos[..., 1] - self.ground_height
         height, speed = frame.pose.toe.pos[..., 1] - self.ground_height, frame.toe_speed
         low = gate.below(height, self.planted_height, band=HEIGHT_BAND)
@@ -143,17 +141,13 @@ class SpeedContact(AbstractContact):
         return Contact(lift, planted, planted, 1.0 - lowish * slowish)
 
     def advance(
-        self,
-        contact: Contact,
-        dt: Array,
-        state: SpeedState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: Moment, contact: Contact, state: SpeedState
     ) -> tuple[SpeedState, Contact]:
-        before = jnp.where(started, state.standing, contact.planted)
+        gate = now.gate
+        before = jnp.where(now.started, state.standing, contact.planted)
         one, zero = jnp.ones_like(before), jnp.zeros_like(before)
         standing = gate.choose(contact.planted, one, before)
         standing = gate.choose(contact.lifted, zero, standing)
-        share = jnp.where(started, smoothing.fraction_of_half_life(self.half_life, dt), 1.0)
-        weight = smoothing.lerp(state.weight, standing, share)
+        fraction = now.progress(smoothing.fraction_of_half_life(self.half_life, now.dt))
+        weight = smoothing.lerp(state.weight, standing, fraction)
         return SpeedState(standing, weight), Contact(contact.lift, weight, standing, 1.0 - standing)

@@ -1,20 +1,17 @@
 """Stage 8: where each leg is sent once the body has moved, and how much of foot IK it gets."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Sensed
-from jaxik.world.skeleton import Rig
+from jaxik.world.skeleton import Rig, Transform
 
-from .lock import Held
+from .inputs import SensedMoment
 from .pelvis import PelvisState, asked_heights
 
 HEIGHT_BAND = 0.01  # m
@@ -34,67 +31,47 @@ class AbstractEffector(eqx.Module):
     """Follows the targets."""
 
     @abstractmethod
-    def init(self, rig: Rig, dtype: Any) -> Any:
+    def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame."""
 
     @abstractmethod
-    def awake(self, sensed: Sensed, state: Any, gate: AbstractGate) -> Float[Array, ""]:
+    def awake(self, now: SensedMoment, state: PyTree) -> Float[Array, ""]:
         """0 while the body shall stay as it is, else 1."""
 
     @abstractmethod
     def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        held: Held,
-        pelvis: PelvisState,
-        state: Any,
-        started: Array,
-        gate: AbstractGate,
-    ) -> tuple[Any, Effector]:
+        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: PyTree
+    ) -> tuple[PyTree, Effector]:
         """Memory after this frame, and where the legs go."""
 
 
 class AbstractInstantEffector(AbstractEffector):
     """Follows by the present frame alone."""
 
-    def init(self, rig: Rig, dtype: Any) -> None:
+    def init(self, rig: Rig) -> None:
         return None
 
-    def awake(self, sensed: Sensed, state: None, gate: AbstractGate) -> Float[Array, ""]:
-        return jnp.ones_like(sensed.dt)
+    def awake(self, now: SensedMoment, state: None) -> Float[Array, ""]:
+        return jnp.ones_like(now.dt)
 
 
 class DirectEffector(AbstractInstantEffector):
     """The targets as they are; a foot without ground goes where it was animated."""
 
     def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        held: Held,
-        pelvis: PelvisState,
-        state: None,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
-        return None, Effector(target_ws, held.rot_ws, sensed.weight)
+        return None, Effector(target.pos, target.rot, now.sensed.weight)
 
 
 class FoundEffector(AbstractInstantEffector):
     """The targets of feet that found ground; other legs stay as the body carries them (ozz)."""
 
     def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        held: Held,
-        pelvis: PelvisState,
-        state: None,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
-        return None, Effector(target_ws, held.rot_ws, sensed.weight * sensed.foothold.found)
+        sensed = now.sensed
+        return None, Effector(target.pos, target.rot, sensed.weight * sensed.foothold.found)
 
 
 class HeelEffector(AbstractInstantEffector):
@@ -109,18 +86,12 @@ class HeelEffector(AbstractInstantEffector):
     max_lift: Leaf = parameter(0.60, unit="rad", low=0.0, high=1.2)
 
     def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        held: Held,
-        pelvis: PelvisState,
-        state: None,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
-        turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        sensed = now.sensed
+        turn = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
         arm = quat.rotate(turn, sensed.ankle_ws - sensed.ball_ws)
-        ball = target_ws - arm
+        ball = target.pos - arm
         axis = vec.cross(sensed.ahead_ws, sensed.leg_up_ws)
         spare = vec.length(sensed.ankle_ws - sensed.hip_ws)
         longest = self.extension * (sensed.thigh + sensed.shin)
@@ -128,9 +99,9 @@ class HeelEffector(AbstractInstantEffector):
         hip = sensed.hip_ws + pelvis.offset_ws
         angle = heel_angle(ball - hip, arm, axis, longest)
         level = jnp.zeros_like(angle)
-        angle = gate.clip(angle, level, level + self.max_lift, band=ANGLE_BAND)
+        angle = now.gate.clip(angle, level, level + self.max_lift, band=ANGLE_BAND)
         lift = quat.from_axis_angle(axis, -angle)
-        rot_ws = quat.multiply(lift, held.rot_ws)
+        rot_ws = quat.multiply(lift, target.rot)
         return None, Effector(ball + quat.rotate(lift, arm), rot_ws, sensed.weight)
 
 
@@ -179,42 +150,37 @@ class BodyEffector(AbstractEffector):
     latch_distance: Leaf = parameter(0.01, unit="m", low=0.0, high=0.05, kind="threshold")
     mesh_scale: Leaf = parameter(1.0, unit="1", low=0.5, high=2.0)
 
-    def init(self, rig: Rig, dtype: Any) -> BodyState:
-        return BodyState(jnp.zeros(rig.side.shape, dtype), jnp.zeros((), dtype))
+    def init(self, rig: Rig) -> BodyState:
+        return BodyState(jnp.zeros_like(rig.side), jnp.zeros((), rig.side.dtype))
 
-    def awake(self, sensed: Sensed, state: BodyState, gate: AbstractGate) -> Float[Array, ""]:
-        return 1.0 - state.asleep * self._still(sensed, gate)
+    def awake(self, now: SensedMoment, state: BodyState) -> Float[Array, ""]:
+        return 1.0 - state.asleep * self._still(now)
 
     def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        held: Held,
-        pelvis: PelvisState,
-        state: BodyState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: BodyState
     ) -> tuple[BodyState, Effector]:
-        awake = self.awake(sensed, state, gate)
-        asked = asked_heights(sensed, target_ws)
+        sensed = now.sensed
+        awake = self.awake(now, state)
+        asked = asked_heights(sensed, target.pos)
         goal = asked - pelvis.goal
-        share = smoothing.fraction_of_speed(self.speed, sensed.dt, goal - state.height)
-        share = awake * jnp.where(started, share, 1.0)
+        share = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
+        share = awake * now.progress(share)
         height = smoothing.lerp(state.height, goal, share)
 
-        near = gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
+        near = now.gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
         arrived = jnp.prod(jnp.where(sensed.weight > 0, near, 1.0))
-        falls = jnp.where(self.latch, self._still(sensed, gate), 0.0)
+        falls = jnp.where(self.latch, self._still(now), 0.0)
         asleep = falls * (1.0 - awake * (1.0 - arrived))
 
         moved = vec.scale(sensed.leg_up_ws, height / self.mesh_scale - asked) + pelvis.offset_ws
-        effector = Effector(target_ws + moved, held.rot_ws, sensed.weight)
+        effector = Effector(target.pos + moved, target.rot, sensed.weight)
         return BodyState(height, asleep), effector
 
-    def _still(self, sensed: Sensed, gate: AbstractGate) -> Float[Array, ""]:
+    def _still(self, now: SensedMoment) -> Float[Array, ""]:
         """1 while all feet stand."""
+        sensed = now.sensed
         standing = jnp.where(sensed.weight > 0, sensed.contact.planted, 1.0)
-        return gate.minimum(standing, band=0.1)
+        return now.gate.minimum(standing, band=0.1)
 
 
 @struct
@@ -235,31 +201,23 @@ class FadeEffector(AbstractEffector):
 
     transition_time: Leaf = parameter(0.20, unit="s", low=0.0, high=1.0)
 
-    def init(self, rig: Rig, dtype: Any) -> FadeState:
-        upright = jnp.broadcast_to(quat.identity(dtype), (*rig.side.shape, 4))
-        return FadeState(
-            jnp.zeros(rig.side.shape, dtype), jnp.zeros((*rig.side.shape, 3), dtype), upright
-        )
+    def init(self, rig: Rig) -> FadeState:
+        upright = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
+        return FadeState(jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls), upright)
 
-    def awake(self, sensed: Sensed, state: FadeState, gate: AbstractGate) -> Float[Array, ""]:
-        return jnp.ones_like(sensed.dt)
+    def awake(self, now: SensedMoment, state: FadeState) -> Float[Array, ""]:
+        return jnp.ones_like(now.dt)
 
     def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        held: Held,
-        pelvis: PelvisState,
-        state: FadeState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: FadeState
     ) -> tuple[FadeState, Effector]:
+        sensed = now.sensed
         found = sensed.foothold.found
-        step = jnp.where(started, smoothing.step_of_time(self.transition_time, sensed.dt), 1.0)
+        step = now.progress(smoothing.step_of_time(self.transition_time, now.dt))
         share = smoothing.move_towards(state.share, found, step)
-        asked = target_ws - sensed.ankle_ws
-        offset_ws = gate.choose(found[..., None], asked, state.offset_ws)
-        turn = quat.multiply(held.rot_ws, quat.conjugate(sensed.ankle_rot_ws))
+        asked = target.pos - sensed.ankle_ws
+        offset_ws = now.gate.choose(found[..., None], asked, state.offset_ws)
+        turn = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
         turn_ws = quat.nlerp(state.turn_ws, turn, found)
         effector = Effector(
             sensed.ankle_ws + offset_ws,

@@ -13,10 +13,11 @@ from jaxik.maths.struct import struct
 from jaxik.solvers.aim import aim_rotation
 from jaxik.solvers.two_bone import rotation_about
 from jaxik.world.frame import FORWARD, UP, Frame, GroundHits, Sensed, animated_ankles
-from jaxik.world.skeleton import LegPose, Rig, Transform
+from jaxik.world.skeleton import LegPose, Transform
 from jaxik.world.terrain import Hit
 
 from .effector import Effector
+from .inputs import Inputs
 from .leg import Bend
 from .probe import foot_heading
 
@@ -41,31 +42,19 @@ class AbstractFoot(eqx.Module):
     """Turns feet."""
 
     @abstractmethod
-    def sense(
-        self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate
-    ) -> Float[Array, "legs 4"]:
+    def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
         """The ankles' rotation in the world that memory may keep, before the legs are solved."""
 
     @abstractmethod
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        effector: Effector,
-        bend: Bend,
-        gate: AbstractGate,
-    ) -> Planted:
+    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
         """The solved legs with their feet turned."""
 
 
 class AbstractAnimatedFoot(AbstractFoot):
     """Turns feet from where the animation has them."""
 
-    def sense(
-        self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate
-    ) -> Float[Array, "legs 4"]:
-        return animated_ankles(frame).rot
+    def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
+        return animated_ankles(inputs.frame).rot
 
 
 class PitchRollFoot(AbstractAnimatedFoot):
@@ -83,16 +72,8 @@ class PitchRollFoot(AbstractAnimatedFoot):
     max_roll: Leaf = parameter(0.26, unit="rad", low=0.0, high=1.0)
     min_roll: Leaf = parameter(-0.52, unit="rad", low=-1.0, high=0.0)
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        effector: Effector,
-        bend: Bend,
-        gate: AbstractGate,
-    ) -> Planted:
-        world = frame.world_from_model
+    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+        rig, frame, gate = inputs.rig, inputs.frame, inputs.gate
         up = sensed.leg_up_ws
         left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
         outer = vec.scale(left, rig.side)
@@ -103,7 +84,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
         shin = vec.normalize(
             bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
-        shin = quat.rotate(world.rot, shin)
+        shin = quat.rotate(frame.world_from_model.rot, shin)
         free_pitch, free_roll = pitch, roll
         pitch = limited(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
         roll = limited(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
@@ -131,22 +112,15 @@ class AimFoot(AbstractAnimatedFoot):
     twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
     weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        effector: Effector,
-        bend: Bend,
-        gate: AbstractGate,
-    ) -> Planted:
+    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+        rig, frame = inputs.rig, inputs.frame
         carried = bend.pose.ankle
         into_model = frame.world_from_model.inverse()
         foot = quat.multiply(carried.rot, rig.ankle_from_foot)
         aim = into_model.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
         upward, ahead = (quat.rotate(foot, vec.constant(axis, aim)) for axis in (UP, FORWARD))
         start = quat.rotate(foot, self.offset)
-        turn, reached = aim_rotation(aim, upward, start, ahead, ahead, self.twist, gate)
+        turn, reached = aim_rotation(aim, upward, start, ahead, ahead, self.twist, inputs.gate)
         weight = jnp.where(self.enabled, effector.weight * sensed.foothold.found, 0.0)
         turn = quat.nlerp(quat.identity(turn.dtype), turn, weight * self.weight)
         full = jnp.where(weight * self.weight >= 1, 1.0, 0.0)
@@ -162,42 +136,25 @@ class FlatFoot(AbstractFoot):
 
     max_tilt: Leaf = parameter(0.7853981634, unit="rad", low=0.0, high=1.5)
 
-    def sense(
-        self, rig: Rig, frame: Frame, up_ws: Array, ground: GroundHits, gate: AbstractGate
-    ) -> Float[Array, "legs 4"]:
-        ahead, right = foot_heading(rig, frame, up_ws)
+    def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
+        up_ws = inputs.terrain.leg_up_ws
+        ahead, right = foot_heading(inputs, up_ws)
         pitch = rise_angle(ground.ankle, ground.toe, ahead, up_ws)
         roll = rise_angle(ground.ankle, ground.corner, right, up_ws)
         tilt = quat.multiply(quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, -roll))
-        level = quat.multiply(upright(ahead, up_ws), quat.conjugate(rig.ankle_from_foot))
-        flat = quat.multiply(at_most(tilt, self.max_tilt, gate), level)
-        return quat.nlerp(animated_ankles(frame).rot, flat, ground.ankle.found)
+        level = quat.multiply(upright(ahead, up_ws), quat.conjugate(inputs.rig.ankle_from_foot))
+        flat = quat.multiply(at_most(tilt, self.max_tilt, inputs.gate), level)
+        return quat.nlerp(animated_ankles(inputs.frame).rot, flat, ground.ankle.found)
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        effector: Effector,
-        bend: Bend,
-        gate: AbstractGate,
-    ) -> Planted:
-        return turned(frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
+    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+        return turned(inputs.frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
 
 
 class KeepFoot(AbstractAnimatedFoot):
     """Feet keep their animated rotation in the world (Unreal, seed 001)."""
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        effector: Effector,
-        bend: Bend,
-        gate: AbstractGate,
-    ) -> Planted:
-        return turned(frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight))
+    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+        return turned(inputs.frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight))
 
 
 def turned(frame: Frame, effector: Effector, bend: Bend, rot_ws: Array, reached: Array) -> Planted:

@@ -1,17 +1,18 @@
 """Stage 5: the body's lean against the slope under the feet (the record's "undulation")."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Frame, GroundHits, Slope, heading
+from jaxik.world.frame import Contact, GroundHits, Slope, heading
+from jaxik.world.skeleton import Rig
+
+from .inputs import Inputs, SensedMoment
 
 
 @struct
@@ -26,26 +27,15 @@ class AbstractLean(eqx.Module):
     """Leans the body."""
 
     @abstractmethod
-    def init(self, dtype: Any) -> Any:
+    def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame."""
 
     @abstractmethod
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, weight: Array
-    ) -> Slope:
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
         """The slope that this frame alone shows."""
 
     @abstractmethod
-    def advance(
-        self,
-        slope: Slope,
-        up_ws: Array,
-        slide: Array,
-        dt: Array,
-        state: Any,
-        started: Array,
-        gate: AbstractGate,
-    ) -> tuple[Any, Lean]:
+    def advance(self, now: SensedMoment, state: PyTree) -> tuple[PyTree, Lean]:
         """The lean after memory."""
 
 
@@ -80,14 +70,13 @@ class SlopeLean(AbstractLean):
     spring: Leaf = switch(False)
     tick_hz: Leaf = constant(30.0)
 
-    def init(self, dtype: Any) -> LeanState:
-        zero = jnp.zeros((), dtype)
+    def init(self, rig: Rig) -> LeanState:
+        zero = jnp.zeros((), rig.side.dtype)
         return LeanState(zero, zero, zero, zero, zero)
 
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, weight: Array
-    ) -> Slope:
-        forward_ws, right_ws = heading(frame.world_from_model, up_ws)
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
+        up_ws = inputs.terrain.up_ws
+        forward_ws, right_ws = heading(inputs.frame.world_from_model, up_ws)
         share = contact.weight * ground.ankle.found * weight
         normal = vec.sum_vectors(vec.scale(ground.ankle.normal, share))
         normal = jnp.where(vec.sum_last(share) > 0, normal, up_ws)
@@ -99,23 +88,15 @@ class SlopeLean(AbstractLean):
             right_ws,
         )
 
-    def advance(
-        self,
-        slope: Slope,
-        up_ws: Array,
-        slide: Array,
-        dt: Array,
-        state: LeanState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
-    ) -> tuple[LeanState, Lean]:
+    def advance(self, now: SensedMoment, state: LeanState) -> tuple[LeanState, Lean]:
+        gate, dt, slope, slide = now.gate, now.dt, now.sensed.slope, now.sensed.slide
         entering = gate.above(slide - state.slide, jnp.zeros_like(slide), band=0.1)
         slide_gain = gate.choose(entering, self.slide_on_gain, self.slide_off_gain)
         slide_share = smoothing.fraction_of_gain(slide_gain, dt, self.tick_hz)
-        sliding = smoothing.lerp(state.slide, slide, jnp.where(started, slide_share, 1.0))
+        sliding = smoothing.lerp(state.slide, slide, now.progress(slide_share))
 
         gain = smoothing.lerp(self.gain, self.gain_slide, sliding)
-        share = jnp.where(started, smoothing.fraction_of_gain(gain, dt, self.tick_hz), 1.0)
+        share = now.progress(smoothing.fraction_of_gain(gain, dt, self.tick_hz))
         forward, forward_speed = smoothing.follow(
             smoothing.Motion(state.forward, state.forward_speed),
             slope.forward,
@@ -130,32 +111,23 @@ class SlopeLean(AbstractLean):
         lean_forward = forward * smoothing.lerp(self.forward_rate, self.forward_rate_slide, sliding)
         lean_side = side * smoothing.lerp(self.side_rate, self.side_rate_slide, sliding)
         turn = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
-        lean = Lean(quat.from_rotvec(turn), _normal(slope, up_ws, forward, side))
+        lean = Lean(quat.from_rotvec(turn), _normal(slope, now.sensed.up_ws, forward, side))
         return LeanState(forward, side, sliding, forward_speed, side_speed), lean
 
 
 class NoLean(AbstractLean):
     """The body stays as upright as it was animated."""
 
-    def init(self, dtype: Any) -> None:
+    def init(self, rig: Rig) -> None:
         return None
 
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, weight: Array
-    ) -> Slope:
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
+        frame = inputs.frame
         level = jnp.zeros_like(frame.dt)
-        return Slope(level, level, *heading(frame.world_from_model, up_ws))
+        return Slope(level, level, *heading(frame.world_from_model, inputs.terrain.up_ws))
 
-    def advance(
-        self,
-        slope: Slope,
-        up_ws: Array,
-        slide: Array,
-        dt: Array,
-        state: None,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
-    ) -> tuple[None, Lean]:
+    def advance(self, now: SensedMoment, state: None) -> tuple[None, Lean]:
+        up_ws = now.sensed.up_ws
         return None, Lean(quat.identity(up_ws.dtype), up_ws)
 
 

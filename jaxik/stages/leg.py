@@ -1,5 +1,6 @@
 """Stage 9: two-bone legs that bring the ankles to their targets."""
 
+import dataclasses
 from abc import abstractmethod
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.two_bone import (
     LENGTH_BAND,
+    PoleBend,
     hinge_rotation,
     local,
     pole_bend,
@@ -19,8 +21,10 @@ from jaxik.solvers.two_bone import (
     swing_rotation,
     third_side,
 )
-from jaxik.world.frame import Frame, Sensed
+from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
+
+from .inputs import Inputs
 
 
 @struct
@@ -33,23 +37,23 @@ class Bend:
     reached: Float[Array, " legs"]  # 1 where the ankle is at its target, else 0
 
 
+@struct
+class LegGoal:
+    """What a leg is solved for."""
+
+    pose: LegPose  # legs, animated, on the moved body, model space
+    target_ms: Float[Array, "legs 3"]  # m, of the ankle
+    weight: Float[Array, " legs"]  # 0..1
+
+
 class AbstractLeg(eqx.Module):
     """Solves legs."""
 
     weight: eqx.AbstractVar[Array]  # 0..1, share of foot IK
 
     @abstractmethod
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        carried: LegPose,
-        target_ms: Array,
-        weight: Array,
-        gate: AbstractGate,
-    ) -> Bend:
-        """The leg with its ankle at `target_ms`, m; `carried` is animated, on the moved body."""
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+        """The legs with their ankles at their targets."""
 
 
 class TwoBone(AbstractLeg):
@@ -72,22 +76,12 @@ class TwoBone(AbstractLeg):
     twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
     weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        carried: LegPose,
-        target_ms: Array,
-        weight: Array,
-        gate: AbstractGate,
-    ) -> Bend:
-        return self.solve(rig, carried, target_ms, weight, gate)
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+        return self.solve(inputs.rig, goal, inputs.gate)
 
-    def solve(
-        self, rig: Rig, pose: LegPose, target_ms: Array, weight: Array, gate: AbstractGate
-    ) -> Bend:
-        """The leg by itself: `pose` with its ankle at `target_ms`, m, model space."""
+    def solve(self, rig: Rig, goal: LegGoal, gate: AbstractGate) -> Bend:
+        """The leg by itself: with its ankle at the goal's target."""
+        pose, target_ms = goal.pose, goal.target_ms
         to_hip, to_ankle, hinge = bones(rig, pose)
         to_target = vec.subtract(target_ms, pose.hip.pos)
         reach, reached = vec.stacked_barrier(*self._reach(to_hip, to_ankle, to_target, gate))
@@ -95,7 +89,7 @@ class TwoBone(AbstractLeg):
         turn = quat.from_half_angle(hinge, half_cos, half_sin)
         bent = quat.rotate(turn, to_ankle) - to_hip
         swing = swing_rotation(bent, to_target, hinge, self.twist)
-        return bend_leg(rig, pose, swing, half_cos, half_sin, reached, weight)
+        return bend_leg(rig, goal, PoleBend(swing, half_cos, half_sin, reached))
 
     def _reach(
         self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate
@@ -134,20 +128,11 @@ class PoleLeg(AbstractLeg):
     twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
     weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        carried: LegPose,
-        target_ms: Array,
-        weight: Array,
-        gate: AbstractGate,
-    ) -> Bend:
-        _, to_ankle, hinge = bones(rig, carried)
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+        _, to_ankle, hinge = bones(inputs.rig, goal.pose)
         pole = vec.cross(hinge, to_ankle)
-        weight = jnp.where(self.enabled, weight, 0.0)
-        return solve_to_pole(rig, carried, target_ms, pole, self.soften, self.twist, weight, gate)
+        goal = dataclasses.replace(goal, weight=jnp.where(self.enabled, goal.weight, 0.0))
+        return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
 
 
 class HintLeg(AbstractLeg):
@@ -162,20 +147,12 @@ class HintLeg(AbstractLeg):
     twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
     weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
 
-    def pose(
-        self,
-        rig: Rig,
-        frame: Frame,
-        sensed: Sensed,
-        carried: LegPose,
-        target_ms: Array,
-        weight: Array,
-        gate: AbstractGate,
-    ) -> Bend:
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+        frame = inputs.frame
         toe = frame.world_from_model.inverse().apply(sensed.ground.toe.point)
         calf = frame.pose.knee.pos - frame.pose.ankle.pos
-        pole = toe + calf + self.hint_offset - carried.hip.pos
-        return solve_to_pole(rig, carried, target_ms, pole, self.soften, self.twist, weight, gate)
+        pole = toe + calf + self.hint_offset - goal.pose.hip.pos
+        return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
 
 
 def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
@@ -186,36 +163,22 @@ def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
 
 
 def solve_to_pole(
-    rig: Rig,
-    carried: LegPose,
-    target_ms: Array,
-    pole_ms: Array,
-    soften: Array,
-    twist: Array,
-    weight: Array,
-    gate: AbstractGate,
+    inputs: Inputs, goal: LegGoal, pole_ms: Array, soften: Array, twist: Array
 ) -> Bend:
     """The leg whose plane contains the direction `pole_ms`."""
-    to_hip, to_ankle, hinge = bones(rig, carried)
-    to_target = target_ms - carried.hip.pos
-    bend = pole_bend(to_hip, to_ankle, hinge, to_target, pole_ms, soften, twist, gate)
-    return bend_leg(rig, carried, bend.swing, bend.half_cos, bend.half_sin, bend.reached, weight)
+    to_hip, to_ankle, hinge = bones(inputs.rig, goal.pose)
+    to_target = goal.target_ms - goal.pose.hip.pos
+    bend = pole_bend(to_hip, to_ankle, hinge, to_target, pole_ms, soften, twist, inputs.gate)
+    return bend_leg(inputs.rig, goal, bend)
 
 
-def bend_leg(
-    rig: Rig,
-    pose: LegPose,
-    swing: Array,
-    half_cos: Array,
-    half_sin: Array,
-    reached: Array,
-    weight: Array,
-) -> Bend:
-    """The leg with its knee turned about its hinge, then its hip, each by a share `weight`."""
+def bend_leg(rig: Rig, goal: LegGoal, bend: PoleBend) -> Bend:
+    """The leg with its knee turned about its hinge, then its hip, each by the goal's weight."""
+    pose, weight = goal.pose, goal.weight
     to_hip, to_ankle, hinge = bones(rig, pose)
-    half_cos, half_sin = quat.nlerp_half(half_cos, half_sin, weight)
+    half_cos, half_sin = quat.nlerp_half(bend.half_cos, bend.half_sin, weight)
     turn = quat.from_half_angle(hinge, half_cos, half_sin)
-    swing = quat.nlerp_identity(swing, weight)
+    swing = quat.nlerp_identity(bend.swing, weight)
 
     knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -to_hip))
     whole = quat.multiply(swing, turn)
@@ -234,5 +197,5 @@ def bend_leg(
         solved,
         local(pose.hip.rot, swing),
         quat.from_half_angle(rig.knee_axis_ls, half_cos, half_sin),
-        reached * jnp.where(weight >= 1, 1.0, 0.0),
+        bend.reached * jnp.where(weight >= 1, 1.0, 0.0),
     )

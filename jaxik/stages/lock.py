@@ -1,19 +1,18 @@
 """Stage 6: feet that keep their place in the world while they stand."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import LegTerrains, Terrain, cast
+from jaxik.world.terrain import cast
+
+from .inputs import SensedMoment
 
 DISTANCE_BAND = 0.01  # m
 COSINE_BAND = 0.03  # about 2 degrees at a right angle
@@ -34,40 +33,27 @@ class AbstractLock(eqx.Module):
     """Keeps feet in place."""
 
     @abstractmethod
-    def init(self, rig: Rig, dtype: Any) -> Any:
+    def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame."""
 
     @abstractmethod
     def advance(
-        self,
-        terrain: Terrain | LegTerrains,
-        sensed: Sensed,
-        foothold_ws: Array,
-        hip_ws: Array,
-        state: Any,
-        started: Array,
-        gate: AbstractGate,
-    ) -> tuple[Any, Held]:
+        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PyTree
+    ) -> tuple[PyTree, Held]:
         """Memory after this frame, and what each foot keeps."""
 
 
 class NoLock(AbstractLock):
     """Feet follow their footholds."""
 
-    def init(self, rig: Rig, dtype: Any) -> None:
+    def init(self, rig: Rig) -> None:
         return None
 
     def advance(
-        self,
-        terrain: Terrain | LegTerrains,
-        sensed: Sensed,
-        foothold_ws: Array,
-        hip_ws: Array,
-        state: None,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: None
     ) -> tuple[None, Held]:
         free = jnp.zeros_like(foothold_ws)
+        sensed = now.sensed
         return None, Held(free, sensed.rot_ws, jnp.zeros_like(sensed.foothold.found))
 
 
@@ -119,39 +105,33 @@ class OffsetLock(AbstractLock):
     lock_half_life: Leaf = parameter(0.05, unit="s", low=0.002, high=0.5, scale="log")
     unlock_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
 
-    def init(self, rig: Rig, dtype: Any) -> LockState:
-        each = jnp.zeros(rig.side.shape, dtype)
-        spread = jnp.zeros((*rig.side.shape, 3), dtype)
+    def init(self, rig: Rig) -> LockState:
+        each = jnp.zeros_like(rig.side)
+        spread = jnp.zeros_like(rig.knee_axis_ls)
         return LockState(each, each, spread, spread, spread, spread)
 
     def advance(
-        self,
-        terrain: Terrain | LegTerrains,
-        sensed: Sensed,
-        foothold_ws: Array,
-        hip_ws: Array,
-        state: LockState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: LockState
     ) -> tuple[LockState, Held]:
+        sensed, gate = now.sensed, now.gate
         up, platform = sensed.leg_up_ws, sensed.platform
         moved = foothold_ws - platform.apply(state.foothold)
         slid = vec.reject(sensed.ball_ws - platform.apply(state.ball), up)
         slid += vec.scale(up, vec.dot(moved, up))
-        moved = jnp.where(started, jnp.where(self.hold_ball, slid, moved), 0.0)
+        moved = jnp.where(now.started, jnp.where(self.hold_ball, slid, moved), 0.0)
         before = quat.rotate(platform.rot, state.offset)
         pointed = quat.rotate(platform.rot, state.ahead)
         pointed = gate.choose(state.locked[..., None], pointed, sensed.ahead_ws)
-        stays = self._may_stay(sensed, foothold_ws, hip_ws, before - moved, gate)
-        stays = stays * self._goes_along(sensed, moved, pointed, gate)
-        starts = stays * self._may_start(sensed, moved, state.factor, gate)
+        stays = self._may_stay(now, foothold_ws, hip_ws, before - moved)
+        stays = stays * self._goes_along(now, moved, pointed)
+        starts = stays * self._may_start(now, moved, state.factor)
 
         one, zero = jnp.ones_like(state.locked), jnp.zeros_like(state.locked)
         locked = gate.choose(starts, one, state.locked)
         locked = gate.choose(stays, locked, zero)
 
-        on = smoothing.fraction_of_half_life(self.lock_half_life, sensed.dt)
-        off = smoothing.fraction_of_half_life(self.unlock_half_life, sensed.dt)
+        on = smoothing.fraction_of_half_life(self.lock_half_life, now.dt)
+        off = smoothing.fraction_of_half_life(self.unlock_half_life, now.dt)
         risen = smoothing.lerp(state.factor, one, on)
         factor = gate.choose(locked, risen, smoothing.lerp(state.factor, zero, off))
         held = before - vec.scale(moved, risen)
@@ -168,21 +148,18 @@ class OffsetLock(AbstractLock):
         )
         return after, Held(offset_ws, sensed.rot_ws, locked)
 
-    def _may_start(self, sensed: Sensed, moved: Array, factor: Array, gate: AbstractGate) -> Array:
-        speed = vec.safe_divide(vec.length(moved), sensed.dt)
+    def _may_start(self, now: SensedMoment, moved: Array, factor: Array) -> Array:
+        sensed, gate = now.sensed, now.gate
+        speed = vec.safe_divide(vec.length(moved), now.dt)
         calm = gate.below(speed, self.max_speed, band=SPEED_BAND)
         recovered = gate.below(factor, self.relock_threshold, band=FACTOR_BAND)
         return sensed.contact.planted * calm * recovered * sensed.foothold.found
 
     def _may_stay(
-        self,
-        sensed: Sensed,
-        foothold_ws: Array,
-        hip_ws: Array,
-        offset_ws: Array,
-        gate: AbstractGate,
+        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, offset_ws: Array
     ) -> Array:
         """1 where nothing releases a foot that would keep its place."""
+        sensed, gate = now.sensed, now.gate
         place = foothold_ws + offset_ws + vec.scale(sensed.leg_up_ws, sensed.foothold.lift)
         leg = place - hip_ws
         squares = sensed.thigh**2 + sensed.shin**2
@@ -200,15 +177,14 @@ class OffsetLock(AbstractLock):
         works = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
         return bent * short * ahead * near * works * (1.0 - sensed.contact.lifted)
 
-    def _goes_along(
-        self, sensed: Sensed, moved: Array, pointed: Array, gate: AbstractGate
-    ) -> Array:
+    def _goes_along(self, now: SensedMoment, moved: Array, pointed: Array) -> Array:
         """1 where the animated foot turns and moves little enough for one that keeps its place."""
+        sensed, gate = now.sensed, now.gate
         alignment = vec.dot(pointed, sensed.ahead_ws)
         along = gate.above(alignment, jnp.cos(self.release_heading), band=COSINE_BAND)
         # Half a turn is as far as a foot can point elsewhere.
         along = jnp.where(self.release_heading < jnp.pi, along, 1.0)
-        speed = vec.safe_divide(vec.length(moved), sensed.dt)
+        speed = vec.safe_divide(vec.length(moved), now.dt)
         return along * gate.below(speed, self.release_speed, band=SPEED_BAND)
 
 
@@ -235,29 +211,23 @@ class PlantLock(AbstractLock):
     plant_weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
     plant_speed: Leaf = parameter(float("inf"), unit="1/s", low=0.1, high=20.0, scale="log")
 
-    def init(self, rig: Rig, dtype: Any) -> PlantState:
-        each = jnp.zeros(rig.side.shape, dtype)
-        spread = jnp.zeros((*rig.side.shape, 3), dtype)
-        upright = jnp.broadcast_to(quat.identity(dtype), (*rig.side.shape, 4))
+    def init(self, rig: Rig) -> PlantState:
+        each = jnp.zeros_like(rig.side)
+        spread = jnp.zeros_like(rig.knee_axis_ls)
+        upright = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
         return PlantState(each, each, spread, each, upright)
 
     def advance(
-        self,
-        terrain: Terrain | LegTerrains,
-        sensed: Sensed,
-        foothold_ws: Array,
-        hip_ws: Array,
-        state: PlantState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
     ) -> tuple[PlantState, Held]:
+        sensed, gate = now.sensed, now.gate
         up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
         before = state.locked
         kept_ws = gate.choose(before[..., None], platform.apply(state.foothold), foothold_ws)
         kept_rot = quat.nlerp(sensed.rot_ws, platform.apply_rot(state.rot), before)
 
         hit = cast(
-            terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
+            now.terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
         )
         over_ground = vec.dot(kept_ws - hit.point, up)
         clearance = gate.choose(before, state.clearance, over_ground * hit.found)
@@ -265,7 +235,7 @@ class PlantLock(AbstractLock):
         planted_ws = gate.choose(hit.found[..., None], followed, kept_ws)
 
         locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
-        step = jnp.where(started, smoothing.step_of_speed(self.plant_speed, sensed.dt), 1.0)
+        step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
         share = smoothing.move_towards(state.share, self.plant_weight, step)
         counts = locked * share
         held = Held(

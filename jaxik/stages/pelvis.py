@@ -2,19 +2,19 @@
 
 import dataclasses
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
+from jaxik.world.skeleton import Rig, Transform
 
+from .inputs import SensedMoment
 from .lean import Lean
 
 HEIGHT_BAND = 0.01  # m
@@ -32,10 +32,10 @@ class PelvisState:
     half_height: Float[Array, ""]  # m, of the character's capsule; 0 where a rule has none
 
     @classmethod
-    def level(cls, dtype: Any) -> "PelvisState":
+    def level(cls, rig: Rig) -> "PelvisState":
         """Nothing moved."""
-        zero = jnp.zeros((), dtype)
-        return cls(zero, zero, zero, jnp.zeros(3, dtype), zero)
+        zero = jnp.zeros((), rig.side.dtype)
+        return cls(zero, zero, zero, jnp.zeros(3, rig.side.dtype), zero)
 
     @classmethod
     def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
@@ -44,25 +44,24 @@ class PelvisState:
         return cls(height, zero, goal, vec.scale(up_ws, height), zero)
 
 
+@struct
+class PelvisMoment(SensedMoment):
+    """A moment, with what only the pelvis reads."""
+
+    lean: Lean
+    awake: Float[Array, ""]  # 0 while the body is to stay where it is, else 1
+
+
 class AbstractPelvis(eqx.Module):
     """Moves the body."""
 
-    def init(self, dtype: Any) -> PelvisState:
+    def init(self, rig: Rig) -> PelvisState:
         """Memory before the first frame."""
-        return PelvisState.level(dtype)
+        return PelvisState.level(rig)
 
     @abstractmethod
-    def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        lean: Lean,
-        state: PelvisState,
-        awake: Array,
-        started: Array,
-        gate: AbstractGate,
-    ) -> PelvisState:
-        """The offset after this frame; with `awake` 0 it stays as it is."""
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        """The offset after this frame, for ankles that are to go to `target`."""
 
 
 class LowestPelvis(AbstractPelvis):
@@ -80,17 +79,9 @@ class LowestPelvis(AbstractPelvis):
     vertical_only: Leaf = switch(True)
     tick_hz: Leaf = constant(30.0)
 
-    def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        lean: Lean,
-        state: PelvisState,
-        awake: Array,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
-    ) -> PelvisState:
-        asked = asked_heights(sensed, target_ws)
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        asked = asked_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         taking_part = sensed.weight > 0
         top = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
@@ -100,13 +91,13 @@ class LowestPelvis(AbstractPelvis):
         goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, goal, 0.0)
         share = smoothing.lerp(
-            smoothing.fraction_of_gain(self.off_gain, sensed.dt, self.tick_hz),
-            smoothing.fraction_of_gain(self.on_gain, sensed.dt, self.tick_hz),
+            smoothing.fraction_of_gain(self.off_gain, now.dt, self.tick_hz),
+            smoothing.fraction_of_gain(self.on_gain, now.dt, self.tick_hz),
             standing,
         )
-        share = awake * jnp.where(started, share, 1.0)
+        share = now.awake * now.progress(share)
         height = smoothing.lerp(state.height, goal, share)
-        along = jnp.where(self.vertical_only, sensed.up_ws, lean.normal_ws)
+        along = jnp.where(self.vertical_only, sensed.up_ws, now.lean.normal_ws)
         return PelvisState.at(height, goal, along)
 
 
@@ -122,25 +113,17 @@ class CapsulePelvis(AbstractPelvis):
     speed: Leaf = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
     half_height: Leaf = parameter(0.90, unit="m", low=0.3, high=2.0)
 
-    def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        lean: Lean,
-        state: PelvisState,
-        awake: Array,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
-    ) -> PelvisState:
-        asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target_ws), 0.0)
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target.pos), 0.0)
         lowest = gate.minimum(asked, band=HEIGHT_BAND)
         zero = jnp.zeros_like(lowest)
         sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, sunk, 0.0)
 
         def follow(value: Array, goal: Array) -> Array:
-            share = smoothing.fraction_of_speed(self.speed, sensed.dt, goal - value)
-            return smoothing.lerp(value, goal, awake * jnp.where(started, share, 1.0))
+            share = smoothing.fraction_of_speed(self.speed, now.dt, goal - value)
+            return smoothing.lerp(value, goal, now.awake * now.progress(share))
 
         height = follow(state.height, goal)
         half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
@@ -162,18 +145,10 @@ class LegLengthPelvis(AbstractPelvis):
     damp: Leaf = switch(True)
     speed: Leaf = parameter(10.0, unit="1/s", low=0.5, high=30.0, scale="log")
 
-    def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        lean: Lean,
-        state: PelvisState,
-        awake: Array,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
-    ) -> PelvisState:
-        lowest = rise_to_length(sensed, target_ws, self.min_length)
-        highest = rise_to_length(sensed, target_ws, self.max_length)
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        lowest = rise_to_length(sensed, target.pos, self.min_length)
+        highest = rise_to_length(sensed, target.pos, self.max_length)
         asks = (sensed.foothold.found > 0) & (sensed.weight > 0)
         zero = jnp.zeros_like(lowest[:1])
         lifted = jnp.concatenate([jnp.where(asks, lowest, -FAR), zero])
@@ -181,8 +156,8 @@ class LegLengthPelvis(AbstractPelvis):
         bounds = jnp.concatenate([jnp.where(asks, highest, FAR), lift[None]])
         goal = jnp.where(self.enabled, gate.minimum(bounds, band=HEIGHT_BAND), 0.0)
 
-        share = smoothing.fraction_of_speed(self.speed, sensed.dt, goal - state.height)
-        share = awake * jnp.where(started & self.damp, share, 1.0)
+        share = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
+        share = now.awake * jnp.where(now.started & self.damp, share, 1.0)
         height = smoothing.lerp(state.height, goal, share)
         return PelvisState.at(height, goal, sensed.up_ws)
 
@@ -195,35 +170,27 @@ class AbstractFollowingPelvis(AbstractPelvis):
     spring: eqx.AbstractVar[Array]
 
     @abstractmethod
-    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
-        """Height over the animation to go to, m; `otherwise` where no foot has a say."""
+    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
+        """Height over the animation to go to, m; `resting` where no foot asks for one."""
 
-    def advance(
-        self,
-        sensed: Sensed,
-        target_ws: Array,
-        lean: Lean,
-        state: PelvisState,
-        awake: Array,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
-    ) -> PelvisState:
-        asked = asked_heights(sensed, target_ws)
-        otherwise = jnp.where(started, state.goal, mean_height(sensed, asked))
-        goal = self.goal(sensed, target_ws, otherwise, gate)
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        asked = asked_heights(sensed, target.pos)
+        resting = jnp.where(now.started, state.goal, mean_height(sensed, asked))
+        goal = self.goal(now, target, resting)
         gap = goal - state.height
         share = gate.choose(
             gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
-            smoothing.fraction_of_half_life(self.rise_half_life, sensed.dt),
-            smoothing.fraction_of_half_life(self.fall_half_life, sensed.dt),
+            smoothing.fraction_of_half_life(self.rise_half_life, now.dt),
+            smoothing.fraction_of_half_life(self.fall_half_life, now.dt),
         )
-        share = jnp.where(started, share, 1.0)
+        share = now.progress(share)
         height, velocity = smoothing.follow(
-            smoothing.Motion(state.height, state.velocity), goal, share, sensed.dt, self.spring
+            smoothing.Motion(state.height, state.velocity), goal, share, now.dt, self.spring
         )
-        height = smoothing.lerp(state.height, height, awake)
+        height = smoothing.lerp(state.height, height, now.awake)
         after = PelvisState.at(height, goal, sensed.up_ws)
-        return dataclasses.replace(after, velocity=awake * velocity)
+        return dataclasses.replace(after, velocity=now.awake * velocity)
 
 
 class SupportPelvis(AbstractFollowingPelvis):
@@ -240,14 +207,15 @@ class SupportPelvis(AbstractFollowingPelvis):
     fall_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
     spring: Leaf = switch(False)
 
-    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
-        asked = asked_heights(sensed, target_ws)
+    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
+        sensed, gate = now.sensed, now.gate
+        asked = asked_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         total = vec.sum_last(weight)
         taking_part = sensed.weight > 0
         lowest = gate.minimum(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
         support = vec.safe_divide(vec.sum_last(weight * asked), total)
-        return jnp.where(total > 0, smoothing.lerp(support, lowest, self.lowest_share), otherwise)
+        return jnp.where(total > 0, smoothing.lerp(support, lowest, self.lowest_share), resting)
 
 
 class ReachPelvis(AbstractFollowingPelvis):
@@ -267,8 +235,9 @@ class ReachPelvis(AbstractFollowingPelvis):
     fall_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
     spring: Leaf = switch(False)
 
-    def goal(self, sensed: Sensed, target_ws: Array, otherwise: Array, gate: AbstractGate) -> Array:
-        asked = asked_heights(sensed, target_ws)
+    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
+        sensed, gate = now.sensed, now.gate
+        asked = asked_heights(sensed, target.pos)
         taking_part = sensed.weight > 0
         mean = mean_height(sensed, asked)
         highest = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
@@ -282,7 +251,7 @@ class ReachPelvis(AbstractFollowingPelvis):
             return -self.softness * jax.nn.logsumexp(-rises / self.softness)
 
         animated = reachable(sensed.ankle_ws, jnp.zeros_like(wanted))
-        return reachable(target_ws, wanted) - animated
+        return reachable(target.pos, wanted) - animated
 
 
 def mean_height(sensed: Sensed, asked: Array) -> Float[Array, ""]:

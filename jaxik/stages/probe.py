@@ -16,6 +16,8 @@ from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animate
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
 
+from .inputs import Inputs
+
 HEIGHT_BAND = 0.01  # m
 SPEED_BAND = 0.05  # m/s
 MARGIN = 0.1  # m by which a ray is cast beyond its reach, so that a softened end has two sides
@@ -25,15 +27,7 @@ class AbstractProbe(eqx.Module):
     """Looks for ground."""
 
     @abstractmethod
-    def sense(
-        self,
-        rig: Rig,
-        terrain: Terrain | LegTerrains,
-        frame: Frame,
-        contact: Contact,
-        foot_height: Array,
-        gate: AbstractGate,
-    ) -> GroundHits:
+    def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         """What the rays of each leg see in this frame; `foot_height`, m, is sole to ankle."""
 
 
@@ -46,19 +40,12 @@ class FootProbe(AbstractProbe):
     use_toe: Leaf = switch(True)
     layers: Leaf = parameter_tree.layers()
 
-    def sense(
-        self,
-        rig: Rig,
-        terrain: Terrain | LegTerrains,
-        frame: Frame,
-        contact: Contact,
-        foot_height: Array,
-        gate: AbstractGate,
-    ) -> GroundHits:
+    def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
+        terrain, frame = inputs.terrain, inputs.frame
         reach = self.ray_up + self.ray_down
         above = vec.scale(terrain.leg_up_ws, self.ray_up)
         ankle_ws = animated_ankles(frame).pos
-        toe_ws = frame.world_from_model.apply(toe_point(rig, frame, self.toe_ls))
+        toe_ws = frame.world_from_model.apply(toe_point(inputs.rig, frame, self.toe_ls))
         ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
         toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
         rays = rays_of(ankle, self.ray_up, self.ray_down, self.layers)
@@ -76,15 +63,8 @@ class RootProbe(AbstractProbe):
     ray_down: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
     layers: Leaf = parameter_tree.layers()
 
-    def sense(
-        self,
-        rig: Rig,
-        terrain: Terrain | LegTerrains,
-        frame: Frame,
-        contact: Contact,
-        foot_height: Array,
-        gate: AbstractGate,
-    ) -> GroundHits:
+    def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
+        terrain, frame = inputs.terrain, inputs.frame
         up, ankle_ws = terrain.leg_up_ws, animated_ankles(frame).pos
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
         start = ankle_ws + vec.scale(up, self.ray_up - over_root)
@@ -116,22 +96,15 @@ class CornerProbe(AbstractProbe):
     stable_speed: Leaf = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
     layers: Leaf = parameter_tree.layers()
 
-    def sense(
-        self,
-        rig: Rig,
-        terrain: Terrain | LegTerrains,
-        frame: Frame,
-        contact: Contact,
-        foot_height: Array,
-        gate: AbstractGate,
-    ) -> GroundHits:
-        up, foot = terrain.leg_up_ws, animated_ankles(frame)
-        below = foot_height + self._extra(frame, foot.pos, up, gate)
+    def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
+        frame, gate, up = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
+        foot = animated_ankles(frame)
+        below = foot_height + self._extra(inputs, foot.pos, up)
         reach = self.ray_up + below
 
         def look(*points_ws: Array) -> list[Hit]:
             starts = [place + vec.scale(up, self.ray_up) for place in points_ws]
-            hits = cast_each(terrain, starts, reach + MARGIN, self.layers)
+            hits = cast_each(inputs.terrain, starts, reach + MARGIN, self.layers)
             seen = (gate.below(hit.distance, reach, band=HEIGHT_BAND) for hit in hits)
             return [seen_if(hit, hit.found * near) for hit, near in zip(hits, seen, strict=True)]
 
@@ -140,7 +113,7 @@ class CornerProbe(AbstractProbe):
         sole = gate.choose(
             ankle.found[..., None], ankle.point, foot.pos - vec.scale(up, foot_height)
         )
-        ahead, right = foot_heading(rig, frame, up)
+        ahead, right = foot_heading(inputs, up)
         over = sole + vec.scale(up, foot_height)
         level_toe = vec.scale(ahead, self.foot_length)
         level_corner = vec.scale(right, self.half_width)
@@ -152,8 +125,9 @@ class CornerProbe(AbstractProbe):
         rays = rays_of(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
         return GroundHits(ankle, toe, corner, rays)
 
-    def _extra(self, frame: Frame, foot_ws: Array, up_ws: Array, gate: AbstractGate) -> Array:
+    def _extra(self, inputs: Inputs, foot_ws: Array, up_ws: Array) -> Array:
         """How far under a standing sole each foot's rays end, m."""
+        frame, gate = inputs.frame, inputs.gate
         height = vec.dot(foot_ws - frame.world_from_model.pos, up_ws)
         low = gate.below(height, self.stable_height, band=HEIGHT_BAND)
         slow = gate.below(frame.foot_speed, self.stable_speed, band=SPEED_BAND)
@@ -180,12 +154,13 @@ def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
     return frame.pose.ankle.pos + quat.rotate(foot, vec.stack(rig.side * x, y, z))
 
 
-def foot_heading(rig: Rig, frame: Frame, up_ws: Array) -> tuple[Array, Array]:
+def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
     """Forward and right of each animated foot, unit, at right angles to up, world space.
 
     A foot that points along up has the character's.
     """
-    foot = quat.multiply(animated_ankles(frame).rot, rig.ankle_from_foot)
+    frame = inputs.frame
+    foot = quat.multiply(animated_ankles(frame).rot, inputs.rig.ankle_from_foot)
     sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
     ahead = vec.normalize(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
     return ahead, vec.cross(ahead, up_ws)

@@ -8,23 +8,24 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, parameter, switch
-from jaxik.world.frame import Frame
-from jaxik.world.terrain import LegTerrains, Terrain, cast
+from jaxik.world.terrain import cast
+
+from .inputs import Inputs
 
 
 class AbstractRoot(eqx.Module):
     """Moves the whole character before its legs look for ground."""
 
     @abstractmethod
-    def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
+    def sense(self, inputs: Inputs) -> Float[Array, ""]:
         """How far along up the character is moved in this frame, m."""
 
 
 class KeepRoot(AbstractRoot):
     """The character stays where the game put it."""
 
-    def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
-        return jnp.zeros_like(frame.dt)
+    def sense(self, inputs: Inputs) -> Float[Array, ""]:
+        return jnp.zeros_like(inputs.frame.dt)
 
 
 class GroundRoot(AbstractRoot):
@@ -38,8 +39,9 @@ class GroundRoot(AbstractRoot):
     ray_down: Leaf = parameter(float("inf"), unit="m", low=0.0, high=20.0, kind="threshold")
     layers: Leaf = parameter_tree.layers()
 
-    def sense(self, terrain: Terrain | LegTerrains, frame: Frame) -> Float[Array, ""]:
-        origin, up = frame.world_from_model.pos, terrain.up_ws
+    def sense(self, inputs: Inputs) -> Float[Array, ""]:
+        terrain = inputs.terrain
+        origin, up = inputs.frame.world_from_model.pos, terrain.up_ws
         above = origin + vec.scale(up, self.ray_up)
         hit = cast(terrain.body, above, self.ray_up + self.ray_down, self.layers)
         height = vec.dot(hit.point - origin, up)

@@ -4,13 +4,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, quat, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Frame, GroundHits, Stride, animated_ankles
-from jaxik.world.skeleton import Rig
+from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
 
+from .inputs import Inputs
 from .probe import AbstractProbe, rays_of, unseen
 
 HEIGHT_BAND = 0.01  # m
@@ -56,17 +55,10 @@ class StrideProbe(AbstractProbe):
     stance_time: Leaf = parameter(0.65, unit="s", low=0.2, high=1.5)
     swing_time: Leaf = parameter(0.45, unit="s", low=0.1, high=1.0)
 
-    def sense(
-        self,
-        rig: Rig,
-        terrain: Terrain | LegTerrains,
-        frame: Frame,
-        contact: Contact,
-        foot_height: Array,
-        gate: AbstractGate,
-    ) -> GroundHits:
+    def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
+        terrain, frame = inputs.terrain, inputs.frame
         level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
-        stride = self._stride(frame, contact, level, gate)
+        stride = self._stride(inputs, contact, level)
         last, low = self._look(terrain, level, stride.last_ws)
         next_, high = self._look(terrain, level, stride.next_ws)
         found = jnp.where(last.found > next_.found, last.found, next_.found)
@@ -80,8 +72,8 @@ class StrideProbe(AbstractProbe):
         share = s_curve(share, self.steepness)
         height = low + rise * share
         top = low + jnp.where(rise > 0, rise, 0.0)
-        feet = self._feet(rig, frame, level, foot_height)
-        height += self._over_edges(terrain, level, stride, feet, height, top, gate)
+        feet = self._feet(inputs, level, foot_height)
+        height += self._over_edges(inputs, stride, feet, height, top)
         height = jnp.where(found > 0, height, 0.0)
 
         ankle_ws = level.at(animated_ankles(frame).pos) + vec.scale(level.up_ws, height)
@@ -90,8 +82,9 @@ class StrideProbe(AbstractProbe):
         rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
         return GroundHits(hit, unseen(hit), unseen(hit), rays)
 
-    def _stride(self, frame: Frame, contact: Contact, level: "Level", gate: AbstractGate) -> Stride:
+    def _stride(self, inputs: Inputs, contact: Contact, level: "Level") -> Stride:
         """The stride as it is told, or else as velocity foretells it."""
+        frame, gate = inputs.frame, inputs.gate
         told = frame.stride
         velocity = vec.reject(frame.velocity_ws, level.up_ws)
         ball = level.at(frame.world_from_model.apply(frame.pose.toe.pos))
@@ -128,26 +121,22 @@ class StrideProbe(AbstractProbe):
         low = 1.0 - smooth_share((jnp.abs(step) - self.max_step) / STEP_FADE)
         return low * (1.0 - smooth_share((slope - self.max_slope) / SLOPE_FADE))
 
-    def _feet(self, rig: Rig, frame: Frame, level: "Level", foot_height: Array) -> Array:
+    def _feet(self, inputs: Inputs, level: "Level", foot_height: Array) -> Array:
         """The soles' heels and balls as animated, (2 legs 3), m, world space."""
+        frame = inputs.frame
         ankle = animated_ankles(frame)
-        foot = quat.multiply(ankle.rot, rig.ankle_from_foot)
+        foot = quat.multiply(ankle.rot, inputs.rig.ankle_from_foot)
         under = vec.stack(jnp.zeros_like(self.heel_length), -foot_height, -self.heel_length)
         heel = ankle.pos + quat.rotate(foot, under)
         ball = frame.world_from_model.apply(frame.pose.toe.pos)
         return jnp.stack([heel, ball - vec.scale(level.up_ws, self.ball_height)])
 
     def _over_edges(
-        self,
-        terrain: Terrain | LegTerrains,
-        level: "Level",
-        stride: Stride,
-        feet: Array,
-        height: Array,
-        top: Array,
-        gate: AbstractGate,
+        self, inputs: Inputs, stride: Stride, feet: Array, height: Array, top: Array
     ) -> Float[Array, " legs"]:
         """How much higher, m, each foot goes so as not to touch what lies between its footholds."""
+        terrain, gate = inputs.terrain, inputs.gate
+        level = Level(inputs.frame.world_from_model.pos, terrain.leg_up_ws)
         shares = (jnp.arange(WAY, dtype=height.dtype) + 0.5) / WAY
         way_ws = stride.last_ws + vec.scale(
             stride.next_ws - stride.last_ws, shares[:, None]

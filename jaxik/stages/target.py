@@ -1,18 +1,19 @@
 """Stage 4: where each foot would stand, with the ground's height smoothed over time."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.world.frame import Contact, Foothold, Frame, GroundHits, animated_ankles, foothold
+from jaxik.world.frame import Contact, Foothold, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
+
+from .inputs import Inputs, SensedMoment
 
 HEIGHT_BAND = 0.01  # m
 
@@ -23,32 +24,26 @@ class AbstractTarget(eqx.Module):
     foot_height: eqx.AbstractVar[Array]  # m, sole to ankle
 
     @abstractmethod
-    def init(self, rig: Rig, dtype: Any) -> Any:
+    def init(self, rig: Rig) -> PyTree:
         """Memory before the first frame."""
 
     @abstractmethod
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
-    ) -> Foothold:
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         """The foothold that this frame alone asks for."""
 
     @abstractmethod
-    def advance(
-        self, foothold: Foothold, dt: Array, state: Any, started: Array, gate: AbstractGate
-    ) -> tuple[Any, Float[Array, " legs"]]:
+    def advance(self, now: SensedMoment, state: PyTree) -> tuple[PyTree, Float[Array, " legs"]]:
         """How far along up each foothold is moved by memory and limits, m."""
 
 
 class AbstractInstantTarget(AbstractTarget):
     """Places footholds by the present frame alone."""
 
-    def init(self, rig: Rig, dtype: Any) -> None:
+    def init(self, rig: Rig) -> None:
         return None
 
-    def advance(
-        self, foothold: Foothold, dt: Array, state: None, started: Array, gate: AbstractGate
-    ) -> tuple[None, Float[Array, " legs"]]:
-        return None, jnp.zeros_like(foothold.height)
+    def advance(self, now: SensedMoment, state: None) -> tuple[None, Float[Array, " legs"]]:
+        return None, jnp.zeros_like(now.sensed.foothold.height)
 
 
 @struct
@@ -77,14 +72,13 @@ class SlopeTarget(AbstractTarget):
     fall_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
     spring: Leaf = switch(False)
 
-    def init(self, rig: Rig, dtype: Any) -> TargetState:
-        each = jnp.zeros(rig.side.shape, dtype)
-        return TargetState(each, each)
+    def init(self, rig: Rig) -> TargetState:
+        zero = jnp.zeros_like(rig.side)
+        return TargetState(zero, zero)
 
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
-    ) -> Foothold:
-        hit = ground.ankle
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
+        hit, up_ws = ground.ankle, inputs.terrain.leg_up_ws
+        frame, gate = inputs.frame, inputs.gate
         over = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
         standing = hit.point + vec.scale(up_ws, over - self.foot_height)
         point_ws = gate.choose(
@@ -93,13 +87,9 @@ class SlopeTarget(AbstractTarget):
         return foothold(frame, up_ws, point_ws, contact.lift, hit.found)
 
     def advance(
-        self,
-        foothold: Foothold,
-        dt: Array,
-        state: TargetState,
-        started: Bool[Array, ""],
-        gate: AbstractGate,
+        self, now: SensedMoment, state: TargetState
     ) -> tuple[TargetState, Float[Array, " legs"]]:
+        foothold, gate, dt = now.sensed.foothold, now.gate, now.dt
         gap = foothold.height - state.height
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         share = gate.choose(
@@ -110,7 +100,7 @@ class SlopeTarget(AbstractTarget):
         height, velocity = smoothing.follow(
             smoothing.Motion(state.height, state.velocity),
             foothold.height,
-            jnp.where(started, share, 1.0),
+            now.progress(share),
             dt,
             self.spring,
         )
@@ -129,9 +119,8 @@ class SoleTarget(AbstractInstantTarget):
     foot_height: Leaf = parameter(0.12, unit="m", low=0.0, high=0.2)
     max_slope: Leaf = parameter(1.5, unit="rad", low=0.1, high=1.5)
 
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
-    ) -> Foothold:
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
+        frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit = ground.ankle
         lift = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
         bare = _under(animated_ankles(frame).pos, up_ws, lift)
@@ -147,9 +136,8 @@ class ContactTarget(AbstractInstantTarget):
 
     foot_height: Leaf = parameter(0.10, unit="m", low=0.0, high=0.2)
 
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
-    ) -> Foothold:
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
+        frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit = ground.ankle
         lift = jnp.broadcast_to(self.foot_height, hit.found.shape)
         bare = _under(animated_ankles(frame).pos, up_ws, lift)
@@ -172,9 +160,8 @@ class RootTarget(AbstractInstantTarget):
         """0: heights are those of ankles."""
         return jnp.zeros_like(self.adjust)
 
-    def sense(
-        self, frame: Frame, up_ws: Array, ground: GroundHits, contact: Contact, gate: AbstractGate
-    ) -> Foothold:
+    def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
+        frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit, ankle_ws = ground.ankle, animated_ankles(frame).pos
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up_ws)
         standing = contact.weight * hit.found

@@ -10,6 +10,7 @@ import pytest
 
 import jaxik
 from jaxik import HARD
+from jaxik.stages.inputs import Inputs
 from reference import maths, poses, things
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import QUICK, RIG
@@ -90,8 +91,9 @@ def heights(ground: Any, frames: jaxik.Frame) -> jax.Array:
     ik, rig = to_ik({}, "stride"), to_rig(RIG)
 
     def look(frame: jaxik.Frame) -> jax.Array:
-        contact = ik.contact.sense(frame, HARD)
-        seen = ik.probe.sense(rig, ground, frame, contact, ik.target.foot_height, HARD)
+        inputs = Inputs(rig, ground, frame, HARD)
+        contact = ik.contact.sense(inputs)
+        seen = ik.probe.sense(inputs, contact, ik.target.foot_height)
         return seen.ankle.point[0, 1]
 
     return jax.vmap(look)(frames)
