@@ -165,7 +165,7 @@ def base(name: str) -> Clip:
 
 def reference(made: Made, flat: Clip, terrain: Terrain) -> Clip:
     """The flat base as the pipeline with the true parameters has it, without noise."""
-    ik = parameter_tree.replace(experiment.name_preset(made.preset), made.truth)
+    ik = parameter_tree.replace(systems.preset_system(made.preset), made.truth)
     result = jaxik.run(ik, flat.rig, terrain, clip_frames.frames_from_clip(flat))
     return dataclasses.replace(
         clip_frames.clip_from_result(flat, result), source=made.name.replace("_", " ")

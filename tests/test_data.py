@@ -122,7 +122,7 @@ def test_a_reference_differs_from_the_truth_by_the_noise_that_the_file_tells(mak
 
 
 def test_a_truth_is_within_bounds_and_far_from_its_preset(one):
-    ik = experiment.name_preset(one.preset)
+    ik = systems.preset_system(one.preset)
     declared = parameter_tree.declarations(ik)
     numbers = {name: value for name, value in one.truth.items() if not isinstance(value, bool)}
     assert len(numbers) >= 5
@@ -144,7 +144,7 @@ def test_the_truth_of_the_uneven_walk_has_thresholds_in_order(make):
 @pytest.mark.parametrize("preset", ["ozz", "unreal", "mec"])
 def test_an_experiment_frees_what_the_truth_holds_and_fixes_its_switches(make, preset):
     (one,) = (each for each in make.MADE if each.preset == preset)
-    asked = experiment.load_experiment(DATA / "experiments" / f"{preset}.toml")
+    asked = experiment_files.load_experiment(DATA / "experiments" / f"{preset}.toml")
     assert asked.preset == preset
     switches = {name for name, value in one.truth.items() if isinstance(value, bool)}
     assert set(asked.free) >= set(one.truth) - switches

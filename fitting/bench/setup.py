@@ -14,7 +14,7 @@ from fitting.datasets import clip_frames
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip
-from fitting.experiments.experiment import make_scene
+from fitting.experiments.problems import ClipData, make_scene
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
@@ -279,7 +279,7 @@ def problem_of(
     reference: Clip, base: Clip, uneven: terrain.Terrain, names: tuple[str, ...] = tuple(TRUTH)
 ) -> Problem:
     """The fit of these parameters to a recording."""
-    scene = make_scene(reference, base, uneven, SIGMAS)
+    scene = make_scene(ClipData(reference, base, uneven), SIGMAS)
     ik = jaxik.presets.record()
     return Problem(
         make_space(ik, [free_parameter(ik, name) for name in names]), (scene,), residuals_of_scenes

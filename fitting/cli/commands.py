@@ -45,10 +45,10 @@ from . import progress
 def fit(options: argparse.Namespace) -> int:
     """Fits, and leaves a run folder with tables and plots."""
     _prepare_jax()
-    asked = experiment.load_experiment(options.experiment)
-    truth = fit_report.truth_of(asked)
+    asked = experiment_files.load_experiment(options.experiment)
+    truth = known_values.load_known_values(asked)
     run_folder.check_place(options.output)
-    problem = experiment.make_problem(asked)
+    problem = problems.make_problem(asked)
     print(f"fitting {len(asked.free)} parameters of {asked.preset} to {len(asked.clips)} clip(s)")
     with progress.Line(progress.fit_line) as line:
         solution = study.search(problem, asked, line)
@@ -61,7 +61,7 @@ def fit(options: argparse.Namespace) -> int:
 def contribution(options: argparse.Namespace) -> int:
     """Fits an experiment without each of its rules, and leaves a folder with what that costs."""
     _prepare_jax()
-    asked = experiment.load_experiment(options.experiment)
+    asked = experiment_files.load_experiment(options.experiment)
     run_folder.check_place(options.output)
     with progress.Line(progress.fit_line) as line:
         rows = contributing.contribution(
@@ -81,8 +81,8 @@ def sample(options: argparse.Namespace) -> int:
     asked, told = run_folder.load_fit(options.run)
     if options.max_steps is not None:
         asked = experiment.with_max_steps(asked, options.max_steps)
-    truth = fit_report.truth_of(asked)
-    problem = experiment.make_problem(asked)
+    truth = known_values.load_known_values(asked)
+    problem = problems.make_problem(asked)
     names = [row["name"] for row in told["parameters"]]
     if names != list(problem.space.names):
         raise ValueError(
@@ -106,7 +106,7 @@ def apply(options: argparse.Namespace) -> int:
     """Runs a run's fitted parameters on a clip."""
     _prepare_jax()
     run_folder.load_fit(options.run)
-    ik, _ = parameter_files.from_toml(options.run / run_folder.PARAMETERS)
+    ik, _ = parameter_files.load_system(options.run / run_folder.PARAMETERS)
     return _solve_clip(ik, options)
 
 
@@ -114,8 +114,8 @@ def run(options: argparse.Namespace) -> int:
     """Runs a preset or a parameter file on a clip."""
     _prepare_jax()
     if options.parameters is not None:
-        return _solve_clip(parameter_files.from_toml(options.parameters)[0], options)
-    return _solve_clip(systems.name_preset(options.preset), options)
+        return _solve_clip(parameter_files.load_system(options.parameters)[0], options)
+    return _solve_clip(systems.preset_system(options.preset), options)
 
 
 def compare(options: argparse.Namespace) -> int:
@@ -171,14 +171,14 @@ def terrain(options: argparse.Namespace) -> int:
     for name in ("sole", "margin"):
         if getattr(options, name) < 0:
             raise ValueError(f"--{name} is {getattr(options, name):g}; wanted 0 or more metres")
-    terrain_report.check_places(options.output)
+    terrain_report.check_output_files(options.output)
     clip = clips.load_clip(options.clip)
     kind = None if options.model == "auto" else options.model
     found = reconstruct(clip, sole=options.sole, kind=kind)
     terrain_report.write(options.output, found, clip, options.sole, options.margin)
-    print(f"{terrain_report.counted(found)}\n")
-    print(formatting.aligned(terrain_report.table(found)))
-    print(f"\n{terrain_report.sentence(found)}; written to {options.output}")
+    print(f"{terrain_report.count_stances(found)}\n")
+    print(formatting.aligned(terrain_report.prediction_table(found)))
+    print(f"\n{terrain_report.describe_surface(found)}; written to {options.output}")
     return 0
 
 
@@ -220,7 +220,7 @@ def convert(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.file} has {1 + len(more)} rows; give a file with one record")
     if options.way == "to-toml":
         with validation.error_context(options.file):
-            text = parameter_files.to_toml(record.to_ik(only, reading))
+            text = parameter_files.system_to_toml(record.to_ik(only, reading))
         files.write_text(options.output, text)
     else:
         files.write(options.output, lambda path: path.write_bytes(record.to_bytes(only)))
@@ -278,7 +278,7 @@ def _solve_clip(ik: jaxik.FootIK, options: argparse.Namespace) -> int:
     base = load_flat_animation(options.clip)
     ground = mesh_files.load_terrain(options.terrain, file_up=options.file_up)
     motion = clip_frames.frames_from_clip(base, floor=options.floor)
-    experiment.check_shapes(ik, base.rig, ground, motion)
+    problems.check_shapes(ik, base.rig, ground, motion)
     began = time.perf_counter()
     result, solved = comparing.solve(ik, base, ground, motion, options.floor)
     clips.save_clip(options.output, solved, joints=clip_frames.positions_by_role(solved))

@@ -32,10 +32,10 @@ def read(path: Path, reading: record.Reading, base: record.Record | None) -> lis
     """
     kind = path.suffix.lower()
     if kind == ".toml":
-        ik, preset = parameter_files.from_toml(path)
+        ik, preset = parameter_files.load_system(path)
         if preset != "record":
             raise ValueError(f"{path}: parameters of {preset!r}; only those of 'record' make one")
-        if other := systems.exchanged(ik, systems.name_preset(preset)):
+        if other := systems.changed_rules(ik, systems.preset_system(preset)):
             raise ValueError(f"{path}: rules {other}; only those of 'record' make one")
         return [record.from_ik(ik, base, reading)]
     if base is not None:

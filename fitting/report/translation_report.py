@@ -36,7 +36,7 @@ def write(run: Path, made: Translation, fitted: Fit) -> str:
         "shortcomings": difference_report.shortcomings(found, made.source.name, made.target.name),
     }
     files.write_text(run / NUMBERS, json.dumps(told, indent=2))
-    text = parameter_files.to_toml(fitted.ik, made.target.preset)
+    text = parameter_files.system_to_toml(fitted.ik, made.target.preset)
     files.write_text(run / f"{made.target.preset}.toml", text)
     opening = _opening(made, fitted, found) + [_pictures(run, made, found)]
     fit_report.write_fit(run, fitted, opening, _both(made, fitted))

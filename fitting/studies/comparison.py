@@ -64,7 +64,7 @@ def name_systems(
                 raise ValueError(f"{option} {text!r}: wanted names with commas between them")
             of_file = option == "--parameters"
             name = Path(given).stem if of_file else given
-            ik = parameter_files.from_toml(given)[0] if of_file else name_preset(given)
+            ik = parameter_files.load_system(given)[0] if of_file else name_preset(given)
             if grounded and not of_file and "root.enabled" in leaf_names(ik):
                 ik = parameter_tree.replace(ik, {"root.enabled": True})
             if name in (*systems, ANIMATED):

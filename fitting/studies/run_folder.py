@@ -51,7 +51,7 @@ def save_solution(run: Path, experiment: Experiment, problem: Problem, solution:
     (run / FIT).unlink(missing_ok=True)  # of an earlier fit: the run is finished when it is there
     ik = problem.space.unpack(jnp.asarray(solution.u))
     write_text(run / EXPERIMENT, resolved(experiment, run))
-    write_text(run / PARAMETERS, parameter_files.to_toml(ik, experiment.preset))
+    write_text(run / PARAMETERS, parameter_files.system_to_toml(ik, experiment.preset))
 
 
 def save_fit(run: Path, fitted: Fit) -> None:

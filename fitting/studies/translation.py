@@ -84,10 +84,10 @@ def read_system(given: str, option: str) -> System:
     """
     path = Path(given)
     if path.suffix.lower() == ".toml":
-        ik, preset = parameter_files.from_toml(path)
+        ik, preset = parameter_files.load_system(path)
         return System(path.stem, preset, ik)
     with validation.error_context(f"{option} takes a preset or a parameter .toml"):
-        return System(given, given, systems.name_preset(given))
+        return System(given, given, systems.preset_system(given))
 
 
 def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
@@ -101,7 +101,7 @@ def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
     if path.suffix.lower() == ".toml":
         content = validation.read_toml(path, "a free-parameter")
         validation.check_table(content, {"free": validation.TABLE}, given)
-        named = systems.free_table(content.get("free", {}), f"{given} [free]")
+        named = systems.read_free_table(content.get("free", {}), f"{given} [free]")
     else:
         named = {one.strip(): {} for one in given.split(",") if one.strip()}
     if not named:
@@ -151,7 +151,7 @@ def plan(
             f"{len(paths)} clip(s) and {len(terrains)} terrain(s); wanted a terrain for each clip"
         )
     run = run.resolve()
-    alike = systems.rules_of(source.ik) == systems.rules_of(target.ik)
+    alike = systems.rule_names(source.ik) == systems.rule_names(target.ik)
     truth = run / SOURCE if alike else None
     entries, pairs = [], []
     for i, (path, terrain) in enumerate(zip(paths, terrains, strict=True)):
@@ -166,8 +166,8 @@ def plan(
                 label=f"source: {source.name}", mask_pops=False,
             )
         )  # fmt: skip
-    preset = systems.name_preset(target.preset)
-    rules = systems.exchanged(target.ik, preset)
+    preset = systems.preset_system(target.preset)
+    rules = systems.changed_rules(target.ik, preset)
     asked = Experiment(
         path=run / run_folder.EXPERIMENT,
         clips=tuple(entries),
@@ -179,14 +179,14 @@ def plan(
         parameters=_changed(target.ik, systems.with_rules(preset, rules, target.name)),
         sigmas=SIGMAS,
     )
-    problem = experiment.problem_of(asked, pairs)
+    problem = problems.problem_from_clips(asked, pairs)
     _check_moves(source, problem)
     if named is None:
         moving = sensitivity.moving(target.ik, asked.free, problem.data)
         if not moving:
             raise ValueError(f"no parameter of {target.name} moves anything in these clips")
         asked = replace(asked, free={name: asked.free[name] for name in moving})
-        problem = experiment.problem_of(asked, pairs)
+        problem = problems.problem_from_clips(asked, pairs)
     motions = tuple(reference for reference, _, _ in pairs)
     return Translation(source, target, asked, motions, problem, named is not None)
 
@@ -195,7 +195,7 @@ def _solved(source: System, base: clips.Clip, ground: Any) -> clips.Clip:
     """What the source makes of a clip."""
     motion = clip_frames.frames_from_clip(base)
     with validation.error_context(source.name):
-        experiment.check_shapes(source.ik, base.rig, ground, motion)
+        problems.check_shapes(source.ik, base.rig, ground, motion)
         _, solved = solve(source.ik, base, ground, motion, 0.0)
     return replace(solved, source=f"{source.name} on {base.source}")
 
@@ -240,4 +240,6 @@ def save_source(run: Path, made: Translation) -> None:
     run.mkdir(parents=True, exist_ok=True)
     for entry, motion in zip(made.experiment.clips, made.motions, strict=True):
         clips.save_clip(entry.reference, motion, joints=clip_frames.positions_by_role(motion))
-    files.write_text(run / SOURCE, parameter_files.to_toml(made.source.ik, made.source.preset))
+    files.write_text(
+        run / SOURCE, parameter_files.system_to_toml(made.source.ik, made.source.preset)
+    )

@@ -55,7 +55,7 @@ def cache(tmp_path_factory):
 @pytest.fixture
 def quickly(monkeypatch):
     """Fits and samplings of residuals that compile at once; reports play the real pipeline."""
-    monkeypatch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
+    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def run(asked, tmp_path_factory) -> Path:
     """A finished fit; not to be written to."""
     folder = tmp_path_factory.mktemp("runs") / "hill"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
+        patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
         assert main.main(["fit", str(asked), "-o", str(folder)]) == 0
     return folder
 

@@ -72,7 +72,7 @@ MISFITS = [  # found when the problem is made
 
 
 def test_the_embedded_experiment_is_read_as_it_stands():
-    read = experiment.load_experiment(UNEVEN_WALK)
+    read = experiment_files.load_experiment(UNEVEN_WALK)
     assert (read.name, read.preset, read.loss, read.seed) == ("uneven walk", "record", "squares", 0)
     (clip,) = read.clips
     paths = (clip.reference, clip.base, clip.terrain, clip.truth)
@@ -83,7 +83,7 @@ def test_the_embedded_experiment_is_read_as_it_stands():
 
 
 def test_what_a_file_leaves_out_has_defaults_and_its_name_is_the_file_s(tmp_path):
-    read = experiment.load_experiment(write(tmp_path, "hill.toml"))
+    read = experiment_files.load_experiment(write(tmp_path, "hill.toml"))
     assert read.name == "hill" and read.fps is None and read.parameters == {}
     assert read.fit == experiment.FitOptions() and read.sample == experiment.SampleOptions()
     assert read.free == {"pelvis.on_gain": {}, "foot.max_pitch": {"low": 0.1}}
@@ -92,24 +92,24 @@ def test_what_a_file_leaves_out_has_defaults_and_its_name_is_the_file_s(tmp_path
 @pytest.mark.parametrize(("parts", "said"), MISTAKES)
 def test_a_mistake_in_the_file_is_told_with_what_was_wanted(tmp_path, parts, said):
     with pytest.raises(ValueError, match=f"experiment.toml.*{said}"):
-        experiment.load_experiment(write(tmp_path, **parts))
+        experiment_files.load_experiment(write(tmp_path, **parts))
 
 
 @pytest.mark.parametrize(("parts", "said"), MISFITS)
 def test_what_does_not_fit_the_preset_or_the_clips_is_told(tmp_path, parts, said):
-    read = experiment.load_experiment(write(tmp_path, **parts))
+    read = experiment_files.load_experiment(write(tmp_path, **parts))
     with pytest.raises(ValueError, match=said):
-        experiment.make_problem(read)
+        problems.make_problem(read)
 
 
 def test_a_file_that_is_not_there_or_no_toml_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no.toml: no such file, wanted an experiment file"):
-        experiment.load_experiment(tmp_path / "no.toml")
+        experiment_files.load_experiment(tmp_path / "no.toml")
     with pytest.raises(ValueError, match="a folder, wanted an experiment file"):
-        experiment.load_experiment(tmp_path)
+        experiment_files.load_experiment(tmp_path)
     (tmp_path / "bad.toml").write_text("clips = [")
     with pytest.raises(ValueError, match="bad.toml: not TOML"):
-        experiment.load_experiment(tmp_path / "bad.toml")
+        experiment_files.load_experiment(tmp_path / "bad.toml")
 
 
 def test_paths_are_meant_from_beside_the_file_wherever_it_is_called_from(tmp_path, monkeypatch):
@@ -118,13 +118,13 @@ def test_paths_are_meant_from_beside_the_file_wherever_it_is_called_from(tmp_pat
     clips = '[[clips]]\nreference = "uneven_walk.npz"\nterrain = "uneven_walk.ply"\n'
     path = write(tmp_path, clips=clips)
     monkeypatch.chdir("/")
-    (clip,) = experiment.load_experiment(path).clips
+    (clip,) = experiment_files.load_experiment(path).clips
     assert clip.reference.is_absolute() and clip.base is None
 
 
 def test_the_fixed_parameters_are_in_the_system_and_the_free_ones_start_at_its_values(tmp_path):
     parts = {"rest": "[parameters]\nlock.enabled = false\nfoot.max_pitch = [0.3, 0.5]"}
-    problem = experiment.make_problem(experiment.load_experiment(write(tmp_path, **parts)))
+    problem = problems.make_problem(experiment_files.load_experiment(write(tmp_path, **parts)))
     base = problem.space.system
     assert not parameter_tree.get(base, "lock.enabled")
     np.testing.assert_array_equal(parameter_tree.get(base, "foot.max_pitch"), [0.3, 0.5])
@@ -137,8 +137,8 @@ def test_the_fixed_parameters_are_in_the_system_and_the_free_ones_start_at_its_v
 
 
 def test_a_scene_holds_the_clips_cut_and_resampled_alike(tmp_path):
-    read = experiment.load_experiment(write(tmp_path, top="fps = 15.0"))
-    (scene,) = experiment.make_problem(read).data
+    read = experiment_files.load_experiment(write(tmp_path, top="fps = 15.0"))
+    (scene,) = problems.make_problem(read).data
     assert scene.frames.dt.shape == (16,) and float(scene.frames.dt[0]) == pytest.approx(1 / 15)
     reference = load_clip(ROOT / "data/clips/uneven_walk.npz")
     base = load_clip(ROOT / "data/clips/uneven_walk_base.npz")
@@ -159,14 +159,14 @@ def test_a_marker_pop_is_not_seen(tmp_path):
     positions[45, clip.rig.joints[0][2]] += 0.2
     save_clip(tmp_path / "popped.npz", dataclasses.replace(clip, positions_ws=positions))
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk.npz", "popped.npz") + SECOND
-    read = experiment.load_experiment(write(tmp_path, clips=clips))
-    (scene,) = experiment.make_problem(read).data
+    read = experiment_files.load_experiment(write(tmp_path, clips=clips))
+    (scene,) = problems.make_problem(read).data
     assert (
         not scene.reference.observed[15]
         and np.asarray(scene.reference.observed)[[0, 12, 18, 30]].all()
     )
     resampled = dataclasses.replace(read, fps=15.0)
-    assert not experiment.make_problem(resampled).data[0].reference.observed[7]
+    assert not problems.make_problem(resampled).data[0].reference.observed[7]
 
 
 def test_contacts_are_held_against_labels_only(tmp_path):
@@ -174,16 +174,18 @@ def test_contacts_are_held_against_labels_only(tmp_path):
     save_clip(tmp_path / "bare.npz", dataclasses.replace(clip, stance=None))
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk.npz", "bare.npz") + SECOND
     rest = "[sigmas]\ncontact = 0.5"
-    with_labels = experiment.make_problem(experiment.load_experiment(write(tmp_path, rest=rest)))
-    read = experiment.load_experiment(write(tmp_path, rest=rest, clips=clips))
+    with_labels = problems.make_problem(
+        experiment_files.load_experiment(write(tmp_path, rest=rest))
+    )
+    read = experiment_files.load_experiment(write(tmp_path, rest=rest, clips=clips))
     assert float(with_labels.data[0].sigmas.contact) == 0.5
-    assert np.isinf(experiment.make_problem(read).data[0].sigmas.contact)
+    assert np.isinf(problems.make_problem(read).data[0].sigmas.contact)
 
 
 def test_without_a_base_a_flat_one_is_made(tmp_path):
     clips = "\n".join(line for line in CLIP.splitlines() if not line.startswith("base")) + "\n"
-    read = experiment.load_experiment(write(tmp_path, clips=clips + SECOND))
-    reference, base, _ = experiment.load_pair(read.clips[0], None)
+    read = experiment_files.load_experiment(write(tmp_path, clips=clips + SECOND))
+    reference, base, _ = problems.load_clip_data(read.clips[0], None)
     stands = base.stance_labels() & reference.stance_labels()
     assert np.abs(base.joints_ws(3)[..., 1][stands]).max() < 0.2
     assert np.ptp(base.positions_ws[:, base.rig.pelvis, 1]) < 1e-9
@@ -205,13 +207,13 @@ def test_a_base_of_other_frames_is_refused(tmp_path, change, said):
         clip = dataclasses.replace(clip, fps=change["fps"])
     save_clip(tmp_path / "base.npz", clip)
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk_base.npz", "base.npz")
-    read = experiment.load_experiment(write(tmp_path, clips=clips))
+    read = experiment_files.load_experiment(write(tmp_path, clips=clips))
     with pytest.raises(ValueError, match=said):
-        experiment.make_problem(read)
+        problems.make_problem(read)
 
 
 def test_more_steps_are_one_or_more(tmp_path):
-    read = experiment.load_experiment(write(tmp_path))
+    read = experiment_files.load_experiment(write(tmp_path))
     assert experiment.with_max_steps(read, 7).sample.max_steps == 7
     with pytest.raises(ValueError, match="max-steps is 0; wanted 1 or more"):
         experiment.with_max_steps(read, 0)
@@ -219,7 +221,7 @@ def test_more_steps_are_one_or_more(tmp_path):
 
 def test_the_blocks_experiment_makes_a_problem(mocap):
     path = ROOT / "data" / "experiments" / "blocks.toml"
-    problem = experiment.make_problem(experiment.load_experiment(path))
+    problem = problems.make_problem(experiment_files.load_experiment(path))
     (scene,) = problem.data
     assert scene.frames.dt.shape == (1141,)  # 38 s
     assert 0.9 < float(scene.reference.observed.mean()) < 1.0

@@ -21,7 +21,9 @@ def test_every_parameter_convention_and_switch_comes_back_exactly(tmp_path):
     per_leg = {"foot.max_roll": jnp.array([0.1, 0.2]), "pelvis.tick_hz": jnp.array(60.0)}
     ik = parameter_tree.replace(parameter_tree.replace(jaxik.presets.record(), ODD), per_leg)
     ik = parameter_tree.replace(ik, {"leg.soften": jnp.nextafter(jnp.array(0.9), jnp.array(1.0))})
-    back, preset = parameter_files.from_toml(written(tmp_path, parameter_files.to_toml(ik)))
+    back, preset = parameter_files.load_system(
+        written(tmp_path, parameter_files.system_to_toml(ik))
+    )
     assert preset == "record"
     for name in leaf_names(ik):
         np.testing.assert_array_equal(
@@ -30,7 +32,7 @@ def test_every_parameter_convention_and_switch_comes_back_exactly(tmp_path):
 
 
 def test_what_a_file_leaves_out_is_the_preset_s(tmp_path):
-    ik, preset = parameter_files.from_toml(
+    ik, preset = parameter_files.load_system(
         written(tmp_path, "lock.enabled = false\nleg.soften = 1\n")
     )
     assert preset == "record"
@@ -43,7 +45,7 @@ def test_what_a_file_leaves_out_is_the_preset_s(tmp_path):
 
 
 def test_one_value_a_leg_is_taken(tmp_path):
-    ik, _ = parameter_files.from_toml(written(tmp_path, "[foot]\nmax_pitch = [0.3, 0.4]\n"))
+    ik, _ = parameter_files.load_system(written(tmp_path, "[foot]\nmax_pitch = [0.3, 0.4]\n"))
     np.testing.assert_array_equal(parameter_tree.get(ik, "foot.max_pitch"), [0.3, 0.4])
 
 
@@ -70,14 +72,14 @@ def test_one_value_a_leg_is_taken(tmp_path):
 )
 def test_a_wrong_file_is_refused_with_what_came_and_what_was_wanted(tmp_path, text, said):
     with pytest.raises(ValueError, match=said):
-        parameter_files.from_toml(written(tmp_path, text))
+        parameter_files.load_system(written(tmp_path, text))
 
 
 def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no.toml: no such file, wanted a parameter file"):
-        parameter_files.from_toml(tmp_path / "no.toml")
+        parameter_files.load_system(tmp_path / "no.toml")
     with pytest.raises(ValueError, match="a folder, wanted a parameter file"):
-        parameter_files.from_toml(tmp_path)
+        parameter_files.load_system(tmp_path)
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(ValueError, match="binary.toml: not TOML"):
-        parameter_files.from_toml(tmp_path / "binary.toml")
+        parameter_files.load_system(tmp_path / "binary.toml")

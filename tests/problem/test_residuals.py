@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting.experiments import experiment
+from fitting.experiments.known_values import load_known_values
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
-from fitting.report.fit_report import truth_of
 from support.experiments import CLIP, UNEVEN_WALK, write
 
 BESIDE = 0.1  # in u, away from where the clip was made
@@ -36,13 +36,13 @@ correlation = 0.4
 @pytest.fixture(scope="module")
 def embedded() -> Problem:
     """The embedded experiment."""
-    return experiment.make_problem(experiment.load_experiment(UNEVEN_WALK))
+    return problems.make_problem(experiment_files.load_experiment(UNEVEN_WALK))
 
 
 @pytest.fixture(scope="module")
 def truth(embedded) -> jax.Array:
     """`u` of the parameters that made its clip; what their file leaves out is the preset's."""
-    known = truth_of(experiment.load_experiment(UNEVEN_WALK))
+    known = load_known_values(experiment_files.load_experiment(UNEVEN_WALK))
     assert known is not None
     names = embedded.space.names
     return embedded.space.pack({name: known[name] for name in names if name in known})
@@ -70,7 +70,7 @@ def scene(tmp_path_factory) -> Scene:
         tmp_path_factory.mktemp("scene"), clips=CLIP, clip="start = 2.0\nend = 2.67",
         rest=EVERY_KIND,
     )  # fmt: skip
-    (made,) = experiment.make_problem(experiment.load_experiment(path)).data
+    (made,) = problems.make_problem(experiment_files.load_experiment(path)).data
     seen = jnp.ones_like(made.reference.observed).at[9].set(False)
     return eqx.tree_at(lambda scene: scene.reference.observed, made, seen)
 
@@ -282,7 +282,7 @@ def test_another_clip_of_the_same_shape_compiles_nothing(embedded, truth, jacobi
     reference = dataclasses.replace(scene.reference, pelvis=pelvis, ankle=ankle)
     frames = eqx.tree_at(lambda frames: frames.slide, scene.frames, 1 - scene.frames.slide)
     other = dataclasses.replace(scene, reference=reference, frames=frames)
-    again = experiment.make_problem(experiment.load_experiment(UNEVEN_WALK))
+    again = problems.make_problem(experiment_files.load_experiment(UNEVEN_WALK))
     again = dataclasses.replace(again, data=(other,))
     compiled = []
 

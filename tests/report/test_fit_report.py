@@ -131,7 +131,7 @@ def line_of(text: str, name: str) -> str:
 
 
 def test_the_truth_is_that_of_the_first_clip_that_has_one(experiment):
-    assert fit_report.truth_of(experiment) == {
+    assert known_values.load_known_values(experiment) == {
         "contact.planted_height": 0.10,
         "pelvis.on_gain": 0.5,
         "probe.toe_ls": pytest.approx(0.13 / 3),
@@ -139,12 +139,12 @@ def test_the_truth_is_that_of_the_first_clip_that_has_one(experiment):
         "probe.toe_ls[1]": -0.07,
         "probe.toe_ls[2]": 0.2,
     }
-    assert fit_report.truth_of(replace(experiment, clips=experiment.clips[:1])) is None
+    assert known_values.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
 
 
 def test_the_truth_of_one_leg_is_that_of_all(experiment):
     one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
-    truth = fit_report.truth_of(one_leg)
+    truth = known_values.load_known_values(one_leg)
     assert truth is not None and truth["pelvis.on_gain[1]"] == 0.5
 
 
@@ -153,11 +153,13 @@ def test_a_truth_that_is_no_toml_is_refused_with_its_name(experiment, tmp_path):
     path.write_text("contact = [")
     entry = replace(experiment.clips[0], truth=path)
     with pytest.raises(ValueError, match=r"broken\.toml: not TOML"):
-        fit_report.truth_of(replace(experiment, clips=(entry,)))
+        known_values.load_known_values(replace(experiment, clips=(entry,)))
 
 
 def test_the_terminal_tells_values_truth_bounds_and_what_is_undetermined(fitted, experiment):
-    text = fit_report.fit_text(run_folder.describe_fit(fitted), fit_report.truth_of(experiment))
+    text = fit_report.fit_text(
+        run_folder.describe_fit(fitted), known_values.load_known_values(experiment)
+    )
     assert text.startswith("Not converged")
     assert "Cost 900 before, 100 after" in text
     # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.01 to 0.95.

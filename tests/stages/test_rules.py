@@ -8,7 +8,14 @@ import pytest
 
 import jaxik
 from fitting.cli import main
-from fitting.experiments import ablations, experiment, parameter_files, systems
+from fitting.experiments import (
+    ablations,
+    experiment_files,
+    known_values,
+    parameter_files,
+    problems,
+    systems,
+)
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Solution
 from fitting.report import fit_report
@@ -33,7 +40,7 @@ def written(folder, text):
 def test_every_rule_that_a_preset_has_is_known_at_its_stage():
     assert list(systems.STAGES) == [one.name for one in dataclasses.fields(jaxik.FootIK)]
     for name in PRESETS:
-        for stage, there in systems.rules_of(systems.name_preset(name)).items():
+        for stage, there in systems.rule_names(systems.preset_system(name)).items():
             assert there in systems.STAGES[stage]
     assert systems.STAGES["leg"]["PoleLeg"] is leg.PoleLeg
     abstract = [n for rules in systems.STAGES.values() for n in rules if n.startswith("Abstract")]
@@ -48,8 +55,8 @@ def test_an_exchanged_rule_has_its_defaults_and_one_that_is_there_keeps_its_valu
         parameter_tree.get(made, "pelvis.speed"), pelvis.CapsulePelvis().speed
     )
     assert made.probe is ozz.probe and np.isinf(parameter_tree.get(made, "probe.ray_down"))
-    assert systems.exchanged(made, ozz) == {"pelvis": "CapsulePelvis"}
-    assert systems.exchanged(ozz, presets.ozz()) == {}
+    assert systems.changed_rules(made, ozz) == {"pelvis": "CapsulePelvis"}
+    assert systems.changed_rules(ozz, presets.ozz()) == {}
 
 
 @pytest.mark.parametrize(
@@ -75,9 +82,9 @@ def test_rules_come_back_from_a_parameter_file_with_their_values(tmp_path):
     names = {"pelvis": "LegLengthPelvis", "leg": "PoleLeg", "contact": "IdleContact"}
     ik = systems.with_rules(presets.record(), names, "here")
     ik = parameter_tree.replace(ik, {"pelvis.max_length": 0.91, "contact.idle_speed": 0.07})
-    text = parameter_files.to_toml(ik)
-    back, preset = parameter_files.from_toml(written(tmp_path, text))
-    assert preset == "record" and systems.rules_of(back) == systems.rules_of(ik)
+    text = parameter_files.system_to_toml(ik)
+    back, preset = parameter_files.load_system(written(tmp_path, text))
+    assert preset == "record" and systems.rule_names(back) == systems.rule_names(ik)
     for name in systems.leaf_names(ik):
         np.testing.assert_array_equal(
             parameter_tree.get(back, name), parameter_tree.get(ik, name), err_msg=name
@@ -86,7 +93,7 @@ def test_rules_come_back_from_a_parameter_file_with_their_values(tmp_path):
 
 def test_a_preset_s_own_rules_are_not_written():
     for name in PRESETS:
-        assert "rules" not in parameter_files.to_toml(systems.name_preset(name), name)
+        assert "rules" not in parameter_files.system_to_toml(systems.preset_system(name), name)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +110,7 @@ def test_a_preset_s_own_rules_are_not_written():
 )
 def test_wrong_rules_of_a_parameter_file_are_refused(tmp_path, text, said):
     with pytest.raises(ValueError, match=said):
-        parameter_files.from_toml(written(tmp_path, text))
+        parameter_files.load_system(written(tmp_path, text))
 
 
 def test_a_record_with_another_rule_is_no_record(tmp_path, capsys):
@@ -119,9 +126,9 @@ def test_a_record_with_another_rule_is_no_record(tmp_path, capsys):
 
 def test_an_experiment_may_exchange_rules_and_free_their_parameters(tmp_path):
     rest = "[parameters]\ncontact.idle_speed = 0.5"
-    read = experiment.load_experiment(write(tmp_path, top=RULES, free=FREE, rest=rest))
+    read = experiment_files.load_experiment(write(tmp_path, top=RULES, free=FREE, rest=rest))
     assert read.rules == {"pelvis": "CapsulePelvis", "contact": "IdleContact"}
-    problem = experiment.make_problem(read)
+    problem = problems.make_problem(read)
     base = problem.space.unpack(problem.space.u0)
     assert type(base.pelvis) is pelvis.CapsulePelvis
     assert type(base.contact) is contact.IdleContact
@@ -139,25 +146,27 @@ def test_an_experiment_may_exchange_rules_and_free_their_parameters(tmp_path):
 )
 def test_wrong_rules_of_an_experiment_are_refused(tmp_path, top, said):
     with pytest.raises(ValueError, match=said):
-        experiment.load_experiment(write(tmp_path, top=top))
+        experiment_files.load_experiment(write(tmp_path, top=top))
 
 
 def test_a_parameter_of_a_rule_that_was_exchanged_is_unknown(tmp_path):
-    read = experiment.load_experiment(write(tmp_path, top=RULES))
+    read = experiment_files.load_experiment(write(tmp_path, top=RULES))
     with pytest.raises(ValueError, match="no parameter named 'pelvis.on_gain'"):
-        experiment.make_problem(read)
+        problems.make_problem(read)
 
 
 def test_the_truth_of_an_experiment_is_read_with_its_rules(tmp_path):
     (tmp_path / "truth.toml").write_text("[pelvis]\nspeed = 3.5\n")
     clip = "truth = 'truth.toml'"
-    read = experiment.load_experiment(write(tmp_path, top=RULES, free=FREE, clip=clip))
-    assert fit_report.truth_of(read) == {"pelvis.speed": 3.5}
+    read = experiment_files.load_experiment(write(tmp_path, top=RULES, free=FREE, clip=clip))
+    assert known_values.load_known_values(read) == {"pelvis.speed": 3.5}
 
 
 def test_rules_are_kept_through_a_run(tmp_path):
-    read = experiment.load_experiment(write(tmp_path, top=RULES, free=FREE, clips=CLIP + SECOND))
-    problem = experiment.make_problem(read)
+    read = experiment_files.load_experiment(
+        write(tmp_path, top=RULES, free=FREE, clips=CLIP + SECOND)
+    )
+    problem = problems.make_problem(read)
     u = np.array([0.4, -0.3])
     values = np.asarray(problem.space.values(problem.space.u0 * 0 + u))
     names = problem.space.names
@@ -171,8 +180,8 @@ def test_rules_are_kept_through_a_run(tmp_path):
     again, told = run_folder.load_fit(run)
     assert again.rules == read.rules
     assert json.loads((run / run_folder.FIT).read_text())["parameters"] == told["parameters"]
-    ik, _ = parameter_files.from_toml(run / run_folder.PARAMETERS)
-    assert systems.rules_of(ik) == systems.rules_of(experiment.system(read))
+    ik, _ = parameter_files.load_system(run / run_folder.PARAMETERS)
+    assert systems.rule_names(ik) == systems.rule_names(read.starting_system())
     fitted = [float(parameter_tree.get(ik, name)) for name in names]
     np.testing.assert_allclose(fitted, values, rtol=1e-12)
 
@@ -194,10 +203,10 @@ def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):
     assert made.experiment.rules == {"pelvis": "CapsulePelvis"}
     assert made.experiment.parameters == {"pelvis.speed": 4.0, "leg.soften": 0.9}
     assert made.experiment.clips[0].truth is None, "its parameters are others"
-    again = experiment.system(made.experiment)
-    assert systems.rules_of(again) == systems.rules_of(target.ik)
+    again = made.experiment.starting_system()
+    assert systems.rule_names(again) == systems.rule_names(target.ik)
     fitted = made.problem.space.unpack(made.problem.space.u0)
-    assert systems.rules_of(fitted) == systems.rules_of(target.ik)
+    assert systems.rule_names(fitted) == systems.rule_names(target.ik)
 
 
 # Variants
@@ -213,17 +222,17 @@ parameters = { lock.enabled = false, "leg.soften" = 1.0 }
 
 
 def test_variants_are_read_with_their_rules_and_parameters(tmp_path):
-    read = experiment.load_experiment(write(tmp_path, rest=WITHOUT))
+    read = experiment_files.load_experiment(write(tmp_path, rest=WITHOUT))
     assert read.without == (
-        ablations.Variant("pelvis", {"pelvis": "CapsulePelvis"}, {}),
-        ablations.Variant("locks", {}, {"lock.enabled": False, "leg.soften": 1.0}),
+        ablations.Ablation("pelvis", {"pelvis": "CapsulePelvis"}, {}),
+        ablations.Ablation("locks", {}, {"lock.enabled": False, "leg.soften": 1.0}),
     )
 
 
 def test_variants_are_kept_through_a_run_s_own_file(tmp_path):
-    read = experiment.load_experiment(write(tmp_path, rest=WITHOUT))
-    (tmp_path / "again.toml").write_text(run_folder.resolved(read))
-    assert experiment.load_experiment(tmp_path / "again.toml").without == read.without
+    read = experiment_files.load_experiment(write(tmp_path, rest=WITHOUT))
+    (tmp_path / "again.toml").write_text(experiment_files.experiment_to_toml(read))
+    assert experiment_files.load_experiment(tmp_path / "again.toml").without == read.without
 
 
 @pytest.mark.parametrize(
@@ -258,4 +267,4 @@ def test_variants_are_kept_through_a_run_s_own_file(tmp_path):
 def test_a_wrong_variant_is_refused(tmp_path, table, said):
     place = "top" if table.startswith("without") else "rest"
     with pytest.raises(ValueError, match=f"experiment.toml.*{said}"):
-        experiment.load_experiment(write(tmp_path, **{place: table}))
+        experiment_files.load_experiment(write(tmp_path, **{place: table}))

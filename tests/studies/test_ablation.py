@@ -99,11 +99,11 @@ def without_pipeline(monkeypatch) -> None:
 
 
 def asked(folder: Path, rest: str = WITHOUT, clips: str = SIX, **parts: str):
-    return experiment.load_experiment(write(folder, rest=rest, clips=clips, **parts))
+    return experiment_files.load_experiment(write(folder, rest=rest, clips=clips, **parts))
 
 
 def pairs_of(read: experiment.Experiment) -> list[ablation.Pair]:
-    return [experiment.load_pair(entry, None) for entry in read.clips]
+    return [problems.load_clip_data(entry, None) for entry in read.clips]
 
 
 # Variants
@@ -379,7 +379,7 @@ def test_the_picture_has_a_bar_a_variant_and_a_point_a_part():
 def test_the_command_goes_on_after_an_interrupt_and_then_leaves_its_tables(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
+    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
     without_pipeline(monkeypatch)
     path = write(tmp_path, rest=WITHOUT, clips=SIX)
     words = ["contribution", str(path), "-o", str(tmp_path / "out")]

@@ -24,8 +24,8 @@ def fitted(tmp_path_factory) -> study.Fit:
     folder = tmp_path_factory.mktemp("store")
     rest = "[sigmas]\nbody = inf\ncorrelation = 0.4\n[parameters]\nlock.enabled = false"
     path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.2")
-    asked = experiment.load_experiment(path)
-    problem = experiment.make_problem(asked)
+    asked = experiment_files.load_experiment(path)
+    problem = problems.make_problem(asked)
     u = np.array([0.3, -0.2])
     solution = Solution(
         names=NAMES,
@@ -65,7 +65,7 @@ def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path)
     assert [row["determined"] for row in told["parameters"]] == [True, False]
     assert [row["at_bound"] for row in told["parameters"]] == ["", "high"]
     assert told["correlated"] == [[*NAMES, 0.95]] and told["history"][0]["stage"] == "start"
-    ik, preset = parameter_files.from_toml(run / run_folder.PARAMETERS)
+    ik, preset = parameter_files.load_system(run / run_folder.PARAMETERS)
     assert preset == "record" and not parameter_tree.get(ik, "lock.enabled")
     values = [float(parameter_tree.get(ik, name)) for name in NAMES]
     np.testing.assert_allclose(values, fitted.solution.values, rtol=1e-12)
@@ -73,9 +73,9 @@ def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path)
 
 
 def test_the_experiment_of_a_run_is_whole_even_if_its_file_is_gone(fitted, tmp_path):
-    text = run_folder.resolved(fitted.experiment)
+    text = experiment_files.experiment_to_toml(fitted.experiment)
     (tmp_path / "again.toml").write_text(text)
-    again = experiment.load_experiment(tmp_path / "again.toml")
+    again = experiment_files.load_experiment(tmp_path / "again.toml")
     for name in ("clips", "free", "preset", "name", "fps", "loss", "seed", "parameters", "fit"):
         assert getattr(again, name) == getattr(fitted.experiment, name), name
     assert again.sample == fitted.experiment.sample

@@ -57,7 +57,9 @@ def clip(tmp_path_factory) -> Path:
 def source(tmp_path_factory) -> Path:
     """A `record` with other values."""
     path = tmp_path_factory.mktemp("source") / "mine.toml"
-    path.write_text(parameter_files.to_toml(parameter_tree.replace(presets.record(), TRUTH | SOFT)))
+    path.write_text(
+        parameter_files.system_to_toml(parameter_tree.replace(presets.record(), TRUTH | SOFT))
+    )
     return path
 
 
@@ -74,7 +76,7 @@ def run(source, clip, tmp_path_factory) -> Path:
 @pytest.fixture
 def quickly(monkeypatch):
     """Fits of residuals that compile at once."""
-    monkeypatch.setattr(experiment, "residuals_of_scenes", quick.residuals_of_scenes)
+    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
 
 
 def refused(capsys, *words: object) -> str:
@@ -85,7 +87,7 @@ def refused(capsys, *words: object) -> str:
 
 
 def test_the_parameters_behind_a_motion_are_found_again(run):
-    fitted, preset = parameter_files.from_toml(run / "record.toml")
+    fitted, preset = parameter_files.load_system(run / "record.toml")
     assert preset == "record"
     for name, value in TRUTH.items():
         one = parameter_tree.declarations(fitted)[name]
@@ -97,7 +99,7 @@ def test_the_parameters_behind_a_motion_are_found_again(run):
 
 def test_what_is_said_to_be_reproduced_is_so_by_another_count(run, clip):
     base, reference = load_flat_animation(clip), load_clip(run / "source.npz")
-    ik, _ = parameter_files.from_toml(run / "record.toml")
+    ik, _ = parameter_files.load_system(run / "record.toml")
     ground = mesh_files.load_terrain(GROUND)
     solved = clip_frames.clip_from_result(
         base, jaxik.run(ik, base.rig, ground, clip_frames.frames_from_clip(base))
@@ -144,8 +146,8 @@ def test_the_folder_is_a_run_with_the_same_problem(run, clip):
     assert set(asked.free) == set(TRUTH) and told["converged"]
     text = (run / "experiment.toml").read_text()
     assert 'reference = "source.npz"' in text and f'base = "{clip}"' in text
-    ik, _ = parameter_files.from_toml(run / "parameters.toml")
-    problem = experiment.make_problem(asked)
+    ik, _ = parameter_files.load_system(run / "parameters.toml")
+    problem = problems.make_problem(asked)
     u = problem.space.pack(ik)
     assert float(problem.cost(u)) == pytest.approx(told["cost"], rel=1e-6)
 
@@ -162,7 +164,7 @@ def test_the_summary_puts_both_systems_side_by_side(run):
 
 
 def test_a_source_that_another_system_cannot_follow_is_told_honestly(run):
-    (scene,) = experiment.make_problem(run_folder.load_fit(run)[0]).data
+    (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
     still = parameter_tree.replace(presets.record(), {"leg.weight": 0.0, "lock.enabled": False})
     found = difference.measure(scene, playback.run(still, scene))
     told = difference_report.numbers([found])["all frames"]
@@ -205,7 +207,7 @@ def test_what_the_source_leaves_alone_has_no_share():
 
 
 def test_only_what_moves_the_clip_is_free_unless_it_is_named(run):
-    (scene,) = experiment.make_problem(run_folder.load_fit(run)[0]).data
+    (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
     named = sensitivity.declared(presets.record())
     assert {"probe.toe_ls[0]", "probe.toe_ls[2]", "pelvis.limit"} <= set(named)
     assert named["lock.max_speed"] == {"high": 12.0}  # it is infinite: that must be within reach
@@ -259,7 +261,9 @@ def test_what_cannot_be_translated_is_told_and_nothing_written(
     texts |= {"free.toml": "[free]\npelvis.limit = { hihg = 1.0 }\n", "none.toml": "[fre]\nx = 1\n"}
     still = {"leg.weight": 0.0, "lock.enabled": False, "pelvis.limit": 0.0}
     still |= {f"lean.{side}_rate": 0.0 for side in ("forward", "side")}
-    texts["still.toml"] = parameter_files.to_toml(parameter_tree.replace(presets.record(), still))
+    texts["still.toml"] = parameter_files.system_to_toml(
+        parameter_tree.replace(presets.record(), still)
+    )
     for name, text in texts.items():
         Path(name).write_text(text)
     given = {"--from": "record", "--to": "record", "--clip": clip, "--terrain": GROUND, "-o": "run"}

@@ -21,5 +21,5 @@ if __name__ == "__main__":
         residuals_of_scenes as imported,
     )  # under the name by which the tests know it
 
-    experiment.residuals_of_scenes = imported
+    problems.residuals_of_scenes = imported
     sys.exit(main.main(sys.argv[1:]))
