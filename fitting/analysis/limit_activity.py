@@ -14,6 +14,8 @@ from fitting.problem.scene import Scene
 from fitting.runtime import program_cache
 from jaxik.maths import parameter_tree
 
+from .playback import stage_outputs
+
 ROUNDING = 1e-7  # m, and in quaternions: smaller changes of a pose are rounding
 
 
@@ -41,8 +43,8 @@ def measure(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> ClipActivit
         scene: the clip with its terrain.
         result: of this system on this scene, such as `playback.run` gives.
     """
-    present = np.asarray(scene.rig.present)
-    locked = np.asarray(result.trace.advanced.held.locked)[:, present] > 0.5
+    trace, present = stage_outputs(result), np.asarray(scene.rig.present)
+    locked = np.asarray(trace.advanced.held.locked)[:, present] > 0.5
     switches = np.diff(locked.astype(int), axis=0)
 
     def fraction(weights: Array) -> np.ndarray:
@@ -52,10 +54,10 @@ def measure(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> ClipActivit
         legs=tuple(n for n, here in zip(scene.rig.names, present, strict=True) if here),
         frames=len(locked),
         seconds=float(np.sum(scene.frames.dt)),
-        grounded=fraction(result.trace.sensed.foothold.found),
-        in_contact=fraction(result.trace.sensed.contact.weight),
+        grounded=fraction(trace.sensed.foothold.found),
+        in_contact=fraction(trace.sensed.contact.weight),
         reached=fraction(result.reached),
-        locked=fraction(result.trace.advanced.held.locked),
+        locked=fraction(trace.advanced.held.locked),
         locks=tuple(int(n) for n in (switches > 0).sum(axis=0)),
         releases=tuple(int(n) for n in (switches < 0).sum(axis=0)),
         limits=active_limits(ik, scene, result),
@@ -69,7 +71,7 @@ def active_limits(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> dict[
     limit does in this frame counts. Limits are the smooth parameters named `limit`, `max_…` or
     `min_…`.
     """
-    first, states = jaxik.init(ik, scene.rig), result.trace.advanced.state
+    first, states = jaxik.init(ik, scene.rig), stage_outputs(result).advanced.state
     before = jax.tree.map(
         lambda start, rest: jnp.concatenate([start[None], rest[:-1]]), first, states
     )
@@ -120,7 +122,8 @@ def flipped_decisions(
 
 
 def _decisions(result: jaxik.Result) -> Bool[np.ndarray, " decisions"]:
-    sensed, held = result.trace.sensed, result.trace.advanced.held
+    trace = stage_outputs(result)
+    sensed, held = trace.sensed, trace.advanced.held
     weights = (
         sensed.contact.planted,
         sensed.contact.lifted,

@@ -15,6 +15,7 @@ from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene, legs_ws, pelvis_ws
 from fitting.runtime import program_cache
 from jaxik.maths import vec
+from jaxik.pipeline import Trace
 from jaxik.world import frame
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import cast
@@ -106,6 +107,13 @@ def run(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
     return program_cache.run(ik, scene.rig, scene.terrain, scene.frames)
 
 
+def stage_outputs(result: jaxik.Result) -> Trace:
+    """What each stage made, which the results of `jaxik.run` always hold."""
+    if result.trace is None:
+        raise ValueError("this result holds no trace; wanted one of jaxik.run")
+    return result.trace
+
+
 def play(scene: Scene, result: jaxik.Result) -> Playback:
     """The scene's clip with this result, as NumPy arrays."""
     return jax.tree.map(np.asarray, _play(scene, result))
@@ -124,7 +132,7 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
         cast(scene.terrain, joints + vec.scale(up, jnp.asarray(RAY_START)), RAY_LENGTH)
         for joints in (reference.ankle.pos, toes)
     )
-    errors = errors_by_kind(scene, result)
+    trace, errors = stage_outputs(result), errors_by_kind(scene, result)
     return Playback(
         before=Motion(animated_pelvis.pos, *_positions(animated)),
         after=Motion(solved_pelvis.pos, *_positions(solved)),
@@ -137,8 +145,8 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
         ball_grounded=under_ball.found,
         floor=vec.dot(world.pos, up),
         dt=scene.frames.dt,
-        contact=result.trace.sensed.contact.weight,
-        locked=result.trace.advanced.held.locked,
+        contact=trace.sensed.contact.weight,
+        locked=trace.advanced.held.locked,
         reached=result.reached,
         stance=reference.contact,
         slide=scene.frames.slide,

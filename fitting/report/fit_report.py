@@ -163,7 +163,7 @@ def _worst(run: Path, fitted: Fit, plays: Sequence[Playback]) -> list[str]:
         clip, end = _names(fitted, index)
         title = f"{clip}: the worst {play.time[found.end] - play.time[found.start]:.1f} seconds"
         picture = _keep(
-            run, f"worst{end}", title, worst_window_plots.worst(play, legs, found, title)
+            run, f"worst{end}", title, worst_window_plots.worst_window(play, legs, found, title)
         )
         parts.append(
             "\n".join(f"- {line}" for line in worst_window_report.describe(play, found, legs))

@@ -233,7 +233,7 @@ def test_the_picture_shows_the_window_with_its_stances(tmp_path):
     seen[130:133] = False
     play = played(at("ankle", 120, 0.0, 0.1, 0.0, leg=0), seen, stance=stance)
     found = find_worst_window(play)
-    figure = worst_window_plots.worst(play, LEGS, found, "hill: the worst two seconds")
+    figure = worst_window_plots.worst_window(play, LEGS, found, "hill: the worst two seconds")
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert [title.partition(",")[0].partition(" (")[0] for title in titles] == [
         "Left ankle", "Right ankle", "Pelvis", "Left knee", "Right knee"

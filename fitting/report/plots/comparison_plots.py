@@ -1,7 +1,7 @@
 """The picture of several systems on one clip."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Literal, TypeAlias, TypedDict
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,8 +17,17 @@ from fitting.report.labels import MEASURES
 from .style import BEFORE, CAPTURED, EARTH, GROUND, STAGES, earth, legend, styled, whole_and_part
 
 COLOURS = (*STAGES, CAPTURED)
-DASHES = ("-", "--", ":")  # for more systems than colours
-BARS = 5  # panels of measures in a row
+Dashes: TypeAlias = Literal["-", "--", ":"]
+DASHES: tuple[Dashes, ...] = ("-", "--", ":")  # for more systems than colours
+BAR_PANELS = 5  # in a row
+
+
+class LineStyle(TypedDict):
+    """How a system is drawn, as keywords of `Axes.plot`."""
+
+    color: str
+    linestyle: Dashes
+    linewidth: float
 
 
 @styled
@@ -30,7 +39,7 @@ def overview(
     measures: Mapping[str, Measures],
     title: str,
 ) -> Figure:
-    """Heights of ankles and pelvis over the ground under every system, and bars of the measures.
+    """Heights of ankles and pelvis under every system, with the ground, and bars of the measures.
 
     Args:
         time: of each frame, s.
@@ -40,8 +49,8 @@ def overview(
         measures: of the same systems.
         title: of the figure.
     """
-    looks = _looks(motions)
-    bars = -(-len(MEASURES) // BARS)
+    styles = _line_styles(motions)
+    bars = -(-len(MEASURES) // BAR_PANELS)
     heights = 3.4 * (len(legs) + 1) + 0.6, bars * (0.42 * len(motions) + 1.0)
     figure = Figure(figsize=(17, sum(heights) + 1.6), layout="constrained")
     figure.suptitle(title)
@@ -51,51 +60,51 @@ def overview(
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
             for system, motion in motions.items():
-                axes.plot(time, 100 * motion.ankle[:, leg, 1], **looks[system])
+                axes.plot(time, 100 * motion.ankle[:, leg, 1], **styles[system])
             earth(axes, time, 100 * ground[:, leg])
-            axes.set_title(f"{_words(name)} ankle, over the ground under the animated one")
+            axes.set_title(f"{_title(name)} ankle, with the ground under the animated one")
         for system, motion in motions.items():
-            shown[-1].plot(time, 100 * motion.pelvis[:, 1], **looks[system])
+            shown[-1].plot(time, 100 * motion.pelvis[:, 1], **styles[system])
         earth(shown[-1], time, 100 * ground.mean(axis=1))
-        shown[-1].set_title("Pelvis, over the mean of the ground under the animated feet")
+        shown[-1].set_title("Pelvis, with the mean ground under the animated feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
-    grid = lower.subplots(bars, BARS, squeeze=False, sharey=True)
+    grid = lower.subplots(bars, BAR_PANELS, squeeze=False, sharey=True)
     for axes, key in zip(grid.flat, MEASURES, strict=False):
-        _bars(axes, key, measures, looks)
-    lines = [Line2D([], [], label=name, **look) for name, look in looks.items()]
+        _bars(axes, key, measures, styles)
+    lines = [Line2D([], [], label=name, **style) for name, style in styles.items()]
     legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
     return figure
 
 
-def _looks(systems: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """How each system is drawn: the animation, which is the first, in grey.
+def _line_styles(systems: Iterable[str]) -> dict[str, LineStyle]:
+    """Line styles by system; the first one, which is the animation, is grey.
 
-    Each line is thinner than the one before, below it, so that both show where they meet.
+    Each line is thinner than the one drawn before it, so that both are visible where they coincide.
     """
     first, *others = systems
-    looks = {first: {"color": BEFORE, "linestyle": "-", "linewidth": 3.5}}
+    styles: dict[str, LineStyle] = {first: {"color": BEFORE, "linestyle": "-", "linewidth": 3.5}}
     for index, name in enumerate(others):
-        lap, colour = divmod(index, len(COLOURS))
-        dashes = DASHES[lap % len(DASHES)]
-        wide = max(1.1, 2.6 - 0.4 * index)
-        looks[name] = {"color": COLOURS[colour], "linestyle": dashes, "linewidth": wide}
-    return looks
+        repeat, colour = divmod(index, len(COLOURS))
+        dashes = DASHES[repeat % len(DASHES)]
+        width = max(1.1, 2.6 - 0.4 * index)
+        styles[name] = {"color": COLOURS[colour], "linestyle": dashes, "linewidth": width}
+    return styles
 
 
-def _words(name: str) -> str:
-    """A leg's name as the beginning of a title."""
+def _title(name: str) -> str:
+    """The name of a leg at the beginning of a title."""
     return name.replace("_", " ").capitalize()
 
 
 def _bars(
-    axes: Axes, key: str, measures: Mapping[str, Measures], looks: Mapping[str, dict[str, Any]]
+    axes: Axes, key: str, measures: Mapping[str, Measures], styles: Mapping[str, LineStyle]
 ) -> None:
-    """One measure of all systems, with its value at the end of each bar."""
-    values = [getattr(one, key) for one in measures.values()]
+    """One measure of all systems, with the value at the end of each bar."""
+    values = [getattr(measured, key) for measured in measures.values()]
     widths = MEASURES[key].factor * np.nan_to_num(values)
     rows = np.arange(len(values))
-    axes.barh(rows, widths, color=[looks[name]["color"] for name in measures], height=0.7)
+    axes.barh(rows, widths, color=[styles[name]["color"] for name in measures], height=0.7)
     for row, width, value in zip(rows, widths, values, strict=True):
         axes.annotate(
             MEASURES[key].format(value),
@@ -104,9 +113,11 @@ def _bars(
             textcoords="offset points",
             va="center",
         )
-    smallest = 10.0 ** (1 - MEASURES[key].digits)  # of a scale: what rounds to 0 looks like 0
+    smallest = 10.0 ** (
+        1 - MEASURES[key].digits
+    )  # smallest axis: a value that rounds to 0 looks like 0
     axes.set_xlim(0.0, 1.35 * max(*widths, smallest))
-    axes.xaxis.set_visible(False)  # the values stand at the bars
+    axes.xaxis.set_visible(False)  # the values are at the bars
     axes.spines["bottom"].set_visible(False)
     axes.set_ylim(len(values) - 0.4, -0.6)
     axes.set_yticks(rows, list(measures))

@@ -1,4 +1,4 @@
-"""The picture of what one system leaves of another's correction."""
+"""The picture of what remains of another system's correction."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +14,7 @@ from .style import AFTER, BEFORE, EARTH, legend, styled
 
 @styled
 def difference(clip: Difference, source: str, target: str, title: str) -> Figure:
-    """Size of the source's correction and of what the target leaves of it, over time."""
+    """Size of the source's correction, and of what remains of it under the target, over time."""
     names = [
         name
         for name in DIFFERENCES
@@ -25,10 +25,10 @@ def difference(clip: Difference, source: str, target: str, title: str) -> Figure
     rows = figure.subplots(max(len(names), 1), 1, sharex=True, squeeze=False)[:, 0]
     for axes, name in zip(rows, names, strict=False):
         kind = DIFFERENCES[name]
-        several = clip.remaining[name].shape[1] > 1
+        of_legs = clip.remaining[name].shape[1] > 1
         for series, colour in ((clip.correction, BEFORE), (clip.remaining, AFTER)):
             axes.plot(clip.time, kind.factor * series[name].max(axis=1), color=colour)
-        axes.set_title(kind.name.capitalize() + (" (of the legs the larger)" if several else ""))
+        axes.set_title(kind.name.capitalize() + (" (the larger of the legs)" if of_legs else ""))
         axes.set_ylabel(kind.unit)
         axes.set_ylim(bottom=0)
         _shade(axes, clip)
@@ -45,7 +45,7 @@ def difference(clip: Difference, source: str, target: str, title: str) -> Figure
 
 
 def _shade(axes: Axes, clip: Difference) -> None:
-    """Marks the seconds in which the character stands."""
+    """Marks the time in which the character stands."""
     edges = np.flatnonzero(np.diff(clip.standing.astype(int), prepend=0, append=0))
     for start, end in edges.reshape(-1, 2):
         axes.axvspan(float(clip.time[start]), float(clip.time[end - 1]), color=EARTH, zorder=0)

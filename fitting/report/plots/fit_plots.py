@@ -1,4 +1,4 @@
-"""Pictures of a fit, to be read without explanation; each function makes one figure."""
+"""Pictures of a fit; each function draws one figure."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,30 +26,31 @@ from .style import (
     STANDING,
     earth,
     legend,
-    spans,
-    stretch,
+    sections,
+    steepest_part,
     styled,
     whole_and_part,
 )
-from .style import STYLE as STYLE
 
-STRIDE = 0.3  # m, between two drawn legs
+LEG_SPACING = 0.3  # m, smallest distance between two drawn legs
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
 
 
 @styled
 def motion(play: Playback, legs: Sequence[str], title: str) -> Figure:
-    """Heights of ankles and pelvis over time, the ground below them; whole clip and a stretch."""
+    """Heights of ankles and pelvis over time above the ground; whole clip and a part of it."""
     figure, columns = _whole_and_part(play, len(legs) + 1, title)
     ground = 100 * play.ground_height()
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
-            _three(axes, play, lambda one, leg=leg: 100 * play.height(one.ankle[:, leg]))
+            _plot_motions(
+                axes, play, lambda motion, leg=leg: 100 * play.height(motion.ankle[:, leg])
+            )
             earth(axes, play.time, ground[:, leg])
-            axes.set_title(f"{name.capitalize()} ankle, over the ground under it ({play.label})")
-        _three(shown[-1], play, lambda one: 100 * play.height(one.pelvis))
+            axes.set_title(f"{name.capitalize()} ankle, with the ground under it ({play.label})")
+        _plot_motions(shown[-1], play, lambda motion: 100 * play.height(motion.pelvis))
         earth(shown[-1], play.time, ground.mean(axis=1))
-        shown[-1].set_title("Pelvis, over the mean of the ground under the feet")
+        shown[-1].set_title("Pelvis, with the mean ground under the feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
     legend(figure, *_lines(play), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
@@ -58,29 +59,31 @@ def motion(play: Playback, legs: Sequence[str], title: str) -> Figure:
 
 @styled
 def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
-    """Legs from the side over the ground, in the stretch of the clip that climbs most."""
-    start, end = stretch(play.time, play.height(play.captured.pelvis))
+    """Legs seen from the side, in the part of the clip that climbs most."""
+    start, end = steepest_part(play.time, play.height(play.captured.pelvis))
     inside = slice(start, end + 1)
-    way = play.travelled[inside]
-    apart = max(STRIDE, (np.max(way) - np.min(way)) / 20)
-    chosen = start + np.unique(np.floor((way - way[0]) / apart), return_index=True)[1]
-    tall = np.clip(16.0 * 1.35 / (np.ptp(way) + 1.6), 2.2, 6.5)
+    travelled = play.travelled[inside]
+    spacing = max(LEG_SPACING, (np.max(travelled) - np.min(travelled)) / 20)
+    chosen = start + np.unique(np.floor((travelled - travelled[0]) / spacing), return_index=True)[1]
+    tall = np.clip(16.0 * 1.35 / (np.ptp(travelled) + 1.6), 2.2, 6.5)
     figure = Figure(figsize=(17, (tall + 0.7) * len(legs) + 1.4), layout="constrained")
     figure.suptitle(f"{title}, seen from the right, {_seconds(play, start, end)}")
     rows = figure.subplots(len(legs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for leg, (axes, name) in enumerate(zip(rows, legs, strict=True)):
-        for colour, one in _motions(play):
-            joints = np.stack([one.hip, one.knee, one.ankle, one.toe], axis=-2)[:, leg]
+        for colour, motion in _motions(play):
+            joints = np.stack([motion.hip, motion.knee, motion.ankle, motion.toe], axis=-2)[:, leg]
             across, height = play.along(joints)[chosen], play.height(joints)[chosen]
             axes.plot(across.T, height.T, color=colour, linewidth=2.0, solid_capstyle="round")
             axes.plot(across[:, 1:3].T, height[:, 1:3].T, "o", color=colour, markersize=4)
-            pelvis = play.along(one.pelvis)[inside], play.height(one.pelvis)[inside]
+            pelvis = play.along(motion.pelvis)[inside], play.height(motion.pelvis)[inside]
             axes.plot(*pelvis, color=colour, linewidth=2.6)
         along = play.along(play.ground_ws)[inside, leg]
         order = np.argsort(along, kind="stable")
         earth(axes, along[order], play.ground_height()[inside, leg][order])
         axes.set_aspect("equal")
-        axes.set_title(f"{name.capitalize()} leg every {100 * apart:.0f} cm, and the pelvis' way")
+        axes.set_title(
+            f"{name.capitalize()} leg every {100 * spacing:.0f} cm, and the path of the pelvis"
+        )
         axes.set_ylabel("height, m")
     rows[-1].set_xlabel("distance travelled, m")
     ground = Patch(facecolor=EARTH, edgecolor=GROUND, label="ground under this foot's track")
@@ -90,12 +93,12 @@ def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
 
 @styled
 def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
-    """Knee angles over time with the fitted limits; whole clip and a stretch."""
+    """Knee angles over time with the fitted limits; whole clip and a part of it."""
     figure, columns = _whole_and_part(play, len(legs), title)
     lines = _lines(play)
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=True)):
-            _three(axes, play, lambda one, leg=leg: np.degrees(one.knee_angle[:, leg]))
+            _plot_motions(axes, play, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg]))
             axes.set_title(f"{name.capitalize()} knee (180° is straight)")
             low, high = axes.get_ylim()
             for limit in limits:
@@ -111,38 +114,38 @@ def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: s
 
 @styled
 def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
-    """Errors of each kind over time, and how they spread against the sigma that was assumed."""
+    """Errors of each kind over time, and their distribution against the assumed sigma."""
     kinds = fitted.fitted_kinds
     figure = Figure(figsize=(17, 3.0 * len(kinds) + 1.8), layout="constrained")
     figure.suptitle(title)
     grid = figure.subplots(len(kinds), 2, squeeze=False, width_ratios=[2.4, 1])
     for (axes, side), kind in zip(grid, kinds, strict=True):
-        words, unit, factor = RESIDUALS[kind]
+        name, unit, factor = RESIDUALS[kind]
         for play, colour in ((first, BEFORE), (fitted, AFTER)):
             size = factor * _size(play, kind)
             axes.plot(_times(play, size), size, color=colour, linewidth=1.2)
         axes.axhline(factor * float(fitted.sigmas[kind]), **SIGMA)
-        of_legs = "" if kind in ("pelvis", "body") else " (of the legs' the larger)"
-        axes.set_title(f"{words}: size of the error{of_legs}")
+        of_legs = "" if kind in ("pelvis", "body") else " (the larger of the legs)"
+        axes.set_title(f"{name}: size of the error{of_legs}")
         axes.set_ylabel(unit)
         axes.set_xlim(fitted.time[0], fitted.time[-1])
         axes.set_ylim(bottom=0)
-        _spread(side, np.asarray(first.residuals[kind]), np.asarray(fitted.residuals[kind]))
-        side.set_title(f"{words}: spread of the residuals")
+        _distribution(side, np.asarray(first.residuals[kind]), np.asarray(fitted.residuals[kind]))
+        side.set_title(f"{name}: distribution of the residuals")
     grid[-1, 0].set_xlabel("time, s")
-    grid[-1, 1].set_xlabel("residual as the fit sees it, in sigmas")
+    grid[-1, 1].set_xlabel("residual, in sigmas")
     legend(
         figure,
-        Line2D([], [], color=BEFORE, linewidth=3, label="with the preset's parameters"),
-        Line2D([], [], color=AFTER, linewidth=3, label="with the fitted parameters"),
-        Line2D([], [], **SIGMA, label="assumed sigma; right: its normal curve"),
+        Line2D([], [], color=BEFORE, linewidth=3, label="preset parameters"),
+        Line2D([], [], color=AFTER, linewidth=3, label="fitted parameters"),
+        Line2D([], [], **SIGMA, label="assumed sigma; right: normal distribution"),
     )
     return figure
 
 
 @styled
 def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
-    """When each foot stands and locks, as lanes; the whole clip and a stretch."""
+    """When each foot stands and locks, as lanes; the whole clip and a part of it."""
     labelled, locking = bool(np.any(play.stance)), bool(np.any(play.locked))
     lanes: list[tuple[str, str, np.ndarray]] = []
     for leg, name in enumerate(legs):
@@ -155,7 +158,7 @@ def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
             )
     if np.any(play.slide):
         lanes.append(("sliding", SLIDING, np.asarray(play.slide)))
-    parts = spans(play.time, play.height(play.captured.pelvis))
+    parts = sections(play.time, play.height(play.captured.pelvis))
     tall = (0.55 * len(lanes) + 1.3) * len(parts) + 1.3
     figure = Figure(figsize=(17, tall), layout="constrained")
     figure.suptitle(title if locking else f"{title} (no foot ever locks)")
@@ -174,30 +177,30 @@ def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
         (labelled, Patch(color=CAPTURED, label=f"stance, {play.label}")),
         (bool(np.any(play.slide)), Patch(color=SLIDING, label="sliding")),
     ]
-    legend(figure, *(entry for there, entry in shown if there))
+    legend(figure, *(entry for visible, entry in shown if visible))
     return figure
 
 
 @styled
 def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
-    """Cost of the fit over its time, by stage, and the best so far."""
+    """Cost of the fit over time, by stage, and the best so far."""
     figure = Figure(figsize=(13, 6.5), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots()
-    for i, stage in enumerate(dict.fromkeys(one.stage for one in history)):
-        those = [one for one in history if one.stage == stage and np.isfinite(one.cost)]
+    for i, stage in enumerate(dict.fromkeys(step.stage for step in history)):
+        steps = [step for step in history if step.stage == stage and np.isfinite(step.cost)]
         axes.plot(
-            [one.seconds for one in those],
-            [one.cost for one in those],
+            [step.seconds for step in steps],
+            [step.cost for step in steps],
             "o",
             markersize=7,
             color=STAGES[i % len(STAGES)],
             label=f"stage: {stage}",
         )
-    best = [(one.seconds, one.best) for one in history if np.isfinite(one.best)]
+    best = [(step.seconds, step.best) for step in history if np.isfinite(step.best)]
     if best:
         axes.step(*zip(*best, strict=True), where="post", color="black", label="best so far")
-    axes.axhline(cost_before, color=BEFORE, linestyle="--", label="before the fit (the preset)")
+    axes.axhline(cost_before, color=BEFORE, linestyle="--", label="preset, before the fit")
     axes.set_yscale("log")
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         ticks(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
@@ -208,9 +211,9 @@ def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
 
 
 def _lines(play: Playback) -> list[Line2D]:
-    """What the colours of the three motions mean."""
+    """Legend entries of the three motions."""
     shown = (
-        (BEFORE, "before: animation on a flat floor"),
+        (BEFORE, "flat animation, before foot IK"),
         (AFTER, "after fitted foot IK"),
         (CAPTURED, play.label),
     )
@@ -224,18 +227,20 @@ def _whole_and_part(play: Playback, rows: int, title: str) -> tuple[Figure, list
 
 
 def _motions(play: Playback) -> list[tuple[str, Motion]]:
-    """In the order in which they are drawn, with their colours."""
+    """The three motions with their colours, in drawing order."""
     return [(BEFORE, play.before), (CAPTURED, play.captured), (AFTER, play.after)]
 
 
-def _three(axes: Axes, play: Playback, of: Callable[[Motion], np.ndarray]) -> None:
-    """One number of the animation, the capture and the result, over time."""
-    for colour, one in _motions(play):
-        axes.plot(play.time, of(one), color=colour, linewidth=1.2 if colour == BEFORE else 1.7)
+def _plot_motions(axes: Axes, play: Playback, series: Callable[[Motion], np.ndarray]) -> None:
+    """Plots one series of the animation, the captured and the solved motion over time."""
+    for colour, motion in _motions(play):
+        axes.plot(
+            play.time, series(motion), color=colour, linewidth=1.2 if colour == BEFORE else 1.7
+        )
 
 
 def _size(play: Playback, kind: str) -> np.ndarray:
-    """Length of the error of a kind in every frame, the larger of the legs; NaN where not seen."""
+    """Length of the error of a kind in every frame, the larger of the legs; NaN if not seen."""
     error = np.abs(np.asarray(play.errors[kind]))
     if kind != "contact":
         error = np.linalg.norm(error, axis=-1)
@@ -249,11 +254,11 @@ def _times(play: Playback, series: np.ndarray) -> np.ndarray:
     return play.time if len(series) == len(play.time) else play.time[1:-1]
 
 
-def _spread(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
-    """Histograms of residuals in sigmas with the normal curve; what lies beyond 5 is put at 5."""
+def _distribution(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
+    """Histograms of residuals in sigmas with the normal curve; values beyond 5 are shown at 5."""
     edges = np.linspace(-5.0, 5.0, 41)
-    for rows, colour, fill in ((first, BEFORE, True), (fitted, AFTER, False)):
-        values = np.clip(rows[rows != 0], -5.0, 5.0)  # rows not seen are 0
+    for residuals, colour, fill in ((first, BEFORE, True), (fitted, AFTER, False)):
+        values = np.clip(residuals[residuals != 0], -5.0, 5.0)  # 0 in frames that were not seen
         if values.size:
             density = np.histogram(values, edges, density=True)[0]
             axes.stairs(density, edges, fill=fill, color=colour, alpha=0.45 if fill else 1.0)
@@ -267,7 +272,7 @@ def _spread(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
 
 
 def _draw_lanes(axes: Axes, time: np.ndarray, lanes: Sequence[tuple[str, str, np.ndarray]]) -> None:
-    """Series of 0..1 one above the other; a mark where a locked foot is released."""
+    """Series of 0..1 above one another, with a mark where a locked foot is released."""
     for row, (_, colour, series) in enumerate(reversed(lanes)):
         axes.fill_between(time, row, row + 0.75 * series, step="post", color=colour, linewidth=0)
         axes.axhline(row, color="#bbbbbb", linewidth=0.7)

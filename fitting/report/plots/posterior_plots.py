@@ -1,4 +1,4 @@
-"""Pictures of a posterior: the corner, and the walkers' ways."""
+"""Pictures of a posterior: the corner plot and the chain."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,9 +12,9 @@ from fitting.inference.sampling.posterior import Posterior
 from .style import AFTER, BEFORE, CAPTURED, styled
 
 SAMPLES = 20_000  # at most, in the corner
-WALKERS = 40  # at most, in the chain's picture
+WALKERS = 40  # at most, in the picture of the chain
 POINTS = 1500  # at most, of each walker
-MARGIN = 0.05  # of a panel's width
+MARGIN = 0.05  # fraction of a panel's width
 
 
 @styled
@@ -25,21 +25,21 @@ def corner(
     truth: Mapping[str, float] | None,
     title: str,
 ) -> Figure:
-    """Every parameter and every pair of them: samples, the fit and the truth where it is known."""
+    """Every parameter and every pair of them: samples, best fit, and truth if known."""
     size = len(posterior.names)
     samples = posterior.kept.reshape(-1, size)
     samples = samples[:: max(1, len(samples) // SAMPLES)]
-    marks = [[known.get(name) for name in posterior.names] for known in (fitted, truth or {})]
+    marks = [[values.get(name) for name in posterior.names] for values in (fitted, truth or {})]
     inches = 1.2 + max(size, 3) * (2.2 if size <= 6 else 1.75)
-    small = 15 if size <= 6 else 11
+    font_size = 15 if size <= 6 else 11
     figure = Figure(figsize=(inches, inches), dpi=100)
     corner_library.corner(
         samples,
         fig=figure,
         bins=30,
-        range=[_range(samples[:, i], [one[i] for one in marks]) for i in range(size)],
+        range=[_range(samples[:, i], [values[i] for values in marks]) for i in range(size)],
         labels=[label.replace(".", ".\n", 1) for label in labels],
-        label_kwargs={"fontsize": small},
+        label_kwargs={"fontsize": font_size},
         labelpad=0.12 if size <= 6 else 0.25,
         quantiles=[0.025, 0.975],
         color=AFTER,
@@ -51,20 +51,22 @@ def corner(
     )
     for axes in figure.axes:
         axes.grid(False)
-        axes.tick_params(labelsize=small - 2)
+        axes.tick_params(labelsize=font_size - 2)
     for values, colour, dashes in zip(marks, (BEFORE, CAPTURED), ("--", "-"), strict=True):
         style = {"color": colour, "linestyle": dashes, "linewidth": 1.8}
         corner_library.overplot_lines(figure, values, **style)
     entries = [
         Line2D([], [], color=AFTER, linewidth=4, label="posterior: contours hold 39 % and 86 %"),
         Line2D([], [], color=AFTER, linestyle="--", label="ends of the 95 % interval"),
-        Line2D([], [], color=BEFORE, linestyle="--", linewidth=1.8, label="the fit"),
+        Line2D([], [], color=BEFORE, linestyle="--", linewidth=1.8, label="best fit"),
     ]
     if truth:
-        entries.append(Line2D([], [], color=CAPTURED, linewidth=1.8, label="the truth"))
-    large = np.clip(1.1 * inches, 12, 24)
-    figure.suptitle(title, fontsize=1.3 * large, x=0.98, ha="right")
-    figure.legend(handles=entries, loc="upper right", bbox_to_anchor=(0.98, 0.94), fontsize=large)
+        entries.append(Line2D([], [], color=CAPTURED, linewidth=1.8, label="truth"))
+    legend_size = np.clip(1.1 * inches, 12, 24)
+    figure.suptitle(title, fontsize=1.3 * legend_size, x=0.98, ha="right")
+    figure.legend(
+        handles=entries, loc="upper right", bbox_to_anchor=(0.98, 0.94), fontsize=legend_size
+    )
     return figure
 
 
@@ -84,10 +86,10 @@ def chain(
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     every = max(1, len(posterior.u) // POINTS)
     steps = posterior.thin_by * (1 + np.arange(len(posterior.u)))
-    some = np.unique(np.linspace(0, posterior.u.shape[1] - 1, WALKERS).astype(int))
+    shown = np.unique(np.linspace(0, posterior.u.shape[1] - 1, WALKERS).astype(int))
     for axes, (label, series, true) in zip(grid.T.flat, panels, strict=False):
         colour = {"color": AFTER, "linewidth": 0.5, "alpha": 0.35}
-        axes.plot(steps[::every], series[::every][:, some], **colour)
+        axes.plot(steps[::every], series[::every][:, shown], **colour)
         for stuck in posterior.stuck:
             axes.plot(steps[::every], series[::every, stuck], color="black", linewidth=1.2)
         axes.axvspan(0, posterior.burn_in * posterior.thin_by, color="#dddddd")
@@ -103,11 +105,13 @@ def chain(
     for lowest in {*range(rows - 1, len(panels), rows), len(panels) - 1}:
         grid.T.flat[lowest].set_xlabel("step of the sampler")
     entries = [
-        Line2D([], [], color=AFTER, label=f"walkers ({len(some)} of {posterior.u.shape[1]} shown)"),
-        Line2D([], [], color="#dddddd", linewidth=8, label="burn-in, left out"),
+        Line2D(
+            [], [], color=AFTER, label=f"walkers ({len(shown)} of {posterior.u.shape[1]} shown)"
+        ),
+        Line2D([], [], color="#dddddd", linewidth=8, label="burn-in, discarded"),
     ]
     if truth:
-        entries.append(Line2D([], [], color=CAPTURED, linewidth=2.0, label="the truth"))
+        entries.append(Line2D([], [], color=CAPTURED, linewidth=2.0, label="truth"))
     if posterior.stuck:
         entries.append(Line2D([], [], color="black", label="stuck walkers"))
     figure.legend(handles=entries, loc="outside lower center", ncols=4)
@@ -115,11 +119,11 @@ def chain(
 
 
 def _range(samples: np.ndarray, marks: Sequence[float | None]) -> tuple[float, float]:
-    """Ends of a panel: nearly all samples, the marks, a margin; never of no width."""
+    """Ends of a panel: nearly all samples, the marks and a margin; never of zero width."""
     low, high = np.quantile(samples, [0.001, 0.999])
     low, high = (
         min([low, *(m for m in marks if m is not None)]),
         max([high, *(m for m in marks if m is not None)]),
     )
-    wide = max(high - low, 1e-6 * max(abs(high), 1.0))
-    return float(low - MARGIN * wide), float(high + MARGIN * wide)
+    width = max(high - low, 1e-6 * max(abs(high), 1.0))
+    return float(low - MARGIN * width), float(high + MARGIN * width)

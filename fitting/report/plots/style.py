@@ -1,4 +1,4 @@
-"""What figures have in common: colours, letters, ground, columns in time, the way to a file."""
+"""What all figures share: colours, fonts, ground, time axes, and saving to a file."""
 
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,13 @@ from matplotlib.figure import Figure, FigureBase
 
 from fitting.runtime import files
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
+# The palette of Okabe and Ito, which colour-blind readers can distinguish.
 BEFORE, AFTER, CAPTURED = "#8c8c8c", "#0072B2", "#D55E00"
 STANDING, LOCKED, SLIDING = "#56B4E9", "#009E73", "#CC79A7"
 STAGES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 GROUND, EARTH = "#5f5236", "#ece5d6"
-SPAN = 5.0  # s, of the stretch that is also shown enlarged
-LONG = 8.0  # s; shorter clips need no enlargement
+SPAN = 5.0  # s, length of the section that is also shown enlarged
+LONG = 8.0  # s; shorter clips are not enlarged
 STYLE: Any = {
     "font.size": 13,
     "axes.titlesize": 14,
@@ -37,8 +37,8 @@ STYLE: Any = {
 styled = matplotlib.rc_context(STYLE)
 
 
-def stretch(time: np.ndarray, pelvis: np.ndarray) -> tuple[int, int]:
-    """First and last frame of the seconds in which the pelvis climbs and sinks most.
+def steepest_part(time: np.ndarray, pelvis: np.ndarray) -> tuple[int, int]:
+    """First and last frame of the section in which the pelvis rises and falls most.
 
     Args:
         time: of each frame, s.
@@ -53,24 +53,24 @@ def stretch(time: np.ndarray, pelvis: np.ndarray) -> tuple[int, int]:
     return start, start + frames
 
 
-def spans(time: np.ndarray, pelvis: np.ndarray) -> list[tuple[int, int]]:
-    """First and last frames of what is shown: the whole clip and, of a long one, a stretch."""
+def sections(time: np.ndarray, pelvis: np.ndarray) -> list[tuple[int, int]]:
+    """First and last frames of the sections shown: the whole clip and, of a long one, a part."""
     whole = 0, len(time) - 1
-    return list(dict.fromkeys([whole, stretch(time, pelvis)]))
+    return list(dict.fromkeys([whole, steepest_part(time, pelvis)]))
 
 
 def whole_and_part(
     figure: FigureBase, time: np.ndarray, pelvis: np.ndarray, rows: int
 ) -> list[list[Axes]]:
-    """Axes in a column for the whole clip and, for a long clip, in one for a stretch of it.
+    """Axes in a column for the whole clip and, for a long clip, in another for a part of it.
 
     Args:
-        figure: to be drawn into.
+        figure: to draw into.
         time: of each frame, s.
-        pelvis: its height, m, which tells the stretch.
-        rows: of axes.
+        pelvis: its height, m, which decides the part.
+        rows: number of axes in a column.
     """
-    parts = spans(time, pelvis)
+    parts = sections(time, pelvis)
     ratios = [1.6, 1.0][: len(parts)]
     grid = figure.subplots(rows, len(parts), squeeze=False, sharey="row", width_ratios=ratios)
     for column, (start, end) in zip(grid.T, parts, strict=True):
@@ -82,7 +82,7 @@ def whole_and_part(
 
 
 def earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
-    """Ground as an area with an edge, down to the end of what the axes show by now."""
+    """Ground as a filled area with an edge, down to the current lower limit of the axes."""
     axes.plot(across, height, color=GROUND, linewidth=1.4)
     low, high = axes.get_ylim()
     axes.fill_between(across, height, low, where=np.isfinite(height), color=EARTH, linewidth=0)
@@ -90,11 +90,11 @@ def earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
 
 
 def legend(figure: Figure, *entries: Any, columns: int = 4) -> None:
-    """What the colours of a figure mean, below it."""
+    """Adds a legend below the figure."""
     figure.legend(handles=entries, loc="outside lower center", ncols=min(columns, len(entries)))
 
 
 def save(path: Path, figure: Figure) -> None:
-    """Writes a figure; never half a file."""
+    """Writes a figure; never leaves half a file."""
     look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
     files.write(path, lambda temporary: figure.savefig(temporary, **look))

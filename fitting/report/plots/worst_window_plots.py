@@ -13,13 +13,14 @@ from fitting.analysis.worst_window import WorstWindow
 
 from .style import AFTER, CAPTURED, EARTH, GROUND, STANDING, earth, legend, styled
 
-STANCE, UNSEEN = 0.22, "#dddddd"
+STANCE_ALPHA = 0.22
+UNSEEN = "#dddddd"
 
 
 @styled
-def worst(play: Playback, legs: Sequence[str], found: WorstWindow, title: str) -> Figure:
+def worst_window(play: Playback, legs: Sequence[str], window: WorstWindow, title: str) -> Figure:
     """Heights of feet and pelvis, and knee angles, captured and fitted, in the worst window."""
-    inside = slice(found.start, found.end + 1)
+    inside = slice(window.start, window.end + 1)
     time = play.time[inside]
     rows = 2 * len(legs) + 1
     figure = Figure(figsize=(17, 3.1 * rows + 1.6), layout="constrained")
@@ -27,49 +28,52 @@ def worst(play: Playback, legs: Sequence[str], found: WorstWindow, title: str) -
     panels = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
     ground = 100 * play.ground_height()[inside]
 
-    def draw(axes: Axes, of: Callable[[Motion], np.ndarray]) -> None:
+    def draw(axes: Axes, series: Callable[[Motion], np.ndarray]) -> None:
         for colour, motion in ((CAPTURED, play.captured), (AFTER, play.after)):
-            axes.plot(time, of(motion)[inside], color=colour, linewidth=2.2)
+            axes.plot(time, series(motion)[inside], color=colour, linewidth=2.2)
 
     for leg, name in enumerate(legs):
         foot, knee = panels[leg], panels[len(legs) + 1 + leg]
-        draw(foot, lambda one, leg=leg: 100 * play.height(one.ankle[:, leg]))
+        draw(foot, lambda motion, leg=leg: 100 * play.height(motion.ankle[:, leg]))
         earth(foot, time, ground[:, leg])
-        foot.set_title(f"{name.capitalize()} ankle, over the ground under it ({play.label})")
-        draw(knee, lambda one, leg=leg: np.degrees(one.knee_angle[:, leg]))
+        foot.set_title(f"{name.capitalize()} ankle, with the ground under it ({play.label})")
+        draw(knee, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg]))
         knee.set_title(f"{name.capitalize()} knee (180° is straight)")
         knee.set_ylabel("knee angle, degrees")
         for axes in (foot, knee):
-            _shade(axes, time, np.asarray(play.stance)[inside, leg] > 0.5, STANDING, STANCE)
-    middle = panels[len(legs)]
-    draw(middle, lambda one: 100 * play.height(one.pelvis))
-    middle.set_title("Pelvis")
+            stance = np.asarray(play.stance)[inside, leg] > 0.5
+            _shade(axes, time, stance, color=STANDING, alpha=STANCE_ALPHA)
+    pelvis = panels[len(legs)]
+    draw(pelvis, lambda motion: 100 * play.height(motion.pelvis))
+    pelvis.set_title("Pelvis")
     for axes in panels[: len(legs) + 1]:
         axes.set_ylabel("height, cm")
     for axes in panels:
-        _shade(axes, time, ~np.asarray(play.seen)[inside], UNSEEN, 1.0)
-        axes.axvline(play.time[found.frame], color="black", linestyle=":", linewidth=1.6)
+        _shade(axes, time, ~np.asarray(play.seen)[inside], color=UNSEEN)
+        axes.axvline(play.time[window.frame], color="black", linestyle=":", linewidth=1.6)
     panels[-1].set_xlabel("time, s")
     panels[-1].set_xlim(time[0], time[-1])
     entries = [
         Line2D([], [], color=CAPTURED, linewidth=3, label=play.label),
         Line2D([], [], color=AFTER, linewidth=3, label="after fitted foot IK"),
         Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"),
-        Patch(color=STANDING, alpha=STANCE, label="the foot stands, as captured"),
-        Line2D([], [], color="black", linestyle=":", label="the largest error"),
+        Patch(color=STANDING, alpha=STANCE_ALPHA, label="captured stance"),
+        Line2D([], [], color="black", linestyle=":", label="largest error"),
     ]
     if not np.all(np.asarray(play.seen)[inside]):
-        entries.append(Patch(color=UNSEEN, label="not seen by the fit"))
+        entries.append(Patch(color=UNSEEN, label="left out of the fit"))
     legend(figure, *entries, columns=6)
     return figure
 
 
-def _shade(axes: Axes, time: np.ndarray, where: np.ndarray, colour: str, alpha: float) -> None:
-    """Colours the whole height of the axes at these frames."""
+def _shade(
+    axes: Axes, time: np.ndarray, mask: np.ndarray, *, color: str, alpha: float = 1.0
+) -> None:
+    """Colours the whole height of the axes where the mask is true."""
     half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    edges = np.flatnonzero(np.diff(where.astype(int), prepend=0, append=0))
+    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0))
     for start, end in edges.reshape(-1, 2):
         axes.axvspan(
             float(time[start]) - half, float(time[end - 1]) + half,
-            color=colour, alpha=alpha, linewidth=0, zorder=0,
+            color=color, alpha=alpha, linewidth=0, zorder=0,
         )  # fmt: skip
