@@ -22,7 +22,7 @@ import numpy as np
 
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
-from fitting.inference.optimisation.search import solve
+from fitting.inference.optimisation.search import find_best_fit
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling.posterior import sample_posterior
 from fitting.problem.problem import Problem
@@ -71,7 +71,7 @@ def fit(row: Row, sizes: Sizes) -> None:
     found: dict[str, Any] = {}
 
     def ours() -> None:
-        found["ours"] = solve(problem, progress=lambda now: row.tell(f"fit: {now.stage}"))
+        found["ours"] = find_best_fit(problem, progress=lambda now: row.tell(f"fit: {now.stage}"))
         if found["ours"].interrupted:  # the solver keeps Ctrl-C to itself; half a run is no figure
             raise KeyboardInterrupt
 
@@ -178,7 +178,7 @@ def main() -> None:
     folder = Path(sys.argv[1])
     reference, base = (load_clip(folder / name) for name in CLIPS)
     problem = setup.problem_of(reference, base, load_terrain(folder / GROUND))
-    print(f"{solve(problem).seconds:.2f}")
+    print(f"{find_best_fit(problem).seconds:.2f}")
 
 
 if __name__ == "__main__":

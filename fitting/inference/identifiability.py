@@ -144,8 +144,8 @@ def profile(problem: Problem, solution: Solution, name: str) -> Profile:
     i = space.names.index(name)
     low, high = float(space.low[i]), float(space.high[i])
     here = float(solution.values[i])
-    half = population.POPULATION // 2
-    values = np.sort(np.append(np.linspace(low, high, population.POPULATION - 1), here))
+    half = population.BATCH // 2
+    values = np.sort(np.append(np.linspace(low, high, population.BATCH - 1), here))
     rises = _rises(problem, solution, i, values, follow=True)
     for _ in range(2):
         start, end = _hull(values, rises)
@@ -182,5 +182,5 @@ def _rises(
     for _ in range(3 if follow else 1):
         born = population.evaluate(problem, candidates, solution.jacobian)
         cost = np.minimum(cost, born.cost)
-        candidates = born.moved
+        candidates = born.stepped
     return cost - solution.cost

@@ -16,7 +16,7 @@ from fitting.problem.space import Space, make_space
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
-from .optimisation.population import POPULATION, from_values
+from .optimisation.population import BATCH, from_values
 
 SHARES = (np.arange(6) + 0.5) / 6  # of a range, where each parameter is tried
 DRAWS = 2  # places besides the present values: there a threshold may hide what another place shows
@@ -72,8 +72,8 @@ def _reach(space: Space, scenes: tuple[Scene, ...], place: np.ndarray) -> np.nda
     candidates = from_values(space, every)
     first = _rows(space, scenes, candidates[:1])[0]
     moved = [
-        np.abs(_rows(space, scenes, candidates[i : i + POPULATION]) - first)
-        for i in range(1, len(candidates), POPULATION)
+        np.abs(_rows(space, scenes, candidates[i : i + BATCH]) - first)
+        for i in range(1, len(candidates), BATCH)
     ]
     furthest = np.concatenate([np.nan_to_num(one).max(axis=1) for one in moved])
     return furthest.reshape(space.size, len(SHARES)).max(axis=1)
@@ -81,7 +81,7 @@ def _reach(space: Space, scenes: tuple[Scene, ...], place: np.ndarray) -> np.nda
 
 def _rows(space: Space, scenes: tuple[Scene, ...], some: np.ndarray) -> np.ndarray:
     """Rows of at most a population; filled up, so that there is one program."""
-    filled = jnp.asarray(np.resize(some, (POPULATION, space.size)), space.u0.dtype)
+    filled = jnp.asarray(np.resize(some, (BATCH, space.size)), space.u0.dtype)
     return np.asarray(_rows_of_all(space, scenes, filled))[: len(some)]
 
 

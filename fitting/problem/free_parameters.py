@@ -23,7 +23,7 @@ class FreeParameter:
     high: float
     prior_mean: float  # in the parameter's unit
     prior_sd: float  # in u
-    kind: parameter_tree.Kind
+    kind: parameter_tree.ParameterKind
     scale: parameter_tree.Scale
     above: str | None  # dotted name of the leaf that the value stays above
 
@@ -42,7 +42,7 @@ class FreeParameter:
 OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
 
 
-def free_parameter(ik: eqx.Module, name: str, **overrides: float | str) -> FreeParameter:
+def free_parameter(ik: eqx.Module, name: str, **overrides: float | int | str) -> FreeParameter:
     """The parameter of this name as its rule declares it, with overrides.
 
     A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
@@ -69,7 +69,7 @@ def free_parameter(ik: eqx.Module, name: str, **overrides: float | str) -> FreeP
     declaration = declared[leaf]
     kind = overrides.get("kind", declaration.kind)
     scale = overrides.get("scale", declaration.scale)
-    _check_choice(name, "kind", kind, get_args(parameter_tree.Kind))
+    _check_choice(name, "kind", kind, get_args(parameter_tree.ParameterKind))
     _check_choice(name, "scale", scale, get_args(parameter_tree.Scale))
     low = float(overrides.get("low", declaration.low))
     high = float(overrides.get("high", declaration.high))
@@ -80,7 +80,7 @@ def free_parameter(ik: eqx.Module, name: str, **overrides: float | str) -> FreeP
         high=high,
         prior_mean=float(overrides.get("prior_mean", min(max(present, low), high))),
         prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
-        kind=cast(parameter_tree.Kind, kind),
+        kind=cast(parameter_tree.ParameterKind, kind),
         scale=cast(parameter_tree.Scale, scale),
         above=_absolute(declaration.above, leaf),
     )

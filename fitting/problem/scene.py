@@ -51,4 +51,4 @@ def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:
 def legs_ws(scene: Scene, result: jaxik.Result) -> jaxik.LegPose:
     """The solved legs, (frames legs), world space."""
     world = scene.frames.world_from_model
-    return result.pose.moved(Transform(world.pos[:, None], world.rot[:, None]))
+    return result.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))

@@ -11,7 +11,8 @@ from jaxtyping import Float
 import jaxik
 from fitting.experiments.experiment import Experiment, load_experiment, make_problem
 from fitting.inference.identifiability import Identifiability, identify
-from fitting.inference.optimisation.search import solve
+from fitting.inference.optimisation.search import find_best_fit
+from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress, sample_posterior
 from fitting.problem.problem import Problem
@@ -79,10 +80,10 @@ def search(
 
     Starts in `u` take the place of those that the experiment asks for.
     """
-    return solve(
+    return find_best_fit(
         problem,
+        SearchSettings(max_steps=experiment.fit.max_steps),
         starts=experiment.fit.starts if starts is None else starts,
-        max_steps=experiment.fit.max_steps,
         seed=experiment.seed,
         progress=progress,
     )

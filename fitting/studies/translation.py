@@ -28,7 +28,10 @@ from fitting.datasets.terrain import mesh_files
 from fitting.experiments import experiment, parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.inference import sensitivity
-from fitting.inference.optimisation.population import evaluate, offsets, sweep
+from fitting.inference.optimisation.population import evaluate
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.optimisation.state import Search, SearchState
+from fitting.inference.optimisation.sweep import sweep
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.runtime import files, validation
@@ -227,12 +230,14 @@ def approach(problem: Problem) -> np.ndarray:
     """
     u = np.asarray(problem.space.pack({}))
     cost = float(evaluate(problem, u[None]).cost[0])
-    places = offsets()
+    search = Search(problem, SearchSettings(min_sweep_gain=GAIN))
+    state = SearchState.at(u, cost)
     for _ in range(SWEEPS):
-        if (found := sweep(problem, u, cost, GAIN, places)) is None:
+        before = state.point
+        state = sweep(search, state)
+        if state.point is before:
             break
-        u, cost = found
-    return u[None]
+    return state.point.u[None]
 
 
 def save_source(run: Path, made: Translation) -> None:

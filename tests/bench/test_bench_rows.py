@@ -12,7 +12,7 @@ from fitting.bench import crowd, fits, measure, peers, rows, scaling, setup
 from fitting.bench import report as bench_report
 from fitting.bench import tasks as bench_tasks
 from fitting.bench.setup import Sizes
-from fitting.inference.optimisation.search import solve
+from fitting.inference.optimisation.search import find_best_fit
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
@@ -228,9 +228,9 @@ def test_scaling_has_a_curve_and_a_slope_for_each_size(quickly, tmp_path, monkey
 
 def test_a_fit_that_was_interrupted_is_no_figure(quickly, monkeypatch):
     def interrupted(problem, progress):
-        return dataclasses.replace(solve(problem), interrupted=True)
+        return dataclasses.replace(find_best_fit(problem), interrupted=True)
 
-    monkeypatch.setattr(fits, "solve", interrupted)
+    monkeypatch.setattr(fits, "find_best_fit", interrupted)
     tasks = measure.choose(bench_tasks.TASKS, "fit")
     report = measure.measure(tasks, SMALL, True, lambda line: None)
     assert report.interrupted and report.rows[-1].figures == []

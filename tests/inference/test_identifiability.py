@@ -8,6 +8,7 @@ import pytest
 
 from fitting.inference import identifiability
 from fitting.inference.optimisation import population, search
+from fitting.inference.optimisation.settings import SearchSettings
 from fitting.problem import free_parameters
 from fitting.problem.problem import Problem
 from support import toy
@@ -21,7 +22,7 @@ def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, search.
     """A solution found in a few steps, as it starts where it should end."""
     problem = toy.make_problem(seed, truth=truth)
     start = np.clip(np.asarray(problem.space.pack(truth)), -5, 5)
-    return problem, search.solve(problem, starts=start[None], max_steps=24)
+    return problem, search.find_best_fit(problem, SearchSettings(max_steps=24), starts=start[None])
 
 
 @pytest.fixture(scope="module")

@@ -32,14 +32,20 @@ TRACES = []  # one entry for each time that JAX traces the residuals
 class Toy(eqx.Module):
     """As many parameters as wanted, each between 0 and 1."""
 
-    x: Float[Array, " legs"] = parameter_tree.parameter((0.5,), unit="", low=0.0, high=1.0)
+    x: Float[Array, " legs"] = parameter_tree.parameter(
+        (0.5,), unit="", low=0.0, high=1.0, doc="X of the test rule."
+    )
 
 
 class Step(eqx.Module):
     """A height that counts from a moment on."""
 
-    height: Array = parameter_tree.parameter(0.5, unit="m", low=0.0, high=1.0)
-    moment: Array = parameter_tree.parameter(0.5, unit="s", low=0.0, high=1.0, kind="threshold")
+    height: Array = parameter_tree.parameter(
+        0.5, unit="m", low=0.0, high=1.0, doc="Height of the test rule."
+    )
+    moment: Array = parameter_tree.parameter(
+        0.5, unit="s", low=0.0, high=1.0, kind="threshold", doc="Moment of the test rule."
+    )
 
 
 def linear_in_u(ik, data):

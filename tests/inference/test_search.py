@@ -10,7 +10,9 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from fitting.inference.optimisation import jacobian, levenberg_marquardt, population, search
+from fitting.inference.optimisation import levenberg_marquardt, models, population, search, sweep
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.optimisation.state import ROUNDING
 from fitting.problem import free_parameters, space
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree
@@ -23,9 +25,15 @@ SHARE = 0.05  # of the range: how near the truth a fit must come
 class Curve(eqx.Module):
     """A decay that jumps where a decision turns."""
 
-    height: jax.Array = parameter_tree.parameter(0.8, unit="1", low=0.0, high=4.0)
-    rate: jax.Array = parameter_tree.parameter(1.0, unit="1/s", low=0.1, high=10.0, scale="log")
-    turn: jax.Array = parameter_tree.parameter(0.7, unit="s", low=0.0, high=1.0, kind="threshold")
+    height: jax.Array = parameter_tree.parameter(
+        0.8, unit="1", low=0.0, high=4.0, doc="Height of the test rule."
+    )
+    rate: jax.Array = parameter_tree.parameter(
+        1.0, unit="1/s", low=0.1, high=10.0, scale="log", doc="Rate of the test rule."
+    )
+    turn: jax.Array = parameter_tree.parameter(
+        0.7, unit="s", low=0.0, high=1.0, kind="threshold", doc="Turn of the test rule."
+    )
 
 
 TIME = jnp.linspace(0, 1, 200)
@@ -114,7 +122,7 @@ def test_other_data_of_the_same_shape_compile_nothing():
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        search.solve(problem, max_steps=40)
+        search.find_best_fit(problem, SearchSettings(max_steps=40))
         assert not compiled
         jax.jit(lambda x: x + 1)(1.0)  # the listener does hear a compilation
         assert compiled
@@ -145,7 +153,7 @@ def test_an_interrupt_keeps_the_best_point():
             raise KeyboardInterrupt
 
     problem = toy.make_problem(CLIPS[0])
-    solution = search.solve(problem, progress=stop_later)
+    solution = search.find_best_fit(problem, progress=stop_later)
     assert not solution.converged
     assert solution.message.startswith("Interrupted after")
     assert solution.cost == min(seen) < solution.cost_before
@@ -154,7 +162,7 @@ def test_an_interrupt_keeps_the_best_point():
 
 def test_too_few_steps_are_said_not_to_have_converged():
     problem = toy.make_problem(CLIPS[0])
-    solution = search.solve(problem, max_steps=10)
+    solution = search.find_best_fit(problem, SearchSettings(max_steps=10))
     assert solution.steps == 10
     assert not solution.converged
     assert solution.message == "Not converged: the 10 steps allowed for a start were used up."
@@ -164,13 +172,13 @@ def test_too_few_steps_are_said_not_to_have_converged():
 @pytest.mark.parametrize("walls", [(-1.0, 2.1), (1.0, 9.0)], ids=["by the truth", "at the start"])
 def test_a_region_where_residuals_are_not_finite_is_survived(walls):
     problem = curve_problem(walls=walls)
-    solution = search.solve(problem)
+    solution = search.find_best_fit(problem)
     assert solution.converged, solution.message
     assert errors(problem, solution.values, CURVE_TRUTH).max() < SHARE
 
 
 def test_residuals_that_are_nowhere_finite_are_told_in_a_sentence():
-    solution = search.solve(curve_problem(walls=(9.0, 9.0)))
+    solution = search.find_best_fit(curve_problem(walls=(9.0, 9.0)))
     assert not solution.converged
     assert solution.message == "Not converged: no residuals are finite at any starting point."
     assert solution.cost == np.inf
@@ -179,7 +187,7 @@ def test_residuals_that_are_nowhere_finite_are_told_in_a_sentence():
 def test_a_fit_may_be_of_thresholds_alone():
     base = Curve(height=jnp.asarray(2.0), rate=jnp.asarray(3.0))
     problem = eqx.tree_at(lambda p: p.space.system, curve_problem(("turn",)), base)
-    solution = search.solve(problem)
+    solution = search.find_best_fit(problem)
     assert solution.converged, solution.message
     assert errors(problem, solution.values, CURVE_TRUTH).max() < SHARE
 
@@ -187,7 +195,7 @@ def test_a_fit_may_be_of_thresholds_alone():
 @functools.cache
 def error_with_outliers(loss: str) -> float:
     problem = curve_problem(outliers=0.05, loss=loss)
-    return errors(problem, search.solve(problem).values, CURVE_TRUTH).max()
+    return errors(problem, search.find_best_fit(problem).values, CURVE_TRUTH).max()
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -226,7 +234,7 @@ def test_slopes_are_made_only_where_the_cost_is_low_enough():
 @pytest.mark.parametrize("rows", [3, 5, 127, 128, 129, 1000, 20000])
 def test_the_triangle_of_tall_rows_has_their_squares(rows):
     tall = np.random.default_rng(rows).normal(size=(rows, 5)) * [1.0, 1e-3, 1e3, 1.0, 1.0]
-    small = np.asarray(jacobian.triangle(jnp.asarray(tall)))
+    small = np.asarray(models.triangular_factor(jnp.asarray(tall)))
     assert small.shape == (5, 5)
     np.testing.assert_array_equal(small, np.triu(small))
     np.testing.assert_allclose(small.T @ small, tall.T @ tall, rtol=1e-10, atol=1e-10)
@@ -235,24 +243,24 @@ def test_the_triangle_of_tall_rows_has_their_squares(rows):
 
 
 def test_the_same_seed_gives_the_same_solution():
-    first, second = (search.solve(curve_problem(), seed=4) for _ in range(2))
+    first, second = (search.find_best_fit(curve_problem(), seed=4) for _ in range(2))
     np.testing.assert_array_equal(first.u, second.u)
     assert [r.cost for r in first.history] == [r.cost for r in second.history]
 
 
 def test_several_starts_are_tried_and_the_best_is_kept():
     problem = curve_problem()
-    solution = search.solve(problem, starts=3)
+    solution = search.find_best_fit(problem, starts=3)
     assert [r.start for r in solution.history if r.stage == "start"] == [0, 1, 2]
-    assert solution.cost <= min(r.cost for r in solution.history) * (1 + search.ROUNDING)
+    assert solution.cost <= min(r.cost for r in solution.history) * (1 + ROUNDING)
     given = np.asarray([[2.0, 2.0], [0.0, 0.0]])
-    assert search.solve(problem, starts=given).cost == pytest.approx(solution.cost)
+    assert search.find_best_fit(problem, starts=given).cost == pytest.approx(solution.cost)
 
 
 def test_a_fit_keeps_the_type_of_its_numbers():
     problem = curve_problem(("turn", "height", "rate"))
     problem = jax.tree.map(lambda x: x.astype("float32"), problem)
-    solution = search.solve(problem)
+    solution = search.find_best_fit(problem)
     assert solution.u.dtype == solution.jacobian.dtype == np.float32
     assert errors(problem, solution.values, CURVE_TRUTH).max() < SHARE
 
@@ -260,7 +268,7 @@ def test_a_fit_keeps_the_type_of_its_numbers():
 @pytest.mark.parametrize("options", [{"starts": 0}, {"max_steps": 0}])
 def test_no_start_and_no_step_are_refused(options):
     with pytest.raises(ValueError, match="wanted at least 1 of each"):
-        search.solve(curve_problem(), **options)
+        search.find_best_fit(curve_problem(), **options)
 
 
 def test_each_sweep_looks_in_the_widest_gap_that_the_sweeps_before_have_left():

@@ -1,4 +1,4 @@
-"""Programs that are kept between processes: the same answers, and traced once."""
+"""Programs kept between processes: they give the same output, and are traced once."""
 
 import functools
 import os
@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.runtime import program_cache
+from fitting.runtime import files, program_cache
 from jaxik.maths import vec
 
 TRACED = []
 
 
 def stretch(scale, points, *, by=1.0):
-    """Stands for a function of the project, whose tracing is counted."""
+    """A stand-in for a function of the project; counts how often it is traced."""
     TRACED.append(points.shape)
     return {
         "longer": scale * by * points / jnp.linalg.norm(points, axis=-1, keepdims=True),
@@ -32,7 +32,7 @@ def stretch(scale, points, *, by=1.0):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A cache of JAX's of its own, and `stretch` counted as the project's."""
+    """A JAX cache for this test alone; `stretch` passes for one of the project's functions."""
     config: Any = jax.config
     before = config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
@@ -46,27 +46,27 @@ def points(count=4, dtype=float):
     return jnp.asarray(np.random.default_rng(0).normal(size=(count, 3)), dtype)
 
 
-def same(found, wanted):
-    assert jax.tree.structure(found) == jax.tree.structure(wanted)
-    assert found["name"] == wanted["name"] == "stretched"
-    np.testing.assert_array_equal(found["longer"], wanted["longer"])
-    np.testing.assert_array_equal(found["half"][0], wanted["half"][0])
+def assert_same(output, expected):
+    assert jax.tree.structure(output) == jax.tree.structure(expected)
+    assert output["name"] == expected["name"] == "stretched"
+    np.testing.assert_array_equal(output["longer"], expected["longer"])
+    np.testing.assert_array_equal(output["half"][0], expected["half"][0])
 
 
-def again():
-    """What another process would have."""
+def fresh():
+    """The cached function as a new process would have it."""
     return program_cache.cached(stretch)
 
 
-def test_what_is_kept_answers_like_the_function_and_is_traced_once(folder):
-    wanted = eqx.filter_jit(stretch)(2.0, points(), by=3.0)
+def test_a_cached_function_gives_the_same_output_and_is_traced_once(folder):
+    expected = eqx.filter_jit(stretch)(2.0, points(), by=3.0)
     TRACED.clear()
     for _ in range(2):
-        same(again()(2.0, points(), by=3.0), wanted)
+        assert_same(fresh()(2.0, points(), by=3.0), expected)
     assert TRACED == [(4, 3)] and len(list(folder.iterdir())) == 1
 
 
-def test_each_shape_type_and_constant_has_a_program_of_its_own(folder):
+def test_each_shape_type_and_constant_gets_its_own_program(folder):
     calls = [
         ((2.0, points()), {}),
         ((2.0, points(5)), {}),
@@ -77,26 +77,26 @@ def test_each_shape_type_and_constant_has_a_program_of_its_own(folder):
     ]
     for times in (1, 2):
         for args, named in calls:
-            found = again()(*args, **named)
+            output = fresh()(*args, **named)
             np.testing.assert_allclose(
-                jnp.linalg.norm(found["longer"], axis=-1),
+                jnp.linalg.norm(output["longer"], axis=-1),
                 float(args[0]) * named.get("by", 1.0),
                 rtol=1e-6,
             )
-            assert found["longer"].dtype == args[1].dtype
+            assert output["longer"].dtype == args[1].dtype
         assert len(TRACED) == len(list(folder.iterdir())) == len(calls), times
 
 
-def test_a_change_of_the_source_is_seen(folder, monkeypatch):
-    again()(2.0, points())
+def test_a_change_of_the_source_makes_a_new_program(folder, monkeypatch):
+    fresh()(2.0, points())
     sources = program_cache._sources()
     monkeypatch.setattr(program_cache, "_sources", lambda: sources + b"changed")
-    again()(2.0, points())
+    fresh()(2.0, points())
     assert len(TRACED) == 2
 
 
-def test_the_source_is_that_of_both_packages(tmp_path, monkeypatch):
-    monkeypatch.setattr(program_cache, "OWN", ("jaxik",))
+def test_the_source_of_both_packages_counts(tmp_path, monkeypatch):
+    monkeypatch.setattr(program_cache, "PROJECT", ("jaxik",))
     program_cache._sources.cache_clear()
     alone = program_cache._sources()
     monkeypatch.undo()
@@ -105,108 +105,159 @@ def test_the_source_is_that_of_both_packages(tmp_path, monkeypatch):
 
 
 def by_function(change, at):
-    """Stands for a function of the project that takes another one."""
+    """A stand-in for a function of the project that takes another function."""
     TRACED.append(at.shape)
     return change(at)
 
 
-def test_what_is_static_is_kept_by_its_name_where_its_source_is_known(folder, monkeypatch):
+def test_static_arguments_from_the_project_are_identified_by_name(folder, monkeypatch):
     monkeypatch.setattr(by_function, "__module__", "fitting.somewhere")
     for _ in range(2):
-        found = program_cache.cached(by_function)(vec.sum_last, points())
-        np.testing.assert_array_equal(found, vec.sum_last(points()))
+        output = program_cache.cached(by_function)(vec.sum_last, points())
+        np.testing.assert_array_equal(output, vec.sum_last(points()))
     assert len(TRACED) == len(list(folder.iterdir())) == 1
 
 
-@pytest.mark.parametrize("change", [lambda at: at + 1, stretch], ids=["lambda", "another's module"])
-def test_a_function_of_the_users_is_called_and_not_kept(folder, monkeypatch, change):
+@pytest.mark.parametrize("change", [lambda at: at + 1, stretch], ids=["lambda", "user's module"])
+def test_a_user_function_as_an_argument_is_called_but_not_kept(folder, monkeypatch, change):
     monkeypatch.setattr(by_function, "__module__", "fitting.somewhere")
     if change is stretch:
         monkeypatch.setattr(stretch, "__module__", "mine")
         change = functools.partial(stretch, 1.0)
     for _ in range(2):
-        found = program_cache.cached(by_function)(change, points())
-    assert jax.tree.leaves(found)[0].shape == (4, 3)
+        output = program_cache.cached(by_function)(change, points())
+    assert jax.tree.leaves(output)[0].shape == (4, 3)
     assert len(TRACED) >= 2 and not folder.exists()
 
 
-def test_a_program_of_a_function_of_the_users_is_not_kept(folder, monkeypatch):
+def test_a_program_of_a_user_function_is_not_kept(folder, monkeypatch):
     monkeypatch.setattr(stretch, "__module__", "mine")
-    np.testing.assert_allclose(again()(2.0, points())["half"][0], points() / 2)
+    np.testing.assert_allclose(fresh()(2.0, points())["half"][0], points() / 2)
     assert not folder.exists()
 
 
-def test_inside_another_program_it_is_part_of_that(folder):
-    stretched = again()
+def test_inside_another_program_it_becomes_part_of_it(folder):
+    stretched = fresh()
 
     def whole(p):
         return jax.vmap(lambda each: stretched(2.0, each)["longer"])(p[None])[0].sum()
 
-    slope = jax.jit(jax.grad(whole))(points())
-    assert slope.shape == (4, 3) and np.isfinite(slope).all() and np.any(slope != 0)
+    gradient = jax.jit(jax.grad(whole))(points())
+    assert gradient.shape == (4, 3)
+    assert np.isfinite(gradient).all() and np.any(gradient != 0)
     assert not folder.exists()
 
 
-def test_one_within_another_that_knows_all_its_arguments_waits_for_nobody(folder, monkeypatch):
-    inner, known = again(), points()
+def test_a_cached_call_with_constant_arguments_inside_a_trace_does_not_deadlock(
+    folder, monkeypatch
+):
+    inner, known = fresh(), points()
 
     def outer(p):
-        return p + inner(2.0, known)["longer"]  # nothing of the inner call is traced
+        return p + inner(2.0, known)["longer"]  # the arguments of the inner call are not traced
 
     monkeypatch.setattr(outer, "__module__", "fitting.somewhere")
-    found = program_cache.cached(outer)(points())
-    np.testing.assert_allclose(found, points() + stretch(2.0, points())["longer"])
+    output = program_cache.cached(outer)(points())
+    np.testing.assert_allclose(output, points() + stretch(2.0, points())["longer"])
 
 
 @pytest.mark.parametrize(
-    "left", [b"", b"damaged", pickle.dumps(None), pickle.dumps((b"no program", 0, None))]
+    "content", [b"", b"damaged", pickle.dumps(None), pickle.dumps((b"no program", 0, None))]
 )
-def test_a_damaged_file_is_made_anew(folder, left):
-    wanted = again()(2.0, points())
+def test_a_damaged_file_is_replaced(folder, content):
+    expected = fresh()(2.0, points())
     (file,) = folder.iterdir()
-    whole = file.read_bytes()
-    file.write_bytes(left)
-    same(again()(2.0, points()), wanted)
-    assert len(TRACED) == 2 and file.read_bytes() == whole
+    intact = file.read_bytes()
+    file.write_bytes(content)
+    assert_same(fresh()(2.0, points()), expected)
+    assert len(TRACED) == 2 and file.read_bytes() == intact
 
 
-def test_a_folder_that_cannot_be_written_is_no_hindrance(folder):
+class Hostile:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+class Deferred:
+    """Calls a function of the project that writes files, when it is unpickled."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self):
+        return files.write_text, (self.mark, "")
+
+
+@pytest.mark.parametrize("payload", [Hostile, Deferred])
+def test_a_hostile_file_runs_no_code(folder, payload):
+    expected = fresh()(2.0, points())
+    (file,) = folder.iterdir()
+    mark = folder.parent / "mark"
+    file.write_bytes(pickle.dumps((payload(mark), 0, None)))
+    assert_same(fresh()(2.0, points()), expected)
+    assert not mark.exists() and len(TRACED) == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_file_that_others_may_write_is_not_read(folder):
+    fresh()(2.0, points())
+    (file,) = folder.iterdir()
+    file.chmod(0o666)
+    fresh()(2.0, points())
+    assert len(TRACED) == 2
+    assert not file.stat().st_mode & 0o002, "the file was replaced by a new one"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_file_of_another_user_is_not_read(folder, monkeypatch):
+    fresh()(2.0, points())
+    monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
+    fresh()(2.0, points())
+    assert len(TRACED) == 2
+
+
+def test_a_folder_that_cannot_be_written_to_does_no_harm(folder):
     folder.write_text("a file in its place")
-    same(again()(2.0, points()), again()(2.0, points()))
+    assert_same(fresh()(2.0, points()), fresh()(2.0, points()))
     assert folder.read_text() == "a file in its place"
 
 
 def test_nothing_is_kept_where_jax_keeps_nothing(folder, monkeypatch):
     jax.config.update("jax_enable_compilation_cache", False)
-    again()(2.0, points())
+    fresh()(2.0, points())
     jax.config.update("jax_enable_compilation_cache", True)
     assert not folder.exists()
 
 
-def test_a_mistake_in_a_call_is_told_as_ever(folder):
+def test_a_mistake_in_a_call_raises_the_usual_error(folder):
     with pytest.raises(ValueError, match="Incompatible shapes"):
-        again()(jnp.zeros(2), points())
+        fresh()(jnp.zeros(2), points())
     assert not folder.exists()
 
 
 def test_a_fit_in_another_process_traces_nothing_large(tmp_path):
-    """Two processes, whose hashes differ, find the same programs."""
+    """Two processes with different hash seeds find the same programs."""
     code = """
 import sys, jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 from fitting.bench import setup
 from fitting.runtime import program_cache
-from fitting.inference.optimisation.levenberg_marquardt import evaluated
-from fitting.inference.optimisation.jacobian import hard
+from fitting.inference.optimisation.levenberg_marquardt import evaluate
+from fitting.inference.optimisation.models import HardModel
 traced = []
 real = program_cache._trace
 program_cache._trace = lambda *args: traced.append(args[0].__name__) or real(*args)
 problem = setup.problem(60)
-at = evaluated(hard, problem.space.u0, (problem, problem.space.u0))
+at = evaluate(HardModel(problem, problem.space.u0), problem.space.u0)
 print(float(at.cost), *traced)
 """
-    told = [
+    outputs = [
         subprocess.run(
             [sys.executable, "-c", code, str(tmp_path)],
             env=os.environ | {"PYTHONHASHSEED": seed},
@@ -217,5 +268,5 @@ print(float(at.cost), *traced)
         ).stdout.split()
         for seed in ("1", "2")
     ]
-    assert told[0][0] == told[1][0]
-    assert {"begin", "step"} <= set(told[0][1:]) and told[1][1:] == []
+    assert outputs[0][0] == outputs[1][0]
+    assert {"begin", "step"} <= set(outputs[0][1:]) and outputs[1][1:] == []

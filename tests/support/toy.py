@@ -25,31 +25,63 @@ SIGMA_PITCH = 0.02  # rad
 
 class Lock(eqx.Module):
     height_on: Array = parameter_tree.parameter(
-        0.06, unit="m", low=0.01, high=0.12, kind="threshold"
+        0.06, unit="m", low=0.01, high=0.12, kind="threshold", doc="Height on of the test rule."
     )
     height_off: Array = parameter_tree.parameter(
-        0.10, unit="m", low=0.02, high=0.2, kind="threshold", above="height_on"
+        0.10,
+        unit="m",
+        low=0.02,
+        high=0.2,
+        kind="threshold",
+        above="height_on",
+        doc="Height off of the test rule.",
     )
-    speed_on: Array = parameter_tree.parameter(0.6, unit="m/s", low=0.1, high=1.5, kind="threshold")
+    speed_on: Array = parameter_tree.parameter(
+        0.6, unit="m/s", low=0.1, high=1.5, kind="threshold", doc="Speed on of the test rule."
+    )
     speed_off: Array = parameter_tree.parameter(
-        1.2, unit="m/s", low=0.2, high=2.5, kind="threshold", above="speed_on"
+        1.2,
+        unit="m/s",
+        low=0.2,
+        high=2.5,
+        kind="threshold",
+        above="speed_on",
+        doc="Speed off of the test rule.",
     )
-    half_life: Array = parameter_tree.parameter(0.06, unit="s", low=0.01, high=0.3, scale="log")
-    release: Array = parameter_tree.parameter(0.1, unit="s", low=0.01, high=0.5, scale="log")
+    half_life: Array = parameter_tree.parameter(
+        0.06, unit="s", low=0.01, high=0.3, scale="log", doc="Half life of the test rule."
+    )
+    release: Array = parameter_tree.parameter(
+        0.1, unit="s", low=0.01, high=0.5, scale="log", doc="Release of the test rule."
+    )
 
 
 class Body(eqx.Module):
-    gain: Array = parameter_tree.parameter(0.3, unit="1/tick", low=0.02, high=0.9, scale="gain")
+    gain: Array = parameter_tree.parameter(
+        0.3, unit="1/tick", low=0.02, high=0.9, scale="gain", doc="Gain of the test rule."
+    )
     tick_hz: Array = eqx.field(default=30.0, converter=parameter_tree.as_float_array)
-    drop: Array = parameter_tree.parameter(0.15, unit="m", low=0.0, high=0.4)
-    rise: Array = parameter_tree.parameter(0.05, unit="m", low=0.0, high=0.2)
+    drop: Array = parameter_tree.parameter(
+        0.15, unit="m", low=0.0, high=0.4, doc="Drop of the test rule."
+    )
+    rise: Array = parameter_tree.parameter(
+        0.05, unit="m", low=0.0, high=0.2, doc="Rise of the test rule."
+    )
 
 
 class Foot(eqx.Module):
-    share: Array = parameter_tree.parameter(0.6, unit="1", low=0.0, high=1.2)
-    limit: Array = parameter_tree.parameter((0.4, 0.4), unit="rad", low=0.1, high=0.8)
-    half_life: Array = parameter_tree.parameter(0.08, unit="s", low=0.01, high=0.4, scale="log")
-    idle: Array = parameter_tree.parameter(0.5, unit="1", low=0.0, high=1.0)  # does nothing
+    share: Array = parameter_tree.parameter(
+        0.6, unit="1", low=0.0, high=1.2, doc="Share of the test rule."
+    )
+    limit: Array = parameter_tree.parameter(
+        (0.4, 0.4), unit="rad", low=0.1, high=0.8, doc="Limit of the test rule."
+    )
+    half_life: Array = parameter_tree.parameter(
+        0.08, unit="s", low=0.01, high=0.4, scale="log", doc="Half life of the test rule."
+    )
+    idle: Array = parameter_tree.parameter(
+        0.5, unit="1", low=0.0, high=1.0, doc="Idle of the test rule."
+    )  # does nothing
 
 
 class Toy(eqx.Module):
@@ -188,7 +220,7 @@ NAMES = (*THRESHOLDS, *SMOOTH, "foot.idle")
 def solved(seed: int) -> tuple[Problem, search.Solution]:
     """A problem and its solution, made once for all tests."""
     problem = make_problem(seed)
-    return problem, search.solve(problem)
+    return problem, search.find_best_fit(problem)
 
 
 def make_problem(

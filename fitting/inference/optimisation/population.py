@@ -1,9 +1,9 @@
-"""Many candidates at once: what they cost, and where they would go."""
+"""Many candidates at once: their costs, and the breeding of thresholds from the best of them."""
 
-import itertools
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,25 +13,31 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import EDGE, Space
 from fitting.runtime.program_cache import cached
 
-POPULATION = 64  # candidates in one vmapped call
-SWEEP = 6  # values of one parameter, spread over its range
-TRIES = 2  # sweeps in a row that find nothing and end a search
-GOLDEN = (5**0.5 - 1) / 2
+from .state import Point, Search, SearchState
+
+BATCH = 64  # candidates in one call of a vmapped program, which is compiled for this number only
 
 
-class Population(eqx.Module):
-    """Many `u` evaluated at once."""
+class Evaluation(NamedTuple):
+    """Candidates and their costs."""
 
-    cost: Float[np.ndarray, " population"]  # hard; infinite where a row is not finite
-    moved: Float[np.ndarray, "population free"]  # after one Gauss-Newton step of smooth columns
-    promised: Float[np.ndarray, " population"]  # cost there if the given slopes held
+    cost: Float[np.ndarray, " candidates"]  # of the hard program; infinite where not finite
+    stepped: Float[np.ndarray, "candidates free"]  # after a Gauss-Newton step
+    predicted: Float[np.ndarray, " candidates"]  # cost there if the Jacobian held
 
 
 def from_values(
     space: Space, values: Float[np.ndarray, "candidates free"]
 ) -> Float[np.ndarray, "candidates free"]:
-    """`u` of many rows of values."""
-    return _in_parts(_from_values, space, values)
+    """`u` of candidates that are given by their values."""
+    return _in_batches(_from_values, space, values)
+
+
+def to_values(
+    space: Space, candidates: Float[np.ndarray, "candidates free"]
+) -> Float[np.ndarray, "candidates free"]:
+    """The parameters of candidates in their own units."""
+    return _in_batches(_to_values, space, candidates)
 
 
 @cached
@@ -40,63 +46,64 @@ def _from_values(space: Space, values: Array) -> Array:
 
 
 @cached
-def _values_of(space: Space, candidates: Array) -> Array:
+def _to_values(space: Space, candidates: Array) -> Array:
     return jax.vmap(space.values)(candidates)
 
 
-def _in_parts(
+def _in_batches(
     convert: Callable[[Space, Array], Array], space: Space, rows: np.ndarray
 ) -> np.ndarray:
-    """Any number of rows converted, POPULATION at a time, the last part filled up: one program."""
+    """Converts any number of rows, BATCH at a time, the last batch filled up: one program."""
     parts = []
-    for first in range(0, len(rows), POPULATION):
-        some = rows[first : first + POPULATION]
-        filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), space.u0.dtype)
-        parts.append(np.asarray(convert(space, filled))[: len(some)])
+    for first in range(0, len(rows), BATCH):
+        batch = rows[first : first + BATCH]
+        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), space.u0.dtype)
+        parts.append(np.asarray(convert(space, filled))[: len(batch)])
     return np.concatenate(parts)
 
 
 @cached
 def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
-    rows = jax.vmap(problem.residuals)(candidates)
-    return 0.5 * jnp.sum(rows**2, axis=1), rows
+    residuals = jax.vmap(problem.residuals)(candidates)
+    return 0.5 * jnp.sum(residuals**2, axis=1), residuals
 
 
 def evaluate(
     problem: Problem,
     candidates: Float[np.ndarray, "candidates free"],
-    slopes: Float[np.ndarray, "rows free"] | None = None,
-) -> Population:
-    """Costs of any number of `u`, and where one Gauss-Newton step of these slopes takes them.
+    jacobian: Float[np.ndarray, "residuals free"] | None = None,
+) -> Evaluation:
+    """Costs of any number of `u`, and where one Gauss-Newton step with this Jacobian takes them.
 
-    Evaluated POPULATION at a time, the last call filled up, so that there is one program. Without
-    slopes nothing moves.
+    Parameters whose column is zero, as those of thresholds are, stay where they are; without a
+    Jacobian all do. Evaluated BATCH at a time, the last batch filled up, so that there is one
+    program.
     """
     dtype = problem.space.u0.dtype
     # JAX multiplies: two threads of NumPy's library wait on each other, 0.3 s on a busy machine.
-    steep = None if slopes is None else jnp.asarray(slopes, dtype)
-    costs, pulls = [], []
-    for first in range(0, len(candidates), POPULATION):
-        some = candidates[first : first + POPULATION]
-        filled = jnp.asarray(np.resize(some, (POPULATION, some.shape[1])), dtype)
-        cost, rows = _evaluate(problem, filled)
-        costs.append(np.asarray(cost)[: len(some)])
-        if steep is not None:
-            pulls.append(np.asarray(rows @ steep)[: len(some)])
+    matrix = None if jacobian is None else jnp.asarray(jacobian, dtype)
+    costs, gradients = [], []
+    for first in range(0, len(candidates), BATCH):
+        batch = candidates[first : first + BATCH]
+        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), dtype)
+        cost, residuals = _evaluate(problem, filled)
+        costs.append(np.asarray(cost)[: len(batch)])
+        if matrix is not None:
+            gradients.append(np.asarray(residuals @ matrix)[: len(batch)])
     cost = np.concatenate(costs)
     finite = np.isfinite(cost)
     cost = np.where(finite, cost, np.inf)
-    if steep is None:
-        return Population(cost, candidates, cost)
-    gram = np.asarray(steep.T @ steep)
-    empty = np.diag(gram) == 0  # such a column does not move
-    pull = np.concatenate(pulls)
-    steps = -np.linalg.solve(gram + np.diag(empty), pull.T).T
-    moved, promised = candidates + steps, cost + 0.5 * np.sum(pull * steps, axis=1)
-    return Population(
+    if matrix is None:
+        return Evaluation(cost, candidates, cost)
+    gram = np.asarray(matrix.T @ matrix)
+    zero = np.diag(gram) == 0
+    gradient = np.concatenate(gradients)
+    steps = -np.linalg.solve(gram + np.diag(zero), gradient.T).T
+    stepped, predicted = candidates + steps, cost + 0.5 * np.sum(gradient * steps, axis=1)
+    return Evaluation(
         cost,
-        np.where(np.isfinite(moved), moved, candidates),
-        np.where(finite, promised, np.inf),
+        np.where(np.isfinite(stepped), stepped, candidates),
+        np.where(finite, predicted, np.inf),
     )
 
 
@@ -104,71 +111,70 @@ def vary(
     space: Space,
     parents: Float[np.ndarray, "candidates free"],
     shifts: Float[np.ndarray, "candidates free"],
-    renewed: Bool[np.ndarray, "candidates free"],
+    redrawn: Bool[np.ndarray, "candidates free"],
     random: np.random.Generator,
 ) -> Float[np.ndarray, "candidates free"]:
-    """`u` with some values shifted and some drawn anew from their range, the others being kept.
+    """`u` with some values shifted and some drawn anew from their range, the others kept.
 
-    Values and not `u` are kept: a threshold above another one would move with it, off the plateau
-    that it had found. Shifts are in the log-odds of the share of the range; 0 keeps a value.
+    Values are kept, not `u`: a threshold that stays above another one would move with it, off the
+    plateau it had reached. Shifts are in the log-odds of the fraction of the range; 0 keeps a
+    value.
     """
     low, high = np.asarray(space.low), np.asarray(space.high)
-    before = _in_parts(_values_of, space, parents)
-    share = np.clip((before - low) / (high - low), EDGE, 1 - EDGE)
-    odds = np.log(share / (1 - share)) + shifts
-    odds[renewed] = random.logistic(size=int(renewed.sum()))
-    varied = low + (high - low) / (1 + np.exp(-odds))
-    values = np.where((shifts != 0) | renewed, varied, before)
-    return from_values(space, values)
+    before = to_values(space, parents)
+    fraction = np.clip((before - low) / (high - low), EDGE, 1 - EDGE)
+    log_odds = np.log(fraction / (1 - fraction)) + shifts
+    log_odds[redrawn] = random.logistic(size=int(redrawn.sum()))
+    varied = low + (high - low) / (1 + np.exp(-log_odds))
+    return from_values(space, np.where((shifts != 0) | redrawn, varied, before))
 
 
-def offsets() -> Iterator[float]:
-    """Where the values of sweeps lie, one sweep's between all those of the sweeps before it."""
-    return ((0.5 + GOLDEN * number) % 1.0 for number in itertools.count())
+def breed(search: Search, state: SearchState, spread: float) -> SearchState:
+    """The best of some generations bred from the state's point, which has a Jacobian.
 
+    The most promising children of a generation come again after a Gauss-Newton step, since other
+    thresholds need other smooth parameters.
 
-def sweep(
-    problem: Problem,
-    u: Float[np.ndarray, " free"],
-    cost: float,
-    gain: float,
-    places: Iterator[float],
-) -> tuple[np.ndarray, float] | None:
-    """A `u`, and its cost, with some parameters carried elsewhere in their range.
-
-    The first of TRIES sweeps that lowers the cost by `gain` of itself; None where none does.
+    Args:
+        search: the problem and the settings.
+        state: where the breeding begins.
+        spread: standard deviation of the threshold shifts in the first generation, in `u`.
     """
-    for offset in itertools.islice(places, TRIES):
-        carried, lower = _swept(problem, u, (np.arange(SWEEP) + offset) / SWEEP)
-        if lower <= cost * (1 - gain):
-            return carried, lower
-    return None
+    settings, jacobian = search.settings, state.point.jacobian
+    random = state.generator()
+    elite, stepped = state.point.u[None], state.point.u[None][:0]
+    costs = np.asarray([state.point.cost])
+    for generation in range(settings.generations):
+        count = settings.population - len(stepped)
+        children = _children(
+            search, elite, count, spread * settings.generation_decay**generation, random
+        )
+        children = np.concatenate([stepped, children])
+        evaluation = evaluate(search.problem, children, jacobian)
+        candidates = np.concatenate([elite, children])
+        costs = np.concatenate([costs, evaluation.cost])
+        order = np.argsort(costs, kind="stable")[: settings.elite]
+        elite, costs = candidates[order], costs[order]
+        promising = np.argsort(evaluation.predicted, kind="stable")
+        stepped = evaluation.stepped[promising[: settings.gauss_newton_children]]
+        state = search.move(state, "blocks", Point(elite[0], float(costs[0])))
+    return dataclasses.replace(state, random=random)
 
 
-def _swept(
-    problem: Problem, u: Float[np.ndarray, " free"], shares: Float[np.ndarray, " values"]
-) -> tuple[np.ndarray, float]:
-    """The best `u`, and its cost, that these shares of the parameters' ranges make.
+def _children(
+    search: Search, elite: np.ndarray, count: int, spread: float, random: np.random.Generator
+) -> np.ndarray:
+    """Children of randomly chosen parents, with some thresholds shifted.
 
-    Each parameter in turn takes all the values, the others keeping theirs; then the best of each
-    are taken over together, as many of them, the best first, as make the lowest cost.
+    A fraction of them also have one parameter, of either kind, drawn anew from its range: a clamp
+    that is never reached has no derivative, and this frees it.
     """
-    space = problem.space
-    size = space.size
-    odds = np.tile(np.log(shares / (1 - shares))[:, None], size)
-    at, *grid = _in_parts(_values_of, space, np.concatenate([u[None], odds]))
-    grid = np.asarray(grid)
-    alone = np.tile(at, (size, len(shares), 1))
-    for i in range(size):
-        alone[i, :, i] = grid[:, i]
-    candidates = from_values(space, alone.reshape(-1, size))
-    costs = evaluate(problem, candidates).cost.reshape(size, -1)
-
-    together = np.tile(at, (size, 1))
-    for rank, i in enumerate(np.argsort(costs.min(axis=1), kind="stable")):
-        together[rank:, i] = grid[np.argmin(costs[i]), i]
-    joined = from_values(space, together)
-    every = np.concatenate([candidates, joined])
-    costs = np.concatenate([costs.ravel(), evaluate(problem, joined).cost])
-    best = int(np.argmin(costs))
-    return every[best], float(costs[best])
+    thresholds, settings = search.thresholds, search.settings
+    parents = elite[random.integers(len(elite), size=count)]
+    rate = max(settings.shifted_fraction, 1 / max(1, thresholds.sum()))
+    shifted = (random.random(parents.shape) < rate) & thresholds
+    shifts = random.normal(0, spread, parents.shape) * shifted
+    redrawn = np.zeros(parents.shape, bool)
+    chosen = np.arange(count // settings.redrawn_one_in)
+    redrawn[chosen, random.integers(thresholds.size, size=chosen.size)] = True
+    return vary(search.problem.space, parents, shifts, redrawn, random)

@@ -1,4 +1,4 @@
-"""What a running fit reports, and where it ended."""
+"""What a search reports while it runs, and its result."""
 
 import dataclasses
 
@@ -8,28 +8,28 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """One report of a running fit."""
+    """One report of a running search."""
 
-    stage: str
-    start: int  # which start, from 0
-    step: int  # steps of Levenberg–Marquardt so far, in this start
-    cost: float  # where the stage stands
-    best: float  # lowest cost on the hard rows so far, over all starts
-    seconds: float  # since the beginning
+    stage: str  # start, blocks, ensemble, sweep, slopes or polish
+    start: int  # index of the starting point
+    step: int  # Levenberg–Marquardt steps so far, from this start
+    cost: float  # of the point that the stage has reached
+    best: float  # minimum cost of the hard program so far, over all starts
+    seconds: float  # since the search began
 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """Where a fit ended, and how."""
+    """The best point of a search, and how the search ended."""
 
     names: tuple[str, ...]
     u: Float[np.ndarray, " free"]
-    values: Float[np.ndarray, " free"]  # in their own units
-    cost_before: float  # of the base's values
+    values: Float[np.ndarray, " free"]  # in the parameters' units
+    cost_before: float  # of the system's values before the fit
     cost: float
     converged: bool
     message: str  # one sentence
-    jacobian: Float[np.ndarray, "rows free"]  # of `Problem.rows` at `u`; zero at thresholds
+    jacobian: Float[np.ndarray, "residuals free"]  # of `Problem.residuals`; 0 for thresholds
     history: tuple[Progress, ...]
     steps: int  # of Levenberg–Marquardt, all starts together
     seconds: float

@@ -1,0 +1,98 @@
+"""Descents by Levenberg–Marquardt: short ones between other stages, and the polish at the end.
+
+Each raises `StepsUsedUp` before a step that would exceed the `max_steps` of a start.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from . import levenberg_marquardt
+from .levenberg_marquardt import LMState
+from .models import EnsembleModel, HardModel, problem_jacobian
+from .settings import SearchSettings
+from .state import Point, Search, SearchState
+
+
+def descend(search: Search, state: SearchState, stage: str) -> SearchState:
+    """A short descent of the smooth parameters from the state's point, thresholds frozen."""
+    settings = search.settings
+    return _descend(search, state, stage, settings.descent_steps, settings.max_rejected_steps)
+
+
+def polish(search: Search, state: SearchState) -> SearchState:
+    """A descent of the smooth parameters to its end; `converged` if that is the best point."""
+    settings = search.settings
+    patience = settings.polish_max_rejected_steps
+    return _descend(search, state, "polish", settings.max_steps, patience)
+
+
+def _descend(
+    search: Search, state: SearchState, stage: str, max_steps: int, max_rejected: int
+) -> SearchState:
+    u = search.array(state.point.u)
+    model = HardModel(search.problem, u)
+    lm = state.evaluated
+    if lm is None or not np.array_equal(u, lm.u):
+        lm = levenberg_marquardt.evaluate(model, u)
+    state = dataclasses.replace(state, point=_point(lm))
+    pace = Pace()
+    for _ in range(max_steps):
+        state = search.spend_step(state)
+        before, lm = lm, levenberg_marquardt.step(model, lm)
+        pace = pace.after(before, lm, search.settings)
+        finished = pace.finished(search.settings, max_rejected)
+        converged = stage == "polish" and finished
+        state = search.move(state, stage, _point(lm), converged=converged)
+        if finished:
+            break
+    return state
+
+
+def descend_ensemble(
+    search: Search, state: SearchState, shifts: Float[Array, "ensemble free"]
+) -> SearchState:
+    """A short descent of all parameters on the mean residuals over shifted thresholds.
+
+    The new point has no cost yet: that of the mean is not the hard program's.
+    """
+    model = EnsembleModel(search.problem, shifts)
+    lm = levenberg_marquardt.evaluate(model, search.array(state.point.u))
+    pace = Pace()
+    for _ in range(search.settings.descent_steps):
+        state = search.spend_step(state)
+        before, lm = lm, levenberg_marquardt.step(model, lm)
+        pace = pace.after(before, lm, search.settings)
+        state = search.report(state, "ensemble", float(lm.cost))
+        if pace.finished(search.settings, search.settings.max_rejected_steps):
+            break
+    return dataclasses.replace(state, point=Point(np.asarray(lm.u)))
+
+
+def _point(lm: LMState) -> Point:
+    """Where a descent on the hard model stands."""
+    cost = float(lm.cost)
+    return Point(
+        np.asarray(lm.u), cost if np.isfinite(cost) else np.inf, problem_jacobian(lm.jacobian)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """How well a descent is doing."""
+
+    small: int = 0  # accepted steps in a row that gained next to nothing
+    rejected: int = 0  # rejected steps in a row
+
+    def after(self, before: LMState, after: LMState, settings: SearchSettings) -> "Pace":
+        """The pace after one more step."""
+        if not after.accepted:
+            return Pace(self.small, self.rejected + 1)
+        cost = np.asarray(before.cost)
+        small = cost - np.asarray(after.cost) <= settings.min_step_gain * cost
+        return Pace(self.small + 1 if small else 0)
+
+    def finished(self, settings: SearchSettings, max_rejected: int) -> bool:
+        """Whether further steps are not worth it."""
+        return self.small >= settings.max_small_steps or self.rejected >= max_rejected

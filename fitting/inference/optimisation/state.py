@@ -1,0 +1,114 @@
+"""What the stages of a search hand on to each other.
+
+Every stage is a function `(search, state, ...) -> state`. A `Search` is what stays the same, a
+`SearchState` what changes. Stages change neither: called again with the same state they do the
+same.
+"""
+
+import copy
+import dataclasses
+import time
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.problem.problem import Problem
+
+from .levenberg_marquardt import LMState
+from .settings import DEFAULTS, SearchSettings
+from .solution import Progress
+
+ROUNDING = 1e-9  # relative: two programs sum the same cost in different orders
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A point of the search space."""
+
+    u: Float[np.ndarray, " free"]
+    cost: float = np.inf  # of the hard program; infinite where not finite, or not evaluated
+    jacobian: Float[np.ndarray, "residuals free"] | None = None  # of `Problem.residuals`
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchState:
+    """Where a search stands."""
+
+    point: Point  # where the next stage begins
+    best: Point  # of the whole search
+    random: np.random.Generator  # use `generator`, never this one itself
+    converged: bool = False  # the best point is the end of a finished polish
+    start: int = 0  # index of the starting point
+    start_steps: int = 0  # Levenberg–Marquardt steps from this start
+    steps: int = 0  # and from all starts
+    sweeps: int = 0  # so far; the next one looks between the values of these
+    evaluated: LMState | None = None  # first starting point, evaluated while programs compiled
+    history: tuple[Progress, ...] = ()
+
+    @classmethod
+    def at(
+        cls, u: Float[np.ndarray, " free"], cost: float = np.inf, seed: int = 0
+    ) -> "SearchState":
+        """The beginning of a search at a point."""
+        return cls(Point(u, cost), Point(u, cost), np.random.default_rng(seed))
+
+    def generator(self) -> np.random.Generator:
+        """A copy of the random generator, to draw from and to put into the next state."""
+        return copy.deepcopy(self.random)
+
+
+class StepsUsedUp(Exception):
+    """Raised by a stage when the steps allowed for a start are used up."""
+
+    def __init__(self, state: SearchState) -> None:
+        super().__init__()
+        self.state = state  # as it was then
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """What all stages of a search share."""
+
+    problem: Problem
+    settings: SearchSettings = DEFAULTS
+    observe: Callable[[SearchState], None] = lambda state: None  # called with every report
+    began: float = dataclasses.field(default_factory=time.perf_counter)  # s
+
+    @property
+    def thresholds(self) -> np.ndarray:
+        """Which parameters only move hard decisions."""
+        return np.asarray(self.problem.space.thresholds)
+
+    def array(self, u: np.ndarray) -> Float[Array, " free"]:
+        """`u` as the problem's programs take it."""
+        return jnp.asarray(u, self.problem.space.u0.dtype)
+
+    def spend_step(self, state: SearchState) -> SearchState:
+        """The state with one more step of Levenberg–Marquardt counted.
+
+        Raises:
+            StepsUsedUp: if the start has none left.
+        """
+        if state.start_steps >= self.settings.max_steps:
+            raise StepsUsedUp(state)
+        return dataclasses.replace(state, start_steps=state.start_steps + 1, steps=state.steps + 1)
+
+    def report(self, state: SearchState, stage: str, cost: float) -> SearchState:
+        """The state with one more line of history, which is reported."""
+        elapsed = time.perf_counter() - self.began
+        line = Progress(stage, state.start, state.start_steps, cost, state.best.cost, elapsed)
+        state = dataclasses.replace(state, history=(*state.history, line))
+        self.observe(state)
+        return state
+
+    def move(
+        self, state: SearchState, stage: str, point: Point, *, converged: bool = False
+    ) -> SearchState:
+        """The state at another point, remembered if it is the best one, and reported."""
+        state = dataclasses.replace(state, point=point)
+        as_good = converged and point.cost <= state.best.cost * (1 + ROUNDING)
+        if point.cost < state.best.cost or as_good:
+            state = dataclasses.replace(state, best=point, converged=converged)
+        return self.report(state, stage, point.cost)

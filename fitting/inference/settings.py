@@ -1,0 +1,77 @@
+"""Settings of the search and of the sampler: numbers with a unit, a range and a meaning.
+
+A settings class is a frozen dataclass whose fields are all declared with `setting`. The declaration
+is the only place where a default, its range and its meaning stand: experiment files and error
+messages read it from there (`describe`).
+"""
+
+import dataclasses
+import math
+from typing import Any, ClassVar, Protocol
+
+
+class Settings(Protocol):
+    """A dataclass of settings."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+
+Value = int | float | tuple[float, ...] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What is known of one setting."""
+
+    meaning: str  # one sentence
+    unit: str  # "1" for a ratio
+    low: float  # of each number, where there are several
+    high: float
+    integer: bool
+    several: bool = False  # a tuple of numbers
+    optional: bool = False  # None stands for a number that is chosen later
+
+    @property
+    def range(self) -> str:
+        """What a value may be, for error messages."""
+        kind = "whole number" if self.integer else "number"
+        limits = f" from {self.low:g}" + (f" to {self.high:g}" if self.high < math.inf else "")
+        return f"a list of {kind}s{limits}" if self.several else f"a {kind}{limits}"
+
+    def allows(self, value: object) -> bool:
+        """Whether a setting may have this value."""
+        if self.several:
+            return isinstance(value, tuple) and len(value) > 0 and all(map(self._fits, value))
+        return (value is None and self.optional) or self._fits(value)
+
+    def _fits(self, number: object) -> bool:
+        kinds = int if self.integer else (int, float)
+        return (
+            isinstance(number, kinds)
+            and not isinstance(number, bool)
+            and self.low <= number <= self.high
+        )
+
+
+def setting(
+    default: Value, meaning: str, *, unit: str = "1", low: float = 0, high: float = math.inf
+) -> Any:
+    """A field of a settings class; its kind is that of the default, None meaning an integer."""
+    several = isinstance(default, tuple)
+    example = default[0] if isinstance(default, tuple) else default
+    integer = not isinstance(example, float)
+    declared = Setting(meaning, unit, low, high, integer, several, default is None)
+    return dataclasses.field(default=default, metadata={"setting": declared})
+
+
+def describe(settings: Settings | type[Settings]) -> dict[str, Setting]:
+    """The settings of a class or an object, by name."""
+    return {field.name: field.metadata["setting"] for field in dataclasses.fields(settings)}
+
+
+def check(settings: Settings) -> None:
+    """Raises ValueError for the first setting that is out of its range."""
+    for name, declared in describe(settings).items():
+        value = getattr(settings, name)
+        if not declared.allows(value):
+            raise ValueError(f"{name} is {value!r}, wanted {declared.range}: {declared.meaning}")
