@@ -7,13 +7,13 @@ go through the scan (`advance`). Everything is for one character: batch with `la
 import dataclasses
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import HARD, AbstractGate
+from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.struct import struct
 from jaxik.stages.contact import AbstractContact
 from jaxik.stages.effector import AbstractEffector, Effector
@@ -31,7 +31,7 @@ from jaxik.world.skeleton import LegPose, Rig, Transform, bone_lengths
 from jaxik.world.terrain import LegTerrains, Terrain
 
 
-class FootIK(eqx.Module):
+class FootIK(Rule):
     """A foot-IK system: one rule a stage, in the order in which they run."""
 
     contact: AbstractContact

@@ -1,23 +1,31 @@
-"""What a rule is made of: parameters that know their unit, range and kind, and switches.
+"""What a rule is made of: parameters that know their meaning, unit and range, and switches.
 
-A stage's rule is an `eqx.Module` whose float fields are declared with `parameter`. The declaration
-is the only place where a number's default, unit and range stand: presets, the fit, the reports and
-the error messages read it from there.
+A stage's rule is a `Rule` whose fields are declared with `parameter`, `constant`, `switch` and
+`layers`. The declaration is the only place where a number's meaning, default, unit and range stand:
+presets, fits, reports and error messages read it from there.
 """
+
+# pyright: reportInvalidTypeVarUse=false
 
 import dataclasses
 import operator
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
-Rule = TypeVar("Rule", bound=eqx.Module)
-Kind = Literal["smooth", "threshold"]
+Tree = TypeVar("Tree", bound=eqx.Module)
+Declared = TypeVar("Declared")  # whatever type a field is annotated with
+ParameterKind = Literal["smooth", "threshold"]
 Scale = Literal["linear", "log", "gain"]
+
+MOST_SHOWN = 8  # numbers of one leaf that are printed one by one
+ALL_LAYERS = 0xFFFFFFFF
 
 
 if TYPE_CHECKING:
@@ -26,10 +34,17 @@ if TYPE_CHECKING:
         """Type of a field that reads as an array and may be given as a Python number."""
 
         def __get__(self, rule: object, owner: type | None = None) -> Array: ...
-        def __set__(self, rule: object, value: ArrayLike | Sequence[float]) -> None: ...
+        def __set__(self, rule: object, value: ArrayLike | Sequence) -> None: ...
 
 else:
     Leaf = jax.Array
+
+
+class Rule(eqx.Module):
+    """One implementation of a stage. Printed, it lists its parameters with their units."""
+
+    def __repr__(self) -> str:
+        return outline(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,19 +54,25 @@ class Declaration:
     unit: str
     low: float  # a fit stays between low and high
     high: float
-    kind: Kind  # a threshold moves a hard decision: its derivative there is zero
+    kind: ParameterKind  # a threshold moves a hard decision: its derivative there is zero
     scale: Scale  # a gain is fitted as its half-life
     above: str | None  # name of the field of the same rule that this one stays above
+    doc: str  # one sentence: what the parameter does
 
 
-def as_float_array(x: Any) -> Any:
-    """Python numbers and sequences become float arrays; arrays and tracers stay as they are."""
+def as_float_array(x: ArrayLike | Sequence) -> Array:
+    """Python numbers and sequences as float arrays; arrays and tracers stay as they are."""
     return x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.result_type(float))
 
 
-def as_switch(x: Any) -> Any:
-    """Python booleans become 0-d arrays, so that a switch is data and never a new program."""
+def as_switch(x: ArrayLike) -> Array:
+    """Python booleans as 0-d arrays, so that a switch is data and needs no new program."""
     return x if isinstance(x, jax.Array) else jnp.asarray(x, bool)
+
+
+def as_layers(x: ArrayLike) -> Array:
+    """Python integers as 0-d masks of layers."""
+    return x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.uint32)
 
 
 def parameter(
@@ -60,56 +81,93 @@ def parameter(
     unit: str,
     low: float,
     high: float,
-    kind: Kind = "smooth",
+    doc: str,
+    kind: ParameterKind = "smooth",
     scale: Scale = "linear",
     above: str | None = None,
-) -> Any:
-    """A float leaf of a rule, `()` shared by the legs or `(legs,)` one each."""
-    declaration = Declaration(unit, low, high, kind, scale, above)
+) -> Declared:
+    """Declares a float field of a rule: one number for all legs, or one a leg.
+
+    Args:
+        default: its value in a rule made without it.
+        unit: such as "m", "rad" or "1/s"; "1" for a plain number.
+        low: a fit goes no lower.
+        high: a fit goes no higher.
+        doc: one sentence, for users, that says what the parameter does.
+        kind: "threshold" if it moves a hard decision, so that its derivative there is zero.
+        scale: how a fit steps: "linear", by factors ("log"), or as the half-life of a "gain".
+        above: the field of the same rule that it stays above, if any.
+    """
+    declaration = Declaration(unit, low, high, kind, scale, above, doc)
+    metadata = {"declaration": declaration, "unit": unit, "doc": doc}
+    return _field(default, as_float_array, metadata)
+
+
+def half_life_parameter(default: float, *, doc: str) -> Declared:
+    """Declares a half-life, s: fitted by factors from 2 ms to 0.5 s; at 0 memory jumps."""
+    return parameter(default, unit="s", low=0.002, high=0.5, scale="log", doc=doc)
+
+
+def gain_parameter(default: float, *, doc: str) -> Declared:
+    """Declares a gain per tick, 0..1: fitted as its half-life; at 1 memory jumps."""
+    return parameter(default, unit="1/tick", low=0.01, high=0.95, scale="gain", doc=doc)
+
+
+def constant(default: float, *, unit: str, doc: str) -> Declared:
+    """Declares a float field of a rule that is a convention, such as a tick rate: never fitted."""
+    return _field(default, as_float_array, {"unit": unit, "doc": doc})
+
+
+def switch(default: bool, *, doc: str) -> Declared:
+    """Declares a boolean field of a rule."""
+    return _field(default, as_switch, {"doc": doc})
+
+
+def layers(default: int = ALL_LAYERS) -> Declared:
+    """Declares a mask of the layers that a rule's rays see, one bit a layer (`layer_mask`)."""
+    doc = "Layers of the terrain that the rays see, one bit each."
+    return _field(default, as_layers, {"doc": doc})
+
+
+def _field(default, converter, metadata: dict):
     return eqx.field(
-        default_factory=lambda: as_float_array(default),
-        converter=as_float_array,
-        metadata={"declaration": declaration},
+        default_factory=lambda: converter(default), converter=converter, metadata=metadata
     )
 
 
-def constant(default: float) -> Any:
-    """A float leaf of a rule that is a convention, such as a tick rate: never fitted."""
-    return eqx.field(default_factory=lambda: as_float_array(default), converter=as_float_array)
-
-
-def switch(default: bool) -> Any:
-    """A boolean leaf of a rule."""
-    return eqx.field(default_factory=lambda: as_switch(default), converter=as_switch)
-
-
-def layers(default: int = 0xFFFFFFFF) -> Any:
-    """A mask of the layers that a rule's rays see, one bit a layer (`terrain.layer_mask`)."""
-    return eqx.field(
-        default_factory=lambda: jnp.asarray(default, jnp.uint32),
-        converter=lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x, jnp.uint32),
-    )
-
-
-def declarations(module: eqx.Module, path: str = "") -> dict[str, Declaration]:
+def declarations(module: eqx.Module) -> dict[str, Declaration]:
     """Every declared parameter of a rule or of a tree of rules, by dotted name."""
-    found: dict[str, Declaration] = {}
+    return {
+        name: field.metadata["declaration"]
+        for name, field in _fields(module)
+        if "declaration" in field.metadata
+    }
+
+
+def docs(module: eqx.Module) -> dict[str, str]:
+    """The sentence of meaning of each parameter, constant and switch, by dotted name."""
+    return {
+        name: field.metadata["doc"] for name, field in _fields(module) if "doc" in field.metadata
+    }
+
+
+def _fields(module: eqx.Module, path: str = "") -> Iterator[tuple[str, dataclasses.Field]]:
+    """The fields of a tree that are not modules themselves, by dotted name."""
     for field in dataclasses.fields(module):
         name = f"{path}{field.name}"
-        if "declaration" in field.metadata:
-            found[name] = field.metadata["declaration"]
-        elif isinstance(child := getattr(module, field.name), eqx.Module):
-            found |= declarations(child, f"{name}.")
-    return found
+        if isinstance(child := getattr(module, field.name), eqx.Module):
+            yield from _fields(child, f"{name}.")
+        else:
+            yield name, field
 
 
-def get(module: eqx.Module, name: str) -> jax.Array:
+def get(module: eqx.Module, name: str) -> Array:
     """The leaf with this dotted name."""
     return operator.attrgetter(name)(module)
 
 
-def replace(module: Rule, values: dict[str, Any]) -> Rule:
-    """The tree with the leaves of these dotted names exchanged.
+def replace(module: Tree, values: Mapping[str, ArrayLike | Sequence]) -> Tree:
+    """The tree with other leaves under these dotted names.
 
     Raises:
         ValueError: for a name that the tree does not have.
@@ -120,6 +178,47 @@ def replace(module: Rule, values: dict[str, Any]) -> Rule:
         try:
             leaves.append(jnp.asarray(value, getter(module).dtype))
         except AttributeError:
-            there_are = list(declarations(module))
-            raise ValueError(f"no parameter named {name!r}; there are {there_are}") from None
+            known = list(declarations(module))
+            raise ValueError(f"no parameter named {name!r}; there are {known}") from None
     return eqx.tree_at(lambda tree: [getter(tree) for getter in getters], module, leaves)
+
+
+def outline(module: eqx.Module) -> str:
+    """A tree of rules as aligned text: stage, rule, and each parameter with its unit."""
+    return "\n".join([type(module).__name__, *_outlined(module, "  ")])
+
+
+def _outlined(module: eqx.Module, indent: str) -> Iterator[str]:
+    fields = dataclasses.fields(module)
+    width = max((len(field.name) for field in fields), default=0)
+    for field in fields:
+        value = getattr(module, field.name)
+        head = f"{indent}{field.name:<{width}}  "
+        if isinstance(value, eqx.Module):
+            yield head + type(value).__name__
+            yield from _outlined(value, f"{indent}  ")
+        else:
+            yield head + _shown(value, field.metadata.get("unit", ""))
+
+
+def _shown(value: object, unit: str) -> str:
+    """A leaf's value and unit; its type and shape where it is a tracer, or many numbers."""
+    if isinstance(value, Tracer) or not isinstance(value, jax.Array | np.ndarray):
+        return eqx.tree_pformat(value)
+    if value.size > MOST_SHOWN:
+        return f"{eqx.tree_pformat(value)} {unit}".rstrip()
+    numbers = np.asarray(value)
+    if numbers.dtype == bool:
+        return _listed(numbers, lambda on: "on" if on else "off")
+    if numbers.dtype == np.uint32:
+        return _listed(numbers, lambda mask: "all" if mask == ALL_LAYERS else f"{mask:#x}")
+    text = _listed(numbers, "{:.4g}".format)
+    if unit == "rad":
+        return f"{text} rad ({_listed(np.degrees(numbers), '{:.4g}°'.format)})"
+    return text if unit == "1" else f"{text} {unit}".rstrip()
+
+
+def _listed(numbers: np.ndarray, show: Callable) -> str:
+    """Numbers as text: one alone, more in brackets."""
+    parts = [_listed(np.asarray(part), show) for part in numbers] if numbers.ndim else []
+    return f"[{', '.join(parts)}]" if numbers.ndim else show(numbers[()])

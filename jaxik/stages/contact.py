@@ -2,12 +2,11 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact
 from jaxik.world.skeleton import Rig
@@ -18,7 +17,7 @@ HEIGHT_BAND = 0.01  # m over which a softened height decision turns
 SPEED_BAND = 0.05  # m/s, likewise
 
 
-class AbstractContact(eqx.Module):
+class AbstractContact(Rule):
     """Reads contact from the animation."""
 
     @abstractmethod
@@ -47,10 +46,25 @@ class AbstractInstantContact(AbstractContact):
 class HeightContact(AbstractInstantContact):
     """By the ankle's height: 1 below `planted_height`, 0 above `raised_height`, linear between."""
 
-    ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
-    planted_height: Leaf = parameter(0.10, unit="m", low=0.0, high=0.4, kind="threshold")
+    ground_height: Leaf = parameter(
+        0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
+    )
+    planted_height: Leaf = parameter(
+        0.10,
+        unit="m",
+        low=0.0,
+        high=0.4,
+        kind="threshold",
+        doc="Ankle height over the floor below which a foot counts as planted.",
+    )
     raised_height: Leaf = parameter(
-        0.16, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
+        0.16,
+        unit="m",
+        low=0.0,
+        high=0.6,
+        kind="threshold",
+        above="planted_height",
+        doc="Ankle height over the floor above which a foot counts as lifted.",
     )
 
     def sense(self, inputs: Inputs) -> Contact:
@@ -77,7 +91,14 @@ class StandingContact(AbstractInstantContact):
 class IdleContact(AbstractInstantContact):
     """All feet stand while the character does, none while it moves (Unreal, seed 001)."""
 
-    idle_speed: Leaf = parameter(0.0, unit="m/s", low=0.0, high=3.0, kind="threshold")
+    idle_speed: Leaf = parameter(
+        0.0,
+        unit="m/s",
+        low=0.0,
+        high=3.0,
+        kind="threshold",
+        doc="Speed of the character up to which it counts as standing still.",
+    )
 
     def sense(self, inputs: Inputs) -> Contact:
         lift = inputs.frame.pose.ankle.pos[..., 1]
@@ -89,7 +110,9 @@ class IdleContact(AbstractInstantContact):
 class LabelContact(AbstractInstantContact):
     """As the animation is labelled (`Stride.standing`): what its author or a capture says."""
 
-    ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
+    ground_height: Leaf = parameter(
+        0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
+    )
 
     def sense(self, inputs: Inputs) -> Contact:
         standing = inputs.frame.stride.standing
@@ -114,16 +137,46 @@ class SpeedContact(AbstractContact):
     ball is slower than 0.25 m/s, a swinging one's hardly ever.
     """
 
-    ground_height: Leaf = parameter(0.0, unit="m", low=-0.5, high=0.5)
-    planted_height: Leaf = parameter(0.075, unit="m", low=0.0, high=0.4, kind="threshold")
+    ground_height: Leaf = parameter(
+        0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
+    )
+    planted_height: Leaf = parameter(
+        0.075,
+        unit="m",
+        low=0.0,
+        high=0.4,
+        kind="threshold",
+        doc="A swinging foot can plant once its ball is below this height.",
+    )
     raised_height: Leaf = parameter(
-        0.10, unit="m", low=0.0, high=0.6, kind="threshold", above="planted_height"
+        0.10,
+        unit="m",
+        low=0.0,
+        high=0.6,
+        kind="threshold",
+        above="planted_height",
+        doc="A planted foot lifts once its ball is above this height.",
     )
-    planted_speed: Leaf = parameter(0.25, unit="m/s", low=0.0, high=1.5, kind="threshold")
+    planted_speed: Leaf = parameter(
+        0.25,
+        unit="m/s",
+        low=0.0,
+        high=1.5,
+        kind="threshold",
+        doc="A swinging foot can plant once its ball is slower than this.",
+    )
     raised_speed: Leaf = parameter(
-        0.50, unit="m/s", low=0.0, high=3.0, kind="threshold", above="planted_speed"
+        0.50,
+        unit="m/s",
+        low=0.0,
+        high=3.0,
+        kind="threshold",
+        above="planted_speed",
+        doc="A planted foot lifts once its ball is faster than this.",
     )
-    half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
+    half_life: Leaf = half_life_parameter(
+        0.0, doc="Time in which the contact weight covers half its way after a change."
+    )
 
     def init(self, rig: Rig) -> SpeedState:
         zero = jnp.zeros_like(rig.side)

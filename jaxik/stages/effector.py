@@ -2,12 +2,11 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.skeleton import Rig, Transform
 
@@ -27,7 +26,7 @@ class Effector:
     weight: Float[Array, " legs"]  # 0..1, share of foot IK
 
 
-class AbstractEffector(eqx.Module):
+class AbstractEffector(Rule):
     """Follows the targets."""
 
     @abstractmethod
@@ -82,8 +81,16 @@ class HeelEffector(AbstractInstantEffector):
     (as the heel lift of locomotion systems after Johansen, 2009).
     """
 
-    extension: Leaf = parameter(0.98, unit="1", low=0.8, high=1.0)
-    max_lift: Leaf = parameter(0.60, unit="rad", low=0.0, high=1.2)
+    extension: Leaf = parameter(
+        0.98,
+        unit="1",
+        low=0.8,
+        high=1.0,
+        doc="Part of its length to which a leg stretches before the heel rises.",
+    )
+    max_lift: Leaf = parameter(
+        0.60, unit="rad", low=0.0, high=1.2, doc="Largest angle by which the heel is lifted."
+    )
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -145,10 +152,32 @@ class BodyEffector(AbstractEffector):
     freezes short of its goal, which is the original's trap. Off is recommended.
     """
 
-    speed: Leaf = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
-    latch: Leaf = switch(False)
-    latch_distance: Leaf = parameter(0.01, unit="m", low=0.0, high=0.05, kind="threshold")
-    mesh_scale: Leaf = parameter(1.0, unit="1", low=0.5, high=2.0)
+    speed: Leaf = parameter(
+        15.0,
+        unit="1/s",
+        low=0.5,
+        high=30.0,
+        scale="log",
+        doc="Rate at which feet follow their heights relative to the body.",
+    )
+    latch: Leaf = switch(
+        False, doc="Whether everything stops once the feet have arrived, until the character moves."
+    )
+    latch_distance: Leaf = parameter(
+        0.01,
+        unit="m",
+        low=0.0,
+        high=0.05,
+        kind="threshold",
+        doc="Distance from its goal within which a foot counts as arrived.",
+    )
+    mesh_scale: Leaf = parameter(
+        1.0,
+        unit="1",
+        low=0.5,
+        high=2.0,
+        doc="Scale of the character's mesh, by which heights of feet are divided.",
+    )
 
     def init(self, rig: Rig) -> BodyState:
         return BodyState(jnp.zeros_like(rig.side), jnp.zeros((), rig.side.dtype))
@@ -199,7 +228,9 @@ class FadeEffector(AbstractEffector):
     animation, and the same turn.
     """
 
-    transition_time: Leaf = parameter(0.20, unit="s", low=0.0, high=1.0)
+    transition_time: Leaf = parameter(
+        0.20, unit="s", low=0.0, high=1.0, doc="Time in which foot IK of a leg fades in or out."
+    )
 
     def init(self, rig: Rig) -> FadeState:
         upright = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))

@@ -2,13 +2,12 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.aim import aim_rotation
 from jaxik.solvers.two_bone import rotation_about
@@ -38,7 +37,7 @@ class Planted:
     reached: Float[Array, " legs"]  # 1 where the foot is turned as the ground asks, else 0
 
 
-class AbstractFoot(eqx.Module):
+class AbstractFoot(Rule):
     """Turns feet."""
 
     @abstractmethod
@@ -67,10 +66,34 @@ class PitchRollFoot(AbstractAnimatedFoot):
     sides, A16). They limit what the ground adds: an animation beyond its limits stays as it is.
     """
 
-    max_pitch: Leaf = parameter(0.52, unit="rad", low=0.0, high=1.4)
-    min_pitch: Leaf = parameter(-0.79, unit="rad", low=-1.4, high=0.0)
-    max_roll: Leaf = parameter(0.26, unit="rad", low=0.0, high=1.0)
-    min_roll: Leaf = parameter(-0.52, unit="rad", low=-1.0, high=0.0)
+    max_pitch: Leaf = parameter(
+        0.52,
+        unit="rad",
+        low=0.0,
+        high=1.4,
+        doc="Largest pitch against the shin, toes up, to which the ground turns a foot.",
+    )
+    min_pitch: Leaf = parameter(
+        -0.79,
+        unit="rad",
+        low=-1.4,
+        high=0.0,
+        doc="Largest pitch against the shin, toes down, as a negative angle.",
+    )
+    max_roll: Leaf = parameter(
+        0.26,
+        unit="rad",
+        low=0.0,
+        high=1.0,
+        doc="Largest roll against the shin, outer edge up, to which the ground turns a foot.",
+    )
+    min_roll: Leaf = parameter(
+        -0.52,
+        unit="rad",
+        low=-1.0,
+        high=0.0,
+        doc="Largest roll against the shin, outer edge down, as a negative angle.",
+    )
 
     def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
         rig, frame, gate = inputs.rig, inputs.frame, inputs.gate
@@ -107,10 +130,20 @@ class AimFoot(AbstractAnimatedFoot):
     turned by `twist`. A leg without ground, or with `enabled` off, keeps its foot as carried.
     """
 
-    enabled: Leaf = switch(True)
-    offset: Leaf = parameter((0.0, 0.0, 0.0), unit="m", low=-0.2, high=0.2)
-    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
+    enabled: Leaf = switch(True, doc="Whether feet are turned to the ground.")
+    offset: Leaf = parameter(
+        (0.0, 0.0, 0.0),
+        unit="m",
+        low=-0.2,
+        high=0.2,
+        doc="Where the axis out of the sole starts, from the ankle, in foot axes.",
+    )
+    twist: Leaf = parameter(
+        0.0, unit="rad", low=-1.0, high=1.0, doc="Turn of the foot about its aim."
+    )
+    weight: Leaf = parameter(
+        1.0, unit="1", low=0.0, high=1.0, doc="How far feet are turned to the ground, 0 to 1."
+    )
 
     def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
         rig, frame = inputs.rig, inputs.frame
@@ -134,7 +167,9 @@ class FlatFoot(AbstractFoot):
     zero. Both tilt a foot that stands upright along its up, by `max_tilt` at most.
     """
 
-    max_tilt: Leaf = parameter(0.7853981634, unit="rad", low=0.0, high=1.5)
+    max_tilt: Leaf = parameter(
+        0.7853981634, unit="rad", low=0.0, high=1.5, doc="Largest angle by which a foot is tilted."
+    )
 
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
         up_ws = inputs.terrain.leg_up_ws

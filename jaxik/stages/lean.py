@@ -2,12 +2,11 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, constant, gain_parameter, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact, GroundHits, Slope, heading
 from jaxik.world.skeleton import Rig
@@ -23,7 +22,7 @@ class Lean:
     normal_ws: Float[Array, "3"]  # unit, the smoothed ground normal
 
 
-class AbstractLean(eqx.Module):
+class AbstractLean(Rule):
     """Leans the body."""
 
     @abstractmethod
@@ -59,16 +58,48 @@ class SlopeLean(AbstractLean):
     half-lives of the same gains.
     """
 
-    forward_rate: Leaf = parameter(-0.30, unit="1", low=-1.0, high=1.0)
-    side_rate: Leaf = parameter(-0.10, unit="1", low=-1.0, high=1.0)
-    forward_rate_slide: Leaf = parameter(0.80, unit="1", low=-1.0, high=1.0)
-    side_rate_slide: Leaf = parameter(0.60, unit="1", low=-1.0, high=1.0)
-    gain: Leaf = parameter(0.19, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    gain_slide: Leaf = parameter(0.294, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    slide_on_gain: Leaf = parameter(0.226, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    slide_off_gain: Leaf = parameter(0.135, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    spring: Leaf = switch(False)
-    tick_hz: Leaf = constant(30.0)
+    forward_rate: Leaf = parameter(
+        -0.30,
+        unit="1",
+        low=-1.0,
+        high=1.0,
+        doc="Lean forward per slope ahead; 1 is square to the ground, below 0 into the hill.",
+    )
+    side_rate: Leaf = parameter(
+        -0.10,
+        unit="1",
+        low=-1.0,
+        high=1.0,
+        doc="Lean sideways per slope aside; 1 is square to the ground, below 0 into the hill.",
+    )
+    forward_rate_slide: Leaf = parameter(
+        0.80,
+        unit="1",
+        low=-1.0,
+        high=1.0,
+        doc="Lean forward per slope ahead while the character slides.",
+    )
+    side_rate_slide: Leaf = parameter(
+        0.60,
+        unit="1",
+        low=-1.0,
+        high=1.0,
+        doc="Lean sideways per slope aside while the character slides.",
+    )
+    gain: Leaf = gain_parameter(
+        0.19, doc="Part of the gap that the smoothed slope closes in each tick."
+    )
+    gain_slide: Leaf = gain_parameter(
+        0.294, doc="Part of the gap that the smoothed slope closes in each tick of a slide."
+    )
+    slide_on_gain: Leaf = gain_parameter(
+        0.226, doc="Part of the way into sliding rates covered in each tick as a slide begins."
+    )
+    slide_off_gain: Leaf = gain_parameter(
+        0.135, doc="Part of the way out of sliding rates covered in each tick as a slide ends."
+    )
+    spring: Leaf = switch(False, doc="Whether the slope is smoothed by a critically damped spring.")
+    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
 
     def init(self, rig: Rig) -> LeanState:
         zero = jnp.zeros((), rig.side.dtype)

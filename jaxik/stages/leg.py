@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.two_bone import (
     LENGTH_BAND,
@@ -46,7 +46,7 @@ class LegGoal:
     weight: Float[Array, " legs"]  # 0..1
 
 
-class AbstractLeg(eqx.Module):
+class AbstractLeg(Rule):
     """Solves legs."""
 
     weight: eqx.AbstractVar[Array]  # 0..1, share of foot IK
@@ -69,12 +69,36 @@ class TwoBone(AbstractLeg):
     leg with a zero bone, or lying along its hinge, does not bend.
     """
 
-    max_knee_angle: Leaf = parameter(3.0000531803, unit="rad", low=2.0, high=3.1415926536)
-    min_knee_angle: Leaf = parameter(0.6982008392, unit="rad", low=0.0, high=1.8)
-    soften: Leaf = parameter(0.98, unit="1", low=0.8, high=1.0)
-    as_animated: Leaf = switch(False)
-    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
+    max_knee_angle: Leaf = parameter(
+        3.0000531803,
+        unit="rad",
+        low=2.0,
+        high=3.1415926536,
+        doc="Largest interior angle of the knee; pi is a straight leg.",
+    )
+    min_knee_angle: Leaf = parameter(
+        0.6982008392, unit="rad", low=0.0, high=1.8, doc="Smallest interior angle of the knee."
+    )
+    soften: Leaf = parameter(
+        0.98,
+        unit="1",
+        low=0.8,
+        high=1.0,
+        doc="Part of its reach beyond which a leg slows down instead of snapping straight.",
+    )
+    as_animated: Leaf = switch(
+        False, doc="Whether a leg may stay as straight or bent as animated, beyond the limits."
+    )
+    twist: Leaf = parameter(
+        0.0,
+        unit="rad",
+        low=-1.0,
+        high=1.0,
+        doc="Turn of the leg about the line from hip to target.",
+    )
+    weight: Leaf = parameter(
+        1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
+    )
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
         return self.solve(inputs.rig, goal, inputs.gate)
@@ -123,10 +147,24 @@ class PoleLeg(AbstractLeg):
     bone and whose z is the hinge. With `enabled` off the leg stays as the body carries it.
     """
 
-    enabled: Leaf = switch(True)
-    soften: Leaf = parameter(1.0, unit="1", low=0.1, high=1.0)
-    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
+    enabled: Leaf = switch(True, doc="Whether legs are solved.")
+    soften: Leaf = parameter(
+        1.0,
+        unit="1",
+        low=0.1,
+        high=1.0,
+        doc="Part of its reach beyond which a leg slows down instead of snapping straight.",
+    )
+    twist: Leaf = parameter(
+        0.0,
+        unit="rad",
+        low=-1.0,
+        high=1.0,
+        doc="Turn of the leg about the line from hip to target.",
+    )
+    weight: Leaf = parameter(
+        1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
+    )
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
         _, to_ankle, hinge = bones(inputs.rig, goal.pose)
@@ -142,10 +180,30 @@ class HintLeg(AbstractLeg):
     `hint_offset`, in the character's axes (x left, y up, z forward).
     """
 
-    hint_offset: Leaf = parameter((0.0, 0.0, 0.0), unit="m", low=-0.5, high=0.5)
-    soften: Leaf = parameter(1.0, unit="1", low=0.1, high=1.0)
-    twist: Leaf = parameter(0.0, unit="rad", low=-1.0, high=1.0)
-    weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
+    hint_offset: Leaf = parameter(
+        (0.0, 0.0, 0.0),
+        unit="m",
+        low=-0.5,
+        high=0.5,
+        doc="Offset of the knee's aim in character axes (x left, y up, z forward).",
+    )
+    soften: Leaf = parameter(
+        1.0,
+        unit="1",
+        low=0.1,
+        high=1.0,
+        doc="Part of its reach beyond which a leg slows down instead of snapping straight.",
+    )
+    twist: Leaf = parameter(
+        0.0,
+        unit="rad",
+        low=-1.0,
+        high=1.0,
+        doc="Turn of the leg about the line from hip to target.",
+    )
+    weight: Leaf = parameter(
+        1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
+    )
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
         frame = inputs.frame

@@ -2,12 +2,11 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import cast
@@ -29,7 +28,7 @@ class Held:
     locked: Float[Array, " legs"]  # 1 where the foot keeps its place
 
 
-class AbstractLock(eqx.Module):
+class AbstractLock(Rule):
     """Keeps feet in place."""
 
     @abstractmethod
@@ -86,24 +85,80 @@ class OffsetLock(AbstractLock):
     is at most `relock_threshold`.
     """
 
-    enabled: Leaf = switch(True)
-    hold_ball: Leaf = switch(False)
+    enabled: Leaf = switch(True, doc="Whether planted feet are locked in place.")
+    hold_ball: Leaf = switch(
+        False, doc="Whether a lock holds the ball only, so that the heel can rise."
+    )
     release_min_angle: Leaf = parameter(
-        0.8726646260, unit="rad", low=0.0, high=1.8, kind="threshold"
+        0.8726646260,
+        unit="rad",
+        low=0.0,
+        high=1.8,
+        kind="threshold",
+        doc="A lock lets go if it would bend the knee below this interior angle.",
     )
     release_max_angle: Leaf = parameter(
-        3.0019663134, unit="rad", low=2.0, high=3.1415926536, kind="threshold"
+        3.0019663134,
+        unit="rad",
+        low=2.0,
+        high=3.1415926536,
+        kind="threshold",
+        doc="A lock lets go if it would open the knee beyond this interior angle.",
     )
-    release_cone: Leaf = parameter(0.4363323130, unit="rad", low=0.0, high=1.5, kind="threshold")
-    release_distance: Leaf = parameter(0.20, unit="m", low=0.0, high=0.5, kind="threshold")
+    release_cone: Leaf = parameter(
+        0.4363323130,
+        unit="rad",
+        low=0.0,
+        high=1.5,
+        kind="threshold",
+        doc="A lock lets go if the leg would leave its animated direction by this angle.",
+    )
+    release_distance: Leaf = parameter(
+        0.20,
+        unit="m",
+        low=0.0,
+        high=0.5,
+        kind="threshold",
+        doc="A lock lets go if the foot would be this far from its foothold.",
+    )
     release_heading: Leaf = parameter(
-        3.1415926536, unit="rad", low=0.1, high=3.1415926536, kind="threshold"
+        3.1415926536,
+        unit="rad",
+        low=0.1,
+        high=3.1415926536,
+        kind="threshold",
+        doc="A lock lets go if the animated foot points away by this angle.",
     )
-    release_speed: Leaf = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
-    relock_threshold: Leaf = parameter(0.20, unit="1", low=0.0, high=1.0, kind="threshold")
-    max_speed: Leaf = parameter(float("inf"), unit="m/s", low=0.0, high=3.0, kind="threshold")
-    lock_half_life: Leaf = parameter(0.05, unit="s", low=0.002, high=0.5, scale="log")
-    unlock_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
+    release_speed: Leaf = parameter(
+        float("inf"),
+        unit="m/s",
+        low=0.0,
+        high=3.0,
+        kind="threshold",
+        doc="A lock lets go if the foot would otherwise move faster than this.",
+    )
+    relock_threshold: Leaf = parameter(
+        0.20,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        kind="threshold",
+        doc="A released foot can lock again once its lock has faded to this weight.",
+    )
+    max_speed: Leaf = parameter(
+        float("inf"),
+        unit="m/s",
+        low=0.0,
+        high=3.0,
+        kind="threshold",
+        doc="A foot locks only while it is slower than this.",
+    )
+    lock_half_life: Leaf = half_life_parameter(
+        0.05, doc="Time in which a new lock reaches half its hold."
+    )
+    unlock_half_life: Leaf = half_life_parameter(
+        0.10, doc="Time in which a released foot covers half its way back to the foothold."
+    )
 
     def init(self, rig: Rig) -> LockState:
         each = jnp.zeros_like(rig.side)
@@ -207,9 +262,18 @@ class PlantLock(AbstractLock):
     enable planting over time, or leave the speed endless to set it at once. Follows a platform.
     """
 
-    plant: Leaf = switch(True)
-    plant_weight: Leaf = parameter(1.0, unit="1", low=0.0, high=1.0)
-    plant_speed: Leaf = parameter(float("inf"), unit="1/s", low=0.1, high=20.0, scale="log")
+    plant: Leaf = switch(True, doc="Whether a foot stays where it first found ground.")
+    plant_weight: Leaf = parameter(
+        1.0, unit="1", low=0.0, high=1.0, doc="How much a planted foot keeps its place, 0 to 1."
+    )
+    plant_speed: Leaf = parameter(
+        float("inf"),
+        unit="1/s",
+        low=0.1,
+        high=20.0,
+        scale="log",
+        doc="Rate at which planting moves to its weight; infinite sets it at once.",
+    )
 
     def init(self, rig: Rig) -> PlantState:
         each = jnp.zeros_like(rig.side)

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    Rule,
+    constant,
+    gain_parameter,
+    half_life_parameter,
+    parameter,
+    switch,
+)
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform
@@ -52,7 +60,7 @@ class PelvisMoment(SensedMoment):
     awake: Float[Array, ""]  # 0 while the body is to stay where it is, else 1
 
 
-class AbstractPelvis(eqx.Module):
+class AbstractPelvis(Rule):
     """Moves the body."""
 
     def init(self, rig: Rig) -> PelvisState:
@@ -72,12 +80,20 @@ class LowestPelvis(AbstractPelvis):
     goal is 0. Without a limit and with gains of 1 it is ozz's pelvis correction.
     """
 
-    enabled: Leaf = switch(True)
-    limit: Leaf = parameter(0.30, unit="m", low=0.0, high=0.6)
-    on_gain: Leaf = parameter(0.225, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    off_gain: Leaf = parameter(0.116, unit="1/tick", low=0.01, high=0.95, scale="gain")
-    vertical_only: Leaf = switch(True)
-    tick_hz: Leaf = constant(30.0)
+    enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
+    limit: Leaf = parameter(
+        0.30, unit="m", low=0.0, high=0.6, doc="Furthest that the pelvis moves up or down."
+    )
+    on_gain: Leaf = gain_parameter(
+        0.225, doc="Part of the gap that the pelvis closes in each tick while a foot stands."
+    )
+    off_gain: Leaf = gain_parameter(
+        0.116, doc="Part of the gap that the pelvis closes in each tick while no foot stands."
+    )
+    vertical_only: Leaf = switch(
+        True, doc="Whether the pelvis moves along up, or along the ground's normal."
+    )
+    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
@@ -109,9 +125,18 @@ class CapsulePelvis(AbstractPelvis):
     law. With `enabled` off both go back.
     """
 
-    enabled: Leaf = switch(True)
-    speed: Leaf = parameter(15.0, unit="1/s", low=0.5, high=30.0, scale="log")
-    half_height: Leaf = parameter(0.90, unit="m", low=0.3, high=2.0)
+    enabled: Leaf = switch(True, doc="Whether the pelvis sinks.")
+    speed: Leaf = parameter(
+        15.0,
+        unit="1/s",
+        low=0.5,
+        high=30.0,
+        scale="log",
+        doc="Rate at which pelvis and capsule follow their goals.",
+    )
+    half_height: Leaf = parameter(
+        0.90, unit="m", low=0.3, high=2.0, doc="Half the height of the character's capsule at rest."
+    )
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
@@ -139,11 +164,33 @@ class LegLengthPelvis(AbstractPelvis):
     height asks for the one that comes nearest. Damped, the offset follows by the clamped-speed law.
     """
 
-    enabled: Leaf = switch(True)
-    min_length: Leaf = parameter(0.50, unit="m", low=0.0, high=1.0)
-    max_length: Leaf = parameter(0.88, unit="m", low=0.2, high=1.5, above="min_length")
-    damp: Leaf = switch(True)
-    speed: Leaf = parameter(10.0, unit="1/s", low=0.5, high=30.0, scale="log")
+    enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
+    min_length: Leaf = parameter(
+        0.50,
+        unit="m",
+        low=0.0,
+        high=1.0,
+        doc="Shortest distance from hip to ankle that the pelvis allows.",
+    )
+    max_length: Leaf = parameter(
+        0.88,
+        unit="m",
+        low=0.2,
+        high=1.5,
+        above="min_length",
+        doc="Longest distance from hip to ankle that the pelvis allows.",
+    )
+    damp: Leaf = switch(
+        True, doc="Whether the pelvis follows its goal smoothly; if not, it jumps there."
+    )
+    speed: Leaf = parameter(
+        10.0,
+        unit="1/s",
+        low=0.5,
+        high=30.0,
+        scale="log",
+        doc="Rate at which the pelvis follows its goal.",
+    )
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
@@ -202,10 +249,20 @@ class SupportPelvis(AbstractFollowingPelvis):
     before reach was thought of (the blocks benchmark's table).
     """
 
-    lowest_share: Leaf = parameter(0.30, unit="1", low=0.0, high=1.0)
-    rise_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
-    fall_half_life: Leaf = parameter(0.10, unit="s", low=0.002, high=0.5, scale="log")
-    spring: Leaf = switch(False)
+    lowest_share: Leaf = parameter(
+        0.30,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        doc="Weight of the lowest foot against the mean of those that stand, 0 to 1.",
+    )
+    rise_half_life: Leaf = half_life_parameter(
+        0.10, doc="Time in which the pelvis covers half its way up."
+    )
+    fall_half_life: Leaf = half_life_parameter(
+        0.10, doc="Time in which the pelvis covers half its way down."
+    )
+    spring: Leaf = switch(False, doc="Whether the pelvis moves as a critically damped spring.")
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
@@ -228,12 +285,35 @@ class ReachPelvis(AbstractFollowingPelvis):
     Found on the blocks benchmark, where reach explains most of a walker's pelvis height.
     """
 
-    highest_share: Leaf = parameter(0.75, unit="1", low=0.0, high=1.2)
-    extension: Leaf = parameter(0.958, unit="1", low=0.85, high=1.0)
-    softness: Leaf = parameter(0.025, unit="m", low=0.002, high=0.1, scale="log")
-    rise_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    fall_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    spring: Leaf = switch(False)
+    highest_share: Leaf = parameter(
+        0.75,
+        unit="1",
+        low=0.0,
+        high=1.2,
+        doc="Weight of the highest foot against the mean of all, 0 to 1.",
+    )
+    extension: Leaf = parameter(
+        0.958,
+        unit="1",
+        low=0.85,
+        high=1.0,
+        doc="Part of its length to which a leg may be stretched.",
+    )
+    softness: Leaf = parameter(
+        0.025,
+        unit="m",
+        low=0.002,
+        high=0.1,
+        scale="log",
+        doc="Height over which the limits of the legs blend into each other.",
+    )
+    rise_half_life: Leaf = half_life_parameter(
+        0.0, doc="Time in which the pelvis covers half its way up."
+    )
+    fall_half_life: Leaf = half_life_parameter(
+        0.0, doc="Time in which the pelvis covers half its way down."
+    )
+    spring: Leaf = switch(False, doc="Whether the pelvis moves as a critically damped spring.")
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate

@@ -4,14 +4,13 @@ import dataclasses
 from abc import abstractmethod
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
@@ -23,7 +22,7 @@ SPEED_BAND = 0.05  # m/s
 MARGIN = 0.1  # m by which a ray is cast beyond its reach, so that a softened end has two sides
 
 
-class AbstractProbe(eqx.Module):
+class AbstractProbe(Rule):
     """Looks for ground."""
 
     @abstractmethod
@@ -34,10 +33,32 @@ class AbstractProbe(eqx.Module):
 class FootProbe(AbstractProbe):
     """A ray at the ankle and, if wanted, one at the toe (record: useFootEndRay; ozz without it)."""
 
-    ray_up: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
-    ray_down: Leaf = parameter(0.80, unit="m", low=0.0, high=2.0, kind="threshold")
-    toe_ls: Leaf = parameter((0.0, -0.07, 0.20), unit="m", low=-0.4, high=0.4)
-    use_toe: Leaf = switch(True)
+    ray_up: Leaf = parameter(
+        0.50,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Height above ankle and toe at which the rays start.",
+    )
+    ray_down: Leaf = parameter(
+        0.80,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Depth below ankle and toe to which the rays look.",
+    )
+    toe_ls: Leaf = parameter(
+        (0.0, -0.07, 0.20),
+        unit="m",
+        low=-0.4,
+        high=0.4,
+        doc="Toe of a left foot from its ankle, in foot axes (x left, y up, z forward).",
+    )
+    use_toe: Leaf = switch(
+        True, doc="Whether a second ray, at the toe, measures the pitch of the ground."
+    )
     layers: Leaf = parameter_tree.layers()
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
@@ -59,8 +80,22 @@ class RootProbe(AbstractProbe):
     to `ray_down` (the trace distance) under it.
     """
 
-    ray_up: Leaf = parameter(0.90, unit="m", low=0.0, high=2.0, kind="threshold")
-    ray_down: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_up: Leaf = parameter(
+        0.90,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Height above the character's origin at which rays start: its capsule's centre.",
+    )
+    ray_down: Leaf = parameter(
+        0.50,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Depth below the character's origin to which rays look.",
+    )
     layers: Leaf = parameter_tree.layers()
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
@@ -81,19 +116,72 @@ class CornerProbe(AbstractProbe):
     stable the foot is: the longer one while it is low, slow, or both, as the switches ask.
     """
 
-    active: Leaf = switch(True)
-    ray_up: Leaf = parameter(0.50, unit="m", low=0.0, high=2.0, kind="threshold")
-    foot_length: Leaf = parameter(0.20, unit="m", low=0.02, high=0.5)
-    half_width: Leaf = parameter(0.05, unit="m", low=0.01, high=0.2)
-    extra: Leaf = parameter(0.20, unit="m", low=0.0, high=1.0, kind="threshold")
-    by_height: Leaf = switch(True)
-    by_speed: Leaf = switch(False)
-    extra_min: Leaf = parameter(0.0, unit="m", low=0.0, high=1.0, kind="threshold")
-    extra_max: Leaf = parameter(
-        0.30, unit="m", low=0.0, high=1.0, kind="threshold", above="extra_min"
+    active: Leaf = switch(
+        True, doc="Whether the leg looks for ground; if not, it stays as animated."
     )
-    stable_height: Leaf = parameter(0.12, unit="m", low=0.0, high=0.5, kind="threshold")
-    stable_speed: Leaf = parameter(0.50, unit="m/s", low=0.0, high=3.0, kind="threshold")
+    ray_up: Leaf = parameter(
+        0.50,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Height above the foot at which rays start.",
+    )
+    foot_length: Leaf = parameter(
+        0.20, unit="m", low=0.02, high=0.5, doc="Distance forward from the foot to the toe's ray."
+    )
+    half_width: Leaf = parameter(
+        0.05,
+        unit="m",
+        low=0.01,
+        high=0.2,
+        doc="Distance to the right from the foot to the corner's ray.",
+    )
+    extra: Leaf = parameter(
+        0.20,
+        unit="m",
+        low=0.0,
+        high=1.0,
+        kind="threshold",
+        doc="How far rays look below the sole where neither height nor speed sets it.",
+    )
+    by_height: Leaf = switch(
+        True, doc="Whether rays look deeper below a foot that is low over the root."
+    )
+    by_speed: Leaf = switch(False, doc="Whether rays look deeper below a foot that is slow.")
+    extra_min: Leaf = parameter(
+        0.0,
+        unit="m",
+        low=0.0,
+        high=1.0,
+        kind="threshold",
+        doc="How far rays look below the sole of an unstable foot.",
+    )
+    extra_max: Leaf = parameter(
+        0.30,
+        unit="m",
+        low=0.0,
+        high=1.0,
+        kind="threshold",
+        above="extra_min",
+        doc="How far rays look below the sole of a stable foot.",
+    )
+    stable_height: Leaf = parameter(
+        0.12,
+        unit="m",
+        low=0.0,
+        high=0.5,
+        kind="threshold",
+        doc="Height over the root below which a foot counts as stable.",
+    )
+    stable_speed: Leaf = parameter(
+        0.50,
+        unit="m/s",
+        low=0.0,
+        high=3.0,
+        kind="threshold",
+        doc="Speed below which a foot counts as stable.",
+    )
     layers: Leaf = parameter_tree.layers()
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:

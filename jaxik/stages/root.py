@@ -2,18 +2,17 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.world.terrain import cast
 
 from .inputs import Inputs
 
 
-class AbstractRoot(eqx.Module):
+class AbstractRoot(Rule):
     """Moves the whole character before its legs look for ground."""
 
     @abstractmethod
@@ -34,9 +33,23 @@ class GroundRoot(AbstractRoot):
     Where no ground is found, or with `enabled` off, it stays.
     """
 
-    enabled: Leaf = switch(True)
-    ray_up: Leaf = parameter(10.0, unit="m", low=0.0, high=20.0, kind="threshold")
-    ray_down: Leaf = parameter(float("inf"), unit="m", low=0.0, high=20.0, kind="threshold")
+    enabled: Leaf = switch(True, doc="Whether the character is placed on the ground.")
+    ray_up: Leaf = parameter(
+        10.0,
+        unit="m",
+        low=0.0,
+        high=20.0,
+        kind="threshold",
+        doc="Height above the character's origin at which the ray starts.",
+    )
+    ray_down: Leaf = parameter(
+        float("inf"),
+        unit="m",
+        low=0.0,
+        high=20.0,
+        kind="threshold",
+        doc="Depth below the character's origin to which the ray looks.",
+    )
     layers: Leaf = parameter_tree.layers()
 
     def sense(self, inputs: Inputs) -> Float[Array, ""]:

@@ -40,20 +40,94 @@ class StrideProbe(AbstractProbe):
     animation lifts them, less `clearance`.
     """
 
-    ray_up: Leaf = parameter(1.0, unit="m", low=0.0, high=2.0, kind="threshold")
-    ray_down: Leaf = parameter(1.0, unit="m", low=0.0, high=2.0, kind="threshold")
+    ray_up: Leaf = parameter(
+        1.0,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Height above the character's level at which rays start.",
+    )
+    ray_down: Leaf = parameter(
+        1.0,
+        unit="m",
+        low=0.0,
+        high=2.0,
+        kind="threshold",
+        doc="Depth below the character's level to which rays look.",
+    )
     layers: Leaf = parameter_tree.layers()
-    rise_start: Leaf = parameter(0.0, unit="1", low=0.0, high=0.45)
-    rise_end: Leaf = parameter(1.0, unit="1", low=0.55, high=1.0, above="rise_start")
-    steepness: Leaf = parameter(1.875, unit="1", low=1.0, high=4.0)
-    max_step: Leaf = parameter(0.60, unit="m", low=0.1, high=1.0)
-    max_slope: Leaf = parameter(1.05, unit="rad", low=0.1, high=1.4)
-    clearance: Leaf = parameter(0.0, unit="m", low=-0.1, high=0.1)
-    way_slope: Leaf = parameter(1.5, unit="1", low=0.2, high=5.0, scale="log")
-    heel_length: Leaf = parameter(0.07, unit="m", low=0.0, high=0.2)
-    ball_height: Leaf = parameter(0.055, unit="m", low=0.0, high=0.15)
-    stance_time: Leaf = parameter(0.65, unit="s", low=0.2, high=1.5)
-    swing_time: Leaf = parameter(0.45, unit="s", low=0.1, high=1.0)
+    rise_start: Leaf = parameter(
+        0.0,
+        unit="1",
+        low=0.0,
+        high=0.45,
+        doc="Part of the swing after which the foot begins to change its height.",
+    )
+    rise_end: Leaf = parameter(
+        1.0,
+        unit="1",
+        low=0.55,
+        high=1.0,
+        above="rise_start",
+        doc="Part of the swing after which the foot has its next foothold's height.",
+    )
+    steepness: Leaf = parameter(
+        1.875,
+        unit="1",
+        low=1.0,
+        high=4.0,
+        doc="How much faster than evenly the height changes in the middle of the swing.",
+    )
+    max_step: Leaf = parameter(
+        0.60,
+        unit="m",
+        low=0.1,
+        high=1.0,
+        doc="Height of a step up or down above which the next foothold is ignored.",
+    )
+    max_slope: Leaf = parameter(
+        1.05,
+        unit="rad",
+        low=0.1,
+        high=1.4,
+        doc="Slope of the ground above which the next foothold is ignored.",
+    )
+    clearance: Leaf = parameter(
+        0.0,
+        unit="m",
+        low=-0.1,
+        high=0.1,
+        doc="How much of its animated lift a foot may lose as it passes over an edge.",
+    )
+    way_slope: Leaf = parameter(
+        1.5,
+        unit="1",
+        low=0.2,
+        high=5.0,
+        scale="log",
+        doc="Slope, rise over run, at which a foot climbs to an edge and descends from it.",
+    )
+    heel_length: Leaf = parameter(
+        0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
+    )
+    ball_height: Leaf = parameter(
+        0.055, unit="m", low=0.0, high=0.15, doc="Height of the ball joint above the sole."
+    )
+    stance_time: Leaf = parameter(
+        0.65,
+        unit="s",
+        low=0.2,
+        high=1.5,
+        doc="How long a foot stands, where the animation does not give its footholds.",
+    )
+    swing_time: Leaf = parameter(
+        0.45,
+        unit="s",
+        low=0.1,
+        high=1.0,
+        doc="How long a foot swings, where the animation does not give its footholds.",
+    )
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         terrain, frame = inputs.terrain, inputs.frame

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Contact, Foothold, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
@@ -18,7 +18,7 @@ from .inputs import Inputs, SensedMoment
 HEIGHT_BAND = 0.01  # m
 
 
-class AbstractTarget(eqx.Module):
+class AbstractTarget(Rule):
     """Places footholds."""
 
     foot_height: eqx.AbstractVar[Array]  # m, sole to ankle
@@ -64,13 +64,31 @@ class SlopeTarget(AbstractTarget):
     the foothold is the animation's own.
     """
 
-    min_ankle_height: Leaf = parameter(-0.30, unit="m", low=-1.0, high=0.5)
-    max_ankle_height: Leaf = parameter(0.55, unit="m", low=0.0, high=1.5)
-    foot_height: Leaf = parameter(0.08, unit="m", low=0.0, high=0.2)
-    max_slope: Leaf = parameter(1.0471975512, unit="rad", low=0.1, high=1.5)
-    rise_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    fall_half_life: Leaf = parameter(0.0, unit="s", low=0.002, high=0.5, scale="log")
-    spring: Leaf = switch(False)
+    min_ankle_height: Leaf = parameter(
+        -0.30, unit="m", low=-1.0, high=0.5, doc="Lowest height of the ankle in model space."
+    )
+    max_ankle_height: Leaf = parameter(
+        0.55, unit="m", low=0.0, high=1.5, doc="Highest height of the ankle in model space."
+    )
+    foot_height: Leaf = parameter(
+        0.08, unit="m", low=0.0, high=0.2, doc="Height of the ankle above the sole."
+    )
+    max_slope: Leaf = parameter(
+        1.0471975512,
+        unit="rad",
+        low=0.1,
+        high=1.5,
+        doc="Steepest slope that is compensated; steeper ground counts as this steep.",
+    )
+    rise_half_life: Leaf = half_life_parameter(
+        0.0, doc="Time in which a foothold covers half its way up to higher ground."
+    )
+    fall_half_life: Leaf = half_life_parameter(
+        0.0, doc="Time in which a foothold covers half its way down to lower ground."
+    )
+    spring: Leaf = switch(
+        False, doc="Whether footholds follow the ground as a critically damped spring."
+    )
 
     def init(self, rig: Rig) -> TargetState:
         zero = jnp.zeros_like(rig.side)
@@ -116,8 +134,16 @@ class SoleTarget(AbstractInstantTarget):
     Where no ground was found the foothold is the animation's own.
     """
 
-    foot_height: Leaf = parameter(0.12, unit="m", low=0.0, high=0.2)
-    max_slope: Leaf = parameter(1.5, unit="rad", low=0.1, high=1.5)
+    foot_height: Leaf = parameter(
+        0.12, unit="m", low=0.0, high=0.2, doc="Height of the ankle above the sole."
+    )
+    max_slope: Leaf = parameter(
+        1.5,
+        unit="rad",
+        low=0.1,
+        high=1.5,
+        doc="Steepest slope that is compensated; steeper ground counts as this steep.",
+    )
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
@@ -134,7 +160,13 @@ class ContactTarget(AbstractInstantTarget):
     Where no ground was found the foothold is the animation's own.
     """
 
-    foot_height: Leaf = parameter(0.10, unit="m", low=0.0, high=0.2)
+    foot_height: Leaf = parameter(
+        0.10,
+        unit="m",
+        low=0.0,
+        high=0.2,
+        doc="Height of the ankle above the ground, on slopes too.",
+    )
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
@@ -153,7 +185,9 @@ class RootTarget(AbstractInstantTarget):
     stand, stays where it is.
     """
 
-    adjust: Leaf = parameter(0.0, unit="m", low=-0.1, high=0.1)
+    adjust: Leaf = parameter(
+        0.0, unit="m", low=-0.1, high=0.1, doc="Height added to every foot that stands."
+    )
 
     @property
     def foot_height(self) -> Array:

@@ -1,5 +1,7 @@
 """Rules: parameters that know their unit and range, and trees of them by dotted name."""
 
+from dataclasses import fields
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,21 +10,40 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxik.maths import parameter_tree
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    Rule,
+    constant,
+    gain_parameter,
+    half_life_parameter,
+    layers,
+    parameter,
+    switch,
+)
 
 
-class Lift(eqx.Module):
-    height: jax.Array = parameter_tree.parameter(0.1, unit="m", low=0.0, high=0.5)
-    top: jax.Array = parameter_tree.parameter(
-        (0.2, 0.3), unit="m", low=0.0, high=1.0, kind="threshold", above="height"
+class Lift(Rule):
+    height: Leaf = parameter(0.1, unit="m", low=0.0, high=0.5, doc="Height of the foot.")
+    top: Leaf = parameter(
+        (0.2, 0.3),
+        unit="m",
+        low=0.0,
+        high=1.0,
+        kind="threshold",
+        above="height",
+        doc="Height above which the foot is lifted.",
     )
-    gain: jax.Array = parameter_tree.parameter(0.5, unit="1/tick", low=0.0, high=1.0, scale="gain")
-    tick_hz: jax.Array = parameter_tree.constant(30.0)
-    early: jax.Array = parameter_tree.switch(True)
+    gain: Leaf = gain_parameter(0.5, doc="Part of the gap closed in each tick.")
+    half_life: Leaf = half_life_parameter(0.1, doc="Time in which half of the gap closes.")
+    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second.")
+    early: Leaf = switch(True, doc="Whether the foot is lifted early.")
+    layers: Leaf = layers()
 
 
-class Walk(eqx.Module):
+class Walk(Rule):
     lift: Lift = eqx.field(default_factory=Lift)
-    speed: jax.Array = parameter_tree.parameter(1.4, unit="m/s", low=0.0, high=3.0)
+    max_angle: Leaf = parameter(0.5, unit="rad", low=0.0, high=3.0, doc="Largest angle.")
+    speed: Leaf = parameter(1.4, unit="m/s", low=0.0, high=3.0, doc="Speed of the walk.")
 
 
 def test_parameters_and_constants_become_floats_and_switches_booleans():
@@ -31,12 +52,13 @@ def test_parameters_and_constants_become_floats_and_switches_booleans():
     assert lift.height.dtype == lift.top.dtype == lift.tick_hz.dtype == jnp.result_type(float)
     assert lift.early.dtype == bool and lift.early.shape == ()
     assert_allclose(lift.top, [0.2, 0.3])
-    assert len(jax.tree.leaves(lift)) == 5
+    assert lift.layers.dtype == jnp.uint32
+    assert len(jax.tree.leaves(lift)) == 7
 
 
 def test_what_a_user_gives_is_converted_and_arrays_stay_as_they_are():
     single = jnp.asarray(0.25, jnp.float32)
-    lift = Lift(height=1, top=[1, 2], gain=single, early=0)  # type: ignore[arg-type]
+    lift = Lift(height=1, top=[1, 2], gain=single, early=0)
     assert lift.height.dtype == lift.top.dtype == jnp.result_type(float)
     assert lift.gain is single
     assert not lift.early
@@ -53,20 +75,76 @@ def test_two_rules_do_not_share_their_defaults():
     assert Lift().height is not Lift().height
 
 
-def test_declarations_are_found_by_dotted_name_in_order_and_nothing_else_is():
-    found = parameter_tree.declarations(Walk())
-    assert list(found) == ["lift.height", "lift.top", "lift.gain", "speed"]
-    assert found["lift.height"] == parameter_tree.Declaration(
-        "m", 0.0, 0.5, "smooth", "linear", None
+def test_declarations_list_the_parameters_in_order_and_nothing_else():
+    declarations = parameter_tree.declarations(Walk())
+    lift = ["lift.height", "lift.top", "lift.gain", "lift.half_life"]
+    assert list(declarations) == [*lift, "max_angle", "speed"]
+    assert declarations["lift.height"] == parameter_tree.Declaration(
+        "m", 0.0, 0.5, "smooth", "linear", None, "Height of the foot."
     )
-    assert found["lift.top"] == parameter_tree.Declaration(
-        "m", 0.0, 1.0, "threshold", "linear", "height"
+    top = declarations["lift.top"]
+    assert (top.unit, top.low, top.high) == ("m", 0.0, 1.0)
+    assert (top.kind, top.scale, top.above) == ("threshold", "linear", "height")
+    gain, half_life = declarations["lift.gain"], declarations["lift.half_life"]
+    assert (gain.unit, gain.scale) == ("1/tick", "gain")
+    assert (half_life.unit, half_life.scale) == ("s", "log")
+
+
+def test_everything_declared_has_a_sentence_of_meaning():
+    docs = parameter_tree.docs(Walk())
+    assert docs["lift.height"] == "Height of the foot."
+    assert docs["lift.early"] == "Whether the foot is lifted early."
+    assert list(docs) == [*(f"lift.{field.name}" for field in fields(Lift)), "max_angle", "speed"]
+
+
+def test_a_parameter_needs_a_sentence_of_meaning():
+    with pytest.raises(TypeError, match="doc"):
+        parameter(0.1, unit="m", low=0.0, high=0.5)  # pyright: ignore[reportCallIssue]
+
+
+def test_printing_a_tree_of_rules_shows_values_and_units():
+    assert (
+        str(Walk())
+        == """\
+Walk
+  lift       Lift
+    height     0.1 m
+    top        [0.2, 0.3] m
+    gain       0.5 1/tick
+    half_life  0.1 s
+    tick_hz    30 Hz
+    early      on
+    layers     all
+  max_angle  0.5 rad (28.65°)
+  speed      1.4 m/s"""
     )
-    assert found["lift.gain"].scale == "gain"
+
+
+def test_printing_a_rule_shows_switches_and_layers_of_each_leg():
+    lift = Lift(height=jnp.inf, early=jnp.asarray([True, False]), layers=0b101)
+    assert repr(lift).splitlines() == [
+        "Lift",
+        "  height     inf m",
+        "  top        [0.2, 0.3] m",
+        "  gain       0.5 1/tick",
+        "  half_life  0.1 s",
+        "  tick_hz    30 Hz",
+        "  early      [on, off]",
+        "  layers     0x5",
+    ]
+
+
+def test_printing_a_batch_or_a_traced_rule_shows_shapes():
+    batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (1000, *x.shape)), Lift())
+    assert f"  height     f{8 * batch.height.dtype.itemsize}[1000] m" in repr(batch)
+    texts = []
+    jax.jit(lambda lift: texts.append(repr(lift)))(Lift())
+    assert "  early      bool[]" in texts[0].splitlines()
+    assert "None" in repr(eqx.filter(Lift(), eqx.is_inexact_array))
 
 
 def test_leaves_are_got_by_dotted_name():
-    walk = Walk(lift=Lift(height=0.3))  # type: ignore[arg-type]
+    walk = Walk(lift=Lift(height=0.3))
     assert parameter_tree.get(walk, "lift.height") is walk.lift.height
     assert parameter_tree.get(walk, "speed") is walk.speed
 
