@@ -214,7 +214,7 @@ def _shown(value: object, unit: str) -> str:
         return _listed(numbers, lambda mask: "all" if mask == ALL_LAYERS else f"{mask:#x}")
     text = _listed(numbers, "{:.4g}".format)
     if unit == "rad":
-        return f"{text} rad ({_listed(np.degrees(numbers), '{:.4g}°'.format)})"
+        return f"{text} rad ({_listed(np.asarray(np.degrees(numbers)), '{:.4g}°'.format)})"
     return text if unit == "1" else f"{text} {unit}".rstrip()
 
 
