@@ -34,6 +34,7 @@ def test_a_notebook_is_kept_without_outputs(path):
         assert "execution" not in cell.metadata, cell.source
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # the machinery's; what a notebook warns of is looked at
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
 def test_a_notebook_runs_without_errors_or_warnings(path):

@@ -21,6 +21,8 @@ from jaxik import presets
 from support.clips import assert_close
 from support.quick import TARGETS, residuals_of_scenes
 
+pytestmark = pytest.mark.slow
+
 SMALL = Sizes(
     repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2,
     crowd_repeats=1, cells=8, rays=40, read=1 << 12, side=8, fits=1, walkers=40, steps=2,

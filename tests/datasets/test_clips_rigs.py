@@ -106,6 +106,7 @@ def test_partners_are_the_other_sides():
     assert partners(names) == (1, 0, 2, 3, 5, 4, 7, 6, 9, 8, 11, 10, 12, 14, 13)
 
 
+@pytest.mark.slow
 def test_placing_agrees_with_the_jax_kinematics_and_localising_undoes_it(tmp_path):
     (tmp_path / "a.bvh").write_text(BVH)
     recording = read_bvh(tmp_path / "a.bvh")

@@ -143,6 +143,7 @@ def test_a_clip_of_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
     assert loaded.rig.names == clip.rig.names and loaded.rig.joints == clip.rig.joints
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("animal", "mesh"), [("quadruped", "meadow"), ("climber", "wall")])
 def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh):
     up = terrain_meshes.WALL_UP if animal == "climber" else (0.0, 1.0, 0.0)

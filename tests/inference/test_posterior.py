@@ -396,6 +396,7 @@ def deadly_run(path, death):
     )
 
 
+@pytest.mark.slow
 def test_runs_killed_again_and_again_make_the_chain_of_an_unbroken_run(tmp_path):
     path = tmp_path / "chain.h5"
     journal = journal_path(path)

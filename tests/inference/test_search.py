@@ -78,6 +78,7 @@ def cost_of(problem: Problem, u: np.ndarray) -> float:
     return float(population.evaluate(problem, u[None]).cost[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", CLIPS)
 def test_thresholds_and_smooth_parameters_are_recovered(seed):
     problem, solution = toy.solved(seed)
@@ -169,6 +170,7 @@ def test_too_few_steps_are_said_not_to_have_converged():
     assert solution.cost < solution.cost_before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walls", [(-1.0, 2.1), (1.0, 9.0)], ids=["by the truth", "at the start"])
 def test_a_region_where_residuals_are_not_finite_is_survived(walls):
     problem = curve_problem(walls=walls)
@@ -204,6 +206,7 @@ def test_a_robust_loss_keeps_outliers_from_pulling(loss):
     assert error_with_outliers(loss) < error_with_outliers("squares") / 3
 
 
+@pytest.mark.slow
 def test_the_steps_are_those_of_optimistix_on_the_rows_themselves():
     problem = curve_problem()
     u, args = problem.space.u0, (problem, problem.space.u0)

@@ -15,6 +15,8 @@ from jaxik.world import terrain
 from support.cases import QUICK
 from support.clips import assert_close
 
+pytestmark = pytest.mark.slow
+
 FPS = 60.0
 PLACE = 1e-4  # m, that single precision may cost
 

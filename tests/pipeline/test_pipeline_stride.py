@@ -161,6 +161,7 @@ def test_the_defaults_are_those_of_the_reference(name):
         np.testing.assert_allclose(came, wanted, rtol=1e-6, err_msg=key)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "values", "how"),
     [case[1:] for case in CASES],
@@ -170,6 +171,7 @@ def test_600_frames_agree_with_the_reference(preset, values, how):
     compare(preset, values, clip(**how), uneven(), to_terrain(uneven()))
 
 
+@pytest.mark.slow
 def test_feet_with_an_up_of_their_own_agree_with_the_reference():
     tilts = [maths.turn(axis, 0.2) for axis in (maths.X, -maths.Z, maths.Z)]
     ups = [maths.Y, *(maths.rotate(tilt, maths.Y) for tilt in tilts)]

@@ -12,6 +12,8 @@ from reference.terrain import LegTerrains
 from reference.terrain import Terrain as PlainTerrain
 from support.clips import to_frames, to_ik, to_leg_terrains, to_rig, to_terrain, wandering
 
+pytestmark = pytest.mark.slow
+
 POSITION = 1e-5  # m
 ANGLE = 1e-4  # rad
 FRAMES = 600

@@ -102,6 +102,7 @@ def limits_kept(ik: jaxik.FootIK, frames: jaxik.Frame, result: jaxik.Result) -> 
     return ~held & (reach <= np.asarray(free)).all(axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre(seed):
     rig = make_rig(seed)
@@ -310,6 +311,7 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
 # Memory.
 
 
+@pytest.mark.slow
 def test_steps_equal_the_scan():
     ik, rig, ground, frames = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
     state, whole = jaxik.init(ik, rig), wandered("odd")
@@ -320,6 +322,7 @@ def test_steps_equal_the_scan():
             assert_close(state, at(whole.trace.advanced.state, index), EXACT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_a_clip_cut_in_two_and_resumed_equals_the_whole(name):
     ik, rig, ground, frames = (
@@ -416,6 +419,7 @@ def crowd_result() -> jaxik.Result:
     return crowd_run()(*crowd())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("member", range(2))
 def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
     ik, _, ground, _ = at(crowd(), member)
@@ -428,6 +432,7 @@ def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
     np.testing.assert_allclose(offset_of(together)[:, :2], offset_of(alone), atol=EXACT)
 
 
+@pytest.mark.slow
 def test_a_batched_character_of_three_legs_equals_itself_alone():
     ik, rig, ground, frames = at(crowd(), 2)
     assert_close(at(crowd_result(), 2), jaxik.run(ik, rig, ground, frames), EXACT)
@@ -485,6 +490,7 @@ def doubles(program):
                 yield from doubles(getattr(inner, "jaxpr", inner))
 
 
+@pytest.mark.slow
 def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
     result = jaxik.run(*single_inputs(to_ik(ODD)))
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
@@ -520,6 +526,7 @@ def compilations():
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
+@pytest.mark.slow
 def test_nothing_compiles_at_a_second_call_with_other_values(compilations):
     iks = [to_ik({}), to_ik(ODD)]
     rigs = [to_rig(make_rig(seed)) for seed in range(2)]
@@ -551,6 +558,7 @@ def test_the_hard_program_contains_no_sigmoid_and_the_smooth_one_does():
     assert "logistic" in re.findall(r"= (\w+)", smooth)
 
 
+@pytest.mark.slow
 def test_steps_and_clips_run_inside_jit_vmap_and_scan():
     ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN)
     frames = wander()

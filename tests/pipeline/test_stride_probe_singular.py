@@ -26,6 +26,8 @@ from support.cases import QUICK, RIG, Inputs, measured, swinging, total
 from support.clips import FLAT, planes, to_frames, to_ik, to_rig
 from support.clips import to_terrain as to_ground
 
+pytestmark = pytest.mark.slow
+
 UPHILL, STEEP = planes((0.4, 0, 0)), planes((0, 0.9, 0))
 AT_WORK = {  # everything that the defaults leave off
     "lock.enabled": True,

@@ -31,6 +31,8 @@ from jaxik.world import terrain
 from support.cases import QUICK, RIG
 from support.clips import BROKEN, assert_close, at, planes, to_ik, to_rig, to_terrain, to_transform
 
+pytestmark = pytest.mark.slow
+
 PRESETS = ("ozz", "unreal", "mec", "stride", "by speed")
 AWAKE: dict[str, dict[str, Any]] = {  # rules at work all the way along the clip
     "ozz": {"root.enabled": False},

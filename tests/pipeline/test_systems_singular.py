@@ -20,6 +20,8 @@ from support.cases import QUICK, RIG, Inputs, measured, posed, read
 from support.clips import FLAT, FRAMES, animate, padded, planes, to_frames, to_ik, to_rig
 from support.clips import to_terrain as to_ground
 
+pytestmark = pytest.mark.slow
+
 PRESETS = ("ozz", "unreal", "mec")
 STIFF = {"pelvis.enabled": False}
 STRAIGHT = ([0, 0.9, 0], [0, 0.45, 0], [0, 0.02, 0])

@@ -12,6 +12,7 @@ import pytest
 import jaxik
 from fitting.analysis import limit_activity, playback
 from fitting.datasets.synthetic import walker
+from fitting.experiments import known_values
 from fitting.experiments.experiment import (
     ClipEntry,
     Experiment,
@@ -183,6 +184,7 @@ def test_a_gain_is_told_as_half_life_and_at_30_and_60_hz(fitted):
     assert "truth" not in text and "determined parameters within" not in text
 
 
+@pytest.mark.slow
 def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
     fit_report.write_fit(tmp_path, fitted)
     text = (tmp_path / run_folder.SUMMARY).read_text()
@@ -221,6 +223,7 @@ def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monke
     ]
 
 
+@pytest.mark.slow
 def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
     scene = fitted.problem.data[0]
     played = playback.play(scene, playback.run(fitted.ik, scene))

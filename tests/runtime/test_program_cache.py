@@ -240,6 +240,7 @@ def test_a_mistake_in_a_call_raises_the_usual_error(folder):
     assert not folder.exists()
 
 
+@pytest.mark.slow
 def test_a_fit_in_another_process_traces_nothing_large(tmp_path):
     """Two processes with different hash seeds find the same programs."""
     code = """

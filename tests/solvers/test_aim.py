@@ -182,6 +182,7 @@ def test_slopes_are_finite_there_in_single_precision_too():
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 def test_slopes_are_finite_through_a_smooth_gate():
     def smooth(*case):
         turn, reached = aim.aim_rotation(*map(jnp.asarray, case), gate=Smooth(1.0))
@@ -191,6 +192,7 @@ def test_slopes_are_finite_through_a_smooth_gate():
         finite_jacobian(smooth, *case, 0.3)
 
 
+@pytest.mark.slow
 def test_a_compiled_batch_is_many_singles_in_either_precision():
     cases = [(*case, np.float64(0.3)) for case in SINGULAR.values()]
     for dtype, tolerance in ((jnp.float64, 1e-14), (jnp.float32, 1e-6)):
@@ -203,6 +205,7 @@ def test_a_compiled_batch_is_many_singles_in_either_precision():
             assert found == reached[i]
 
 
+@pytest.mark.slow
 def test_targets_are_broadcast_against_one_joint():
     target = jnp.asarray(np.broadcast_to(X + Y, (3, 2, 3)))
     x, y, nowhere = (jnp.asarray(v) for v in (X, Y, NOWHERE))

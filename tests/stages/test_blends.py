@@ -29,6 +29,8 @@ from support.clips import (
     wandering,
 )
 
+pytestmark = pytest.mark.slow
+
 COUNT = 60  # frames
 DRAWN = 5
 JOINTS = ("hip", "knee", "ankle", "toe")

@@ -15,6 +15,8 @@ from fitting.datasets.terrain import mesh_files
 from fitting.studies import comparison
 from jaxik.world import terrain
 
+pytestmark = pytest.mark.slow
+
 FLAT = ("cmu_asfamc/01_01.amc", "cmu_asfamc/02_01.amc", "cmu_asfamc/02_03.amc",
         "cmu_bvh_mb/cmu_12_01_walk.bvh", "cmu_bvh_max/131_01.bvh")  # fmt: skip
 BALL_HEIGHT = 0.055  # m, of the ball joint over the floor

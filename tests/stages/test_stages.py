@@ -264,11 +264,13 @@ def test_every_field_of_the_record_and_every_parameter_has_a_case():
     assert {case.leaf for case in CASES} == declared | switches
 
 
+@pytest.mark.slow
 @named(CASES)
 def test_a_parameter_moves_the_result_the_way_it_should(case: Case):
     assert_effect(case, "record")
 
 
+@pytest.mark.slow
 @named(SLOPED)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
 def test_a_parameters_slope_is_its_difference_quotient(case: Case, gate: Any):
@@ -407,6 +409,7 @@ def smooth_slopes() -> tuple[jax.Array, jax.Array]:
     return forward_slope(*singular_inputs(Smooth(1.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SINGULAR)
 def test_slopes_are_finite_and_the_same_both_ways(name):
     value, forward, slopes, tangents = at(hard_slopes(), list(SINGULAR).index(name))
@@ -418,6 +421,7 @@ def test_slopes_are_finite_and_the_same_both_ways(name):
     np.testing.assert_allclose(sum(reverse), forward, rtol=1e-9, atol=1e-9 * np.abs(reverse).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SINGULAR)
 def test_slopes_through_softened_decisions_are_finite(name):
     assert np.isfinite(at(smooth_slopes(), list(SINGULAR).index(name))).all()

@@ -266,6 +266,7 @@ def test_every_number_switch_and_mask_of_a_system_has_a_case(preset: str):
     assert {case.leaf for case in CASES[preset] + INERT[preset]} == leaves
 
 
+@pytest.mark.slow
 @listed(CASES)
 def test_a_leaf_moves_the_result_the_way_it_should(preset: str, case: Case):
     assert_effect(case, preset)
@@ -277,6 +278,7 @@ def test_a_leaf_that_no_rule_of_the_system_asks_for_changes_nothing(preset: str,
     assert after == pytest.approx(before, abs=1e-9)
 
 
+@pytest.mark.slow
 @listed(SLOPED)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
 def test_a_numbers_slope_is_its_difference_quotient(preset: str, case: Case, gate: Any):

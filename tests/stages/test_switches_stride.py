@@ -17,6 +17,8 @@ from support.cases import (
 )
 from support.clips import FLAT, planes, to_ik
 
+pytestmark = pytest.mark.slow
+
 NONE, ALL = 0xFFFFFFFE, 0xFFFFFFFF  # masks without and with the layer of the planes
 LOCKS = {"lock.enabled": True}
 LOOSE = LOCKS | {  # nothing releases a lock but what a case sets
