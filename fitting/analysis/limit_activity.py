@@ -44,7 +44,7 @@ def measure(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> ClipActivit
         result: of this system on this scene, such as `playback.run` gives.
     """
     trace, present = stage_outputs(result), np.asarray(scene.rig.present)
-    locked = np.asarray(trace.advanced.held.locked)[:, present] > 0.5
+    locked = np.asarray(trace.advanced.hold.locked)[:, present] > 0.5
     switches = np.diff(locked.astype(int), axis=0)
 
     def fraction(weights: Array) -> np.ndarray:
@@ -57,7 +57,7 @@ def measure(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> ClipActivit
         grounded=fraction(trace.sensed.foothold.found),
         in_contact=fraction(trace.sensed.contact.weight),
         reached=fraction(result.reached),
-        locked=fraction(trace.advanced.held.locked),
+        locked=fraction(trace.advanced.hold.locked),
         locks=tuple(int(n) for n in (switches > 0).sum(axis=0)),
         releases=tuple(int(n) for n in (switches < 0).sum(axis=0)),
         limits=active_limits(ik, scene, result),
@@ -123,7 +123,7 @@ def flipped_decisions(
 
 def _decisions(result: jaxik.Result) -> Bool[np.ndarray, " decisions"]:
     trace = stage_outputs(result)
-    sensed, held = trace.sensed, trace.advanced.held
+    sensed, held = trace.sensed, trace.advanced.hold
     weights = (
         sensed.contact.planted,
         sensed.contact.lifted,

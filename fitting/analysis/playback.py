@@ -146,7 +146,7 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
         floor=vec.dot(world.pos, up),
         dt=scene.frames.dt,
         contact=trace.sensed.contact.weight,
-        locked=trace.advanced.held.locked,
+        locked=trace.advanced.hold.locked,
         reached=result.reached,
         stance=reference.contact,
         slide=scene.frames.slide,

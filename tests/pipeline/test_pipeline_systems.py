@@ -116,7 +116,7 @@ OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # what only this s
     },
     "mec": {
         "extra": lambda result: result.trace.sensed.ground.rays.below,
-        "planted": lambda result: result.trace.advanced.held.locked,
+        "planted": lambda result: result.trace.advanced.hold.locked,
         "plant_weight": lambda result: result.trace.advanced.state.lock.share,
         "fade": lambda result: result.trace.advanced.state.effector.share,
     },

@@ -95,7 +95,7 @@ def heels() -> dict[str, np.ndarray]:
     sensed, advanced = result.trace.sensed, result.trace.advanced
     hip = sensed.hip_ws + advanced.state.pelvis.offset_ws[:, None]
     lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
-    before = advanced.foothold_ws + advanced.held.offset_ws + lift - hip
+    before = advanced.foothold_ws + advanced.hold.offset_ws + lift - hip
     after = advanced.effector.target_ws - hip
     animated = np.linalg.norm(sensed.ankle_ws - sensed.hip_ws, axis=-1)
     longest = np.maximum(VALUES["effector.extension"] * (poses.THIGH + poses.SHIN), animated)
