@@ -21,7 +21,7 @@ from jaxik.stages.foot import AbstractFoot
 from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.stages.lean import AbstractLean, Lean
 from jaxik.stages.leg import AbstractLeg, LegGoal
-from jaxik.stages.lock import AbstractLock, Held
+from jaxik.stages.lock import AbstractLock, Hold
 from jaxik.stages.pelvis import AbstractPelvis, PelvisMoment, PelvisState
 from jaxik.stages.probe import AbstractProbe, foot_heading
 from jaxik.stages.root import AbstractRoot
@@ -64,7 +64,7 @@ class Advanced:
     """What memory makes of a frame."""
 
     foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, before the lock
-    held: Held
+    hold: Hold
     lean: Lean
     effector: Effector
     state: State  # after the frame
@@ -199,7 +199,7 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
     return Result(planted.pose, body, corrections, bend.reached, planted.reached, trace)
 
 
-def contacts_of(rule: AbstractContact, inputs: Inputs, state: State) -> tuple[PyTree, Contact]:
+def sense_contacts(rule: AbstractContact, inputs: Inputs, state: State) -> tuple[PyTree, Contact]:
     """Memory after each frame and the contacts, in a scan of their own.
 
     A rule without memory needs none. The leaves of `inputs.frame` have a leading axis of frames.
@@ -286,7 +286,7 @@ def resume(
     def at(frame: Frame) -> Inputs:
         return dataclasses.replace(inputs, frame=frame)
 
-    memories, contacts = contacts_of(ik.contact, inputs, state)
+    memories, contacts = sense_contacts(ik.contact, inputs, state)
     sensed = jax.vmap(lambda frame, contact: sense(ik, at(frame), contact))(frames, contacts)
 
     def scanned(state: State, frame: tuple[Sensed, PyTree]) -> tuple[State, Advanced]:

@@ -18,7 +18,7 @@ from fitting.datasets.terrain import mesh_files
 from fitting.runtime.threads import cpu_block, on_all_cores, usable_cores
 from jaxik.stages.effector import Effector
 from jaxik.stages.inputs import Inputs
-from jaxik.stages.leg import Bend, LegGoal
+from jaxik.stages.leg import LegGoal, SolvedLeg
 from jaxik.world.terrain import Terrain, cast, plane
 
 from . import peers, setup
@@ -109,7 +109,7 @@ def _inputs(batch: setup.Batch) -> Inputs:
     return Inputs(batch.rig, plane(), batch.frame, jaxik.HARD)
 
 
-def _bend(batch: setup.Batch) -> Bend:
+def _bend(batch: setup.Batch) -> SolvedLeg:
     """Solved legs."""
     goal = LegGoal(batch.frame.pose, batch.target_ms, jnp.ones_like(batch.frame.weight))
     return batch.ik.leg.pose(_inputs(batch), batch.sensed, goal)

@@ -11,7 +11,7 @@ from jaxik.maths.struct import struct
 from jaxik.world.skeleton import Rig, Transform
 
 from .inputs import SensedMoment
-from .pelvis import PelvisState, asked_heights
+from .pelvis import PelvisState, requested_heights
 
 HEIGHT_BAND = 0.01  # m
 ANGLE_BAND = 0.035  # rad, 2 degrees
@@ -190,7 +190,7 @@ class BodyEffector(AbstractEffector):
     ) -> tuple[BodyState, Effector]:
         sensed = now.sensed
         awake = self.awake(now, state)
-        asked = asked_heights(sensed, target.pos)
+        asked = requested_heights(sensed, target.pos)
         goal = asked - pelvis.goal
         share = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
         share = awake * now.progress(share)

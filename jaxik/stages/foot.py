@@ -17,7 +17,7 @@ from jaxik.world.terrain import Hit
 
 from .effector import Effector
 from .inputs import Inputs
-from .leg import Bend
+from .leg import SolvedLeg
 from .probe import foot_heading
 
 ANGLE_BAND = 0.035  # rad, 2 degrees
@@ -29,7 +29,7 @@ LEFT = (1.0, 0.0, 0.0)  # foot axes
 
 
 @struct
-class Planted:
+class SolvedFoot:
     """A leg with its foot turned."""
 
     pose: LegPose  # legs, model space
@@ -45,7 +45,9 @@ class AbstractFoot(Rule):
         """The ankles' rotation in the world that memory may keep, before the legs are solved."""
 
     @abstractmethod
-    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+    def pose(
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+    ) -> SolvedFoot:
         """The solved legs with their feet turned."""
 
 
@@ -95,7 +97,9 @@ class PitchRollFoot(AbstractAnimatedFoot):
         doc="Largest roll against the shin, outer edge down, as a negative angle.",
     )
 
-    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+    def pose(
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+    ) -> SolvedFoot:
         rig, frame, gate = inputs.rig, inputs.frame, inputs.gate
         up = sensed.leg_up_ws
         left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
@@ -145,7 +149,9 @@ class AimFoot(AbstractAnimatedFoot):
         1.0, unit="1", low=0.0, high=1.0, doc="How far feet are turned to the ground, 0 to 1."
     )
 
-    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+    def pose(
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+    ) -> SolvedFoot:
         rig, frame = inputs.rig, inputs.frame
         carried = bend.pose.ankle
         into_model = frame.world_from_model.inverse()
@@ -181,18 +187,24 @@ class FlatFoot(AbstractFoot):
         flat = quat.multiply(at_most(tilt, self.max_tilt, inputs.gate), level)
         return quat.nlerp(animated_ankles(inputs.frame).rot, flat, ground.ankle.found)
 
-    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+    def pose(
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+    ) -> SolvedFoot:
         return turned(inputs.frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
 
 
 class KeepFoot(AbstractAnimatedFoot):
     """Feet keep their animated rotation in the world (Unreal, seed 001)."""
 
-    def pose(self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: Bend) -> Planted:
+    def pose(
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+    ) -> SolvedFoot:
         return turned(inputs.frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight))
 
 
-def turned(frame: Frame, effector: Effector, bend: Bend, rot_ws: Array, reached: Array) -> Planted:
+def turned(
+    frame: Frame, effector: Effector, bend: SolvedLeg, rot_ws: Array, reached: Array
+) -> SolvedFoot:
     """The legs with their ankles turned to `rot_ws` in the world, each by its share of foot IK."""
     wanted = quat.multiply(quat.conjugate(frame.world_from_model.rot), rot_ws)
     rot = quat.nlerp(bend.pose.ankle.rot, wanted, effector.weight)
@@ -200,7 +212,7 @@ def turned(frame: Frame, effector: Effector, bend: Bend, rot_ws: Array, reached:
     return with_ankle(frame, bend, rot, reached * full)
 
 
-def with_ankle(frame: Frame, bend: Bend, rot: Array, reached: Array) -> Planted:
+def with_ankle(frame: Frame, bend: SolvedLeg, rot: Array, reached: Array) -> SolvedFoot:
     """The legs with this rotation of their ankles, model space; the toe goes with it."""
     carried = bend.pose.ankle
     ankle, toe = frame.pose.ankle, frame.pose.toe
@@ -208,7 +220,7 @@ def with_ankle(frame: Frame, bend: Bend, rot: Array, reached: Array) -> Planted:
     ball = quat.rotate(turn, toe.pos - ankle.pos)
     toe = Transform(carried.pos + ball, quat.multiply(turn, toe.rot))
     pose = LegPose(bend.pose.hip, bend.pose.knee, Transform(carried.pos, rot), toe)
-    return Planted(pose, quat.multiply(quat.conjugate(carried.rot), rot), reached)
+    return SolvedFoot(pose, quat.multiply(quat.conjugate(carried.rot), rot), reached)
 
 
 def rise_angle(low: Hit, high: Hit, along: Array, up_ws: Array) -> Array:

@@ -28,7 +28,7 @@ from .inputs import Inputs
 
 
 @struct
-class Bend:
+class SolvedLeg:
     """A solved leg."""
 
     pose: LegPose  # legs, model space; ankle and toe carried along
@@ -52,7 +52,7 @@ class AbstractLeg(Rule):
     weight: eqx.AbstractVar[Array]  # 0..1, share of foot IK
 
     @abstractmethod
-    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         """The legs with their ankles at their targets."""
 
 
@@ -100,10 +100,10 @@ class TwoBone(AbstractLeg):
         1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
     )
 
-    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         return self.solve(inputs.rig, goal, inputs.gate)
 
-    def solve(self, rig: Rig, goal: LegGoal, gate: AbstractGate) -> Bend:
+    def solve(self, rig: Rig, goal: LegGoal, gate: AbstractGate) -> SolvedLeg:
         """The leg by itself: with its ankle at the goal's target."""
         pose, target_ms = goal.pose, goal.target_ms
         to_hip, to_ankle, hinge = bones(rig, pose)
@@ -166,7 +166,7 @@ class PoleLeg(AbstractLeg):
         1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
     )
 
-    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         _, to_ankle, hinge = bones(inputs.rig, goal.pose)
         pole = vec.cross(hinge, to_ankle)
         goal = dataclasses.replace(goal, weight=jnp.where(self.enabled, goal.weight, 0.0))
@@ -205,7 +205,7 @@ class HintLeg(AbstractLeg):
         1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
     )
 
-    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> Bend:
+    def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         frame = inputs.frame
         toe = frame.world_from_model.inverse().apply(sensed.ground.toe.point)
         calf = frame.pose.knee.pos - frame.pose.ankle.pos
@@ -222,7 +222,7 @@ def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
 
 def solve_to_pole(
     inputs: Inputs, goal: LegGoal, pole_ms: Array, soften: Array, twist: Array
-) -> Bend:
+) -> SolvedLeg:
     """The leg whose plane contains the direction `pole_ms`."""
     to_hip, to_ankle, hinge = bones(inputs.rig, goal.pose)
     to_target = goal.target_ms - goal.pose.hip.pos
@@ -230,7 +230,7 @@ def solve_to_pole(
     return bend_leg(inputs.rig, goal, bend)
 
 
-def bend_leg(rig: Rig, goal: LegGoal, bend: PoleBend) -> Bend:
+def bend_leg(rig: Rig, goal: LegGoal, bend: PoleBend) -> SolvedLeg:
     """The leg with its knee turned about its hinge, then its hip, each by the goal's weight."""
     pose, weight = goal.pose, goal.weight
     to_hip, to_ankle, hinge = bones(rig, pose)
@@ -251,7 +251,7 @@ def bend_leg(rig: Rig, goal: LegGoal, bend: PoleBend) -> Bend:
             quat.multiply(whole, pose.toe.rot),
         ),
     )
-    return Bend(
+    return SolvedLeg(
         solved,
         local(pose.hip.rot, swing),
         quat.from_half_angle(rig.knee_axis_ls, half_cos, half_sin),

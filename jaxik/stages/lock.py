@@ -20,7 +20,7 @@ FACTOR_BAND = 0.05
 
 
 @struct
-class Held:
+class Hold:
     """What locks make of the footholds."""
 
     offset_ws: Float[Array, "legs 3"]  # m, kept from the foothold
@@ -38,7 +38,7 @@ class AbstractLock(Rule):
     @abstractmethod
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PyTree
-    ) -> tuple[PyTree, Held]:
+    ) -> tuple[PyTree, Hold]:
         """Memory after this frame, and what each foot keeps."""
 
 
@@ -50,10 +50,10 @@ class NoLock(AbstractLock):
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: None
-    ) -> tuple[None, Held]:
+    ) -> tuple[None, Hold]:
         free = jnp.zeros_like(foothold_ws)
         sensed = now.sensed
-        return None, Held(free, sensed.rot_ws, jnp.zeros_like(sensed.foothold.found))
+        return None, Hold(free, sensed.rot_ws, jnp.zeros_like(sensed.foothold.found))
 
 
 @struct
@@ -167,7 +167,7 @@ class OffsetLock(AbstractLock):
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: LockState
-    ) -> tuple[LockState, Held]:
+    ) -> tuple[LockState, Hold]:
         sensed, gate = now.sensed, now.gate
         up, platform = sensed.leg_up_ws, sensed.platform
         moved = foothold_ws - platform.apply(state.foothold)
@@ -201,7 +201,7 @@ class OffsetLock(AbstractLock):
             into_platform.apply(sensed.ball_ws),
             quat.rotate(into_platform.rot, pointed),
         )
-        return after, Held(offset_ws, sensed.rot_ws, locked)
+        return after, Hold(offset_ws, sensed.rot_ws, locked)
 
     def _may_start(self, now: SensedMoment, moved: Array, factor: Array) -> Array:
         sensed, gate = now.sensed, now.gate
@@ -283,7 +283,7 @@ class PlantLock(AbstractLock):
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
-    ) -> tuple[PlantState, Held]:
+    ) -> tuple[PlantState, Hold]:
         sensed, gate = now.sensed, now.gate
         up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
         before = state.locked
@@ -302,7 +302,7 @@ class PlantLock(AbstractLock):
         step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
         share = smoothing.move_towards(state.share, self.plant_weight, step)
         counts = locked * share
-        held = Held(
+        held = Hold(
             vec.scale(planted_ws - foothold_ws, counts),
             quat.nlerp(sensed.rot_ws, kept_rot, counts),
             locked,

@@ -97,7 +97,7 @@ class LowestPelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        asked = asked_heights(sensed, target.pos)
+        asked = requested_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         taking_part = sensed.weight > 0
         top = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
@@ -140,7 +140,7 @@ class CapsulePelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        asked = jnp.where(sensed.weight > 0, asked_heights(sensed, target.pos), 0.0)
+        asked = jnp.where(sensed.weight > 0, requested_heights(sensed, target.pos), 0.0)
         lowest = gate.minimum(asked, band=HEIGHT_BAND)
         zero = jnp.zeros_like(lowest)
         sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
@@ -222,7 +222,7 @@ class AbstractFollowingPelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        asked = asked_heights(sensed, target.pos)
+        asked = requested_heights(sensed, target.pos)
         resting = jnp.where(now.started, state.goal, mean_height(sensed, asked))
         goal = self.goal(now, target, resting)
         gap = goal - state.height
@@ -266,7 +266,7 @@ class SupportPelvis(AbstractFollowingPelvis):
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
-        asked = asked_heights(sensed, target.pos)
+        asked = requested_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         total = vec.sum_last(weight)
         taking_part = sensed.weight > 0
@@ -317,7 +317,7 @@ class ReachPelvis(AbstractFollowingPelvis):
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
-        asked = asked_heights(sensed, target.pos)
+        asked = requested_heights(sensed, target.pos)
         taking_part = sensed.weight > 0
         mean = mean_height(sensed, asked)
         highest = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
@@ -350,6 +350,6 @@ def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Arra
     return along + vec.safe_sqrt(length**2 - across2)
 
 
-def asked_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+def requested_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
     """Height from each animated ankle to its target along the leg's up, m."""
     return vec.dot(target_ws - sensed.ankle_ws, sensed.leg_up_ws)
