@@ -24,7 +24,8 @@ from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
 from fitting.inference.optimisation.search import find_best_fit
 from fitting.inference.optimisation.solution import Solution
-from fitting.inference.sampling.posterior import sample_posterior
+from fitting.inference.sampling.posterior import WalkerStart, sample_posterior
+from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.problem import Problem
 from fitting.runtime.threads import usable_cores
 
@@ -152,7 +153,8 @@ def posterior(row: Row, sizes: Sizes) -> None:
 
     def sampled(steps: int) -> None:
         made = sample_posterior(
-            problem, centre, sd, walkers=sizes.walkers, max_steps=steps, stop_at=1e9,
+            problem, WalkerStart(centre, sd),
+            SamplerSettings(walkers=sizes.walkers, max_steps=steps, stop_at=1e9),
             progress=lambda now: row.tell(f"posterior: step {now.step} of {now.max_steps}"),
         )  # fmt: skip
         if made.interrupted:

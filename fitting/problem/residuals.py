@@ -23,6 +23,7 @@ def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " residua
 
 def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     """Result minus reference, by kind of residual, in the unit of its sigma."""
+    assert result.trace is not None  # `jaxik.run` always has one
     reference, present = scene.reference, scene.rig.present[:, None]
     legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
     ankle = (legs.ankle.pos - reference.ankle.pos) * present

@@ -221,7 +221,7 @@ def _health(posterior: Posterior) -> list[str]:
         f"Mean acceptance {formatting.percent(float(posterior.acceptance.mean()))}; slowest "
         f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
         f"Stuck walkers: {stuck}; left out of the summary: "
-        f"{', '.join(map(str, posterior.apart)) or 'none'}.",
+        f"{', '.join(map(str, posterior.isolated)) or 'none'}.",
     ]
 
 

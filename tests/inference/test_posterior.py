@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from fitting.inference.sampling import diagnostics, posterior, sampler
 from fitting.inference.sampling.chain import Chain, Identity, journal_path
-from fitting.inference.sampling.posterior import sample_posterior
+from fitting.inference.sampling.posterior import Posterior, WalkerStart
+from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.free_parameters import PRIOR_SD, free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
@@ -98,13 +99,23 @@ def autocorrelated(share, shape, seed=0):
     return series
 
 
+def sample(
+    problem, start_u, start_sd, *, seed=0, path=None, progress=None, **settings
+) -> Posterior:
+    """The posterior with these settings of the sampler."""
+    start = WalkerStart(np.asarray(start_u), np.asarray(start_sd))
+    return posterior.sample_posterior(
+        problem, start, SamplerSettings(**settings), seed=seed, path=path, progress=progress
+    )
+
+
 # Known posteriors
 
 
 @pytest.mark.parametrize(("size", "stop_at"), [(10, 50.0), (20, 25.0)])
 def test_a_known_normal_is_found_with_its_variances(size, stop_at):
     problem, mean, covariance = normal(size)
-    found = sample_posterior(problem, mean, np.sqrt(np.diag(covariance)), stop_at=stop_at)
+    found = sample(problem, mean, np.sqrt(np.diag(covariance)), stop_at=stop_at)
     assert found.converged, found.message
     centred = (found.u[found.burn_in :] - mean) @ np.linalg.inv(np.linalg.cholesky(covariance)).T
     count = centred.shape[0] * centred.shape[1]
@@ -136,7 +147,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
         one = eqx.tree_at(lambda p: p.data[1], problem, jnp.asarray(seen))
         mean = covariance @ factor.T @ factor @ seen
         sd = np.sqrt(np.diag(covariance))
-        found = sample_posterior(one, mean, sd, seed=seed, max_steps=350, stop_at=1e9)
+        found = sample(one, mean, sd, seed=seed, max_steps=350, stop_at=1e9)
         values = np.asarray(one.space.values(jnp.asarray(truth)))
         exact = np.asarray(one.space.values(jnp.asarray(mean)))
         for row, value, median in zip(found.summary, values, exact, strict=True):
@@ -157,7 +168,7 @@ def test_a_threshold_is_sampled_as_integrated_on_a_grid():
     space = make_space(ik, [free_parameter(ik, "height"), free_parameter(ik, "moment")])
     problem = Problem(space, (moments, seen), step_minus_seen)
     start = space.pack({"height": 0.7, "moment": 0.43})
-    found = sample_posterior(problem, start, np.array([0.3, 0.05]), walkers=32)
+    found = sample(problem, start, np.array([0.3, 0.05]), walkers=32)
     assert found.converged, found.message
 
     axis = jnp.linspace(-7, 7, 281)
@@ -173,15 +184,15 @@ def test_a_threshold_is_sampled_as_integrated_on_a_grid():
 
 def test_a_step_into_nan_is_never_taken():
     problem = toy(2, nan_above, jnp.asarray(0.55))
-    found = sample_posterior(problem, np.zeros(2), np.ones(2), max_steps=300)
+    found = sample(problem, np.zeros(2), np.ones(2), max_steps=300)
     assert np.isfinite(found.log_probability).all()
     assert 0.5 < found.values.max() < 0.55
 
 
 def test_a_start_without_a_finite_log_probability_is_an_error():
     problem = toy(2, nan_above, jnp.asarray(0.5))
-    with pytest.raises(ValueError, match="only 0 of 8 walkers found a finite log-probability"):
-        sample_posterior(problem, np.full(2, 3.0), np.full(2, 0.01))
+    with pytest.raises(ValueError, match="only 0 of 8 walkers have a finite log-probability"):
+        sample(problem, np.full(2, 3.0), np.full(2, 0.01))
 
 
 # What a run does
@@ -190,16 +201,14 @@ def test_a_start_without_a_finite_log_probability_is_an_error():
 def test_a_run_is_decided_by_its_seed():
     problem, mean, covariance = normal(3)
     sd = np.sqrt(np.diag(covariance))
-    first, again, other = (
-        sample_posterior(problem, mean, sd, seed=seed, max_steps=50) for seed in (1, 1, 2)
-    )
+    first, again, other = (sample(problem, mean, sd, seed=seed, max_steps=50) for seed in (1, 1, 2))
     assert np.array_equal(first.u, again.u)
     assert not np.array_equal(first.u[0], other.u[0])
 
 
 def test_a_run_stops_at_fifty_steady_autocorrelation_times():
     problem, mean, covariance = normal(2)
-    found = sample_posterior(problem, mean, np.sqrt(np.diag(covariance)))
+    found = sample(problem, mean, np.sqrt(np.diag(covariance)))
     steps = len(found.u)
     slowest = found.autocorrelation_time.max()
     assert found.converged and found.message.startswith("Converged: ")
@@ -214,7 +223,7 @@ def test_a_run_stops_at_fifty_steady_autocorrelation_times():
 
 def test_a_run_that_is_too_short_says_so():
     problem, mean, covariance = normal(5)
-    found = sample_posterior(problem, mean, np.sqrt(np.diag(covariance)), max_steps=200)
+    found = sample(problem, mean, np.sqrt(np.diag(covariance)), max_steps=200)
     assert not found.converged
     assert "too short: 200 steps" in found.message
 
@@ -222,8 +231,8 @@ def test_a_run_that_is_too_short_says_so():
 def test_thinning_keeps_every_so_manyth_step():
     problem, mean, covariance = normal(2)
     sd = np.sqrt(np.diag(covariance))
-    every = sample_posterior(problem, mean, sd, max_steps=60, stop_at=1e9)
-    third = sample_posterior(problem, mean, sd, max_steps=60, stop_at=1e9, thin_by=3)
+    every = sample(problem, mean, sd, max_steps=60, stop_at=1e9)
+    third = sample(problem, mean, sd, max_steps=60, stop_at=1e9, thin_by=3)
     assert np.array_equal(third.u, every.u[2::3])
 
 
@@ -232,9 +241,9 @@ def test_progress_is_reported_and_nothing_compiles_between_checks():
     sd = np.sqrt(np.diag(covariance))
     seen = []
     TRACES.clear()
-    sample_posterior(problem, mean, sd, max_steps=200, check_every=20, progress=seen.append)
+    sample(problem, mean, sd, max_steps=200, check_every=20, progress=seen.append)
     assert len(TRACES) == 1  # half of the walkers at a time, at the start too
-    sample_posterior(normal(7, seed=1)[0], mean, sd, seed=1, max_steps=40)
+    sample(normal(7, seed=1)[0], mean, sd, seed=1, max_steps=40)
     assert len(TRACES) == 1
     assert [one.step for one in seen] == list(range(20, 201, 20))
     assert seen[0].max_steps == 200 and 0 < seen[0].elapsed < seen[-1].elapsed
@@ -244,9 +253,9 @@ def test_progress_is_reported_and_nothing_compiles_between_checks():
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"start_u": np.zeros(2)}, "start_u is .* wanted 3 finite numbers"),
-        ({"start_u": np.array([0, np.nan, 0])}, "start_u is .* wanted 3 finite numbers"),
-        ({"start_sd": np.array([1.0, 0.0, 1.0])}, "start_sd is .* wanted more than 0"),
+        ({"start_u": np.zeros(2)}, "start.u is .* wanted 3 finite numbers"),
+        ({"start_u": np.array([0, np.nan, 0])}, "start.u is .* wanted 3 finite numbers"),
+        ({"start_sd": np.array([1.0, 0.0, 1.0])}, "start.sd is .* wanted more than 0"),
         ({"walkers": 7}, "walkers is 7, wanted an even number from 6 on"),
         ({"walkers": 4}, "walkers is 4, wanted an even number from 6 on"),
         ({"thin_by": 0}, "thin_by is 0"),
@@ -256,7 +265,7 @@ def test_progress_is_reported_and_nothing_compiles_between_checks():
 def test_impossible_arguments_are_answered_at_the_door(changes, complaint):
     arguments = {"start_u": np.zeros(3), "start_sd": np.ones(3)} | changes
     with pytest.raises(ValueError, match=complaint):
-        sample_posterior(normal(3)[0], **arguments)
+        sample(normal(3)[0], **arguments)
 
 
 # Interrupted and killed
@@ -273,12 +282,12 @@ def interrupt_at(step):
 def test_an_interrupt_returns_the_chain_and_the_run_can_go_on(tmp_path):
     problem, mean, covariance = normal(3)
     run = {"start_u": mean, "start_sd": np.sqrt(np.diag(covariance)), "max_steps": 90}
-    whole = sample_posterior(problem, **run)
+    whole = sample(problem, **run)
     path = tmp_path / "chain.h5"
-    part = sample_posterior(problem, **run, path=path, check_every=5, progress=interrupt_at(35))
+    part = sample(problem, **run, path=path, check_every=5, progress=interrupt_at(35))
     assert part.message.startswith("Interrupted, the chain is kept.") and not part.converged
     assert np.array_equal(part.u, whole.u[:35])
-    rest = sample_posterior(problem, **run, path=path)
+    rest = sample(problem, **run, path=path)
     assert np.array_equal(rest.u, whole.u)
     assert np.array_equal(rest.acceptance, whole.acceptance)
     assert [one.name for one in tmp_path.iterdir()] == ["chain.h5"]
@@ -290,19 +299,19 @@ def test_an_interrupt_before_the_first_step_is_passed_on_quietly(monkeypatch, ca
 
     monkeypatch.setattr(sampler, "_log_probabilities", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        sample_posterior(normal(2)[0], np.zeros(2), np.ones(2))
+        sample(normal(2)[0], np.zeros(2), np.ones(2))
     assert capfd.readouterr().out == ""
 
 
 def test_a_finished_run_is_returned_and_a_longer_one_continues_it(tmp_path):
     problem, mean, covariance = normal(2)
     run = {"start_u": mean, "start_sd": np.sqrt(np.diag(covariance)), "path": tmp_path / "a.h5"}
-    first = sample_posterior(problem, **run)
+    first = sample(problem, **run)
     before = run["path"].read_bytes()
-    again = sample_posterior(problem, **run)
+    again = sample(problem, **run)
     assert np.array_equal(first.u, again.u) and again.message == first.message
     assert run["path"].read_bytes() == before
-    longer = sample_posterior(problem, **run, stop_at=100.0)
+    longer = sample(problem, **run, stop_at=100.0)
     assert longer.converged and len(longer.u) > len(first.u)
     assert np.array_equal(longer.u[: len(first.u)], first.u)
 
@@ -310,7 +319,7 @@ def test_a_finished_run_is_returned_and_a_longer_one_continues_it(tmp_path):
 def test_emcee_reads_the_file(tmp_path):
     problem, mean, covariance = normal(2)
     path = tmp_path / "chain.h5"
-    found = sample_posterior(problem, mean, np.sqrt(np.diag(covariance)), path=path, max_steps=40)
+    found = sample(problem, mean, np.sqrt(np.diag(covariance)), path=path, max_steps=40)
     backend: Any = emcee.backends.HDFBackend(str(path), read_only=True)
     assert np.array_equal(backend.get_chain(), found.u)
     assert np.array_equal(backend.get_log_prob(), found.log_probability)
@@ -337,13 +346,13 @@ def test_a_kill_loses_no_finished_step_wherever_it_tears_the_journal(tmp_path):
         left.append((copy, report.step - bool(torn)))
 
     path = tmp_path / "chain.h5"
-    whole = sample_posterior(problem, **run, path=path, progress=snapshot)
+    whole = sample(problem, **run, path=path, progress=snapshot)
     assert len(left) == 7
     for copy, finished in left:
         identity = Identity(problem.space.names, 12, 0, 1, posterior.digest(problem))
         with Chain(identity, copy) as chain:
             assert len(chain) >= finished
-        resumed = sample_posterior(problem, **run, path=copy)
+        resumed = sample(problem, **run, path=copy)
         assert np.array_equal(resumed.u, whole.u)
         assert np.array_equal(resumed.log_probability, whole.log_probability)
         assert np.array_equal(resumed.acceptance, whole.acceptance)
@@ -383,7 +392,7 @@ def deadly_run(path, death):
         exchanges = iter(range(3))
         exchange = os.replace
         os.replace = lambda *names: exchange(*names) if next(exchanges) < 2 else die()
-    return sample_posterior(
+    return sample(
         problem,
         mean,
         np.sqrt(np.diag(covariance)),
@@ -449,7 +458,7 @@ def test_the_chain_of_another_run_is_refused(tmp_path, field, other):
         pass
     before = path.read_bytes()
     with pytest.raises(ValueError, match=f"chain of another run: its {field} is"):
-        sample_posterior(normal(2)[0], np.zeros(2), np.ones(2), path=path)
+        sample(normal(2)[0], np.zeros(2), np.ones(2), path=path)
     assert path.read_bytes() == before
 
 
@@ -463,11 +472,11 @@ def test_a_file_that_is_no_chain_of_ours_is_refused(tmp_path, kind):
     elif kind == "emcee's own":
         emcee.backends.HDFBackend(str(path)).reset(8, 2)
     else:
-        sample_posterior(normal(2)[0], np.zeros(2), np.ones(2), path=path, max_steps=1)
+        sample(normal(2)[0], np.zeros(2), np.ones(2), path=path, max_steps=1)
         with h5py.File(path, "a") as file:
             file["mcmc"].attrs["format"] = 99
     with pytest.raises(ValueError, match="is not a chain of this sampler"):
-        sample_posterior(normal(2)[0], np.zeros(2), np.ones(2), path=path)
+        sample(normal(2)[0], np.zeros(2), np.ones(2), path=path)
 
 
 def test_the_journal_of_a_deleted_or_exchanged_chain_is_ignored(tmp_path):
@@ -479,11 +488,11 @@ def test_the_journal_of_a_deleted_or_exchanged_chain_is_ignored(tmp_path):
         stale = journal_path(path).read_bytes()
     assert len(stale) > 0
     path.unlink()
-    whole = sample_posterior(problem, np.zeros(2), np.ones(2), max_steps=20)
+    whole = sample(problem, np.zeros(2), np.ones(2), max_steps=20)
     journal_path(path).write_bytes(stale)
-    found = sample_posterior(problem, np.zeros(2), np.ones(2), path=path, max_steps=10)
+    found = sample(problem, np.zeros(2), np.ones(2), path=path, max_steps=10)
     journal_path(path).write_bytes(stale)
-    found = sample_posterior(problem, np.zeros(2), np.ones(2), path=path, max_steps=20)
+    found = sample(problem, np.zeros(2), np.ones(2), path=path, max_steps=20)
     assert np.array_equal(found.u, whole.u)
 
 
@@ -534,8 +543,8 @@ def test_a_walker_on_an_island_is_named_and_left_out(monkeypatch):
         return last._replace(log_probability=evaluate(last.u))
 
     monkeypatch.setattr(sampler, "_start", with_a_castaway)
-    found = sample_posterior(problem, np.zeros(6), np.ones(6))
-    assert found.apart == [3] and 3 in found.stuck
+    found = sample(problem, np.zeros(6), np.ones(6))
+    assert found.isolated == [3] and 3 in found.stuck
     assert "left out: 1 of 24 walkers" in found.message
     assert found.converged, found.message
     assert found.kept.shape[1] == 23 and found.kept.max() < 0.999
@@ -546,9 +555,9 @@ def test_too_many_walkers_apart_are_no_convergence():
     log_probability = np.random.default_rng(0).normal(size=(1000, 20))
     log_probability[:, :3] -= 50
     seen = diagnostics.check(np.random.default_rng(1).normal(size=(1000, 20, 2)), log_probability)
-    assert seen.apart.nonzero()[0].tolist() == [0, 1, 2]
+    assert seen.isolated.nonzero()[0].tolist() == [0, 1, 2]
     converged, message = diagnostics.verdict(seen, seen, ("a", "b"), 1, 50.0)
-    assert not converged and "too many walkers sit apart" in message
+    assert not converged and "too many walkers are isolated" in message
 
 
 def test_a_walker_that_hardly_moves_is_named():
@@ -581,8 +590,8 @@ def test_a_parameter_that_never_moves_never_converges():
 def test_an_autocorrelation_time_that_still_changes_is_no_convergence():
     chain = autocorrelated(0.5, (1000, 8, 1))
     latest = diagnostics.check(chain, np.zeros((1000, 8)))
-    before = diagnostics.Check(900, latest.times * 1.06, latest.apart)
-    steady = diagnostics.Check(900, latest.times * 1.04, latest.apart)
+    before = diagnostics.Check(900, latest.times * 1.06, latest.isolated)
+    steady = diagnostics.Check(900, latest.times * 1.04, latest.isolated)
     assert "still changes" in diagnostics.verdict(before, latest, ("a",), 1, 50.0)[1]
     assert "still changes" in diagnostics.verdict(None, latest, ("a",), 1, 50.0)[1]
     assert diagnostics.verdict(steady, latest, ("a",), 1, 50.0)[0]

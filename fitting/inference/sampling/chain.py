@@ -40,7 +40,7 @@ class Identity:
         return f"{zlib.crc32(repr(self).encode()):08x}{self.problem:.24}".encode()
 
 
-class Last(NamedTuple):
+class LastStep(NamedTuple):
     """All that the next step depends on."""
 
     u: Float[np.ndarray, "walkers free"]
@@ -93,11 +93,11 @@ class Chain:
         return np.stack(self._log_probability) if self._u else empty
 
     @property
-    def last(self) -> Last | None:
+    def last(self) -> LastStep | None:
         """Where to go on; None before the first step."""
         if self._random_state is None:
             return None
-        return Last(self._u[-1].copy(), self._log_probability[-1].copy(), self._random_state)
+        return LastStep(self._u[-1].copy(), self._log_probability[-1].copy(), self._random_state)
 
     def append(
         self,

@@ -3,19 +3,19 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 WINDOW = 5.0  # autocorrelation times to sum over (Sokal 1997, Monte Carlo methods, p. 16)
-APART = 5.0  # spreads of log-probability between a walker and the rest
+ISOLATED = 5.0  # spreads of log-probability between a walker and the others
 LAZY = 0.1  # of the median acceptance
 STEADY = 0.05  # relative change of the autocorrelation time between two checks
 SPACING = 0.1  # of the chain's length between two checks, so that 5 % means something
 START = 0.1  # of the chain, not counted for the autocorrelation time
 BURN_IN = 5.0  # autocorrelation times
-MOST_APART = 0.1  # of the walkers may be left out
+MAX_ISOLATED = 0.1  # fraction of the walkers that may be left out
 
 
 def autocorrelation_time(
@@ -62,19 +62,19 @@ def split_r_hat(chain: Float[np.ndarray, "steps walkers free"]) -> Float[np.ndar
     return np.where(moves, np.sqrt((half - 1) / half + ratio), np.inf)
 
 
-def walkers_apart(
+def isolated_walkers(
     log_probability: Float[np.ndarray, "steps walkers"],
 ) -> Bool[np.ndarray, " walkers"]:
-    """Walkers that in the later half of the chain never came near the others' log-probability.
+    """Walkers that in the later half of the chain never come near the others' log-probability.
 
-    Near is within five spreads (1.48 median absolute deviations) of the median. They sit on an
-    island whose weight is negligible: for a normal posterior in ten dimensions a healthy walker is
+    Near is within five spreads (1.48 median absolute deviations) of the median. Such walkers sit on
+    an island of negligible weight: for a normal posterior in ten dimensions a healthy walker is
     that far out in one step of 2,000, and here none of half the chain's steps may be nearer.
     """
     later = log_probability[log_probability.shape[0] // 2 :]
     middle = np.median(later)
     spread = 1.4826 * np.median(np.abs(later - middle))
-    return later.max(axis=0) < middle - APART * spread
+    return later.max(axis=0) < middle - ISOLATED * spread
 
 
 def lazy_walkers(acceptance: Float[np.ndarray, " walkers"]) -> Bool[np.ndarray, " walkers"]:
@@ -82,13 +82,28 @@ def lazy_walkers(acceptance: Float[np.ndarray, " walkers"]) -> Bool[np.ndarray, 
     return acceptance < LAZY * np.median(acceptance)
 
 
+class ParameterSummary(TypedDict):
+    """The posterior of one parameter, in its unit."""
+
+    name: str
+    mean: float
+    sd: float
+    median: float
+    low68: float  # central intervals
+    high68: float
+    low95: float
+    high95: float
+    ess: float  # effective sample size
+    r_hat: float
+
+
 def summarise(
     names: Sequence[str],
     values: Float[np.ndarray, "steps walkers free"],
     times: Float[np.ndarray, " free"],
     r_hat: Float[np.ndarray, " free"],
-) -> list[dict[str, Any]]:
-    """One row a parameter: moments, central intervals, effective sample size, R-hat.
+) -> list[ParameterSummary]:
+    """One row per parameter: moments, central intervals, effective sample size, R-hat.
 
     Args:
         names: of the parameters.
@@ -97,22 +112,22 @@ def summarise(
         r_hat: of the same steps.
     """
     flat = values.reshape(-1, values.shape[-1])
-    low95, low68, median, high68, high95 = np.quantile(
-        flat, [0.025, 0.16, 0.5, 0.84, 0.975], axis=0
-    )
-    columns = {
-        "mean": flat.mean(axis=0),
-        "sd": flat.std(axis=0, ddof=1),
-        "median": median,
-        "low68": low68,
-        "high68": high68,
-        "low95": low95,
-        "high95": high95,
-        "ess": flat.shape[0] / times,
-        "r_hat": r_hat,
-    }
+    quantiles = np.quantile(flat, [0.025, 0.16, 0.5, 0.84, 0.975], axis=0)
+    mean, sd = flat.mean(axis=0), flat.std(axis=0, ddof=1)
+    low95, low68, median, high68, high95 = quantiles
     return [
-        {"name": name} | {key: float(column[i]) for key, column in columns.items()}
+        ParameterSummary(
+            name=name,
+            mean=float(mean[i]),
+            sd=float(sd[i]),
+            median=float(median[i]),
+            low68=float(low68[i]),
+            high68=float(high68[i]),
+            low95=float(low95[i]),
+            high95=float(high95[i]),
+            ess=float(flat.shape[0] / times[i]),
+            r_hat=float(r_hat[i]),
+        )
         for i, name in enumerate(names)
     ]
 
@@ -122,8 +137,8 @@ class Check:
     """What the first `length` steps of a chain look like."""
 
     length: int
-    times: Float[np.ndarray, " free"]  # autocorrelation times of the walkers that are not apart
-    apart: Bool[np.ndarray, " walkers"]
+    times: Float[np.ndarray, " free"]  # autocorrelation times, without isolated walkers
+    isolated: Bool[np.ndarray, " walkers"]
 
     @property
     def slowest(self) -> float:
@@ -133,33 +148,38 @@ class Check:
     @property
     def burn_in(self) -> int:
         """Steps to leave out: five autocorrelation times, from a tenth to a half of the chain."""
-        lost = min(BURN_IN * self.slowest, self.length)  # the time may be infinite
-        return min(self.length // 2, max(int(START * self.length), math.ceil(lost)))
+        steps = min(BURN_IN * self.slowest, self.length)  # the time may be infinite
+        return min(self.length // 2, max(int(START * self.length), math.ceil(steps)))
 
 
 def check(
     u: Float[np.ndarray, "steps walkers free"], log_probability: Float[np.ndarray, "steps walkers"]
 ) -> Check:
-    """Looks at a chain from its start."""
-    apart = walkers_apart(log_probability)
-    counted = u[int(START * len(u)) :, ~apart]
-    return Check(len(u), autocorrelation_time(counted), apart)
+    """Isolated walkers and autocorrelation times of a chain from its first step on."""
+    isolated = isolated_walkers(log_probability)
+    counted = u[int(START * len(u)) :, ~isolated]
+    return Check(len(u), autocorrelation_time(counted), isolated)
 
 
-def check_lengths(stored: int, every: int, limit: int) -> list[int]:
+def check_lengths(stored: int, interval: int, limit: int) -> list[int]:
     """Lengths at which to check a chain, beginning with the last two that are already behind.
 
-    They depend on `stored` only in where they begin, so that a resumed run stops where the unbroken
-    one does. The last one is `limit`.
+    They depend on `stored` only in where they begin, so that a resumed run stops where the
+    uninterrupted one does. The last one is `limit`.
+
+    Args:
+        stored: steps that the chain has already.
+        interval: minimum steps between two checks.
+        limit: steps after which sampling ends.
     """
     lengths = []
     length = 0
     while length < limit:
-        gap = max(every, math.ceil(SPACING * length))
+        gap = max(interval, math.ceil(SPACING * length))
         length = length + gap if length + 2 * gap <= limit else limit
         lengths.append(length)
     after_next = [*lengths[2:], limit + 1, limit + 1]
-    return [now for now, later in zip(lengths, after_next, strict=False) if later > stored]
+    return [length for length, later in zip(lengths, after_next, strict=False) if later > stored]
 
 
 def verdict(
@@ -172,20 +192,20 @@ def verdict(
         latest: the latest check.
         names: of the parameters.
         thin_by: steps of the sampler per step of the chain; the sentence counts the sampler's.
-        stop_at: wanted length in autocorrelation times of the slowest parameter.
+        stop_at: required length in autocorrelation times of the slowest parameter.
     """
-    left_out = int(latest.apart.sum())
+    left_out = int(latest.isolated.sum())
     lengths = latest.length / latest.slowest
-    seen = (
+    facts = (
         f"{latest.length * thin_by} steps are {lengths:.1f} autocorrelation times of"
         f" {names[int(latest.times.argmax())]} ({latest.slowest * thin_by:.1f} steps)"
     )
     if left_out:
-        seen += f"; left out: {left_out} of {latest.apart.size} walkers, which sit apart"
-    if left_out > MOST_APART * latest.apart.size:
-        return False, f"Not converged, too many walkers sit apart: {seen}."
+        facts += f"; left out: {left_out} of {latest.isolated.size} walkers, which are isolated"
+    if left_out > MAX_ISOLATED * latest.isolated.size:
+        return False, f"Not converged, too many walkers are isolated: {facts}."
     if lengths < stop_at:
-        return False, f"Not converged, too short: {seen}; wanted {stop_at:g}."
+        return False, f"Not converged, too short: {facts}; wanted {stop_at:g}."
     if before is None or abs(before.slowest / latest.slowest - 1) > STEADY:
-        return False, f"Not converged, the autocorrelation time still changes: {seen}."
-    return True, f"Converged: {seen}."
+        return False, f"Not converged, the autocorrelation time still changes: {facts}."
+    return True, f"Converged: {facts}."

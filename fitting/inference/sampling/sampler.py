@@ -17,24 +17,24 @@ from fitting.problem.problem import Problem
 from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
-from .chain import Chain, Identity, Last
+from .chain import Chain, Identity, LastStep
 
-DRAWS = 100  # rounds of start walkers
+DRAWS = 100  # attempts to start every walker where its log-probability is finite
 
 
 def moves() -> list[tuple[emcee.moves.Move, float]]:
-    """Proposals and how often each is made."""
+    """Proposals, and the fraction of steps that each makes."""
     return [(emcee.moves.DEMove(), 0.9), (emcee.moves.DEMove(gamma0=1.0), 0.1)]
 
 
 class _Recorder(emcee.backends.Backend):
-    """Hands emcee's steps on to a chain."""
+    """Passes emcee's steps on to a chain."""
 
     def __init__(self, chain: Chain):
         super().__init__()
         self.record = chain.append
 
-    def grow(self, ngrow: int, blobs: Any) -> None:
+    def grow(self, ngrow: int, blobs: object) -> None:
         """The chain grows by itself."""
 
     def save_step(self, state: Any, accepted: np.ndarray) -> None:
@@ -45,19 +45,20 @@ class _Recorder(emcee.backends.Backend):
 def _log_probabilities(
     problem: Problem, u: Float[Array, "walkers free"]
 ) -> Float[Array, " walkers"]:
-    found = lanes(problem.log_probability)(u)
-    return jnp.where(jnp.isfinite(found), found, -jnp.inf)  # emcee raises on NaN
+    log_probability = lanes(problem.log_probability)(u)
+    # emcee raises on NaN
+    return jnp.where(jnp.isfinite(log_probability), log_probability, -jnp.inf)
 
 
 def steps(
     problem: Problem, chain: Chain, start_u: np.ndarray, start_sd: np.ndarray, limit: int
 ) -> Iterator[emcee.State]:
-    """Runs the sampler on from the chain's last step, one stored step at a time."""
+    """Continues the chain from its last step, one stored step at a time, to `limit` stored steps."""
     identity = chain.identity
     dtype = problem.space.u0.dtype
 
     def evaluate(u: np.ndarray) -> np.ndarray:
-        """Half of the walkers at a time, as the moves ask for them: one program."""
+        """Half of the walkers at a time, as the moves need them: one program."""
         halves = np.asarray(u, dtype).reshape(-1, identity.walkers // 2, u.shape[1])
         return np.concatenate(
             [np.asarray(_log_probabilities(problem, jnp.asarray(half)), float) for half in halves]
@@ -86,7 +87,7 @@ def _start(
     evaluate: Callable[[np.ndarray], np.ndarray],
     start_u: np.ndarray,
     start_sd: np.ndarray,
-) -> Last:
+) -> LastStep:
     """Walkers around the start, each drawn until its log-probability is finite."""
     random = np.random.RandomState(identity.seed)  # emcee goes on with this generator's state
     u = np.empty((identity.walkers, start_u.size))
@@ -97,9 +98,9 @@ def _start(
         u[missing] = drawn[missing]
         log_probability[missing] = evaluate(drawn)[missing]
         if np.isfinite(log_probability).all():
-            return Last(u, log_probability, tuple(random.get_state()))
-    found = int(np.isfinite(log_probability).sum())
+            return LastStep(u, log_probability, tuple(random.get_state()))
+    finite = int(np.isfinite(log_probability).sum())
     raise ValueError(
-        f"only {found} of {identity.walkers} walkers found a finite log-probability in {DRAWS}"
-        " draws around start_u; start from a fit, with a smaller start_sd"
+        f"only {finite} of {identity.walkers} walkers have a finite log-probability after {DRAWS}"
+        " draws around start.u; start from a fit, with a smaller start.sd"
     )

@@ -1,0 +1,175 @@
+"""Experiment files: TOML, checked key by key.
+
+preset = "record"                    # a function of jaxik.presets
+rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
+[[clips]]
+reference = "walk.npz"               # the captured motion; paths are relative to this file
+base = "walk_base.npz"               # the flat animation; left out, one is made from the reference
+terrain = "course.ply"
+[parameters]                         # fixed values that differ from the preset's
+lock.enabled = true
+[free]                               # {} takes range, prior and scale from the rule
+pelvis.on_gain = {}
+contact.planted_height = { low = 0.05, high = 0.2 }
+[sigmas]
+ankle = 0.02
+[fit.search]                         # overrides settings of the search, see `SearchSettings`
+final_sweeps = 12
+[[without]]                          # see `ablations`
+name = "locks"
+parameters = { lock.enabled = false }
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import tomli_w
+
+from fitting.inference import settings
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.sampling.settings import SamplerSettings
+from fitting.problem.loss import Loss
+from fitting.runtime import validation
+from fitting.runtime.validation import Constraint, Table, check_table, flatten, nest
+
+from .ablations import read_ablations
+from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions, SampleOptions
+from .systems import preset_system, read_free_table, with_rules
+
+FILE_KEYS = ("reference", "terrain", "base", "truth")
+CLIP_KEYS: dict[str, Constraint] = {
+    **dict.fromkeys((*FILE_KEYS, "label"), validation.TEXT),
+    **dict.fromkeys(("start", "end"), validation.SECONDS),
+    "file_up": validation.one_of(("y", "z")),
+    "mask_pops": validation.BOOLEAN,
+}
+SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
+SIGMA_KEYS |= {"correlation": validation.FRACTION}
+FIT_KEYS: dict[str, Constraint] = {
+    **dict.fromkeys(("starts", "max_steps"), validation.COUNT),
+    "search": validation.TABLE,
+}
+SEARCH_KEYS = {
+    name: Constraint(setting.range, lambda value, setting=setting: setting.allows(_tuple(value)))
+    for name, setting in settings.describe(SearchSettings).items()
+    if name != "max_steps"  # which is a key of [fit]
+}
+SAMPLE_KEYS: dict[str, Constraint] = {
+    **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
+    "stop_at": validation.POSITIVE,
+}
+TABLES = ("free", "rules", "parameters", "sigmas", "fit", "sample")
+TOP_KEYS: dict[str, Constraint] = {
+    "name": validation.TEXT,
+    "preset": validation.TEXT,
+    "loss": validation.one_of(get_args(Loss)),
+    "fps": validation.FINITE_POSITIVE,
+    "seed": validation.SEED,
+    "independent_every": validation.SECONDS,
+    **dict.fromkeys(TABLES, validation.TABLE),
+    "clips": validation.list_of("[[clips]], one for each clip"),
+    "without": validation.list_of("[[without]], one for each variant"),
+}
+
+
+def load_experiment(path: str | Path) -> Experiment:
+    """Reads an experiment file.
+
+    Raises:
+        ValueError: the file does not exist or is not TOML; a key is unknown (the message names the
+            nearest known one); a value has the wrong type; a clip or terrain does not exist.
+    """
+    path = Path(path)
+    return parse_experiment(validation.read_toml(path, "an experiment"), path)
+
+
+def parse_experiment(content: Table, path: Path) -> Experiment:
+    """The experiment in a TOML table; relative paths start from the folder of `path`."""
+    check_table(content, TOP_KEYS, f"{path}")
+    for key in ("clips", "free"):
+        if not content.get(key):
+            raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
+    with validation.error_context(path):
+        ik = preset_system(content.get("preset", "record"))
+    ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
+    check_table(content.get("sigmas", {}), SIGMA_KEYS, f"{path} [sigmas]")
+    free = read_free_table(content["free"], f"{path} [free]")
+    tables = {
+        "clips": tuple(_clip_entry(entry, path) for entry in content["clips"]),
+        "free": free,
+        "parameters": flatten(content.get("parameters", {}), 2),
+        "without": read_ablations(content.get("without", []), ik, f"{path} [[without]]"),
+        "fit": _fit_options(content.get("fit", {}), f"{path}"),
+        "sample": _sample_options(content.get("sample", {}), len(free), f"{path} [sample]"),
+    }
+    return Experiment(**{"path": path, "name": path.stem, **content, **tables})
+
+
+def _fit_options(value: object, where: str) -> FitOptions:
+    table = check_table(value, FIT_KEYS, f"{where} [fit]")
+    changed = check_table(table.get("search", {}), SEARCH_KEYS, f"{where} [fit.search]")
+    changed = {name: _tuple(entry) for name, entry in changed.items()}
+    changed |= {"max_steps": table["max_steps"]} if "max_steps" in table else {}
+    with validation.error_context(f"{where} [fit.search]"):
+        search = SearchSettings(**changed)
+    return FitOptions(table.get("starts", 1), search)
+
+
+def _tuple(value: Any) -> Any:
+    """TOML's lists as the tuples that settings hold."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _sample_options(value: object, free_count: int, where: str) -> SampleOptions:
+    table = check_table(value, SAMPLE_KEYS, where)
+    if "walkers" in table:
+        with validation.error_context(where):
+            SamplerSettings(walkers=table["walkers"]).walkers_for(free_count)
+    return SampleOptions(**table)
+
+
+def _clip_entry(value: object, path: Path) -> ClipEntry:
+    table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
+    entry: dict[str, Any] = dict(table)
+    for key in ("reference", "terrain"):
+        if key not in table:
+            raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
+    for key in FILE_KEYS:
+        if key in table:
+            entry[key] = (path.parent / table[key]).resolve()
+            if not entry[key].is_file():
+                why = validation.why_missing(entry[key])
+                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {why}")
+    return ClipEntry(**entry)
+
+
+def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> str:
+    """The experiment as TOML with absolute paths, so that the file may lie anywhere.
+
+    Paths inside `folder` are written relative to it: those files move with it.
+    """
+    content = _plain(dataclasses.asdict(experiment), folder and folder.resolve())
+    del content["path"]
+    search = content["fit"].pop("search")
+    content["fit"]["max_steps"] = search.pop("max_steps")
+    defaults = dataclasses.asdict(SearchSettings())
+    if changed := {key: search[key] for key in search if search[key] != defaults[key]}:
+        content["fit"]["search"] = _plain(changed, None)
+    for name in ("free", "parameters"):
+        content[name] = nest(content[name])
+    return tomli_w.dumps(content)
+
+
+def _plain(value: Any, folder: Path | None) -> Any:
+    """The value without paths and None, which TOML does not have."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry, folder) for key, entry in value.items() if entry is not None}
+    if isinstance(value, tuple | list):
+        return [_plain(entry, folder) for entry in value]
+    if not isinstance(value, Path):
+        return value
+    if folder is None or not value.is_relative_to(folder):
+        return str(value)
+    return value.relative_to(folder).as_posix()
