@@ -1,11 +1,14 @@
-"""Foot IK as sense, advance, pose: one frame with `step`, a clip with `run`.
+"""The pipeline: one frame with `step`, a joined clip with `run`, part of a clip with `resume`.
 
-What has no memory is computed for all frames at once (`sense`, `pose`); only a few numbers per leg
-go through the scan (`advance`). Everything is for one character: batch with `lanes` or `jax.vmap`.
+Each frame goes through three phases. `sense` and `pose` have no memory and are computed for all
+frames of a clip at once; only `advance`, a few numbers per leg, runs in a scan over the frames.
+Everything here is for one character: batch with `lanes` or `jax.vmap`.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +33,22 @@ from jaxik.world.frame import Contact, Frame, Sensed, animated_ankles
 from jaxik.world.skeleton import LegPose, Rig, Transform, bone_lengths
 from jaxik.world.terrain import LegTerrains, Terrain
 
+Function = TypeVar("Function", bound=Callable[..., object])
+
 
 class FootIK(Rule):
-    """A foot-IK system: one rule a stage, in the order in which they run."""
+    """A foot-IK system: one rule for each of ten stages, in the order in which they run.
+
+    Make one from a preset of `jaxik.presets`, then exchange rules with `dataclasses.replace` and
+    numbers with `jaxik.maths.parameter_tree.replace`:
+
+        ik = dataclasses.replace(jaxik.presets.stride(), pelvis=SupportPelvis(lowest_share=0.5))
+        ik = parameter_tree.replace(ik, {"pelvis.rise_half_life": 0.2})
+
+    Printing a system lists its rules and parameters with their units. It is a pytree whose float
+    leaves are the parameters, so that `jax.grad` with respect to it works. A parameter is one
+    number for all legs or an array with one number a leg.
+    """
 
     contact: AbstractContact
     root: AbstractRoot
@@ -48,9 +64,9 @@ class FootIK(Rule):
 
 @struct
 class State:
-    """All that the pipeline remembers between frames."""
+    """The pipeline's memory between frames; each stage's part belongs to its rule."""
 
-    started: Bool[Array, "*b"]  # False before the first frame, on which memory jumps to its goals
+    started: Bool[Array, "*b"]  # False before the first frame, where memory jumps to its goals
     contact: PyTree
     target: PyTree
     lean: PyTree
@@ -61,18 +77,18 @@ class State:
 
 @struct
 class Advanced:
-    """What memory makes of a frame."""
+    """Output of the stages with memory, in one frame."""
 
-    foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, before the lock
+    foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, not yet locked
     hold: Hold
     lean: Lean
     effector: Effector
-    state: State  # after the frame
+    state: State  # after this frame
 
 
 @struct
 class Corrections:
-    """Local rotations that turn the animated pose into the solved one, right-multiplied."""
+    """Local rotations from the animated pose to the solved one: `solved = animated * correction`."""
 
     hip: Float[Array, "*b legs 4"]
     knee: Float[Array, "*b legs 4"]
@@ -81,7 +97,7 @@ class Corrections:
 
 @struct
 class Trace:
-    """Every stage's output."""
+    """Output of every stage."""
 
     sensed: Sensed
     advanced: Advanced
@@ -89,18 +105,18 @@ class Trace:
 
 @struct
 class Result:
-    """The frame after foot IK."""
+    """One frame after foot IK."""
 
-    pose: LegPose  # legs, model space
-    body: Transform  # carries the animated body to where it belongs, model space
+    pose: LegPose  # solved legs, model space
+    body: Transform  # moves the animated body to its solved place, model space
     corrections: Corrections
     reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
-    aimed: Float[Array, "*b legs"]  # 1 where the foot is turned as its rule wants, else 0
-    trace: Trace | None  # None from a `step` that was not asked for it
+    aimed: Float[Array, "*b legs"]  # 1 where the foot has the rotation its rule wants, else 0
+    trace: Trace | None  # None from a `step` without `trace=True`
 
 
 def init(ik: FootIK, rig: Rig) -> State:
-    """The memory of a character that has not been seen yet: its first frame starts settled."""
+    """Memory before the first frame, which then starts settled, with nothing to catch up on."""
     return State(
         jnp.zeros((), bool),
         ik.contact.init(rig),
@@ -113,7 +129,7 @@ def init(ik: FootIK, rig: Rig) -> State:
 
 
 def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
-    """All that the frame shows by itself, once it is known which feet stand."""
+    """Outputs of the stages that need no memory, given which feet stand."""
     rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
     up = terrain.leg_up_ws
     weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
@@ -156,53 +172,65 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
 
 
 def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Advanced:
-    """Memory: footholds, locks, lean, pelvis and effectors after this frame.
+    """Memory after this frame, and the outputs of the stages that have some.
 
-    That of the contact has advanced already, to `contact`: the senses need it.
+    Args:
+        ik: the system.
+        now: the sensed frame.
+        state: memory after the frame before.
+        contact: the contact stage's memory after this frame: it advances before `sense`.
     """
     sensed, up = now.sensed, now.sensed.leg_up_ws
     with jax.named_scope("target"):
-        target, rise = ik.target.advance(now, state.target)
+        target_state, rise = ik.target.advance(now, state.target)
         foothold_ws = sensed.foothold.point_ws + vec.scale(up, rise)
     with jax.named_scope("lean"):
-        leaning, lean = ik.lean.advance(now, state.lean)
+        lean_state, lean = ik.lean.advance(now, state.lean)
     with jax.named_scope("lock"):
-        # The hip as the frame before left it: this frame's offset follows from the locks.
+        # With the last frame's pelvis: this frame's offset follows from the locks.
         hip_ws = sensed.hip_ws + state.pelvis.offset_ws
-        lock, held = ik.lock.advance(now, foothold_ws, hip_ws, state.lock)
-        target_ws = foothold_ws + held.offset_ws + vec.scale(up, sensed.foothold.lift)
-        ankle = Transform(target_ws, held.rot_ws)
+        lock_state, hold = ik.lock.advance(now, foothold_ws, hip_ws, state.lock)
+        target_ws = foothold_ws + hold.offset_ws + vec.scale(up, sensed.foothold.lift)
+        ankle = Transform(target_ws, hold.rot_ws)
     with jax.named_scope("pelvis"):
         awake = ik.effector.awake(now, state.effector)
         pelvis_now = PelvisMoment(now.dt, now.started, now.gate, sensed, now.terrain, lean, awake)
         pelvis = ik.pelvis.advance(pelvis_now, ankle, state.pelvis)
     with jax.named_scope("effector"):
-        following, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
-    after = State(jnp.ones_like(now.started), contact, target, leaning, lock, pelvis, following)
-    return Advanced(foothold_ws, held, lean, effector, after)
+        effector_state, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
+    after = State(
+        started=jnp.ones_like(now.started),
+        contact=contact,
+        target=target_state,
+        lean=lean_state,
+        lock=lock_state,
+        pelvis=pelvis,
+        effector=effector_state,
+    )
+    return Advanced(foothold_ws, hold, lean, effector, after)
 
 
 def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Result:
     """The solved legs."""
-    rig, frame = inputs.rig, inputs.frame
+    rig, frame, effector = inputs.rig, inputs.frame, advanced.effector
     offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
-    body = carry(rig, frame, advanced.lean.turn_ws, offset_ws)
-    effector = advanced.effector
+    body = body_transform(inputs, advanced.lean.turn_ws, offset_ws)
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
-        carried = frame.pose.transformed(body.repeat(rig.side.size))
-        bend = ik.leg.pose(inputs, sensed, LegGoal(carried, target_ms, effector.weight))
+        moved = frame.pose.transformed(body.repeat(rig.side.size))
+        leg = ik.leg.pose(inputs, sensed, LegGoal(moved, target_ms, effector.weight))
     with jax.named_scope("foot"):
-        planted = ik.foot.pose(inputs, sensed, effector, bend)
-    corrections = Corrections(bend.hip, bend.knee, planted.ankle)
+        foot = ik.foot.pose(inputs, sensed, effector, leg)
+    corrections = Corrections(leg.hip, leg.knee, foot.ankle)
     trace = Trace(sensed, advanced)
-    return Result(planted.pose, body, corrections, bend.reached, planted.reached, trace)
+    return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
 
 
 def sense_contacts(rule: AbstractContact, inputs: Inputs, state: State) -> tuple[PyTree, Contact]:
-    """Memory after each frame and the contacts, in a scan of their own.
+    """The contact stage for a joined clip: memory after each frame, and the contacts.
 
-    A rule without memory needs none. The leaves of `inputs.frame` have a leading axis of frames.
+    It runs in a scan of its own before everything else, or without one if the rule has no memory.
+    The leaves of `inputs.frame` have a leading axis of frames.
     """
     frames, gate = inputs.frame, inputs.gate
     with jax.named_scope("contact"):
@@ -222,18 +250,29 @@ def sense_contacts(rule: AbstractContact, inputs: Inputs, state: State) -> tuple
         return jax.lax.scan(scanned, (state.contact, state.started), (sensed, frames.dt))[1]
 
 
-def carry(rig: Rig, frame: Frame, turn_ws: Array, offset_ws: Array) -> Transform:
-    """The body's move in model space: a turn about the middle of the hips, then an offset."""
-    into_model = quat.conjugate(frame.world_from_model.rot)
-    present = rig.present.astype(offset_ws.dtype)
-    share = present / jnp.maximum(vec.sum_last(present), 1.0)
-    pivot = vec.barrier(vec.sum_vectors(vec.scale(frame.pose.hip.pos, share)))
-    turn = quat.multiply(into_model, quat.multiply(turn_ws, quat.conjugate(into_model)))
-    offset = quat.rotate(into_model, offset_ws)
-    return Transform(pivot + offset - quat.rotate(turn, pivot), turn)
+def body_transform(inputs: Inputs, rot_ws: Array, offset_ws: Array) -> Transform:
+    """The body's motion in model space: a rotation about the mean of its hips, then an offset.
+
+    Args:
+        inputs: the frame and its rig; legs that are not present do not count.
+        rot_ws: rotation, world axes.
+        offset_ws: offset, m, world space.
+    """
+    model_from_world = quat.conjugate(inputs.frame.world_from_model.rot)
+    present = inputs.rig.present.astype(offset_ws.dtype)
+    weight = present / jnp.maximum(vec.sum_last(present), 1.0)
+    pivot = vec.barrier(vec.sum_vectors(vec.scale(inputs.frame.pose.hip.pos, weight)))
+    rot = quat.multiply(model_from_world, quat.multiply(rot_ws, quat.conjugate(model_from_world)))
+    offset = quat.rotate(model_from_world, offset_ws)
+    return Transform(pivot + offset - quat.rotate(rot, pivot), rot)
 
 
-@functools.partial(jax.jit, static_argnames="trace")
+def _jit(**options: str) -> Callable[[Function], Function]:
+    """`jax.jit`, but editors and type checkers still see the function's own signature."""
+    return cast(Callable[[Function], Function], functools.partial(jax.jit, **options))
+
+
+@_jit(static_argnames="trace")
 def step(
     ik: FootIK,
     rig: Rig,
@@ -244,17 +283,20 @@ def step(
     *,
     trace: bool = False,
 ) -> tuple[State, Result]:
-    """One frame of one character, live.
+    """One frame of one character, for use in a game loop.
 
     Args:
         ik: the system; its float leaves are its parameters.
         rig: the legs.
-        terrain: the ground, world space; `LegTerrains` where legs differ in their up.
-        state: memory, from `init` or from the step before.
+        terrain: the terrain, world space; `LegTerrains` where legs differ in their up.
+        state: memory, from `init` or from the previous step.
         frame: the animation.
-        gate: `Hard` decides as a game does; `Smooth` has slopes through decisions.
-        trace: whether the result tells every stage's output. A call spends a third of its time on
-            handing these out, one buffer a leaf.
+        gate: `Hard` decides as a game does; `Smooth` lets gradients through decisions.
+        trace: whether the result contains every stage's output. Handing these out, one buffer per
+            leaf, takes a third of a call's time.
+
+    Returns:
+        Memory after the frame, for the next step, and the result.
     """
     inputs = Inputs(rig, terrain, frame, gate)
     with jax.named_scope("contact"):
@@ -267,7 +309,7 @@ def step(
     return advanced.state, result if trace else dataclasses.replace(result, trace=None)
 
 
-@jax.jit
+@_jit()
 def resume(
     ik: FootIK,
     rig: Rig,
@@ -276,10 +318,13 @@ def resume(
     frames: Frame,
     gate: AbstractGate = HARD,
 ) -> tuple[State, Result]:
-    """A clip from a given memory; the leaves of `frames` have a leading axis of frames.
+    """A clip, or a part of one, that starts with the memory of what came before.
 
-    Equal to `step` for each frame in turn. Returns the memory after the last frame, so that a clip
-    may be cut anywhere.
+    Gives what `step` gives for each frame in turn. For the arguments see `step`; the leaves of
+    `frames` and of the result have a leading axis of frames.
+
+    Returns:
+        Memory after the last frame, so that the remainder can follow, and the result.
     """
     inputs = Inputs(rig, terrain, frames, gate)
 
@@ -300,7 +345,7 @@ def resume(
     return after, result
 
 
-@functools.partial(jax.jit, static_argnames="block")
+@_jit(static_argnames="block")
 def run(
     ik: FootIK,
     rig: Rig,
@@ -310,29 +355,35 @@ def run(
     *,
     block: int | None = None,
 ) -> Result:
-    """A clip of one character; the leaves of `frames` and of the result lead with frames.
+    """A clip of one character, from a fresh start.
 
-    Jit, vmap and differentiate over any argument. `block` cuts a long clip: so many frames are
-    computed at a time, so that besides arguments and results one block is all that memory holds,
-    and in reverse mode one block and the state before each of them. The result is the same.
+    It can be jitted, vmapped and differentiated with respect to any argument. For the arguments see
+    `step`; the leaves of `frames` and of the result have a leading axis of frames.
+
+    Args:
+        block: how many frames to compute at a time, for long clips; None computes all at once. The
+            result is the same, but besides arguments and results only one block has to be in
+            memory, in reverse mode one block and the state before each.
 
     Raises:
-        ValueError: a block of no frames.
+        ValueError: if `block` is less than 1.
     """
     if block is not None and block < 1:
-        raise ValueError(f"block is {block}, wanted 1 frame or more, or None for all at once")
+        raise ValueError(
+            f"block must be at least 1 frame, or None for all frames at once; got {block}"
+        )
     start, count = init(ik, rig), frames.dt.shape[0]
     if block is None or block >= count:
         return resume(ik, rig, terrain, start, frames, gate)[1]
     blocks = count // block
 
-    def resumed(state: State, frames: Frame) -> tuple[State, Result]:
+    def resume_block(state: State, frames: Frame) -> tuple[State, Result]:
         return resume(ik, rig, terrain, state, frames, gate)
 
-    cut = jax.tree.map(lambda x: x[: blocks * block].reshape(blocks, block, *x.shape[1:]), frames)
-    state, results = jax.lax.scan(jax.checkpoint(resumed), start, cut)
-    whole = jax.tree.map(lambda x: x.reshape(blocks * block, *x.shape[2:]), results)
+    split = jax.tree.map(lambda x: x[: blocks * block].reshape(blocks, block, *x.shape[1:]), frames)
+    state, results = jax.lax.scan(jax.checkpoint(resume_block), start, split)
+    joined = jax.tree.map(lambda x: x.reshape(blocks * block, *x.shape[2:]), results)
     if blocks * block == count:
-        return whole
-    rest = resumed(state, jax.tree.map(lambda x: x[blocks * block :], frames))[1]
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), whole, rest)
+        return joined
+    remainder = resume_block(state, jax.tree.map(lambda x: x[blocks * block :], frames))[1]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), joined, remainder)
