@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxik
-from fitting.inference.identifiability import NUDGE
+from fitting.inference.threshold_profile import NUDGE
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 from fitting.runtime import program_cache

@@ -21,7 +21,7 @@ from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.datasets.terrain.reconstruction import reconstruct
 from fitting.experiments import experiment, parameter_files, record_files, systems
-from fitting.inference.identifiability import identify
+from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
 from fitting.report import (
@@ -258,7 +258,7 @@ def _keep_fit(
 ) -> study.Fit:
     """Writes a solution before anything may go wrong with it, then what is known of it."""
     run_folder.save_solution(run, asked, problem, solution)
-    fitted = study.Fit(asked, problem, solution, identify(problem, solution))
+    fitted = study.Fit(asked, problem, solution, assess_identifiability(problem, solution))
     run_folder.save_fit(run, fitted)
     return fitted
 

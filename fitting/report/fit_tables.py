@@ -6,7 +6,7 @@ from typing import Literal, NotRequired, TypeAlias, TypedDict
 
 from fitting.analysis.accuracy import Accuracy
 from fitting.analysis.limit_activity import ClipActivity
-from fitting.inference.identifiability import Profile
+from fitting.inference.threshold_profile import Profile
 
 from .formatting import Table, interval, number, percent
 from .labels import ACCURACY, headings

@@ -1,18 +1,17 @@
-"""One system's parameters from another's motion.
+"""Translation: the parameters of one system fitted to the motion of another.
 
-The source runs on flat animations over terrain; what it makes of them is the reference of an
-ordinary experiment, in which the target's parameters are free. The folder is a run like any other,
-with these files besides:
+The source runs on flat animations over terrain; its motion is the reference of an ordinary
+experiment in which parameters of the target are free. The folder is a run like any other, with
+these files in addition:
 
-source.npz              the source's motion (source_1.npz, ... of several clips)
+source.npz              the source's motion (source_1.npz, ... for several clips)
 source.toml             the source's parameters
 <preset>.toml           the fitted parameters again, under the name of the target's preset
-translation.json        what remains, in numbers
-difference.png          what remains, over time
+translation.json        the remaining differences, as numbers
+difference.png          the remaining differences over time
 """
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +21,10 @@ import numpy as np
 import jaxik
 from fitting.analysis import difference
 from fitting.datasets import clip_frames, clips
-from fitting.datasets.clips import edit
-from fitting.datasets.flat_animation import load_flat_animation
-from fitting.datasets.terrain import mesh_files
-from fitting.experiments import experiment, parameter_files, systems
+from fitting.datasets.clips import Clip, edit
+from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
+from fitting.experiments.problems import ClipData, problem_from_clips
 from fitting.inference import sensitivity
 from fitting.inference.optimisation.population import evaluate
 from fitting.inference.optimisation.settings import SearchSettings
@@ -35,176 +33,174 @@ from fitting.inference.optimisation.sweep import sweep
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.runtime import files, validation
+from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 
 from . import run_folder
-from .comparison import solve
+from .animations import AnimationFiles, load_animation
 
-# Nothing is noisy here: these say how far off still counts as the same.
-SIGMAS = {
+# The source has no noise: these say how far apart two motions still count as the same.
+TOLERANCES = {
     "ankle": 0.005,  # m
     "knee": 0.005,  # m
     "pelvis": 0.005,  # m
     "foot": 0.03,  # rad
     "body": 0.03,  # rad
 }
-SWEEPS, GAIN = 20, 0.01  # of the approach: at most so many, each of so much of the cost
+MAX_SWEEPS = 20  # over the free parameters, before the search
+MIN_SWEEP_GAIN = 0.01  # relative fall of the cost that makes another sweep worthwhile
 SOURCE = "source.toml"
 
 
 @dataclass(frozen=True)
-class System:
-    """A system as it was asked for."""
+class NamedSystem:
+    """A system under the name by which the user asked for it."""
 
-    name: str  # of a preset, or of a parameter file
+    name: str  # of a preset, or the stem of a parameter file
     preset: str
     ik: jaxik.FootIK
 
 
 @dataclass(frozen=True)
-class Translation:
-    """What is to be fitted to what."""
+class TranslationRequest:
+    """Which system is fitted to which, and on what."""
 
-    source: System
-    target: System
+    source: NamedSystem  # whose motion is reproduced
+    target: NamedSystem  # whose parameters are fitted, starting from these values
+    animations: tuple[AnimationFiles, ...]
+    free: Mapping[str, Mapping[str, Any]] | None = None  # None: all that move these clips
+    fps: float | None = None  # clips are resampled to this rate first
+
+
+@dataclass(frozen=True)
+class Translation:
+    """A translation that is ready to be fitted."""
+
+    source: NamedSystem
+    target: NamedSystem
     experiment: Experiment
-    motions: tuple[clips.Clip, ...]  # what the source makes of each clip
-    problem: Problem
-    chosen: bool  # the free parameters were named, and not found by a sweep
+    motions: tuple[Clip, ...]  # of the source, for each clip
+    problem: Problem[jaxik.FootIK]
+    free_was_chosen: bool  # by the user, and not by a sweep over all parameters
 
     @property
     def names(self) -> tuple[str, str]:
-        """What texts call the source and the target."""
+        """The source and the target as texts refer to them."""
         same = self.source.name == self.target.name
         return f"`{self.source.name}`{' (source)' if same else ''}", f"`{self.target.name}`"
 
 
-def read_system(given: str, option: str) -> System:
-    """The system of a preset's name or of a parameter file.
-
-    Raises:
-        ValueError: for a name or a file that is neither.
-    """
-    path = Path(given)
-    if path.suffix.lower() == ".toml":
-        ik, preset = parameter_files.load_system(path)
-        return System(path.stem, preset, ik)
-    with validation.error_context(f"{option} takes a preset or a parameter .toml"):
-        return System(given, given, systems.preset_system(given))
-
-
-def read_free(given: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
-    """FreeParameter parameters by name: `name,name`, or the [free] table of a TOML file as experiments have.
-
-    Raises:
-        ValueError: for no name, an unknown one, or what it cannot be.
-    """
-    path = Path(given)
-    named: dict[str, Mapping[str, Any]]
-    if path.suffix.lower() == ".toml":
-        content = validation.read_toml(path, "a free-parameter")
-        validation.check_table(content, {"free": validation.TABLE}, given)
-        named = systems.read_free_table(content.get("free", {}), f"{given} [free]")
-    else:
-        named = {one.strip(): {} for one in given.split(",") if one.strip()}
-    if not named:
-        raise ValueError(f"--free {given}: names no parameter")
-    with validation.error_context("--free"):
-        for name, options in named.items():
-            free_parameter(ik, name, **options)
-    return named
-
-
-def check_place(run: Path) -> None:
-    """ValueError where no new folder can be made; an empty one counts as new."""
-    run_folder.check_place(run)
-    if run.is_dir() and (there := sorted(os.listdir(run))):
-        raise ValueError(f"{run}: there is something in it already: {there}; name a new folder")
-
-
-def plan(
-    source: System,
-    target: System,
-    paths: Sequence[Path],
-    terrains: Sequence[Path],
-    run: Path,
-    *,
-    named: Mapping[str, Mapping[str, Any]] | None = None,
-    fps: float | None = None,
-    file_up: str = "y",
-) -> Translation:
-    """Runs the source, and says what of the target is to be fitted to it; writes nothing.
+def load_named_system(text: str, option: str = "system") -> NamedSystem:
+    """The system with the name of a preset, or in a parameter file (.toml).
 
     Args:
-        source: whose motion is reproduced.
-        target: what is not free keeps its values, and what is free starts there.
-        paths: clips over flat ground.
-        terrains: a mesh for each.
-        run: folder that the run is going to have.
-        named: free parameters; None takes all that move these clips.
-        fps: rate to which clips are resampled first.
-        file_up: up axis of the meshes.
+        text: the name or the path.
+        option: what the user set to this text, for the error message.
 
     Raises:
-        ValueError: as many clips as terrains are wanted; what cannot be read; a source that moves
-            nothing, or a target none of whose parameters does.
+        ValueError: there is no such preset or file.
     """
-    if len(paths) != len(terrains) or not paths:
-        raise ValueError(
-            f"{len(paths)} clip(s) and {len(terrains)} terrain(s); wanted a terrain for each clip"
-        )
-    run = run.resolve()
-    alike = systems.rule_names(source.ik) == systems.rule_names(target.ik)
-    truth = run / SOURCE if alike else None
-    entries, pairs = [], []
-    for i, (path, terrain) in enumerate(zip(paths, terrains, strict=True)):
-        name = f"source_{i + 1}.npz" if len(paths) > 1 else "source.npz"
-        ground = mesh_files.load_terrain(terrain, file_up=file_up)
-        base = load_flat_animation(path)
-        base = base if fps is None else edit.resample(base, fps)
-        pairs.append((_solved(source, base, ground), base, ground))
-        entries.append(
-            ClipEntry(
-                run / name, terrain.resolve(), path.resolve(), truth, file_up=file_up,
-                label=f"source: {source.name}", mask_pops=False,
-            )
-        )  # fmt: skip
+    path = Path(text)
+    if path.suffix.lower() == ".toml":
+        ik, preset = parameter_files.load_system(path)
+        return NamedSystem(path.stem, preset, ik)
+    with error_context(f"{option} takes a preset or a parameter .toml"):
+        return NamedSystem(text, text, systems.preset_system(text))
+
+
+def read_free(text: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
+    """Free parameters as `--free` names them: `name,name`, or a TOML file with a [free] table.
+
+    Raises:
+        ValueError: no parameter is named, one is unknown, or it cannot be what the table says.
+    """
+    path = Path(text)
+    free: dict[str, Mapping[str, Any]]
+    if path.suffix.lower() == ".toml":
+        content = validation.read_toml(path, "a free-parameter")
+        validation.check_table(content, {"free": validation.TABLE}, text)
+        free = systems.read_free_table(content.get("free", {}), f"{text} [free]")
+    else:
+        free = {name.strip(): {} for name in text.split(",") if name.strip()}
+    if not free:
+        raise ValueError(f"--free {text}: names no parameter")
+    with error_context("--free"):
+        for name, overrides in free.items():
+            free_parameter(ik, name, **overrides)
+    return free
+
+
+def prepare(request: TranslationRequest, run: Path) -> Translation:
+    """Runs the source and builds the problem of fitting the target to it; writes nothing.
+
+    Args:
+        request: what is translated.
+        run: the folder that the run is going to have.
+
+    Raises:
+        ValueError: there is no clip, or a file cannot be read; the source moves nothing in these
+            clips; no parameter of the target does.
+    """
+    if not request.animations:
+        raise ValueError("no clip; wanted at least one, with a terrain for each")
+    source, target, run = request.source, request.target, run.resolve()
+    data = [_source_motion(source, files, request.fps) for files in request.animations]
     preset = systems.preset_system(target.preset)
     rules = systems.changed_rules(target.ik, preset)
-    asked = Experiment(
+    experiment = Experiment(
         path=run / run_folder.EXPERIMENT,
-        clips=tuple(entries),
-        free=named or sensitivity.declared(target.ik),
+        clips=_clip_entries(request, run),
+        free=request.free or sensitivity.all_parameters(target.ik),
         preset=target.preset,
         name=f"{source.name} to {target.name}",
-        fps=fps,
+        fps=request.fps,
         rules=rules,
-        parameters=_changed(target.ik, systems.with_rules(preset, rules, target.name)),
-        sigmas=SIGMAS,
+        parameters=_changed_values(target.ik, systems.with_rules(preset, rules, target.name)),
+        sigmas=TOLERANCES,
     )
-    problem = problems.problem_from_clips(asked, pairs)
+    problem = problem_from_clips(experiment, data)
     _check_moves(source, problem)
-    if named is None:
-        moving = sensitivity.moving(target.ik, asked.free, problem.data)
+    if request.free is None:
+        moving = sensitivity.measure_sensitivity(target.ik, experiment.free, problem.data)
         if not moving:
             raise ValueError(f"no parameter of {target.name} moves anything in these clips")
-        asked = replace(asked, free={name: asked.free[name] for name in moving})
-        problem = problems.problem_from_clips(asked, pairs)
-    motions = tuple(reference for reference, _, _ in pairs)
-    return Translation(source, target, asked, motions, problem, named is not None)
+        experiment = replace(experiment, free={name: experiment.free[name] for name in moving})
+        problem = problem_from_clips(experiment, data)
+    motions = tuple(clip.reference for clip in data)
+    return Translation(source, target, experiment, motions, problem, request.free is not None)
 
 
-def _solved(source: System, base: clips.Clip, ground: Any) -> clips.Clip:
-    """What the source makes of a clip."""
-    motion = clip_frames.frames_from_clip(base)
-    with validation.error_context(source.name):
-        problems.check_shapes(source.ik, base.rig, ground, motion)
-        _, solved = solve(source.ik, base, ground, motion, 0.0)
-    return replace(solved, source=f"{source.name} on {base.source}")
+def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ...]:
+    source, count = request.source, len(request.animations)
+    same_rules = systems.rule_names(source.ik) == systems.rule_names(request.target.ik)
+    return tuple(
+        ClipEntry(
+            reference=run / (f"source_{number}.npz" if count > 1 else "source.npz"),
+            terrain=animation.terrain.resolve(),
+            base=animation.clip.resolve(),
+            truth=run / SOURCE if same_rules else None,
+            file_up=animation.file_up,
+            label=f"source: {source.name}",
+            mask_pops=False,
+        )
+        for number, animation in enumerate(request.animations, 1)
+    )
 
 
-def _changed(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, Any]:
-    """Values in which a system differs from its preset, whose rules are the same."""
+def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None) -> ClipData:
+    """What the source makes of a clip, as the reference."""
+    animation = load_animation(files)
+    if fps is not None:
+        animation = replace(animation, clip=edit.resample(animation.clip, fps))
+    with error_context(source.name):
+        animation.check_shapes(source.ik)
+        _, solved = animation.solve(source.ik)
+    solved = replace(solved, source=f"{source.name} on {animation.clip.source}")
+    return ClipData(solved, animation.clip, animation.terrain)
+
+
+def _changed_values(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, Any]:
+    """Values in which a system differs from its preset, which has the same rules."""
     values = {name: np.asarray(parameter_tree.get(ik, name)) for name in systems.leaf_names(ik)}
     return {
         name: value.tolist()
@@ -213,26 +209,26 @@ def _changed(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, Any]:
     }
 
 
-def _check_moves(source: System, problem: Problem) -> None:
-    """ValueError where the source leaves every clip as it is."""
+def _check_moves(source: NamedSystem, problem: Problem[jaxik.FootIK]) -> None:
+    """Raises ValueError if the source leaves every clip as it is."""
     for scene in problem.data:
-        apart = difference.correction(scene)
-        if any(one.max() > difference.NEGLIGIBLE for one in apart.values()):
+        corrections = difference.correction(scene)
+        if any(series.max() > difference.NEGLIGIBLE for series in corrections.values()):
             return
     raise ValueError(f"{source.name} moves nothing in these clips: there is nothing to reproduce")
 
 
-def approach(problem: Problem) -> np.ndarray:
-    """Where the fit starts, (1, free) in `u`: the target's own values, carried closer one by one.
+def starting_point(problem: Problem[jaxik.FootIK]) -> np.ndarray:
+    """Where the search starts, (1, free) in u: the target's values, improved one by one.
 
-    Far from the source, slopes lead every parameter into the part of some other; single values
-    carried over their ranges do not.
+    Far from the source, a descent makes each parameter do the work of another one. Moving single
+    values over their ranges first does not.
     """
     u = np.asarray(problem.space.pack({}))
     cost = float(evaluate(problem, u[None]).cost[0])
-    search = Search(problem, SearchSettings(min_sweep_gain=GAIN))
+    search = Search(problem, SearchSettings(min_sweep_gain=MIN_SWEEP_GAIN))
     state = SearchState.at(u, cost)
-    for _ in range(SWEEPS):
+    for _ in range(MAX_SWEEPS):
         before = state.point
         state = sweep(search, state)
         if state.point is before:
@@ -240,11 +236,10 @@ def approach(problem: Problem) -> np.ndarray:
     return state.point.u[None]
 
 
-def save_source(run: Path, made: Translation) -> None:
-    """Begins the folder of the run with the source's motion and parameters."""
+def save_source(run: Path, translation: Translation) -> None:
+    """Starts the folder of the run with the source's motion and parameters."""
     run.mkdir(parents=True, exist_ok=True)
-    for entry, motion in zip(made.experiment.clips, made.motions, strict=True):
+    for entry, motion in zip(translation.experiment.clips, translation.motions, strict=True):
         clips.save_clip(entry.reference, motion, joints=clip_frames.positions_by_role(motion))
-    files.write_text(
-        run / SOURCE, parameter_files.system_to_toml(made.source.ik, made.source.preset)
-    )
+    source = translation.source
+    files.write_text(run / SOURCE, parameter_files.system_to_toml(source.ik, source.preset))

@@ -27,7 +27,7 @@ def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, search.
 
 @pytest.fixture(scope="module")
 def report() -> identifiability.Identifiability:
-    return identifiability.identify(*toy.solved(SEED))
+    return identifiability.assess_identifiability(*toy.solved(SEED))
 
 
 def test_a_parameter_that_does_nothing_is_named_undetermined(report):
@@ -90,13 +90,15 @@ def test_a_fit_off_its_minimum_is_told_by_how_much():
     moved = dataclasses.replace(
         solution, u=u, values=np.asarray(problem.space.values(jnp.asarray(u))), cost=cost
     )
-    assert identifiability.identify(problem, moved).improvement > 0.9 * (cost - solution.cost)
+    assert identifiability.assess_identifiability(problem, moved).improvement > 0.9 * (
+        cost - solution.cost
+    )
 
 
 def test_a_value_at_its_bound_is_flagged():
-    assert set(identifiability.identify(*toy.solved(SEED)).at_bound) == {""}
+    assert set(identifiability.assess_identifiability(*toy.solved(SEED)).at_bound) == {""}
     truth = toy.TRUTH | {"body.rise": 0.0, "foot.limit[1]": 0.1}
-    flags = identifiability.identify(*from_the_truth(SEED, truth)).at_bound
+    flags = identifiability.assess_identifiability(*from_the_truth(SEED, truth)).at_bound
     named = {name: flag for name, flag in zip(toy.NAMES, flags, strict=True) if flag}
     assert named == {"body.rise": "low", "foot.limit[1]": "low"}
 
@@ -108,7 +110,9 @@ def test_parameters_that_do_the_same_are_named_as_a_pair(report):
     slopes = solution.jacobian.copy()
     data = slice(0, -problem.space.size)
     slopes[data, one] = slopes[data, other]
-    twin = identifiability.identify(problem, dataclasses.replace(solution, jacobian=slopes))
+    twin = identifiability.assess_identifiability(
+        problem, dataclasses.replace(solution, jacobian=slopes)
+    )
     ((first, second, correlation),) = twin.correlated
     assert {first, second} == {"foot.idle", "body.drop"}
     assert correlation == pytest.approx(-1, abs=1e-3)
@@ -118,7 +122,7 @@ def test_slopes_that_are_not_finite_are_refused():
     problem, solution = toy.solved(SEED)
     broken = dataclasses.replace(solution, jacobian=solution.jacobian * np.nan)
     with pytest.raises(ValueError, match="nothing can be said where the slopes are not finite"):
-        identifiability.identify(problem, broken)
+        identifiability.assess_identifiability(problem, broken)
 
 
 def test_a_profile_of_a_name_that_is_not_free_is_refused():

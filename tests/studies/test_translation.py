@@ -17,7 +17,7 @@ from fitting.datasets import clip_frames
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
-from fitting.experiments import experiment, parameter_files
+from fitting.experiments import parameter_files, problems
 from fitting.inference import sensitivity
 from fitting.report import difference_report
 from fitting.report.labels import DIFFERENCES
@@ -26,6 +26,8 @@ from jaxik import presets
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import ROOT
+
+pytestmark = pytest.mark.slow
 
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
 TRUTH = {"pelvis.on_gain": 0.45, "pelvis.limit": 0.17}
@@ -49,7 +51,7 @@ def clip(tmp_path_factory) -> Path:
     """One and a half seconds of the embedded walk, up the first steps."""
     whole = load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz")
     path = tmp_path_factory.mktemp("clips") / "short.npz"
-    save_clip(path, whole.at(slice(90, 135)))
+    save_clip(path, whole.select(slice(90, 135)))
     return path
 
 
@@ -208,11 +210,11 @@ def test_what_the_source_leaves_alone_has_no_share():
 
 def test_only_what_moves_the_clip_is_free_unless_it_is_named(run):
     (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
-    named = sensitivity.declared(presets.record())
+    named = sensitivity.all_parameters(presets.record())
     assert {"probe.toe_ls[0]", "probe.toe_ls[2]", "pelvis.limit"} <= set(named)
     assert named["lock.max_speed"] == {"high": 12.0}  # it is infinite: that must be within reach
     some = {one: named[one] for one in ("pelvis.limit", "lean.gain_slide", "leg.max_knee_angle")}
-    moving = sensitivity.moving(presets.record(), some, (scene,))
+    moving = sensitivity.measure_sensitivity(presets.record(), some, (scene,))
     assert set(moving) == {"pelvis.limit", "leg.max_knee_angle"}  # nothing slides in this clip
     assert moving["pelvis.limit"] > 5.0
 
