@@ -1,47 +1,70 @@
-"""What `import jaxik` gives: little at once, all of it when asked for."""
+"""What `import jaxik` and `import fitting` offer, to Python, to editors and to type checkers."""
 
 import ast
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from hatchling.builders.wheel import WheelBuilder
 
 import fitting
 import jaxik
 
-FACE = Path(jaxik.__file__)
+ROOT = Path(jaxik.__file__).parents[1]
 
 
-def test_importing_jaxik_waits_with_what_it_names():
-    code = "import sys, jaxik; print('equinox' in sys.modules, 'jax' in sys.modules)"
+def stub_names(package: ModuleType) -> list[str]:
+    """Public names of a package, from the stub that type checkers read."""
+    stub = Path(str(package.__file__)).with_suffix(".pyi")
+    nodes = ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+    return [alias.asname or alias.name for node in imports for alias in node.names]
+
+
+@pytest.mark.parametrize("package", ["jaxik", "fitting"])
+def test_importing_a_package_does_not_import_jax(package):
+    code = f"import sys, {package}; print('equinox' in sys.modules, 'jax' in sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=FACE.parents[1],
-        check=True,
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
     )
     assert done.stdout.split() == ["False", "False"]
 
 
 @pytest.mark.parametrize("package", [jaxik, fitting])
-def test_every_name_that_type_checkers_see_is_there(package):
-    stub = Path(package.__file__).with_suffix(".pyi")
-    names = [
-        alias.asname or alias.name
-        for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    ]
+def test_every_name_in_the_stub_can_be_imported_and_completed(package):
+    names = stub_names(package)
     assert len(names) > 5
     assert set(names) <= set(dir(package)) and set(names) <= set(package.__all__)
     for name in names:
         assert getattr(package, name) is not None
 
 
-def test_a_name_that_there_is_not_is_told():
+def test_an_unknown_name_is_an_error():
     with pytest.raises(AttributeError, match="No jaxik attribute wings"):
         jaxik.wings  # type: ignore[attr-defined]  # noqa: B018
     with pytest.raises(ImportError, match="cannot import name 'wings'"):
         from jaxik import wings  # type: ignore[attr-defined]  # noqa: F401
+
+
+def test_the_wheel_carries_stubs_and_says_that_it_is_typed(tmp_path):
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    for package in ("jaxik", "fitting"):
+        assert {f"{package}/{name}" for name in ("py.typed", "__init__.pyi")} <= names
+
+
+@pytest.mark.slow
+def test_mypy_knows_the_type_of_every_public_name(tmp_path):
+    names = [f"{p.__name__}.{name}" for p in (jaxik, fitting) for name in stub_names(p)]
+    code = "\n".join(["import fitting, jaxik", *(f"reveal_type({name})" for name in names)])
+    command = [sys.executable, "-m", "mypy", "--follow-imports=silent", f"--cache-dir={tmp_path}"]
+    done = subprocess.run([*command, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    revealed = [line for line in done.stdout.splitlines() if "Revealed type is" in line]
+    assert len(revealed) == len(names)
+    unknown = ('"Any"', "JitWrapped")  # a compiled function must keep its signature
+    assert [line for line in revealed if any(word in line for word in unknown)] == []
