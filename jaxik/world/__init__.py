@@ -1,4 +1,10 @@
-"""What foot IK acts on: skeletons, terrain, rays, and the frame of animation."""
+"""What foot IK acts on: skeletons and legs, the terrain, and the frame of animation.
+
+Plain data (structs of arrays) and what follows from it directly: forward kinematics, and the first
+hits of parallel rays. Nothing here decides anything; that is the work of `jaxik.stages`. It is no
+physics engine either: rays run along -up only, and nothing else collides. Start with `skeleton`
+(`Transform`, `LegPose`, `Rig`), then `terrain`, then `frame`.
+"""
 
 import lazy_loader
 

@@ -2,4 +2,5 @@ from . import cells as cells
 from . import frame as frame
 from . import grid as grid
 from . import skeleton as skeleton
+from . import surfaces as surfaces
 from . import terrain as terrain

@@ -1,20 +1,23 @@
-"""The cells of a grid over triangles, and which of them touch which cell; NumPy, on the host."""
+"""Builds the cells of a grid and the lists of triangles that touch them; NumPy, on the host."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-CELLS = 2.0  # cells per triangle, at most; fewer lengthen the lists, more only fill memory
-ENTRIES = 12  # list entries per triangle on average, at most, before cells grow
+CELLS = 2.0  # cells per triangle at most: fewer mean longer lists, more only take memory
+ENTRIES = 12  # list entries per triangle, on average, above which cells grow
 CROWD = 16  # a cell with more triangles is split
-SPLIT = 4  # into this many along each side
-DEPTH = 6  # at most this often
-CHUNK = 1 << 20  # candidates tested at once; bounds the memory of a build
+SPLIT = 4  # into this many parts along each side
+DEPTH = 6  # at most this many times
+CHUNK = 1 << 20  # pairs tested at a time; bounds the memory of a build
+
+# Centres of a cell's parts, in half sides from its own centre, in the order of `Grid._look_up`.
+_OFFSETS = (2 * np.indices((SPLIT, SPLIT)).reshape(2, -1).T + 1) / SPLIT - 1.0
 
 
-class Lists(NamedTuple):
-    """The discrete part of a `Grid`, by the same names."""
+class CellLists(NamedTuple):
+    """The discrete part of a `Grid`; the fields are described there."""
 
     corner: np.ndarray
     pitch: float
@@ -25,63 +28,75 @@ class Lists(NamedTuple):
     depth: int
 
 
-def lists(
+class _Layout(NamedTuple):
+    """A regular grid of unsplit cells."""
+
+    shape: tuple[int, int]  # cells along both sides
+    corner: np.ndarray  # (2) m, of the first cell
+    pitch: float  # m, side of a cell
+
+
+class _Level(NamedTuple):
+    """Cells of one size, and the pairs of a cell and a triangle that touch."""
+
+    centres: np.ndarray  # (cells, 2) m
+    half_side: float  # m
+    cell: np.ndarray  # (pairs) index into `centres`
+    triangle: np.ndarray  # (pairs)
+
+
+def build(
     plan: Float[np.ndarray, "triangles 3 2"], listed: Bool[np.ndarray, " triangles"], pad: float
-) -> Lists:
-    """Which cells there are and what is in them, for the triangles that are to be `listed`."""
+) -> CellLists:
+    """The cells over triangles in the plane.
+
+    Args:
+        plan: corners, m.
+        listed: which triangles are to be found.
+        pad: distance, m, up to which a triangle beside a cell counts as touching it.
+    """
     numbers = np.flatnonzero(listed)
     corners = plan[numbers]
-    shape, corner, pitch = _frame(corners, pad)
-    owner, member = _enumerate(corners, shape, corner, pitch, pad)
-    mids = corner + pitch * (np.indices(shape).reshape(2, -1).T + 0.5)
-    keep = _touching(corners, member, mids[owner], pitch / 2 + pad)
-    owner, member = owner[keep], member[keep]
-
-    children, settled, half, base, depth = [], [], pitch / 2, 0, 0
-    while True:  # `owner` counts within this level, whose first cell is number `base`
-        cells = len(mids)
-        parts = np.full(cells, -1)
-        crowded = np.bincount(owner, minlength=cells) > CROWD
+    layout = _lay_out(corners, pad)
+    level = _first_level(corners, layout, pad)
+    children, settled = [], []
+    base, depth = 0, 0  # base: number of this level's first cell
+    while True:
+        cells = len(level.centres)
+        crowded = np.bincount(level.cell, minlength=cells) > CROWD
         if depth < DEPTH and crowded.any():
-            split, parents, part_member = _split(corners, owner, member, mids, half, crowded, pad)
+            split, finer = _split(corners, level, crowded, pad)
         else:
-            split, parents, part_member = np.zeros(0, np.int64), owner[:0], member[:0]
-        parts[split] = base + cells + SPLIT**2 * np.arange(len(split))
-        stays = parts[owner] < 0
-        settled.append((base + owner[stays], member[stays]))
-        children.append(parts)
+            split, finer = np.zeros(0, np.int64), level
+        first_parts = np.full(cells, -1)
+        first_parts[split] = base + cells + SPLIT**2 * np.arange(len(split))
+        stays = first_parts[level.cell] < 0
+        settled.append((base + level.cell[stays], level.triangle[stays]))
+        children.append(first_parts)
+        base += cells
         if not len(split):
             break
-        mids = (mids[split][:, None] + half * _OFFSETS).reshape(-1, 2)
-        owner, member = parents, part_member
-        base, half, depth = base + cells, half / SPLIT, depth + 1
+        level, depth = finer, depth + 1
 
-    cell = np.concatenate([owners for owners, _ in settled])
-    members = np.concatenate([members for _, members in settled])
+    cell, triangle = (np.concatenate(parts) for parts in zip(*settled, strict=True))
     order = np.argsort(cell, kind="stable")
-    counts = np.bincount(cell, minlength=base + cells)
-    return Lists(
-        corner=corner,
-        pitch=pitch,
+    counts = np.bincount(cell, minlength=base)
+    return CellLists(
+        corner=layout.corner,
+        pitch=layout.pitch,
         first=np.concatenate([[0], np.cumsum(counts)]),
         children=np.concatenate(children),
-        # One entry at least, for the reads of rays that have nothing to meet.
-        members=numbers[members[order]] if len(members) else np.zeros(1, np.int64),
-        shape=shape,
+        # At least one entry, for rays that have nothing to hit but read one all the same.
+        members=numbers[triangle[order]] if len(triangle) else np.zeros(1, np.int64),
+        shape=layout.shape,
         depth=depth,
     )
 
 
-# Middles of a cell's parts, in half sides from its own middle, in the order of `Grid._look_up`.
-_OFFSETS = (2 * np.indices((SPLIT, SPLIT)).reshape(2, -1).T + 1) / SPLIT - 1.0
-
-
-def _frame(
-    corners: np.ndarray, pad: float
-) -> tuple[tuple[int, int], Float[np.ndarray, "2"], float]:
-    """Cells along both sides, the first one's corner and their side, within the budgets."""
+def _lay_out(corners: np.ndarray, pad: float) -> _Layout:
+    """The unsplit cells over these triangles, as many as `CELLS` and `ENTRIES` allow."""
     if not len(corners):
-        return (1, 1), np.zeros(2), 1.0
+        return _Layout((1, 1), np.zeros(2), 1.0)
     low, high = corners.min(axis=1) - pad, corners.max(axis=1) + pad
     origin, size = low.min(axis=0), high.max(axis=0) - low.min(axis=0)
     wanted = CELLS * len(corners)
@@ -91,75 +106,80 @@ def _frame(
         if spans.prod(axis=1).sum() <= ENTRIES * len(corners) + 64:
             break
         pitch *= 1.25
-    # A shift keeps the lines of the grid off the lines of a mesh that is itself a regular grid.
+    # The shift keeps the lines of the grid off those of a mesh that is a regular grid itself.
     across, along = np.floor(size / pitch + 0.37).astype(int) + 1
-    return (int(across), int(along)), origin - 0.37 * pitch, float(pitch)
+    return _Layout((int(across), int(along)), origin - 0.37 * pitch, float(pitch))
 
 
-def _enumerate(
-    corners: np.ndarray, shape: tuple[int, int], corner: np.ndarray, pitch: float, pad: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of cell and triangle whose boxes overlap."""
+def _first_level(corners: np.ndarray, layout: _Layout, pad: float) -> _Level:
+    """The unsplit cells with the triangles that touch them."""
+    shape, corner, pitch = layout
     last = np.array(shape) - 1
     low = np.clip(np.floor((corners.min(axis=1) - pad - corner) / pitch).astype(int), 0, last)
     high = np.clip(np.floor((corners.max(axis=1) + pad - corner) / pitch).astype(int), 0, last)
     spans = high - low + 1
     counts = spans.prod(axis=1)
-    member = np.repeat(np.arange(len(corners)), counts)
-    step = np.arange(len(member)) - np.repeat(np.cumsum(counts) - counts, counts)
-    row = low[member, 0] + step // spans[member, 1]
-    column = low[member, 1] + step % spans[member, 1]
-    return row * shape[1] + column, member
+    # First all pairs whose bounding boxes overlap.
+    triangle = np.repeat(np.arange(len(corners)), counts)
+    step = np.arange(len(triangle)) - np.repeat(np.cumsum(counts) - counts, counts)
+    row = low[triangle, 0] + step // spans[triangle, 1]
+    column = low[triangle, 1] + step % spans[triangle, 1]
+    cell = row * shape[1] + column
+    centres = corner + pitch * (np.indices(shape).reshape(2, -1).T + 0.5)
+    touching = _touching(corners, triangle, centres[cell], pitch / 2 + pad)
+    return _Level(centres, pitch / 2, cell[touching], triangle[touching])
 
 
 def _split(
-    corners: np.ndarray,
-    owner: np.ndarray,
-    member: np.ndarray,
-    mids: np.ndarray,
-    half: float,
-    crowded: np.ndarray,
-    pad: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The crowded cells that are worth splitting, and the pairs of part and triangle they give.
+    corners: np.ndarray, level: _Level, crowded: np.ndarray, pad: float
+) -> tuple[np.ndarray, _Level]:
+    """The crowded cells that are worth splitting, and the level of their parts.
 
-    Parts are numbered from 0 over all split cells. Not worth it: triangles on top of each other,
-    which fill every part as they filled the whole.
+    Not worth it are cells whose triangles lie on top of each other: they would fill every part as
+    they fill the whole.
     """
-    inside = crowded[owner]
+    inside = crowded[level.cell]
     parts = SPLIT**2
-    cell, triangle = np.repeat(owner[inside], parts), np.repeat(member[inside], parts)
+    cell, triangle = np.repeat(level.cell[inside], parts), np.repeat(level.triangle[inside], parts)
     part = np.tile(np.arange(parts), int(inside.sum()))
-    keep = _touching(corners, triangle, mids[cell] + half * _OFFSETS[part], half / SPLIT + pad)
-    cell, triangle, part = cell[keep], triangle[keep], part[keep]
-    before = np.bincount(owner, minlength=len(mids))
-    after = np.bincount(cell, minlength=len(mids))
-    worth = crowded & (after <= before * parts / 2)
-    rank = np.cumsum(worth) - 1
-    kept = worth[cell]
-    return np.flatnonzero(worth), rank[cell[kept]] * parts + part[kept], triangle[kept]
+    centres = level.centres[cell] + level.half_side * _OFFSETS[part]
+    half_side = level.half_side / SPLIT
+    touching = _touching(corners, triangle, centres, half_side + pad)
+    cell, triangle, part = cell[touching], triangle[touching], part[touching]
+    before = np.bincount(level.cell, minlength=len(level.centres))
+    after = np.bincount(cell, minlength=len(level.centres))
+    worthwhile = crowded & (after <= before * parts / 2)
+    rank = np.cumsum(worthwhile) - 1
+    kept = worthwhile[cell]
+    split = np.flatnonzero(worthwhile)
+    return split, _Level(
+        (level.centres[split][:, None] + level.half_side * _OFFSETS).reshape(-1, 2),
+        half_side,
+        rank[cell[kept]] * parts + part[kept],
+        triangle[kept],
+    )
 
 
 def _touching(
-    corners: np.ndarray, member: np.ndarray, mids: np.ndarray, half: float
+    corners: np.ndarray, triangle: np.ndarray, centres: np.ndarray, half_side: float
 ) -> Bool[np.ndarray, " pairs"]:
-    """Whether the square of half side `half` about each middle touches its triangle.
+    """Whether each square of this half side about a centre touches its triangle.
 
-    Separating axes: the two sides of the square and the normals of the triangle's edges.
+    By separating axes: the two sides of the square and the normals of the triangle's edges.
     """
     x, z = corners[..., 0].T, corners[..., 1].T
     edges_x, edges_z = np.roll(x, -1, axis=0) - x, np.roll(z, -1, axis=0) - z
-    square = np.ones_like(x[:1])
-    axes_x = np.concatenate([-edges_z, square, 0 * square])
-    axes_z = np.concatenate([edges_x, 0 * square, square])
-    touching = np.ones(len(member), bool)
+    ones = np.ones_like(x[:1])
+    axes_x = np.concatenate([-edges_z, ones, 0 * ones])
+    axes_z = np.concatenate([edges_x, 0 * ones, ones])
+    touching = np.ones(len(triangle), bool)
     for axis_x, axis_z in zip(axes_x, axes_z, strict=True):
-        places = axis_x * x + axis_z * z
-        margin = half * (np.abs(axis_x) + np.abs(axis_z))
-        low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
-        for begin in range(0, len(member), CHUNK):
+        projected = axis_x * x + axis_z * z
+        margin = half_side * (np.abs(axis_x) + np.abs(axis_z))
+        low, high = projected.min(axis=0) - margin, projected.max(axis=0) + margin
+        for begin in range(0, len(triangle), CHUNK):
             pairs = slice(begin, begin + CHUNK)
-            triangle, mid = member[pairs], mids[pairs]
-            place = axis_x[triangle] * mid[:, 0] + axis_z[triangle] * mid[:, 1]
-            touching[pairs] &= (low[triangle] <= place) & (place <= high[triangle])
+            member, centre = triangle[pairs], centres[pairs]
+            projection = axis_x[member] * centre[:, 0] + axis_z[member] * centre[:, 1]
+            touching[pairs] &= (low[member] <= projection) & (projection <= high[member])
     return touching

@@ -1,4 +1,4 @@
-"""What goes into the pipeline, and what its stages hand on. One character, one frame."""
+"""Data of one character and one frame: what goes into the pipeline and between its stages."""
 
 import dataclasses
 
@@ -17,56 +17,54 @@ UP = (0.0, 1.0, 0.0)  # model space
 
 @struct
 class Stride:
-    """Where each foot of the animation stood last and where it will stand next.
+    """Where each foot of the animation last stood and where it will stand next.
 
-    Places are those of the ball; how high they lie does not count. While a foot stands, its last
-    place is where it is.
+    Positions are those of the ball of the foot; their height is ignored. While a foot stands,
+    `last_ws` is its present position.
     """
 
-    standing: Float[Array, "*b legs"]  # 0..1, the animation's own contact label
+    standing: Float[Array, "*b legs"]  # 0..1, contact label of the animation
     last_ws: Float[Array, "*b legs 3"]  # m
     next_ws: Float[Array, "*b legs 3"]  # m
-    fraction: Float[
-        Array, "*b legs"
-    ]  # 0..1, of the swing's time that has passed; 0 while it stands
-    known: Float[Array, "*b legs"]  # 1, or 0 where nobody tells and places follow from velocity
+    fraction: Float[Array, "*b legs"]  # 0..1, time of the swing that has passed; 0 while standing
+    known: Float[Array, "*b legs"]  # 1, or 0 where positions have to be predicted from velocity
 
     @classmethod
     def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":
-        """Nothing told of feet that stand, as many as `like` and of its dtype."""
-        zero, nowhere = jnp.zeros_like(like), jnp.zeros((*like.shape, 3), like.dtype)
-        return cls(jnp.ones_like(like), nowhere, nowhere, zero, zero)
+        """An unknown stride of standing feet, with the shape and dtype of `like`."""
+        zero, origin = jnp.zeros_like(like), jnp.zeros((*like.shape, 3), like.dtype)
+        return cls(jnp.ones_like(like), origin, origin, zero, zero)
 
 
 @struct
 class Frame:
-    """The animation's frame, before foot IK."""
+    """One frame of animation, before foot IK."""
 
     world_from_model: Transform
     pose: LegPose  # legs, model space
-    weight: Float[Array, "*b legs"]  # 0..1, share of foot IK in each leg
-    slide: Float[Array, "*b"]  # 0..1, 1 while the character slides
+    weight: Float[Array, "*b legs"]  # 0..1, how much foot IK each leg gets
+    slide: Float[Array, "*b"]  # 0..1; 1 while the character slides
     velocity_ws: Float[Array, "*b 3"]  # m/s, of the character
-    foot_speed: Float[Array, "*b legs"]  # m/s, of the animated ankles in the world
-    toe_speed: Float[Array, "*b legs"]  # m/s, of the animated toes in the world
+    foot_speed: Float[Array, "*b legs"]  # m/s, of the animated ankles, world space
+    toe_speed: Float[Array, "*b legs"]  # m/s, of the animated toes, world space
     stride: Stride
-    dt: Float[Array, "*b"]  # s, since the frame before
+    dt: Float[Array, "*b"]  # s, since the previous frame
     platform: Transform  # world_from_platform: the ground's own motion
 
     @property
     def speed(self) -> Float[Array, "*b"]:
-        """Of the character, m/s."""
+        """Speed of the character, m/s."""
         return vec.length(self.velocity_ws)
 
     def translated(self, offset_ws: Float[Array, "*b 3"]) -> "Frame":
-        """The frame with the whole character moved, m."""
+        """The frame with the whole character moved by `offset_ws`, m."""
         world = Transform(self.world_from_model.pos + offset_ws, self.world_from_model.rot)
         return dataclasses.replace(self, world_from_model=world)
 
 
 @struct
 class Rays:
-    """How far over and under a foothold the probe looks, and at what."""
+    """How far above and below a foothold the probe looks, and which layers it hits."""
 
     above: Float[Array, " legs"]  # m
     below: Float[Array, " legs"]  # m
@@ -75,39 +73,39 @@ class Rays:
 
 @struct
 class GroundHits:
-    """What the rays of each leg saw."""
+    """The ground under each leg: what its rays hit."""
 
     ankle: Hit  # legs
     toe: Hit  # legs; `found` is 0 where no toe ray was cast
     corner: Hit  # legs, beside the ankle; `found` is 0 where no such ray was cast
-    rays: Rays  # for a stage that looks under a place of its own
+    rays: Rays  # for stages that cast further rays
 
 
 @struct
 class Contact:
-    """How far each foot stands."""
+    """Which feet stand, according to the animation."""
 
-    lift: Float[Array, " legs"]  # m, animated ankle over the animation's own ground
-    weight: Float[Array, " legs"]  # 0..1
+    lift: Float[Array, " legs"]  # m, of the animated ankle above the animation's own ground
+    weight: Float[Array, " legs"]  # 0..1, 1 for a standing foot
     planted: Float[Array, " legs"]  # decision: low enough to stand
-    lifted: Float[Array, " legs"]  # decision: high enough to have left
+    lifted: Float[Array, " legs"]  # decision: high enough to have left the ground
 
 
 @struct
 class Foothold:
-    """Where each foot would stand; the ankle is `lift` above it along up."""
+    """Where each foot would stand. The ankle is `lift` above that point along up."""
 
     point_ws: Float[Array, "legs 3"]  # m
     lift: Float[Array, " legs"]  # m
-    height: Float[Array, " legs"]  # m, of the point, along up
-    ankle_height_ms: Float[Array, " legs"]  # m, of the ankle over it, in model space
+    height: Float[Array, " legs"]  # m, of the point along up
+    ankle_height_ms: Float[Array, " legs"]  # m, of the ankle above it, model space
     climb: Float[Array, "*legs"]  # model-space height gained per metre along up
     found: Float[Array, " legs"]  # 0..1
 
 
 @struct
 class Slope:
-    """Slope of the ground under the feet, positive where it rises ahead and to the right."""
+    """Slope of the ground under the feet; positive where it rises ahead and to the right."""
 
     forward: Float[Array, ""]  # rad
     side: Float[Array, ""]  # rad
@@ -117,22 +115,22 @@ class Slope:
 
 @struct
 class Sensed:
-    """All that one frame shows without memory."""
+    """What the stages derive from one frame without memory of earlier ones."""
 
-    up_ws: Float[Array, "3"]  # of the body
-    leg_up_ws: Float[Array, "*legs 3"]  # of each leg, or one for all
+    up_ws: Float[Array, "3"]  # up of the body
+    leg_up_ws: Float[Array, "*legs 3"]  # up of each leg, or one for all
     dt: Float[Array, ""]
     slide: Float[Array, ""]
     platform: Transform
     present: Bool[Array, " legs"]
-    weight: Float[Array, " legs"]  # 0..1, share of foot IK in each leg
-    root_ws: Float[Array, "3"]  # m, the move that brought the character to its ground
-    hip_ws: Float[Array, "legs 3"]  # animated and moved by it
-    ankle_ws: Float[Array, "legs 3"]  # likewise
+    weight: Float[Array, " legs"]  # 0..1, how much foot IK each leg gets
+    root_ws: Float[Array, "3"]  # m, offset that put the character on its ground
+    hip_ws: Float[Array, "legs 3"]  # m, animated, with that offset
+    ankle_ws: Float[Array, "legs 3"]  # m, likewise
     ankle_rot_ws: Float[Array, "legs 4"]  # animated
-    ball_ws: Float[Array, "legs 3"]  # m, animated toes, moved likewise
-    ahead_ws: Float[Array, "legs 3"]  # unit, where each animated foot points, level
-    rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule wants them
+    ball_ws: Float[Array, "legs 3"]  # m, animated toes, likewise
+    ahead_ws: Float[Array, "legs 3"]  # unit, horizontal direction of each animated foot
+    rot_ws: Float[Array, "legs 4"]  # ankle rotations that the foot rule wants
     thigh: Float[Array, " legs"]  # m, in this frame
     shin: Float[Array, " legs"]  # m
     ground: GroundHits
@@ -142,7 +140,7 @@ class Sensed:
 
 
 def animated_ankles(frame: Frame) -> Transform:
-    """The animated ankles, (legs), world space."""
+    """The animated ankles (legs), world space."""
     return Transform(
         frame.world_from_model.apply(frame.pose.ankle.pos),
         frame.world_from_model.apply_rot(frame.pose.ankle.rot),
@@ -150,7 +148,7 @@ def animated_ankles(frame: Frame) -> Transform:
 
 
 def foothold(frame: Frame, up_ws: Array, point_ws: Array, lift: Array, found: Array) -> Foothold:
-    """The foothold at a point, m, with the ankle `lift` above it, m."""
+    """The foothold at a point, m, with the ankle `lift`, m, above it."""
     model_up = quat.rotate(frame.world_from_model.rot, vec.constant(UP, up_ws))
     climb = vec.dot(model_up, up_ws)
     base = vec.dot(point_ws - frame.world_from_model.pos, model_up)
@@ -158,9 +156,10 @@ def foothold(frame: Frame, up_ws: Array, point_ws: Array, lift: Array, found: Ar
 
 
 def heading(world_from_model: Transform, up_ws: Float[Array, "*legs 3"]) -> tuple[Array, Array]:
-    """The character's forward and right, unit, at right angles to up, world space.
+    """Unit forward and right of the character at right angles to `up_ws`, world space.
 
-    Where the character looks along up, forward is its own up (a body lying on its back or front).
+    Where the character's forward is along up (a body lying on its back or front), its own up is
+    used instead.
     """
     forward = quat.rotate(world_from_model.rot, vec.constant(FORWARD, up_ws))
     upright = quat.rotate(world_from_model.rot, vec.constant(UP, up_ws))

@@ -10,10 +10,15 @@ from jaxik.maths.struct import struct
 
 @struct
 class Transform:
-    """Rigid transform; named `a_from_b`, it takes points of space b to space a."""
+    """A rigid transform. Named `a_from_b`, it maps points of space b to space a."""
 
     pos: Float[Array, "*b 3"]  # m
     rot: Float[Array, "*b 4"]  # wxyz
+
+    @classmethod
+    def identity(cls, dtype=None) -> "Transform":
+        """The transform that moves nothing."""
+        return cls(jnp.zeros(3, dtype), quat.identity(dtype))
 
     def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*c 3"]:
         """Points of space b, m, in space a."""
@@ -29,9 +34,9 @@ class Transform:
         return Transform(-quat.rotate(back, self.pos), back)
 
     def repeat(self, count: int) -> "Transform":
-        """So many of it, on a last axis such as that of legs.
+        """`count` copies on a new last batch axis, such as the legs.
 
-        Broadcast instead, each of its uses would sum its slopes over the legs in reverse mode.
+        With broadcasting instead, reverse mode would sum over the legs at each use.
         """
         return Transform(vec.repeat(self.pos, count), vec.repeat(self.rot, count))
 
@@ -40,23 +45,19 @@ class Transform:
         return Transform(self.apply(other.pos), self.apply_rot(other.rot))
 
 
-def still(dtype=None) -> Transform:
-    """The transform that moves nothing."""
-    return Transform(jnp.zeros(3, dtype), quat.identity(dtype))
-
-
 class Skeleton(eqx.Module):
     """A tree of joints, parents before children."""
 
     offsets: Float[Array, "joints 3"]  # m, in the parent's space
     names: tuple[str, ...] = eqx.field(static=True)
-    parents: tuple[int, ...] = eqx.field(static=True)  # -1 at the root
+    parents: tuple[int, ...] = eqx.field(static=True)  # -1 at a root
 
     def __check_init__(self) -> None:
         if not len(self.names) == len(self.parents) == self.offsets.shape[0]:
             raise ValueError(
-                f"a skeleton has one name, parent and offset a joint; got {len(self.names)} names, "
-                f"{len(self.parents)} parents, {self.offsets.shape[0]} offsets"
+                "a skeleton has one name, one parent and one offset per joint; got "
+                f"{len(self.names)} names, {len(self.parents)} parents, "
+                f"{self.offsets.shape[0]} offsets"
             )
         for joint, parent in enumerate(self.parents):
             if not -1 <= parent < joint:
@@ -74,10 +75,10 @@ def forward_kinematics(
     """World transforms of all joints, `*b joints`.
 
     Args:
-        skeleton: the tree.
-        rotations_ls: each joint's rotation in its parent's space.
-        positions_ls: each joint's place in its parent's space, m, where it is not the offset (the
-            root's travel); None takes the offsets.
+        skeleton: the joint tree.
+        rotations_ls: rotation of each joint in its parent's space.
+        positions_ls: position of each joint in its parent's space, m; None takes the skeleton's
+            offsets. Needed where a joint translates, as the root does.
     """
     if positions_ls is None:
         positions_ls = jnp.broadcast_to(skeleton.offsets, (*rotations_ls.shape[:-1], 3))
@@ -101,22 +102,22 @@ class LegPose:
     toe: Transform
 
     def transformed(self, by: Transform) -> "LegPose":
-        """The whole pose carried by one transform."""
+        """The whole pose, moved rigidly."""
         return LegPose(by @ self.hip, by @ self.knee, by @ self.ankle, by @ self.toe)
 
 
 @struct
 class Rig:
-    """What a leg is, apart from its pose. Legs of one character may differ in everything."""
+    """What a leg is, apart from its pose. The legs of one character may all differ."""
 
-    knee_axis_ls: Float[Array, "*b legs 3"]  # unit, knee space; a positive turn opens the knee
+    knee_axis_ls: Float[Array, "*b legs 3"]  # unit, knee space; positive rotation opens the knee
     ankle_from_foot: Float[Array, "*b legs 4"]  # foot axes (x left, y up, z forward) in ankle space
     thigh: Float[Array, "*b legs"]  # m, hip to knee
     shin: Float[Array, "*b legs"]  # m, knee to ankle
     foot: Float[Array, "*b legs"]  # m, ankle to ball
     side: Float[Array, "*b legs"]  # +1 left, -1 right, 0 in the middle
-    present: Bool[Array, "*b legs"]  # False pads a batch of mixed leg counts
-    names: tuple[str, ...] = eqx.field(static=True)  # one a leg
+    present: Bool[Array, "*b legs"]  # False for legs that only pad a batch of mixed leg counts
+    names: tuple[str, ...] = eqx.field(static=True)  # one per leg
     joints: tuple[tuple[int, int, int, int], ...] = eqx.field(static=True)  # hip knee ankle toe
     pelvis: int = eqx.field(static=True)  # joint index
 

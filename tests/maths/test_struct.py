@@ -1,4 +1,4 @@
-"""Data that stages hand to each other: what JAX does with it, and what nobody may do."""
+"""Structs: how JAX flattens, maps and prints them, and that they are frozen."""
 
 import dataclasses
 import pickle
@@ -9,50 +9,52 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxik.world.skeleton import LegPose, Rig, Transform, still
+from jaxik.maths import quat
+from jaxik.world.skeleton import LegPose, Rig, Transform
 
-PLACES = np.arange(12.0).reshape(4, 3)
-
-
-def places() -> Transform:
-    return Transform(jnp.asarray(PLACES), jnp.asarray(np.tile([1.0, 0, 0, 0], (4, 1))))
+POSITIONS = np.arange(12.0).reshape(4, 3)
 
 
-def test_jax_takes_it_apart_in_the_order_of_its_fields_and_puts_it_together():
-    pose = LegPose(*(Transform(still().pos + i, still().rot) for i in range(4)))
+def transforms() -> Transform:
+    return Transform(jnp.asarray(POSITIONS), jnp.asarray(np.tile([1.0, 0, 0, 0], (4, 1))))
+
+
+def test_jax_flattens_a_struct_in_field_order_and_rebuilds_it():
+    pose = LegPose(*(Transform(jnp.full(3, float(i)), quat.identity()) for i in range(4)))
     leaves, structure = jax.tree.flatten(pose)
     assert [leaf.shape for leaf in leaves] == [(3,), (4,)] * 4
     assert [float(leaf[0]) for leaf in leaves[::2]] == [0, 1, 2, 3]
-    again = jax.tree.unflatten(structure, leaves)
-    assert isinstance(again, LegPose) and isinstance(again.toe, Transform)
-    assert eqx.tree_equal(again, pose)
+    rebuilt = jax.tree.unflatten(structure, leaves)
+    assert isinstance(rebuilt, LegPose) and isinstance(rebuilt.toe, Transform)
+    assert eqx.tree_equal(rebuilt, pose)
 
 
-def test_it_is_mapped_over_and_compiled_like_any_tree():
-    turned = jax.jit(jax.vmap(lambda one: one @ one))(places())
-    np.testing.assert_allclose(turned.pos, 2 * PLACES)
+def test_a_struct_is_mapped_over_and_compiled_like_any_pytree():
+    squared = jax.jit(jax.vmap(lambda transform: transform @ transform))(transforms())
+    np.testing.assert_allclose(squared.pos, 2 * POSITIONS)
 
 
-def test_paths_name_fields():
+def test_tree_paths_name_the_fields():
     paths = [
-        jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(places())
+        jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(transforms())
     ]
     assert paths == [".pos", ".rot"]
 
 
-def test_static_fields_are_structure():
-    one, legs = jnp.ones(1), (((0, 1, 2, 3),), 0)
+def test_static_fields_belong_to_the_structure():
+    one = jnp.ones(1)
     rigs = [
         Rig(
-            jnp.ones((1, 3)),
-            jnp.ones((1, 4)),
-            one,
-            one,
-            one,
-            one,
-            jnp.ones(1, bool),
-            (name,),
-            *legs,
+            knee_axis_ls=jnp.ones((1, 3)),
+            ankle_from_foot=jnp.ones((1, 4)),
+            thigh=one,
+            shin=one,
+            foot=one,
+            side=one,
+            present=jnp.ones(1, bool),
+            names=(name,),
+            joints=((0, 1, 2, 3),),
+            pelvis=0,
         )
         for name in ("left", "right")
     ]
@@ -61,13 +63,13 @@ def test_static_fields_are_structure():
     assert jax.tree.map(lambda x: x + 1, rigs[1]).names == ("right",)
 
 
-def test_it_stays_as_it_is():
+def test_a_struct_is_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        still().pos = jnp.ones(3)
-    moved = dataclasses.replace(still(), pos=jnp.ones(3))
-    np.testing.assert_array_equal(moved.pos, 1.0)
+        Transform.identity().pos = jnp.ones(3)
+    replaced = dataclasses.replace(Transform.identity(), pos=jnp.ones(3))
+    np.testing.assert_array_equal(replaced.pos, 1.0)
 
 
-def test_it_is_printed_by_shapes_and_may_be_kept():
-    assert "Transform(pos=f64[4,3]" in repr(places())
-    assert eqx.tree_equal(pickle.loads(pickle.dumps(places())), places())
+def test_a_struct_prints_shapes_and_can_be_pickled():
+    assert "Transform(pos=f64[4,3]" in repr(transforms())
+    assert eqx.tree_equal(pickle.loads(pickle.dumps(transforms())), transforms())

@@ -1,0 +1,102 @@
+"""The surfaces of a terrain, planes and triangle meshes, and how rays along -up hit them."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from jaxik.maths import vec
+
+from .grid import Grid
+
+
+class AbstractSurface(eqx.Module):
+    """Something that rays along -up can hit."""
+
+    @abstractmethod
+    def intersect(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        """Intersects rays with the surface; numbers stay finite where there is no hit.
+
+        Returns:
+            Distance, m, to the nearest hit at or below each origin; the unit normal there, on the
+            side of the origin; and whether there is a hit.
+        """
+
+
+class Plane(AbstractSurface):
+    """An infinite two-sided plane. A plane that contains up is never hit."""
+
+    point_ws: Float[Array, "*t 3"]  # m
+    normal_ws: Float[Array, "*t 3"]  # unit
+    layers: UInt[Array, "*t"]  # one bit
+
+    def intersect(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        distance = _plane_distance(origins_ws, up_ws, self.point_ws, self.normal_ws)
+        rise = vec.dot(self.normal_ws, up_ws)
+        # A ray that starts on the plane hits it, however the difference is rounded.
+        size = vec.sum_last(jnp.abs(origins_ws)) + vec.sum_last(jnp.abs(self.point_ws))
+        tolerance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(size)
+        hit = (rise != 0) & (distance * jnp.abs(rise) >= -tolerance) & (self.layers & mask != 0)
+        normal = jnp.where(rise < 0, -self.normal_ws, self.normal_ws)
+        return distance, jnp.broadcast_to(normal, (*distance.shape, 3)), hit
+
+
+class Mesh(AbstractSurface):
+    """Two-sided triangles and the grid that finds them.
+
+    Watertight: no ray passes through an edge or a corner that triangles share. A triangle that
+    contains up (a wall) or has no area is never hit, since a ray along it has no single answer.
+    """
+
+    vertices_ws: Float[Array, "*t vertices 3"]  # m
+    triangles: Int[Array, "*t triangles 3"]
+    layers: UInt[Array, "*t triangles"]  # one bit each
+    grid: Grid
+
+    def with_vertices(self, vertices_ws: Float[Array, "vertices 3"]) -> "Mesh":
+        """The same triangles with moved vertices, m; differentiable.
+
+        The grid is kept. It finds every triangle as long as no vertex has moved further sideways
+        (at right angles to up) than the `slack` that the mesh was built with; movement along up is
+        unlimited. Beyond that, a ray may miss a moved triangle.
+        """
+        grid = self.grid.with_vertices(vertices_ws, self.triangles, self.layers)
+        return Mesh(vertices_ws, self.triangles, self.layers, grid)
+
+    def intersect(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        triangle = self.grid.search(origins_ws, mask)
+        hit = triangle >= 0
+        corners = self.triangles.at[jnp.where(hit, triangle, 0)].get(mode="promise_in_bounds")
+        a, b, c = (
+            self.vertices_ws.at[corners[..., corner]].get(mode="promise_in_bounds")
+            for corner in range(3)
+        )
+        normal = vec.triangle_normal(a, b, c, up_ws)
+        distance = _plane_distance(origins_ws, up_ws, a, normal)
+        # A ray that rounding lets in lies just outside its triangle, which a steep plane turns into
+        # a large error: the value is clipped to the corners, the gradient stays that of the plane.
+        drops = [vec.dot(origins_ws - corner, up_ws) for corner in (a, b, c)]
+        low = jnp.minimum(jnp.minimum(drops[0], drops[1]), drops[2])
+        high = jnp.maximum(jnp.maximum(drops[0], drops[1]), drops[2])
+        distance += jax.lax.stop_gradient(jnp.clip(distance, low, high) - distance)
+        # Without the barrier each use of a hit would compute it from the corners again.
+        x, y, z, distance = vec.stacked_barrier(*vec.components(normal), distance)
+        return distance, vec.stack(x, y, z), hit
+
+
+def _plane_distance(
+    origins: Float[Array, "*b 3"],
+    up: Float[Array, "3"],
+    point: Float[Array, "*#b 3"],
+    normal: Float[Array, "*#b 3"],
+) -> Float[Array, "*b"]:
+    """Distance along -up to a plane; 0 where the plane contains up."""
+    return vec.safe_divide(vec.dot(origins - point, normal), vec.dot(up, normal))
