@@ -1,4 +1,4 @@
-"""Turning a joint until it looks at a target."""
+"""Rotating a joint until it looks at a target, as ozz-animation's aim job does."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -6,40 +6,43 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
 
-from .two_bone import LENGTH_BAND, arc_beside, rotation_about
+from .pole import PoleTarget
+from .reach import LENGTH_BAND
+from .rotations import rotation_about, safe_arc
 
 
 def aim_rotation(
-    to_target: Float[Array, "*t 3"],
+    target: PoleTarget,
     forward: Float[Array, "*f 3"],
     offset: Float[Array, "*o 3"],
     up: Float[Array, "*u 3"],
-    pole: Float[Array, "*p 3"],
-    twist: Float[Array, "*w"],
     gate: AbstractGate,
 ) -> tuple[Float[Array, "*b 4"], Float[Array, "*r"]]:
-    """The joint's turn that lets a ray fixed in it meet the target, and 1 where that can be done.
+    """Rotation of a joint that makes a ray fixed in it pass through the target.
 
-    Ozz's aim job (systems.md, 0). The ray starts at `offset` and runs along `forward`: the shortest
-    arc takes the point where it comes as far from the joint as the target is onto the target; then
-    a turn about the target's direction brings `up` as near to the pole as it can; then `twist`.
+    Consider the point where the ray is as far from the joint as the target is. The shortest arc
+    takes that point to the target; then a rotation about the target's direction brings `up` as
+    near to the pole as it can; then comes the twist. All vectors are in the joint's space and
+    broadcast against each other.
 
-    Nothing turns, and nothing is reached, where the whole line passes outside that distance. With
-    the target on the joint nothing turns. No turn to a pole where it, or the turned `up`, lies
-    along the target or is zero. All vectors are in the joint's space and are broadcast.
+    The joint does not rotate where the target is on the joint. Nor does it where the line of the
+    ray passes the joint farther away than the target is; the target is then not reached. There is
+    no rotation towards a pole where the pole or the rotated `up` is zero or along the target.
 
-    To do a part of it, blend from the identity with `quat.nlerp`. That takes the shorter way
-    always; ozz takes the longer one in some cases, which is not done here.
+    To apply only a part of the rotation, blend from the identity with `quat.nlerp`. That always
+    goes the shorter way; ozz goes the longer way in some cases, which is not reproduced here.
 
     Args:
-        to_target: from the joint, m.
-        forward: unit, direction of the ray.
+        target: from the joint; `up` is turned towards its pole.
+        forward: unit direction of the ray.
         offset: start of the ray, from the joint, m.
-        up: axis that the pole attracts, of any length.
-        pole: direction, of any length.
-        twist: about the target's direction, in the end, rad.
-        gate: how it is decided what can be reached.
+        up: direction, of any length.
+        gate: decides what is reached.
+
+    Returns:
+        The rotation, and 1 where the ray passes through the target, else 0.
     """
+    to_target = target.to_target
     along = vec.dot(forward, offset)
     beside = vec.reject(offset, forward)
     distance = vec.length(to_target)
@@ -47,13 +50,13 @@ def aim_rotation(
     rest = vec.safe_sqrt(vec.dot(to_target, to_target) - vec.dot(beside, beside))
     meeting = offset + vec.scale(forward, rest - along)
 
-    nowhere = vec.constant((0.0, 0.0, 0.0), to_target)
+    zero = vec.constant((0.0, 0.0, 0.0), to_target)
     away = distance > jnp.finfo(distance.dtype).eps
-    target = vec.normalize(to_target, forward)
-    up = vec.normalize(up, nowhere)
-    arc = arc_beside(vec.normalize(meeting, target), target, up)
-    facing = rotation_about(target, quat.rotate(arc, up), vec.normalize(pole, nowhere))
-    turn = quat.multiply(facing, arc)
-    turn = quat.multiply(quat.from_axis_angle(target, twist), turn)
+    direction = vec.normalize(to_target, forward)
+    up = vec.normalize(up, zero)
+    arc = safe_arc(vec.normalize(meeting, direction), direction, up)
+    facing = rotation_about(direction, quat.rotate(arc, up), vec.normalize(target.pole, zero))
+    rot = quat.multiply(facing, arc)
+    rot = quat.multiply(quat.from_axis_angle(direction, target.twist), rot)
     weight = jnp.where(away, reached, 0.0)
-    return quat.nlerp(quat.identity(turn.dtype), turn, weight), reached
+    return quat.nlerp(quat.identity(rot.dtype), rot, weight), reached

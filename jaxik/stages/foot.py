@@ -10,7 +10,8 @@ from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.aim import aim_rotation
-from jaxik.solvers.two_bone import rotation_about
+from jaxik.solvers.pole import PoleTarget
+from jaxik.solvers.rotations import rotation_about
 from jaxik.world.frame import FORWARD, UP, Frame, GroundHits, Sensed, animated_ankles
 from jaxik.world.skeleton import LegPose, Transform
 from jaxik.world.terrain import Hit
@@ -159,7 +160,9 @@ class AimFoot(AbstractAnimatedFoot):
         aim = into_model.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
         upward, ahead = (quat.rotate(foot, vec.constant(axis, aim)) for axis in (UP, FORWARD))
         start = quat.rotate(foot, self.offset)
-        turn, reached = aim_rotation(aim, upward, start, ahead, ahead, self.twist, inputs.gate)
+        turn, reached = aim_rotation(
+            PoleTarget(aim, ahead, self.twist), upward, start, ahead, inputs.gate
+        )
         weight = jnp.where(self.enabled, effector.weight * sensed.foothold.found, 0.0)
         turn = quat.nlerp(quat.identity(turn.dtype), turn, weight * self.weight)
         full = jnp.where(weight * self.weight >= 1, 1.0, 0.0)

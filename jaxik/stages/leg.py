@@ -11,16 +11,10 @@ from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
-from jaxik.solvers.two_bone import (
-    LENGTH_BAND,
-    PoleBend,
-    hinge_rotation,
-    local,
-    pole_bend,
-    soft_limit,
-    swing_rotation,
-    third_side,
-)
+from jaxik.solvers.pole import PoleTarget, bend_to_pole
+from jaxik.solvers.reach import LENGTH_BAND, soft_limit, third_side
+from jaxik.solvers.rotations import local_correction
+from jaxik.solvers.two_bone import Limb, LimbBend, hinge_half_angle, swing_rotation
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 
@@ -106,19 +100,18 @@ class TwoBone(AbstractLeg):
     def solve(self, rig: Rig, goal: LegGoal, gate: AbstractGate) -> SolvedLeg:
         """The leg by itself: with its ankle at the goal's target."""
         pose, target_ms = goal.pose, goal.target_ms
-        to_hip, to_ankle, hinge = bones(rig, pose)
+        limb = limb_of(rig, pose)
         to_target = vec.subtract(target_ms, pose.hip.pos)
-        reach, reached = vec.stacked_barrier(*self._reach(to_hip, to_ankle, to_target, gate))
-        half_cos, half_sin = hinge_rotation(to_hip, to_ankle, hinge, reach)
-        turn = quat.from_half_angle(hinge, half_cos, half_sin)
-        bent = quat.rotate(turn, to_ankle) - to_hip
-        swing = swing_rotation(bent, to_target, hinge, self.twist)
-        return bend_leg(rig, goal, PoleBend(swing, half_cos, half_sin, reached))
+        reach, reached = vec.stacked_barrier(*self._reach(limb, to_target, gate))
+        half_cos, half_sin = hinge_half_angle(limb, reach)
+        knee_rot = quat.from_half_angle(limb.hinge, half_cos, half_sin)
+        bent = quat.rotate(knee_rot, limb.to_ankle) - limb.to_hip
+        swing = swing_rotation(bent, to_target, limb.hinge, self.twist)
+        return bend_leg(rig, goal, LimbBend(swing, half_cos, half_sin, reached))
 
-    def _reach(
-        self, to_hip: Array, to_ankle: Array, to_target: Array, gate: AbstractGate
-    ) -> tuple[Array, Array]:
+    def _reach(self, limb: Limb, to_target: Array, gate: AbstractGate) -> tuple[Array, Array]:
         """Distance from hip to ankle that the limits allow, m, and 1 where that is the target's."""
+        to_hip, to_ankle = limb.to_hip, limb.to_ankle
         animated, distance = vec.length(to_ankle - to_hip), vec.length(to_target)
         thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
         thigh2, shin2, animated, distance = vec.stacked_barrier(thigh2, shin2, animated, distance)
@@ -167,8 +160,8 @@ class PoleLeg(AbstractLeg):
     )
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
-        _, to_ankle, hinge = bones(inputs.rig, goal.pose)
-        pole = vec.cross(hinge, to_ankle)
+        limb = limb_of(inputs.rig, goal.pose)
+        pole = vec.cross(limb.hinge, limb.to_ankle)
         goal = dataclasses.replace(goal, weight=jnp.where(self.enabled, goal.weight, 0.0))
         return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
 
@@ -213,34 +206,33 @@ class HintLeg(AbstractLeg):
         return solve_to_pole(inputs, goal, pole, self.soften, self.twist)
 
 
-def bones(rig: Rig, pose: LegPose) -> tuple[Array, Array, Array]:
-    """From the knee to the hip and to the ankle, m, and the knee's unit hinge; model space."""
+def limb_of(rig: Rig, pose: LegPose) -> Limb:
+    """The legs as limbs, model space."""
     to_hip = vec.subtract(pose.hip.pos, pose.knee.pos)
     to_ankle = vec.subtract(pose.ankle.pos, pose.knee.pos)
-    return to_hip, to_ankle, quat.rotate(pose.knee.rot, rig.knee_axis_ls)
+    return Limb(to_hip, to_ankle, quat.rotate(pose.knee.rot, rig.knee_axis_ls))
 
 
 def solve_to_pole(
     inputs: Inputs, goal: LegGoal, pole_ms: Array, soften: Array, twist: Array
 ) -> SolvedLeg:
     """The leg whose plane contains the direction `pole_ms`."""
-    to_hip, to_ankle, hinge = bones(inputs.rig, goal.pose)
-    to_target = goal.target_ms - goal.pose.hip.pos
-    bend = pole_bend(to_hip, to_ankle, hinge, to_target, pole_ms, soften, twist, inputs.gate)
-    return bend_leg(inputs.rig, goal, bend)
+    limb = limb_of(inputs.rig, goal.pose)
+    target = PoleTarget(goal.target_ms - goal.pose.hip.pos, pole_ms, twist)
+    return bend_leg(inputs.rig, goal, bend_to_pole(limb, target, soften, inputs.gate))
 
 
-def bend_leg(rig: Rig, goal: LegGoal, bend: PoleBend) -> SolvedLeg:
+def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:
     """The leg with its knee turned about its hinge, then its hip, each by the goal's weight."""
     pose, weight = goal.pose, goal.weight
-    to_hip, to_ankle, hinge = bones(rig, pose)
+    limb = limb_of(rig, pose)
     half_cos, half_sin = quat.nlerp_half(bend.half_cos, bend.half_sin, weight)
-    turn = quat.from_half_angle(hinge, half_cos, half_sin)
+    knee_rot = quat.from_half_angle(limb.hinge, half_cos, half_sin)
     swing = quat.nlerp_identity(bend.swing, weight)
 
-    knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -to_hip))
-    whole = quat.multiply(swing, turn)
-    ankle_pos = vec.add(knee_pos, quat.rotate(whole, to_ankle))
+    knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -limb.to_hip))
+    whole = quat.multiply(swing, knee_rot)
+    ankle_pos = vec.add(knee_pos, quat.rotate(whole, limb.to_ankle))
     ankle = Transform(ankle_pos, quat.multiply(whole, pose.ankle.rot))
     solved = LegPose(
         Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
@@ -253,7 +245,7 @@ def bend_leg(rig: Rig, goal: LegGoal, bend: PoleBend) -> SolvedLeg:
     )
     return SolvedLeg(
         solved,
-        local(pose.hip.rot, swing),
+        local_correction(pose.hip.rot, swing),
         quat.from_half_angle(rig.knee_axis_ls, half_cos, half_sin),
         bend.reached * jnp.where(weight >= 1, 1.0, 0.0),
     )
