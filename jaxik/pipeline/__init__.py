@@ -1,0 +1,9 @@
+"""The pipeline: a system of ten rules, and how frames of animation go through it.
+
+Everything here is for one character; batch with `jaxik.lanes` or `jax.vmap`. Start with
+`system.FootIK`, then `phases`, which is the whole algorithm on one page.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,11 @@
+from . import phases as phases
+from . import simulation as simulation
+from . import system as system
+from .simulation import resume as resume
+from .simulation import run as run
+from .simulation import step as step
+from .system import FootIK as FootIK
+from .system import Result as Result
+from .system import State as State
+from .system import Trace as Trace
+from .system import init as init

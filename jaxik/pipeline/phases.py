@@ -1,0 +1,161 @@
+"""The three phases of a frame: `sense`, `advance` and `pose`.
+
+`sense` and `pose` have no memory, so that a clip's frames are computed all at once; only `advance`
+has to run frame by frame. The contact is sensed and advanced before everything else.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxik.maths import quat, vec
+from jaxik.stages.contact import AbstractContact
+from jaxik.stages.inputs import Inputs, Moment, SensedMoment
+from jaxik.stages.leg import LegGoal
+from jaxik.stages.pelvis import PelvisMoment
+from jaxik.stages.probe import foot_heading
+from jaxik.world.frame import Contact, Sensed, animated_ankles
+from jaxik.world.skeleton import Transform, bone_lengths
+
+from .system import Advanced, Corrections, FootIK, Result, State, Trace
+
+
+def sense_contacts(rule: AbstractContact, inputs: Inputs, state: State) -> tuple[PyTree, Contact]:
+    """The contact stage for a whole clip: memory after each frame, and the contacts.
+
+    It runs in a scan of its own before everything else, or without one if the rule has no memory.
+    The leaves of `inputs.frame` have a leading axis of frames.
+    """
+    frames, gate = inputs.frame, inputs.gate
+    with jax.named_scope("contact"):
+        sensed = jax.vmap(lambda frame: rule.sense(dataclasses.replace(inputs, frame=frame)))(
+            frames
+        )
+        if not jax.tree.leaves(state.contact):
+            return state.contact, sensed
+
+        def scanned(
+            carry: tuple[PyTree, Array], frame: tuple[Contact, Array]
+        ) -> tuple[tuple[PyTree, Array], tuple[PyTree, Contact]]:
+            (memory, started), (contact, dt) = carry, frame
+            after, contact = rule.advance(Moment(dt, started, gate), contact, memory)
+            return (after, jnp.ones_like(started)), (after, contact)
+
+        return jax.lax.scan(scanned, (state.contact, state.started), (sensed, frames.dt))[1]
+
+
+def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
+    """Outputs of the stages that need no memory, given which feet stand."""
+    rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
+    up = terrain.leg_up_ws
+    weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
+    with jax.named_scope("root"):
+        root_ws = vec.scale(terrain.up_ws, ik.root.sense(inputs))
+        frame = frame.translated(root_ws)
+        inputs = dataclasses.replace(inputs, frame=frame)
+    with jax.named_scope("probe"):
+        ground = ik.probe.sense(inputs, contact, ik.target.foot_height)
+    with jax.named_scope("target"):
+        foothold = ik.target.sense(inputs, ground, contact)
+    with jax.named_scope("lean"):
+        slope = ik.lean.sense(inputs, ground, contact, weight)
+    with jax.named_scope("foot"):
+        rot_ws = ik.foot.sense(inputs, ground)
+    thigh, shin = bone_lengths(frame.pose)
+    ankle = animated_ankles(frame)
+    return Sensed(
+        up_ws=terrain.up_ws,
+        leg_up_ws=up,
+        dt=frame.dt,
+        slide=frame.slide,
+        platform=frame.platform,
+        present=rig.present,
+        weight=weight,
+        root_ws=root_ws,
+        hip_ws=frame.world_from_model.apply(frame.pose.hip.pos),
+        ankle_ws=ankle.pos,
+        ankle_rot_ws=ankle.rot,
+        ball_ws=frame.world_from_model.apply(frame.pose.toe.pos),
+        ahead_ws=foot_heading(inputs, up)[0],
+        rot_ws=rot_ws,
+        thigh=thigh,
+        shin=shin,
+        ground=ground,
+        contact=contact,
+        foothold=foothold,
+        slope=slope,
+    )
+
+
+def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Advanced:
+    """Memory after this frame, and the outputs of the stages that have some.
+
+    Args:
+        ik: the system.
+        now: the sensed frame.
+        state: memory after the frame before.
+        contact: the contact stage's memory after this frame: it advances before `sense`.
+    """
+    sensed, up = now.sensed, now.sensed.leg_up_ws
+    with jax.named_scope("target"):
+        target_state, rise = ik.target.advance(now, state.target)
+        foothold_ws = sensed.foothold.point_ws + vec.scale(up, rise)
+    with jax.named_scope("lean"):
+        lean_state, lean = ik.lean.advance(now, state.lean)
+    with jax.named_scope("lock"):
+        # With the last frame's pelvis: this frame's offset follows from the locks.
+        hip_ws = sensed.hip_ws + state.pelvis.offset_ws
+        lock_state, hold = ik.lock.advance(now, foothold_ws, hip_ws, state.lock)
+        target_ws = foothold_ws + hold.offset_ws + vec.scale(up, sensed.foothold.lift)
+        ankle = Transform(target_ws, hold.rot_ws)
+    with jax.named_scope("pelvis"):
+        awake = ik.effector.awake(now, state.effector)
+        pelvis_now = PelvisMoment(now.dt, now.started, now.gate, sensed, now.terrain, lean, awake)
+        pelvis = ik.pelvis.advance(pelvis_now, ankle, state.pelvis)
+    with jax.named_scope("effector"):
+        effector_state, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
+    after = State(
+        started=jnp.ones_like(now.started),
+        contact=contact,
+        target=target_state,
+        lean=lean_state,
+        lock=lock_state,
+        pelvis=pelvis,
+        effector=effector_state,
+    )
+    return Advanced(foothold_ws, hold, lean, effector, after)
+
+
+def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Result:
+    """The solved legs."""
+    rig, frame, effector = inputs.rig, inputs.frame, advanced.effector
+    offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
+    body = body_transform(inputs, advanced.lean.turn_ws, offset_ws)
+    target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
+    with jax.named_scope("leg"):
+        moved = frame.pose.transformed(body.repeat(rig.side.size))
+        leg = ik.leg.pose(inputs, sensed, LegGoal(moved, target_ms, effector.weight))
+    with jax.named_scope("foot"):
+        foot = ik.foot.pose(inputs, sensed, effector, leg)
+    corrections = Corrections(leg.hip, leg.knee, foot.ankle)
+    trace = Trace(sensed, advanced)
+    return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
+
+
+def body_transform(inputs: Inputs, rot_ws: Array, offset_ws: Array) -> Transform:
+    """The body's motion in model space: a rotation about the mean of its hips, then an offset.
+
+    Args:
+        inputs: the frame and its rig; legs that are not present do not count.
+        rot_ws: rotation, world axes.
+        offset_ws: offset, m, world space.
+    """
+    model_from_world = quat.conjugate(inputs.frame.world_from_model.rot)
+    present = inputs.rig.present.astype(offset_ws.dtype)
+    weight = present / jnp.maximum(vec.sum_last(present), 1.0)
+    pivot = vec.barrier(vec.sum_vectors(vec.scale(inputs.frame.pose.hip.pos, weight)))
+    rot = quat.multiply(model_from_world, quat.multiply(rot_ws, quat.conjugate(model_from_world)))
+    offset = quat.rotate(model_from_world, offset_ws)
+    return Transform(pivot + offset - quat.rotate(rot, pivot), rot)

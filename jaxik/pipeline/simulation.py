@@ -1,0 +1,143 @@
+"""One frame with `step`, a whole clip with `run`, part of a clip with `resume`."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TypeVar, cast
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from jaxik.maths.gate import HARD, AbstractGate
+from jaxik.stages.inputs import Inputs, Moment, SensedMoment
+from jaxik.world.frame import Frame, Sensed
+from jaxik.world.skeleton import Rig
+from jaxik.world.terrain import LegTerrains, Terrain
+
+from .phases import advance, pose, sense, sense_contacts
+from .system import Advanced, FootIK, Result, State, init
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def _jit(**options: str) -> Callable[[Function], Function]:
+    """`jax.jit`, but editors and type checkers still see the function's own signature."""
+    return cast(Callable[[Function], Function], functools.partial(jax.jit, **options))
+
+
+@_jit(static_argnames="trace")
+def step(
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    state: State,
+    frame: Frame,
+    gate: AbstractGate = HARD,
+    *,
+    trace: bool = False,
+) -> tuple[State, Result]:
+    """One frame of one character, for use in a game loop.
+
+    Args:
+        ik: the system; its float leaves are its parameters.
+        rig: the legs.
+        terrain: the terrain, world space; `LegTerrains` where legs differ in their up.
+        state: memory, from `init` or from the previous step.
+        frame: the animation.
+        gate: `Hard` decides as a game does; `Smooth` lets gradients through decisions.
+        trace: whether the result contains every stage's output. Handing these out, one buffer per
+            leaf, takes a third of a call's time.
+
+    Returns:
+        Memory after the frame, for the next step, and the result.
+    """
+    inputs = Inputs(rig, terrain, frame, gate)
+    with jax.named_scope("contact"):
+        now = Moment(frame.dt, state.started, gate)
+        memory, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
+    sensed = sense(ik, inputs, contact)
+    sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, terrain)
+    advanced = advance(ik, sensed_now, state, memory)
+    result = pose(ik, inputs, sensed, advanced)
+    return advanced.state, result if trace else dataclasses.replace(result, trace=None)
+
+
+@_jit()
+def resume(
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    state: State,
+    frames: Frame,
+    gate: AbstractGate = HARD,
+) -> tuple[State, Result]:
+    """A clip, or a part of one, that starts with the memory of what came before.
+
+    Gives what `step` gives for each frame in turn. For the arguments see `step`; the leaves of
+    `frames` and of the result have a leading axis of frames.
+
+    Returns:
+        Memory after the last frame, so that the rest can follow, and the result.
+    """
+    inputs = Inputs(rig, terrain, frames, gate)
+
+    def at(frame: Frame) -> Inputs:
+        return dataclasses.replace(inputs, frame=frame)
+
+    memories, contacts = sense_contacts(ik.contact, inputs, state)
+    sensed = jax.vmap(lambda frame, contact: sense(ik, at(frame), contact))(frames, contacts)
+
+    def scanned(state: State, frame: tuple[Sensed, PyTree]) -> tuple[State, Advanced]:
+        sensed, memory = frame
+        now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain)
+        advanced = advance(ik, now, state, memory)
+        return advanced.state, advanced
+
+    after, advanced = jax.lax.scan(scanned, state, (sensed, memories))
+    result = jax.vmap(lambda frame, s, a: pose(ik, at(frame), s, a))(frames, sensed, advanced)
+    return after, result
+
+
+@_jit(static_argnames="block")
+def run(
+    ik: FootIK,
+    rig: Rig,
+    terrain: Terrain | LegTerrains,
+    frames: Frame,
+    gate: AbstractGate = HARD,
+    *,
+    block: int | None = None,
+) -> Result:
+    """A clip of one character, from a fresh start.
+
+    It can be jitted, vmapped and differentiated with respect to any argument. For the arguments see
+    `step`; the leaves of `frames` and of the result have a leading axis of frames.
+
+    Args:
+        block: how many frames to compute at a time, for long clips; None computes all at once. The
+            result is the same, but besides arguments and results only one block has to be in
+            memory, in reverse mode one block and the state before each.
+
+    Raises:
+        ValueError: if `block` is less than 1.
+    """
+    if block is not None and block < 1:
+        raise ValueError(
+            f"block must be at least 1 frame, or None for all frames at once; got {block}"
+        )
+    start, count = init(ik, rig), frames.dt.shape[0]
+    if block is None or block >= count:
+        return resume(ik, rig, terrain, start, frames, gate)[1]
+    blocks = count // block
+
+    def resume_block(state: State, frames: Frame) -> tuple[State, Result]:
+        return resume(ik, rig, terrain, state, frames, gate)
+
+    split = jax.tree.map(lambda x: x[: blocks * block].reshape(blocks, block, *x.shape[1:]), frames)
+    state, results = jax.lax.scan(jax.checkpoint(resume_block), start, split)
+    joined = jax.tree.map(lambda x: x.reshape(blocks * block, *x.shape[2:]), results)
+    if blocks * block == count:
+        return joined
+    remainder = resume_block(state, jax.tree.map(lambda x: x[blocks * block :], frames))[1]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), joined, remainder)

@@ -1,0 +1,111 @@
+"""What a foot-IK system is, what it remembers, and what it returns."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxik.maths.parameter_tree import Rule
+from jaxik.maths.struct import struct
+from jaxik.stages.contact import AbstractContact
+from jaxik.stages.effector import AbstractEffector, Effector
+from jaxik.stages.foot import AbstractFoot
+from jaxik.stages.lean import AbstractLean, Lean
+from jaxik.stages.leg import AbstractLeg
+from jaxik.stages.lock import AbstractLock, Hold
+from jaxik.stages.pelvis import AbstractPelvis, PelvisState
+from jaxik.stages.probe import AbstractProbe
+from jaxik.stages.root import AbstractRoot
+from jaxik.stages.target import AbstractTarget
+from jaxik.world.frame import Sensed
+from jaxik.world.skeleton import LegPose, Rig, Transform
+
+
+class FootIK(Rule):
+    """A foot-IK system: one rule for each of ten stages, in the order in which they run.
+
+    Make one from a preset of `jaxik.presets`, then exchange rules with `dataclasses.replace` and
+    numbers with `jaxik.maths.parameter_tree.replace`:
+
+        ik = dataclasses.replace(jaxik.presets.stride(), pelvis=SupportPelvis(lowest_share=0.5))
+        ik = parameter_tree.replace(ik, {"pelvis.rise_half_life": 0.2})
+
+    Printing a system lists its rules and parameters with their units. It is a pytree whose float
+    leaves are the parameters (`equinox.filter_grad` differentiates by them). A parameter is one
+    number for all legs or an array with one number a leg.
+    """
+
+    contact: AbstractContact
+    root: AbstractRoot
+    probe: AbstractProbe
+    target: AbstractTarget
+    lean: AbstractLean
+    lock: AbstractLock
+    pelvis: AbstractPelvis
+    effector: AbstractEffector
+    leg: AbstractLeg
+    foot: AbstractFoot
+
+
+@struct
+class State:
+    """The pipeline's memory between frames; each stage's part belongs to its rule."""
+
+    started: Bool[Array, "*b"]  # False before the first frame, where memory jumps to its goals
+    contact: PyTree
+    target: PyTree
+    lean: PyTree
+    lock: PyTree
+    pelvis: PelvisState
+    effector: PyTree
+
+
+@struct
+class Advanced:
+    """Output of the stages with memory, in one frame."""
+
+    foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, not yet locked
+    hold: Hold
+    lean: Lean
+    effector: Effector
+    state: State  # after this frame
+
+
+@struct
+class Corrections:
+    """Local rotations from animation to solution: `solved = animated * correction`."""
+
+    hip: Float[Array, "*b legs 4"]
+    knee: Float[Array, "*b legs 4"]
+    ankle: Float[Array, "*b legs 4"]
+
+
+@struct
+class Trace:
+    """Output of every stage."""
+
+    sensed: Sensed
+    advanced: Advanced
+
+
+@struct
+class Result:
+    """One frame after foot IK."""
+
+    pose: LegPose  # solved legs, model space
+    body: Transform  # moves the animated body to its solved place, model space
+    corrections: Corrections
+    reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
+    aimed: Float[Array, "*b legs"]  # 1 where the foot has the rotation its rule wants, else 0
+    trace: Trace | None  # None from a `step` without `trace=True`
+
+
+def init(ik: FootIK, rig: Rig) -> State:
+    """Memory before the first frame, which then starts settled, with nothing to catch up on."""
+    return State(
+        jnp.zeros((), bool),
+        ik.contact.init(rig),
+        ik.target.init(rig),
+        ik.lean.init(rig),
+        ik.lock.init(rig),
+        ik.pelvis.init(rig),
+        ik.effector.init(rig),
+    )
