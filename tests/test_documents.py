@@ -25,8 +25,8 @@ from sybil import Example, Sybil
 from sybil.document import Document
 from sybil.parsers import markdown, rest
 
-from fitting.cli import main
-from fitting.experiments import experiment
+from fitting.cli.parser import make_parser
+from fitting.experiments import experiment_files
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("jaxik", "fitting", "data", "tests", "notebooks")
@@ -64,7 +64,7 @@ def check_command(line: str) -> None:
         errors = io.StringIO()
         try:
             with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
-                main.parser().parse_args(words[1:])
+                make_parser().parse_args(words[1:])
         except SystemExit as status:
             assert status.code == 0, f"{line}: {errors.getvalue()}"
     elif tool.startswith("python"):
@@ -89,9 +89,9 @@ def merged(table: Mapping[str, object], changes: Mapping[str, object]) -> dict[s
     """A table with changes, sub-tables merged as well."""
     result = dict(table)
     for key, value in changes.items():
-        old = result.get(key)
-        both_tables = isinstance(old, Mapping) and isinstance(value, Mapping)
-        result[key] = merged(old, value) if both_tables else value
+        if isinstance(old := result.get(key), Mapping) and isinstance(value, Mapping):
+            value = merged(old, value)
+        result[key] = value
     return result
 
 
@@ -129,6 +129,19 @@ def test_the_snippets_of_a_page_run(path, scratch):
 )
 def test_the_examples_of_docstrings_run(path, scratch):
     run_examples(Sybil([rest.DocTestParser()]).parse(path))
+
+
+def test_the_examples_in_the_help_are_commands_that_exist():
+    parser = make_parser()
+    (commands,) = (action for action in parser._actions if action.dest == "command")
+    pages = [
+        parser.format_help(),
+        *(p.format_help() for p in dict(commands.choices or {}).values()),
+    ]
+    lines = re.findall(r"^  (jaxik .*?)(?:  .*)?$", "\n".join(pages), re.MULTILINE)
+    assert len(lines) > 20
+    for line in lines:
+        check_command(line)
 
 
 @each_file(PAGES)
@@ -174,5 +187,6 @@ def test_the_files_and_names_in_a_page_exist(path):
 def test_a_file_cites_no_page_that_is_not_in_the_repository(path):
     text = path.read_text(encoding="utf-8")
     names = {page.name for page in PAGES} | WRITTEN_PAGES
-    assert set(re.findall(r"[\w-]+\.md\b", text)) <= names
-    assert not re.findall(r"\bseed 0\d\d\b|\.\./shared", text) or path.parent.name == "tests"
+    assert set(re.findall(r"[\w-]+\.md\b", text)) - names == set()
+    private = re.findall(r"\bseed 0\d\d\b|\.\./shared", text)
+    assert private == [] or path.parent == ROOT / "tests"
