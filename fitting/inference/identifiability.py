@@ -1,7 +1,7 @@
 """What the data determine of a fit, and what they leave to the prior.
 
-Smooth parameters are judged by the slopes at the solution (Laplace), thresholds by their profile on
-the hard program: a cost of plateaus and cliffs has an interval, and no standard deviation.
+Smooth parameters are judged by the Jacobian at the solution (Laplace's approximation), thresholds
+by their profile on the hard program.
 """
 
 import dataclasses
@@ -10,30 +10,21 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitting.problem.problem import Problem
 
-from .optimisation import population
 from .optimisation.solution import Solution
+from .threshold_profile import Profile, profile
 
-CONTRACTED = 0.5  # below it a parameter counts as undetermined
-CORRELATED = 0.9  # correlations of the posterior from here on are named
-BOUND = 0.01  # share of the range that counts as being at its end
-RISE = 1.92  # of the cost, at the ends of a 95 % interval (chi-square of one parameter, halved)
-NORMAL = 1.96  # standard deviations, likewise
-PRIOR_WIDTH = 0.95  # share of the range within the prior's 95 % interval, which is nearly flat
-NUDGE = 0.1  # share of the range by which a threshold is moved to see what it does
+UNDETERMINED = 0.5  # contraction below which a parameter counts as undetermined
+CORRELATED = 0.9  # posterior correlation from which on a pair is named
+AT_BOUND = 0.01  # fraction of the range that counts as being at its end
+WEAK = 0.3  # component of the weakest direction from which on a parameter is named
+NORMAL = 1.96  # standard deviations in half a 95 % interval
+PRIOR_WIDTH = 0.95  # fraction of the range within the prior's 95 % interval, which is nearly flat
 
-
-@dataclasses.dataclass(frozen=True)
-class Profile:
-    """Cost over one threshold, the smooth parameters following."""
-
-    values: Float[np.ndarray, " points"]  # in its unit, rising
-    rises: Float[np.ndarray, " points"]  # of the cost above the least of them
-    interval: tuple[float, float]  # 95 %: where the rise stays below 1.92, and what lies between
-    nudged: tuple[float, float]  # rise when moved alone by a tenth of the range, down and up
+Bound = Literal["", "low", "high"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,146 +32,116 @@ class Identifiability:
     """How well each free parameter is determined; arrays in the order of the names."""
 
     names: tuple[str, ...]
-    contraction: Float[np.ndarray, " free"]  # 0: the prior is all there is, 1: the data decide
+    contraction: Float[np.ndarray, " free"]  # 0: only the prior is known, 1: the data decide
     interval: Float[np.ndarray, "free 2"]  # 95 %, in the parameter's unit
     sd: Float[np.ndarray, " free"]  # of u; NaN for thresholds
-    at_bound: tuple[Literal["", "low", "high"], ...]
+    at_bound: tuple[Bound, ...]
     eigenvalues: Float[np.ndarray, " smooth"]  # rising; information in units of the prior's
-    weakest: tuple[str, ...]  # names that make up the direction of the least eigenvalue
-    correlated: tuple[tuple[str, str, float], ...]
+    weakest: tuple[str, ...]  # parameters in the direction of the smallest eigenvalue
+    correlated: tuple[tuple[str, str, float], ...]  # strongest first
     profiles: dict[str, Profile]  # of thresholds
-    improvement: float  # how far a profile went below the solution's cost; 0 at a minimum
+    improvement: float  # how far a profile fell below the solution's cost; 0 at a minimum
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Names that these data leave to the prior."""
+        """Parameters that these data leave to the prior."""
         pairs = zip(self.names, self.contraction, strict=True)
-        return tuple(name for name, contraction in pairs if contraction < CONTRACTED)
+        return tuple(name for name, contraction in pairs if contraction < UNDETERMINED)
 
 
-def identify(problem: Problem, solution: Solution) -> Identifiability:
+def assess_identifiability(problem: Problem, solution: Solution) -> Identifiability:
     """What the data of a problem determine around its solution.
 
-    The contraction of a smooth parameter is `1 - (posterior sd / prior sd)²` in `u`, the thresholds
-    being held; of a threshold it is the same of the interval's share of the range.
+    The contraction of a smooth parameter is `1 - (posterior sd / prior sd)²` in `u`, with the
+    thresholds fixed. That of a threshold is the same of its interval's fraction of the range.
 
     Raises:
-        ValueError: if the slopes at the solution are not finite.
+        ValueError: if the Jacobian at the solution is not finite.
     """
     space = problem.space
     if not np.isfinite(solution.jacobian).all():
-        raise ValueError(f"nothing can be said where the slopes are not finite: {solution.message}")
-    chosen = np.flatnonzero(space.smooth)
-    prior_sd = np.asarray(space.prior_sd)[chosen]
-    scaled = solution.jacobian[: -space.size, chosen] * prior_sd
-    information = scaled.T @ scaled
-    eigenvalues, directions = np.linalg.eigh(information)
-    covariance = np.linalg.inv(information + np.eye(chosen.size))  # in prior variances
-    shares = np.diag(covariance)
+        raise ValueError(
+            f"the Jacobian at the solution is not finite, so nothing is known of how well the"
+            f" parameters are determined: {solution.message}"
+        )
+    laplace = _Laplace.around(problem, solution)
     profiles = {
         name: profile(problem, solution, name)
-        for name, decides in zip(space.names, space.thresholds, strict=True)
-        if decides
+        for name, threshold in zip(space.names, space.thresholds, strict=True)
+        if threshold
     }
     contraction = np.zeros(space.size)
-    contraction[chosen] = 1 - shares
-    sd = np.full(space.size, np.nan)
-    sd[chosen] = np.sqrt(shares) * prior_sd
-    u, ends = jnp.asarray(solution.u), jnp.diag(jnp.nan_to_num(jnp.asarray(NORMAL * sd)))
-    low, high = (np.diag(jax.vmap(space.values)(u + sign * ends)) for sign in (-1, 1))
-    interval = np.stack([low, high], axis=1)
+    contraction[laplace.smooth] = 1 - np.diag(laplace.covariance)
+    sd = laplace.sd(problem)
+    interval = _interval(problem, solution, sd)
     for i, name in enumerate(space.names):
         if name in profiles:
             interval[i] = profiles[name].interval
             width = (interval[i, 1] - interval[i, 0]) / float(space.high[i] - space.low[i])
             contraction[i] = max(0.0, 1 - (width / PRIOR_WIDTH) ** 2)
-    names = [space.names[i] for i in chosen]
-    weights = np.abs(directions[:, :1])
-    best = min([0.0, *(float(one.rises.min()) for one in profiles.values())])
+    names = [space.names[i] for i in laplace.smooth]
+    fractions = jax.nn.sigmoid(jnp.asarray(solution.u))
     return Identifiability(
         names=space.names,
         contraction=contraction,
         interval=interval,
         sd=sd,
-        at_bound=tuple(_bound_of(share) for share in jax.nn.sigmoid(u)),
-        eigenvalues=eigenvalues,
-        weakest=tuple(name for name, weight in zip(names, weights, strict=True) if weight > 0.3),
-        correlated=_pairs(names, covariance),
+        at_bound=tuple(_bound(float(fraction)) for fraction in fractions),
+        eigenvalues=laplace.eigenvalues,
+        weakest=tuple(n for n, x in zip(names, laplace.weakest, strict=True) if abs(x) > WEAK),
+        correlated=_correlated(names, laplace.covariance),
         profiles=profiles,
-        improvement=-best,
+        improvement=-min([0.0, *(float(profile.rises.min()) for profile in profiles.values())]),
     )
 
 
-def _bound_of(share: Array) -> Literal["", "low", "high"]:
-    return "low" if share < BOUND else "high" if share > 1 - BOUND else ""
+@dataclasses.dataclass(frozen=True)
+class _Laplace:
+    """The normal approximation of the smooth parameters' posterior, in prior units."""
+
+    smooth: np.ndarray  # indices among the free parameters
+    covariance: np.ndarray  # in prior variances
+    eigenvalues: np.ndarray  # of the information, rising
+    weakest: np.ndarray  # eigenvector of the smallest one
+
+    @classmethod
+    def around(cls, problem: Problem, solution: Solution) -> "_Laplace":
+        space = problem.space
+        smooth = np.flatnonzero(space.smooth)
+        scaled = solution.jacobian[: -space.size, smooth] * np.asarray(space.prior_sd)[smooth]
+        information = scaled.T @ scaled
+        eigenvalues, directions = np.linalg.eigh(information)
+        covariance = np.linalg.inv(information + np.eye(smooth.size))
+        return cls(smooth, covariance, eigenvalues, directions[:, :1].ravel())
+
+    def sd(self, problem: Problem) -> np.ndarray:
+        """Standard deviation of `u`, NaN for thresholds."""
+        sd = np.full(problem.space.size, np.nan)
+        prior_sd = np.asarray(problem.space.prior_sd)[self.smooth]
+        sd[self.smooth] = np.sqrt(np.diag(self.covariance)) * prior_sd
+        return sd
 
 
-def _pairs(names: list[str], covariance: np.ndarray) -> tuple[tuple[str, str, float], ...]:
+def _interval(problem: Problem, solution: Solution, sd: np.ndarray) -> np.ndarray:
+    """Values at either end of the 95 % interval of `u`, (free, 2); no width where `sd` is NaN."""
+    half_widths = jnp.diag(jnp.nan_to_num(jnp.asarray(NORMAL * sd)))
+    u = jnp.asarray(solution.u)
+    ends = [jax.vmap(problem.space.values)(u + sign * half_widths) for sign in (-1, 1)]
+    return np.stack([np.diag(end) for end in ends], axis=1)
+
+
+def _bound(fraction: float) -> Bound:
+    return "low" if fraction < AT_BOUND else "high" if fraction > 1 - AT_BOUND else ""
+
+
+def _correlated(names: list[str], covariance: np.ndarray) -> tuple[tuple[str, str, float], ...]:
     """Pairs of strong correlation, the strongest first."""
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
-    found = [
+    pairs = [
         (names[i], names[j], float(correlation[i, j]))
         for i in range(len(names))
         for j in range(i)
         if abs(correlation[i, j]) >= CORRELATED
     ]
-    return tuple(sorted(found, key=lambda pair: -abs(pair[2])))
-
-
-def profile(problem: Problem, solution: Solution, name: str) -> Profile:
-    """Cost over the range of one threshold, the others keeping their values.
-
-    The smooth parameters follow by two Gauss-Newton steps with the slopes at the solution. First
-    the whole range, then again where the interval ends; it reaches out to the first point beyond,
-    since a cliff may lie anywhere between two points.
-
-    Raises:
-        ValueError: for a name that is not free.
-    """
-    space = problem.space
-    if name not in space.names:
-        raise ValueError(f"not free: {name!r}; free are {list(space.names)}")
-    i = space.names.index(name)
-    low, high = float(space.low[i]), float(space.high[i])
-    here = float(solution.values[i])
-    half = population.BATCH // 2
-    values = np.sort(np.append(np.linspace(low, high, population.BATCH - 1), here))
-    rises = _rises(problem, solution, i, values, follow=True)
-    for _ in range(2):
-        start, end = _hull(values, rises)
-        first = np.linspace(values[max(start - 1, 0)], values[start], half)
-        last = np.linspace(values[end], values[min(end + 1, len(values) - 1)], half)
-        finer = np.concatenate([first, last])
-        values, order = np.unique(np.concatenate([values, finer]), return_index=True)
-        rises = np.concatenate([rises, _rises(problem, solution, i, finer, follow=True)])[order]
-    start, end = _hull(values, rises)
-    nudge = NUDGE * (high - low)
-    sides = np.clip([here - nudge, here + nudge], low, high)
-    down, up = _rises(problem, solution, i, sides, follow=False)
-    interval = (values[max(start - 1, 0)], values[min(end + 1, len(values) - 1)])
-    return Profile(
-        values, rises, (float(interval[0]), float(interval[1])), (float(down), float(up))
-    )
-
-
-def _hull(values: np.ndarray, rises: np.ndarray) -> tuple[int, int]:
-    """First and last point within the interval."""
-    within = np.flatnonzero(rises <= rises.min() + RISE)
-    return int(within[0]), int(within[-1])
-
-
-def _rises(
-    problem: Problem, solution: Solution, i: int, values: np.ndarray, *, follow: bool
-) -> np.ndarray:
-    """Cost above the solution's with the i-th value exchanged, the other values being kept."""
-    space = problem.space
-    table = np.tile(solution.values, (len(values), 1))
-    table[:, i] = values
-    candidates = population.from_values(space, table)
-    cost = np.full(len(values), np.inf)
-    for _ in range(3 if follow else 1):
-        born = population.evaluate(problem, candidates, solution.jacobian)
-        cost = np.minimum(cost, born.cost)
-        candidates = born.stepped
-    return cost - solution.cost
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))

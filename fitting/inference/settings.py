@@ -1,22 +1,13 @@
 """Settings of the search and of the sampler: numbers with a unit, a range and a meaning.
 
-A settings class is a frozen dataclass whose fields are all declared with `setting`. The declaration
-is the only place where a default, its range and its meaning stand: experiment files and error
-messages read it from there (`describe`).
+A settings class is a frozen dataclass derived from `Settings` whose fields are all declared with
+`setting`. The declaration is the only place where a default, its range and its meaning stand:
+experiment files and error messages read it from there.
 """
 
 import dataclasses
 import math
-from typing import Any, ClassVar, Protocol
-
-
-class Settings(Protocol):
-    """A dataclass of settings."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-
-Value = int | float | tuple[float, ...] | None
+from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +16,8 @@ class Setting:
 
     meaning: str  # one sentence
     unit: str  # "1" for a ratio
-    low: float  # of each number, where there are several
-    high: float
+    low: int | float  # of each number, where there are several
+    high: int | float
     integer: bool
     several: bool = False  # a tuple of numbers
     optional: bool = False  # None stands for a number that is chosen later
@@ -54,24 +45,45 @@ class Setting:
 
 
 def setting(
-    default: Value, meaning: str, *, unit: str = "1", low: float = 0, high: float = math.inf
+    default: int | float | tuple[float, ...] | None,
+    meaning: str,
+    *,
+    unit: str = "1",
+    low: int | float = 0,
+    high: int | float = math.inf,
 ) -> Any:
     """A field of a settings class; its kind is that of the default, None meaning an integer."""
     several = isinstance(default, tuple)
     example = default[0] if isinstance(default, tuple) else default
-    integer = not isinstance(example, float)
-    declared = Setting(meaning, unit, low, high, integer, several, default is None)
+    declared = Setting(
+        meaning=meaning,
+        unit=unit,
+        low=low,
+        high=high,
+        integer=not isinstance(example, float),
+        several=several,
+        optional=default is None,
+    )
     return dataclasses.field(default=default, metadata={"setting": declared})
 
 
-def describe(settings: Settings | type[Settings]) -> dict[str, Setting]:
-    """The settings of a class or an object, by name."""
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Base of settings classes; checks every value when one is made.
+
+    Raises:
+        ValueError: for a setting out of its range.
+    """
+
+    def __post_init__(self) -> None:
+        for name, declared in describe(type(self)).items():
+            value = getattr(self, name)
+            if not declared.allows(value):
+                raise ValueError(
+                    f"{name} is {value!r}, wanted {declared.range}: {declared.meaning}"
+                )
+
+
+def describe(settings: type[Settings]) -> dict[str, Setting]:
+    """The settings of a class by name, in the order of its fields."""
     return {field.name: field.metadata["setting"] for field in dataclasses.fields(settings)}
-
-
-def check(settings: Settings) -> None:
-    """Raises ValueError for the first setting that is out of its range."""
-    for name, declared in describe(settings).items():
-        value = getattr(settings, name)
-        if not declared.allows(value):
-            raise ValueError(f"{name} is {value!r}, wanted {declared.range}: {declared.meaning}")

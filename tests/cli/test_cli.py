@@ -18,7 +18,7 @@ import pytest
 
 from fitting.cli import commands, main, progress
 from fitting.datasets.clips import load_clip
-from fitting.experiments import experiment
+from fitting.experiments import problems
 from fitting.inference.optimisation import search
 from fitting.inference.sampling.chain import journal_path
 from fitting.studies import run_folder
@@ -252,7 +252,7 @@ def test_the_parameters_are_kept_if_anything_fails_after_the_search(
     def fail(*_):
         raise ValueError("no slopes")
 
-    monkeypatch.setattr(commands, "identify", fail)
+    monkeypatch.setattr(commands, "assess_identifiability", fail)
     assert "no slopes" in refused_after_progress(capsys, "fit", asked, "-o", tmp_path / "run")
     assert tree(tmp_path / "run") == {run_folder.EXPERIMENT, run_folder.PARAMETERS}
 

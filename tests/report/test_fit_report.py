@@ -20,7 +20,8 @@ from fitting.experiments.experiment import (
     make_scene,
     system,
 )
-from fitting.inference.identifiability import Identifiability, Profile
+from fitting.inference.identifiability import Identifiability
+from fitting.inference.threshold_profile import Profile
 from fitting.inference.optimisation import search
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem import residuals

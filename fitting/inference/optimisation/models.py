@@ -1,6 +1,6 @@
 """Residuals and Jacobians that Levenberg–Marquardt can follow although thresholds have none."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from fitting.problem.problem import Problem
 BLOCK = 128  # rows of a QR decomposition that fit into a core's cache
 
 
+@runtime_checkable
 class Model(Protocol):
     """A least-squares problem: residuals and their derivatives at a point."""
 

@@ -2,11 +2,11 @@
 
 import dataclasses
 
-from fitting.inference.settings import check, setting
+from fitting.inference.settings import Settings, setting
 
 
 @dataclasses.dataclass(frozen=True)
-class SearchSettings:
+class SearchSettings(Settings):
     """Settings of `search.find_best_fit`.
 
     The defaults were tuned on walks over uneven ground: more of anything takes longer and rarely
@@ -92,7 +92,7 @@ class SearchSettings:
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.gauss_newton_children >= self.population:
             raise ValueError(
                 f"gauss_newton_children is {self.gauss_newton_children},"

@@ -81,7 +81,7 @@ class Search:
         """Which parameters only move hard decisions."""
         return np.asarray(self.problem.space.thresholds)
 
-    def array(self, u: np.ndarray) -> Float[Array, " free"]:
+    def array(self, u: Float[np.ndarray, "*n free"]) -> Float[Array, "*n free"]:
         """`u` as the problem's programs take it."""
         return jnp.asarray(u, self.problem.space.u0.dtype)
 

@@ -53,7 +53,7 @@ def _log_probabilities(
 def steps(
     problem: Problem, chain: Chain, start_u: np.ndarray, start_sd: np.ndarray, limit: int
 ) -> Iterator[emcee.State]:
-    """Continues the chain from its last step, one stored step at a time, to `limit` stored steps."""
+    """Continues the chain from its last step to `limit` stored steps, one at a time."""
     identity = chain.identity
     dtype = problem.space.u0.dtype
 

@@ -2,11 +2,11 @@
 
 import dataclasses
 
-from fitting.inference.settings import check, setting
+from fitting.inference.settings import Settings, setting
 
 
 @dataclasses.dataclass(frozen=True)
-class SamplerSettings:
+class SamplerSettings(Settings):
     """Settings of `posterior.sample_posterior`.
 
     Raises:
@@ -29,7 +29,7 @@ class SamplerSettings:
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.max_steps < self.thin_by:
             raise ValueError(
                 f"max_steps is {self.max_steps}, wanted at least thin_by, which is {self.thin_by}"
