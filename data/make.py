@@ -33,7 +33,7 @@ from fitting.datasets.clips import Clip, save_clip
 from fitting.datasets.synthetic import multi_limb, terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip, Stop
 from fitting.datasets.terrain import mesh_files
-from fitting.experiments import experiment
+from fitting.experiments import systems
 from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain
 
@@ -41,8 +41,8 @@ HERE = Path(__file__).resolve().parent
 TERRAINS = {
     "slope": terrain_meshes.slope,
     "steps": terrain_meshes.steps,
-    "rubble": terrain_meshes.stones,
-    "uneven_walk": terrain_meshes.uneven,
+    "rubble": terrain_meshes.rubble,
+    "uneven_walk": terrain_meshes.uneven_walk,
     "stop_and_go": terrain_meshes.stop_and_go,
     "meadow": terrain_meshes.meadow,
     "wall": terrain_meshes.wall,
@@ -57,17 +57,17 @@ GRAIN = 2.0**-24  # m, and of quaternions; 6e-8
 
 def uneven_walk() -> Clip:
     """The flat base of the uneven walk."""
-    return walker.walk(SECONDS, FPS, 2, slips=SLIPS, slides=SLIDES)
+    return walker.walk(SECONDS, FPS, 2, (*SLIPS, *SLIDES))
 
 
 def stop_and_go() -> Clip:
     """The flat base of the walk that stops."""
-    return walker.walk(SECONDS, FPS, 4, stops=STOPS)
+    return walker.walk(SECONDS, FPS, 4, STOPS)
 
 
 def quadruped() -> Clip:
     """A quadruped's walk."""
-    return multi_limb.crawl(multi_limb.QUADRUPED, 5.0, FPS, 3)
+    return multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, FPS, 3)
 
 
 def climber() -> Clip:

@@ -15,7 +15,7 @@ from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts, load_clip, save_clip
 from fitting.datasets.synthetic import terrain_meshes
 from fitting.datasets.terrain import mesh_files
-from fitting.experiments import experiment
+from fitting.experiments import experiment_files, systems
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 
@@ -56,6 +56,7 @@ def under(ground, points):
     return jax.jit(terrain.cast)(ground, points + np.array([0.0, 2.0, 0.0]), 4.0)
 
 
+@pytest.mark.slow
 def test_terrains_and_truth_come_out_again_to_the_byte(made):
     names = {f"terrains/{path.name}" for path in (DATA / "terrains").iterdir()}
     assert names == {f"terrains/{path.name}" for path in (made / "terrains").iterdir()}
@@ -63,12 +64,14 @@ def test_terrains_and_truth_come_out_again_to_the_byte(made):
         assert (made / name).read_bytes() == (DATA / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_every_clip_is_one_that_is_made(made):
     kept = {path.name for path in (DATA / "clips").iterdir()}
     assert kept == {path.name for path in (made / "clips").iterdir()}
     assert {name.removesuffix(".npz") for name in kept if name.endswith(".npz")} == set(CLIPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CLIPS)
 def test_clips_come_out_again(made, name):
     ours, theirs = (load_clip(folder / "clips" / f"{name}.npz") for folder in (made, DATA))
@@ -213,7 +216,9 @@ def test_the_wall_has_holds_of_two_to_six_centimetres():
     assert 0.2 < len(holds) / len(proud) < 0.4
 
 
-@pytest.mark.parametrize("name", ["slope", "steps", "stones", "uneven", "stop_and_go", "meadow"])
+@pytest.mark.parametrize(
+    "name", ["slope", "steps", "rubble", "uneven_walk", "stop_and_go", "meadow"]
+)
 def test_a_course_has_no_hole_and_faces_up(tmp_path, name):
     mesh = getattr(terrain_meshes, name)()
     mesh_files.save_mesh(tmp_path / "ground.ply", *mesh)

@@ -1,9 +1,10 @@
-"""Flat base animations: what a game would play on flat ground, made from a clip on uneven ground.
+"""Flat animations: what a game would play on flat ground, derived from a clip on uneven ground.
 
-The captured feet with the ground taken out: through each stance a foot is lowered by the height of
-the ground under it, between two stances by a quintic smoothstep from one height to the next. The
-pelvis keeps its way over the ground plan at a constant height, and knees are rebuilt by the cosine
-law in the plane in which the captured leg bends.
+Foot IK takes such an animation and the terrain, and should return the captured motion. To derive
+it, the terrain is taken out from under the feet: during a stance a foot is lowered by the height of
+the ground below it, and between two stances by a quintic smoothstep from one height to the next.
+The pelvis keeps its path in the ground plane at a constant height. Knees follow from the law of
+cosines, in the plane in which the captured leg bends.
 """
 
 from collections.abc import Callable
@@ -19,85 +20,87 @@ from fitting.runtime.validation import error_context
 from .clips import contacts, load_clip
 from .clips.clip import Clip
 from .clips.formats.npz import is_blocks_file
-from .clips.recording import local_from_world, place
-from .clips.rigs import hinges, unit
+from .clips.kinematics import local_from_world, world_from_local
+from .clips.leg_geometry import Vectors, bone_rotation, knee_hinges, knee_positions, unit
 
-STRETCH = 1e-4  # m, change of a bone's length that counts as stretching
-LONGEST = 0.9995  # share of a leg's length that it may be stretched to
+HeightFunction = Callable[[np.ndarray], np.ndarray]
+"""Ground heights, m, (points,), below points (points, 3), m."""
+
+LENGTH_TOLERANCE = 1e-4  # m: a bone whose length varies by more is being stretched
+MAX_REACH = 0.9995  # of a leg's length, to which it may be extended
 
 
 def flatten_clip(
-    clip: Clip,
-    height_under: Callable[[np.ndarray], np.ndarray],
-    *,
-    pelvis_height: float | None = None,
+    clip: Clip, height_under: HeightFunction, *, pelvis_height: float | None = None
 ) -> Clip:
     """The clip over a flat floor at y = 0.
 
-    Feet keep their orientation and their way over the ground plan; where the pelvis is too high for
-    a leg, its foot is drawn along the line to its hip until the leg reaches, and bones keep their
-    lengths always. Hips and the body above them move with the pelvis as captured.
+    Feet keep their orientation and their path in the ground plane. Where the pelvis is too high for
+    a leg, its foot moves towards the hip until the leg reaches, so bones always keep their lengths.
+    The body above the hips moves with the pelvis, as captured.
 
     Args:
-        clip: captured motion over the terrain; its contact labels, or if it has none those found
-            from its motion, say when a foot stands.
-        height_under: ground height, m, (points,), under points (points, 3), m.
-        pelvis_height: m; None keeps its mean height over the ground under the standing feet.
+        clip: captured motion over terrain. Its contact labels decide when a foot stands; if it has
+            none, they are detected from its motion.
+        height_under: the height of the terrain.
+        pelvis_height: m; None keeps the mean height above the ground under the standing feet.
 
-    Errors: ValueError when a foot never stands or the ground is not finite under a stance.
+    Raises:
+        ValueError: a foot never stands, or the ground height under a stance is not finite.
     """
     rig = clip.rig
     stance = clip.stance_labels()
-    ground = ground_under(clip, stance, height_under)
+    ground = ground_heights(clip, stance, height_under)
     pelvis = clip.positions_ws[:, rig.pelvis]
     if pelvis_height is None:
-        stands = stance.any(axis=1)
-        under = (ground * stance).sum(axis=1)[stands] / stance.sum(axis=1)[stands]
-        pelvis_height = float(np.mean(pelvis[stands, 1] - under))
+        any_foot = stance.any(axis=1)
+        under = (ground * stance).sum(axis=1)[any_foot] / stance.sum(axis=1)[any_foot]
+        pelvis_height = float(np.mean(pelvis[any_foot, 1] - under))
     lift = (pelvis_height - pelvis[:, 1])[:, None, None] * [0.0, 1.0, 0.0]
-    positions_ws, rotations_ws = clip.positions_ws + lift, clip.rotations_ws.copy()
-    for leg, joints in enumerate(rig.joints):
-        lengths = float(rig.thigh[leg]), float(rig.shin[leg])
-        _rebuild(clip, joints, lengths, ground[:, leg], positions_ws, rotations_ws)
-    positions_ws, rotations_ws = _hang_children(clip, positions_ws, rotations_ws)
-    return replace(clip.with_motion(positions_ws, rotations_ws), stance=stance)
+    flat = _rebuild_legs(
+        clip.with_motion(clip.positions_ws + lift, clip.rotations_ws), clip, ground
+    )
+    return replace(flat, stance=stance)
 
 
 def with_rigid_legs(clip: Clip) -> Clip:
     """The clip with thighs and shins of the rig's lengths in every frame.
 
-    Where an animation stretches a leg its foot is drawn along the line to its hip until the leg
-    reaches; a clip whose bones already keep their lengths is returned as it is.
+    Where the animation stretches a leg, its foot moves towards the hip until the leg reaches. A
+    clip whose bones keep their lengths is returned unchanged.
     """
     rig = clip.rig
     hip, knee, ankle = (clip.joints_ws(role) for role in range(3))
     errors = [
-        np.abs(np.linalg.norm(a - b, axis=-1) - np.asarray(length)).max()
-        for a, b, length in ((hip, knee, rig.thigh), (knee, ankle, rig.shin))
+        np.abs(np.linalg.norm(top - bottom, axis=-1) - np.asarray(length)).max()
+        for top, bottom, length in ((hip, knee, rig.thigh), (knee, ankle, rig.shin))
     ]
-    if max(errors) < STRETCH:
+    if max(errors) < LENGTH_TOLERANCE:
         return clip
-    positions_ws, rotations_ws = clip.positions_ws.copy(), clip.rotations_ws.copy()
-    for leg, joints in enumerate(rig.joints):
-        lengths = float(rig.thigh[leg]), float(rig.shin[leg])
-        _rebuild(clip, joints, lengths, np.zeros(clip.frame_count), positions_ws, rotations_ws)
-    return clip.with_motion(*_hang_children(clip, positions_ws, rotations_ws))
+    return _rebuild_legs(clip, clip, np.zeros((clip.frame_count, len(rig.joints))))
 
 
 def load_flat_animation(path: Path) -> Clip:
-    """The animation in a file as foot IK takes it: a blocks file's base, with rigid legs."""
+    """The animation in a file, ready for foot IK: with rigid legs, and of a blocks file the base.
+
+    Raises:
+        ValueError: as `load_clip`, or the clip has no legs.
+    """
     clip = load_clip(path, variant="base" if is_blocks_file(path) else "captured")
     with error_context(path):
         return with_rigid_legs(clip)
 
 
-def ground_under(
-    clip: Clip, stance: np.ndarray, height_under: Callable[[np.ndarray], np.ndarray]
+def ground_heights(
+    clip: Clip, stance: np.ndarray, height_under: HeightFunction
 ) -> Float64[np.ndarray, "frames legs"]:
-    """Height, m, of the ground that each foot comes from or goes to.
+    """Height of the ground to take out from under each foot, m.
 
-    In a stance the height under the median place of its ball; before the first stance and after the
-    last theirs.
+    During a stance it is the height below the median position of the ball, and between stances it
+    changes smoothly. Before the first stance and after the last it is theirs.
+
+    Raises:
+        ValueError: a foot never stands, or a height is not finite.
     """
     balls = clip.joints_ws(3)
     ground = np.empty(stance.shape)
@@ -105,98 +108,83 @@ def ground_under(
         if not stance[:, leg].any():
             raise ValueError(f"{clip.source}: the {name} foot never stands, so no ground is known")
         falls = contacts.footfalls(balls[:, leg], stance[:, leg])
-        places = falls.places_ws
-        heights = np.asarray(height_under(places), np.float64)
-        if heights.shape != (len(places),) or not np.isfinite(heights).all():
+        points = falls.positions_ws
+        heights = np.asarray(height_under(points), np.float64)
+        if heights.shape != (len(points),) or not np.isfinite(heights).all():
             raise ValueError(
-                f"{clip.source}: wanted {len(places)} finite ground heights under the stances of "
+                f"{clip.source}: wanted {len(points)} finite ground heights under the stances of "
                 f"the {name} foot, got {heights}"
             )
-        low, high, share = heights[falls.last], heights[falls.next], falls.share
-        ground[:, leg] = low + (high - low) * share**3 * (10 - 15 * share + 6 * share**2)
+        start, end, x = heights[falls.last], heights[falls.next], falls.swing_fraction
+        ground[:, leg] = start + (end - start) * x**3 * (10 - 15 * x + 6 * x**2)
     return ground
 
 
-def _rebuild(
-    clip: Clip,
-    joints: tuple[int, int, int, int],
-    lengths: tuple[float, float],
-    ground: np.ndarray,
-    positions_ws: np.ndarray,
-    rotations_ws: np.ndarray,
-) -> None:
-    """Places one leg's joints in the arrays and turns its thigh and shin after them."""
-    captured = [clip.positions_ws[:, joint] for joint in joints]
-    hip = positions_ws[:, joints[0]]
-    drop = ground[:, None] * [0.0, 1.0, 0.0]
-    ankle = captured[2] - drop
-    farthest = LONGEST * sum(lengths)
-    distance = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)
-    ankle = hip + (ankle - hip) * np.minimum(1.0, farthest / distance)
-    knee = bent_knee(hip, ankle, lengths, captured, clip.left_ws())
-    new = [hip, knee, ankle, captured[3] + ankle - captured[2]]
-    for joint, pos in zip(joints, new, strict=True):
-        positions_ws[:, joint] = pos
-    for bone in (0, 1):
-        turn = _frame(new, bone, clip) * _frame(captured, bone, clip).inv()
-        old = Rotation.from_quat(clip.rotations_ws[:, joints[bone]], scalar_first=True)
-        rotations_ws[:, joints[bone]] = (turn * old).as_quat(scalar_first=True)
-
-
-def bent_knee(
-    hip: np.ndarray,
-    ankle: np.ndarray,
-    lengths: tuple[float, float],
-    captured: list[np.ndarray],
-    left_ws: np.ndarray,
-) -> Float64[np.ndarray, "frames 3"]:
-    """The knee between `hip` and `ankle` by the cosine law.
-
-    It bends to where the captured one does, after the shortest turn that takes the captured line
-    from hip to ankle onto the new one.
+def _rebuild_legs(moved: Clip, captured: Clip, ground: np.ndarray) -> Clip:
+    """The clip `moved` with legs that reach the captured feet, lowered by `ground`.
 
     Args:
-        hip, ankle: world space, m, near enough for the lengths.
-        lengths: thigh and shin, m.
-        captured: hip, knee and ankle (and more) of the captured leg, world space, m.
-        left_ws: unit; which way a straight leg's hinge points.
+        moved: the captured clip, its body lifted.
+        captured: the captured clip.
+        ground: m, (frames, legs).
     """
-    thigh, shin = lengths
-    hinge = hinges(captured[0], captured[1], captured[2], left_ws)
-    before, along = unit(captured[2] - captured[0]), unit(ankle - hip)
-    pole = unit(np.cross(before, hinge))
-    axis = np.cross(before, along)  # Rodrigues' formula with the sine as the axis' length
+    rig, left_ws = captured.rig, captured.left_ws()
+    positions_ws, rotations_ws = moved.positions_ws.copy(), captured.rotations_ws.copy()
+    for leg, joints in enumerate(rig.joints):
+        before = [captured.positions_ws[:, joint] for joint in joints]
+        hip = positions_ws[:, joints[0]]
+        bones = float(rig.thigh[leg]), float(rig.shin[leg])
+        ankle = before[2] - ground[:, leg, None] * [0.0, 1.0, 0.0]
+        distance = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)
+        ankle = hip + (ankle - hip) * np.minimum(1.0, MAX_REACH * sum(bones) / distance)
+        pole = _carried_pole(before, ankle - hip, left_ws)
+        knee = knee_positions(hip, ankle, pole, bones)
+        after = [hip, knee, ankle, before[3] + ankle - before[2]]
+        for joint, pos in zip(joints, after, strict=True):
+            positions_ws[:, joint] = pos
+        for bone in (0, 1):
+            change = _bone_axes(after, bone, left_ws) * _bone_axes(before, bone, left_ws).inv()
+            old = Rotation.from_quat(captured.rotations_ws[:, joints[bone]], scalar_first=True)
+            rotations_ws[:, joints[bone]] = (change * old).as_quat(scalar_first=True)
+    return captured.with_motion(*_attach_children(captured, positions_ws, rotations_ws))
+
+
+def _carried_pole(leg: list[Vectors], hip_to_ankle: Vectors, left_ws: Vectors) -> Vectors:
+    """Where the knee of a leg points after the leg is rotated to a new line from hip to ankle.
+
+    The rotation is the shortest one from the old line to the new.
+
+    Args:
+        leg: hip, knee and ankle (and more) before, m.
+        hip_to_ankle: the new line, m.
+        left_ws: unit; the hinge of a leg that is straight.
+    """
+    before, along = unit(leg[2] - leg[0]), unit(hip_to_ankle)
+    pole = unit(np.cross(before, knee_hinges(leg[0], leg[1], leg[2], left_ws)))
+    axis = np.cross(before, along)  # Rodrigues' formula; the axis is as long as the sine
     cos = np.sum(before * along, axis=-1, keepdims=True)
-    pole = (
+    return (
         pole * cos
         + np.cross(axis, pole)
         + axis * (np.sum(axis * pole, axis=-1, keepdims=True) / (1.0 + cos))
     )
-    distance = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)
-    forth = (thigh**2 - shin**2 + distance**2) / (2.0 * distance)
-    return hip + along * forth + pole * np.sqrt(np.maximum(thigh**2 - forth**2, 0.0))
 
 
-def _frame(leg: list[np.ndarray], bone: int, clip: Clip) -> Rotation:
-    """Axes of a thigh (0) or shin (1): along the bone, across it along the hinge, and both."""
-    hinge = hinges(leg[0], leg[1], leg[2], clip.left_ws())
-    along = unit(leg[bone] - leg[bone + 1])
-    across = unit(hinge - along * np.sum(hinge * along, axis=-1, keepdims=True))
-    return Rotation.from_matrix(np.stack([across, along, np.cross(across, along)], axis=-1))
+def _bone_axes(leg: list[Vectors], bone: int, left_ws: Vectors) -> Rotation:
+    """Axes of a thigh (0) or shin (1)."""
+    return bone_rotation(leg[bone], leg[bone + 1], knee_hinges(leg[0], leg[1], leg[2], left_ws))
 
 
-def _hang_children(
+def _attach_children(
     clip: Clip, positions_ws: np.ndarray, rotations_ws: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joints on the legs but not of them (end sites, helpers) as they hung on their parents."""
-    own = {joint for leg in clip.rig.joints for joint in leg}
-    positions_ls, rotations_ls = local_from_world(
-        clip.parents, clip.positions_ws, clip.rotations_ws
-    )
-    kept_pos, kept_rot = local_from_world(clip.parents, positions_ws, rotations_ws)
-    below: set[int] = set()
+    """World transforms with joints below the legs (end sites, helpers) rigid on their parents."""
+    leg_joints = {joint for leg in clip.rig.joints for joint in leg}
+    old_pos, old_rot = local_from_world(clip.parents, clip.positions_ws, clip.rotations_ws)
+    new_pos, new_rot = local_from_world(clip.parents, positions_ws, rotations_ws)
+    attached: set[int] = set()
     for joint, parent in enumerate(clip.parents):
-        if joint not in own and (parent in own or parent in below):
-            below.add(joint)
-            kept_pos[:, joint], kept_rot[:, joint] = positions_ls[:, joint], rotations_ls[:, joint]
-    return place(clip.parents, kept_pos, kept_rot)
+        if joint not in leg_joints and (parent in leg_joints or parent in attached):
+            attached.add(joint)
+            new_pos[:, joint], new_rot[:, joint] = old_pos[:, joint], old_rot[:, joint]
+    return world_from_local(clip.parents, new_pos, new_rot)

@@ -21,7 +21,7 @@ SLOPE = 0.15  # rise per metre of z
 
 @pytest.fixture(scope="module")
 def clip():
-    return walker.walk(2.0, FPS, slides=[speed_profile.Slide(1.0, 1.5)])
+    return walker.walk(2.0, FPS, events=[speed_profile.Slide(1.0, 1.5)])
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_frames_hold_the_clip_in_model_space_over_the_floor(clip):
 
 
 def test_a_single_frame_stands_and_does_not_slide(clip):
-    made = clip_frames.frames_from_clip(dataclasses.replace(clip, slide=None).at(slice(0, 1)))
+    made = clip_frames.frames_from_clip(dataclasses.replace(clip, slide=None).select(slice(0, 1)))
     np.testing.assert_array_equal(made.speed, [0.0])
     np.testing.assert_array_equal(made.slide, [0.0])
 

@@ -109,9 +109,9 @@ def test_the_skeleton_is_found_beside_the_motion_or_asked_for(pair, tmp_path):
     amc, asf = pair()
     one_leg = {"pelvis": "root", "hip_l": "lfemur", "knee_l": "ltibia", "ankle_l": "lfoot"}
     assert load_clip(amc, joints=one_leg).rig.names == ("left",)
-    assert load_clip(amc, asf=asf).measured is None  # one leg is no pair
+    assert load_clip(amc, asf=asf).measured_rig is None  # one leg is no pair
     asf.rename(tmp_path / "b.asf")
-    assert load_clip(amc).frames == 2  # the only one there
+    assert load_clip(amc).frame_count == 2  # the only one there
     (tmp_path / "c.asf").write_text(ASF)
     with pytest.raises(ValueError, match=r"wanted a_01\.asf or a\.asf .*b\.asf.*c\.asf"):
         load_clip(amc)
@@ -127,7 +127,7 @@ def test_the_skeleton_is_found_beside_the_motion_or_asked_for(pair, tmp_path):
         ("axis 10 20 30 XYZ", "axis 10 20 30 XXZ", r"a\.asf:17: wanted an axis order"),
         ("name ltibia", "name lfemur", r"a\.asf:30: wanted a bone name that is not taken"),
         ("root lfemur", "root rfemur", r"a\.asf:39: no bone named rfemur; there are"),
-        ("    lfemur ltibia\n", "", "bones without a way to the root.*ltibia"),
+        ("    lfemur ltibia\n", "", "bones not connected to the root.*ltibia"),
         ("  begin\n    id 1", "    id 1", r"a\.asf:12: wanted begin"),
     ],
 )  # fmt: skip
@@ -142,7 +142,7 @@ def test_malformed_skeletons_are_answered_with_file_and_line(pair, old, new, sai
     [
         ("lfemur 5 6 7", "lfemur 5 6", r"a_01\.amc:6: wanted 3 finite numbers of lfemur"),
         ("lfemur 5 6 7", "lfemur 5 6 7x", r"a_01\.amc:6: wanted 3 numbers of lfemur"),
-        ("lfemur 5 6 7", "lfemur 5 6 nan", "wanted finite numbers; lfemur has others in frame 1"),
+        ("lfemur 5 6 7", "lfemur 5 6 nan", "lfemur has numbers that are not finite in frame 1"),
         ("lfemur 5 6 7\n", "", r"a_01\.amc:4: wanted all bones in frame 1; without \['lfemur'\]"),
         ("lfemur 5 6 8\n", "", r"a_01\.amc:8: wanted all bones in frame 2"),
         ("lfemur 5 6 7", "lfemur 5 6 7\nlfemur 5 6 7", r"a_01\.amc:7: wanted lfemur once"),

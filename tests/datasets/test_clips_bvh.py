@@ -217,7 +217,7 @@ def test_bodies_without_size_or_stance_are_remarked(written):
     for row, z in (("0 87 0 0 0 0", 0), ("0 87 1 0 0 5", 1), ("0 87 2 0 0 9", 2)):
         lying = lying.replace(row, f"0 87 {z} 90 0 0")
     clip = load_clip(written(lying))
-    assert any("not over the feet" in remark for remark in clip.remarks)
+    assert any("not above the feet" in remark for remark in clip.remarks)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fitting.datasets.clips import edit, load_clip
-from fitting.datasets.clips.contacts import stance_labels
+from fitting.datasets.clips.contacts import detect_stances
 from fitting.datasets.clips.joint_roles import find_roles
 from fitting.datasets.clips.rigs import measure_rig
 from fitting.datasets.clips.summary import as_json, as_text, describe
@@ -102,7 +102,7 @@ def test_a_t_pose_its_ramp_and_repeated_last_frames_go(tmp_path, ramp):
 
 def test_a_clip_without_t_pose_or_motion_is_left_alone(walk):
     assert edit.drop_t_pose(walk) is walk
-    still = walk.at(np.zeros(5, int))
+    still = walk.select(np.zeros(5, int))
     assert edit.drop_t_pose(still) is still
 
 
@@ -120,7 +120,10 @@ def test_a_popped_marker_is_masked(walk):
 
 def test_a_clip_mirrored_twice_is_the_clip(walk):
     uneven = replace(
-        walk, measured=replace(walk.measured, thigh=walk.measured.thigh + np.array([0.0, 0.1]))
+        walk,
+        measured_rig=replace(
+            walk.measured_rig, thigh=walk.measured_rig.thigh + np.array([0.0, 0.1])
+        ),
     )
     once = edit.mirror(uneven)
     assert np.allclose(once.joints_ws(2)[:, 0], uneven.joints_ws(2)[:, 1] * [-1, 1, 1])
@@ -138,7 +141,7 @@ def test_a_mirrored_clip_measures_as_its_mirrored_rig(mocap):
     once = edit.mirror(clip)
     roles = find_roles(once.joint_names, once.parents)
     positions, rotations = np.array(once.positions_ws), np.array(once.rotations_ws)
-    again = measure_rig(roles, positions, rotations, stance_labels(once.joints_ws(3), once.fps))
+    again = measure_rig(roles, positions, rotations, detect_stances(once.joints_ws(3), once.fps))
     for name in ("knee_axis_ls", "thigh", "shin", "foot"):
         assert np.allclose(getattr(again, name), getattr(once.rig, name), atol=1e-6)
     gap = np.abs(np.sum(np.asarray(again.ankle_from_foot * once.rig.ankle_from_foot), axis=-1))
@@ -149,7 +152,7 @@ def test_a_one_sided_body_has_no_mirror(walk):
     names = tuple(name.replace("right_knee", "peg") for name in walk.joint_names)
     parents = list(walk.parents)
     parents[names.index("peg")] = 0
-    with pytest.raises(ValueError, match="no mirror.*peg"):
+    with pytest.raises(ValueError, match="cannot be mirrored.*peg"):
         edit.mirror(replace(walk, joint_names=names, parents=tuple(parents)))
 
 
@@ -178,6 +181,6 @@ def test_a_clip_is_described_as_data_and_text(walk):
 
 
 def test_a_clip_without_legs_is_described_too(walk):
-    text = as_text(describe(replace(walk, measured=None, remarks=("no legs recognised",))))
+    text = as_text(describe(replace(walk, measured_rig=None, remarks=("no legs recognised",))))
     assert "no legs recognised" in text and "hip" in text
-    assert describe(replace(walk, measured=None))["legs"] == {}
+    assert describe(replace(walk, measured_rig=None))["legs"] == {}

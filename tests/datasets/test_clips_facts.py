@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import Clip, load_clip
-from fitting.datasets.clips.recording import UP_FROM_Z_UP
+from fitting.datasets.clips.recording import Y_UP_FROM_Z_UP
 
 TOLERANCE = 1e-4  # of body height, and of a rotation matrix
 FILES = [
@@ -40,7 +40,7 @@ def test_no_reference_file_is_left_out(facts):
 
 def test_positions_and_rotations_are_those_of_the_reference(case):
     clip, fact = case
-    axes = UP_FROM_Z_UP if fact["up_axis"] == "z" else np.eye(3)
+    axes = Y_UP_FROM_Z_UP if fact["up_axis"] == "z" else np.eye(3)
     worst = 0.0
     for key, suffix in (("positions", ""), ("bone_start_positions", ""),
                         ("bone_end_positions", "_end")):  # fmt: skip

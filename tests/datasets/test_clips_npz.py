@@ -20,7 +20,7 @@ def walk():
 def assert_same(one, other):
     for field in fields(one):
         first, second = getattr(one, field.name), getattr(other, field.name)
-        if field.name == "measured":
+        if field.name == "measured_rig":
             assert jax.tree.structure(first) == jax.tree.structure(second)
             for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
                 assert a.dtype == b.dtype and np.array_equal(a, b)
@@ -33,7 +33,7 @@ def assert_same(one, other):
 def test_a_saved_clip_comes_back_exactly(walk, tmp_path):
     save_clip(tmp_path / "clip.npz", walk)
     assert_same(load_clip(tmp_path / "clip.npz"), walk)
-    bare = replace(walk, measured=None, stance=None, mask=None, dialect=None, remarks=())
+    bare = replace(walk, measured_rig=None, stance=None, mask=None, dialect=None, remarks=())
     save_clip(tmp_path / "clip.npz", bare)
     assert_same(load_clip(tmp_path / "clip.npz"), bare)
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.clips.contacts import runs
 from fitting.datasets.flat_animation import (
-    LONGEST,
+    MAX_REACH,
     flatten_clip,
-    ground_under,
+    ground_heights,
     load_flat_animation,
     with_rigid_legs,
 )
@@ -72,7 +72,7 @@ def test_a_walk_on_a_flat_floor_is_its_own_base():
 
 
 def test_between_stances_the_ground_goes_over_smoothly(walk):
-    ground = ground_under(walk, walk.stance, stairs)
+    ground = ground_heights(walk, walk.stance, stairs)
     for leg in (0, 1):
         for first, last in runs(walk.stance[:, leg]):
             assert np.ptp(ground[first : last + 1, leg]) == 0.0
@@ -143,7 +143,7 @@ def test_legs_that_stretch_are_made_rigid_and_the_rest_is_left_alone(walk):
     assert np.allclose(np.linalg.norm(knee - hip, axis=-1), thigh, atol=1e-9)
     assert np.allclose(np.linalg.norm(ankle - knee, axis=-1), shin, atol=1e-9)
     reach = np.linalg.norm((stretched(walk).joints_ws(2) - hip), axis=-1)
-    near = reach < LONGEST * (thigh + shin) - 1e-9
+    near = reach < MAX_REACH * (thigh + shin) - 1e-9
     assert near.any() and np.allclose(ankle[near], stretched(walk).joints_ws(2)[near], atol=1e-9)
     assert np.allclose(rigid.positions_ws[:, [0, 1, 5]], walk.positions_ws[:, [0, 1, 5]])
     toe = rigid.positions_ws[:, 4] - rigid.positions_ws[:, 3]
@@ -170,6 +170,6 @@ def test_a_base_is_loaded_from_any_clip_and_of_the_blocks_the_flat_one(walk, tmp
 
 def test_a_base_without_legs_is_refused_with_its_file(walk, tmp_path):
     names = tuple(f"joint {i}" for i in range(len(walk.joint_names)))
-    save_clip(tmp_path / "odd.npz", replace(walk, joint_names=names, measured=None))
+    save_clip(tmp_path / "odd.npz", replace(walk, joint_names=names, measured_rig=None))
     with pytest.raises(ValueError, match=r"odd\.npz: no pair of legs recognised"):
         load_flat_animation(tmp_path / "odd.npz")

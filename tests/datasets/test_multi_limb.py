@@ -9,7 +9,7 @@ import pytest
 import jaxik
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts, load_clip, save_clip
-from fitting.datasets.clips.recording import local_from_world
+from fitting.datasets.clips.kinematics import local_from_world
 from fitting.datasets.synthetic import multi_limb, terrain_meshes
 from fitting.datasets.terrain import mesh_files
 
@@ -27,7 +27,7 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def clip(name):
-    made = {"quadruped": multi_limb.crawl(multi_limb.QUADRUPED, 5.0, 60.0, 1)}
+    made = {"quadruped": multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, 60.0, 1)}
     return made[name] if name in made else multi_limb.climb(6.0, 60.0, 1)
 
 
@@ -43,8 +43,8 @@ def test_the_ball_of_a_standing_foot_lies_on_the_ground_and_does_not_move(name, 
         assert len(spells) >= 2
         for first, last in spells:
             for joint, height in (
-                (toe, BODIES[name].sole),
-                (ankle, BODIES[name].sole + BODIES[name].foot[0]),
+                (toe, BODIES[name].ball_height),
+                (ankle, BODIES[name].ball_height + BODIES[name].ankle_to_ball[0]),
             ):
                 place = on_floor[first : last + 1, joint]
                 assert np.ptp(place, axis=0).max() < EXACT
@@ -53,14 +53,14 @@ def test_the_ball_of_a_standing_foot_lies_on_the_ground_and_does_not_move(name, 
 
 def test_no_foot_sinks_into_the_ground_and_no_knee_comes_near_it(name, clip, on_floor):
     for _, knee, ankle, toe in clip.rig.joints:
-        assert on_floor[:, toe, 1].min() > BODIES[name].sole - EXACT
+        assert on_floor[:, toe, 1].min() > BODIES[name].ball_height - EXACT
         assert on_floor[:, [knee, ankle], 1].min() > 0.06
 
 
 def test_bones_keep_their_lengths_and_limbs_hang_rigidly_on_the_trunk(name, clip):
     for limb, joints in zip(BODIES[name].limbs, clip.rig.joints, strict=True):
         places = [clip.positions_ws[:, joint] for joint in joints]
-        wanted = (*limb.bones, np.hypot(*BODIES[name].foot))
+        wanted = (*limb.bones, np.hypot(*BODIES[name].ankle_to_ball))
         for a, b, length in zip(places, places[1:], wanted, strict=False):
             distance = np.linalg.norm(b - a, axis=-1)
             np.testing.assert_allclose(distance, length, rtol=0, atol=EXACT)
@@ -87,7 +87,7 @@ def test_limbs_stay_bent_the_way_that_they_bend(name, clip, on_floor):
 
 
 def test_the_quadruped_walks_in_lateral_sequence_with_two_feet_or_more_down():
-    clip = multi_limb.crawl(multi_limb.QUADRUPED, 5.0, 60.0, 1)
+    clip = multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, 60.0, 1)
     assert clip.stance is not None
     landings = {
         name: [first for first, _ in contacts.runs(clip.stance[:, leg]) if first > 0]
@@ -129,10 +129,12 @@ def test_on_a_wall_the_root_lies_on_it_with_the_normal_as_its_up():
 
 
 def test_an_animal_may_start_elsewhere_and_a_seed_gives_the_same_steps():
-    first, same, other = (multi_limb.crawl(multi_limb.QUADRUPED, 2.0, 30.0, s) for s in (4, 4, 5))
+    first, same, other = (
+        multi_limb.locomotion(multi_limb.QUADRUPED, 2.0, 30.0, s) for s in (4, 4, 5)
+    )
     np.testing.assert_array_equal(first.positions_ws, same.positions_ws)
     assert np.abs(first.positions_ws - other.positions_ws).max() > 0.005
-    ahead = multi_limb.crawl(multi_limb.QUADRUPED, 2.0, 30.0, 4, start=3.0)
+    ahead = multi_limb.locomotion(multi_limb.QUADRUPED, 2.0, 30.0, 4, multi_limb.Route(start=3.0))
     assert ahead.positions_ws[0, 0, 2] == pytest.approx(3.0)
 
 
@@ -148,7 +150,7 @@ def test_a_clip_of_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
 def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh):
     up = terrain_meshes.WALL_UP if animal == "climber" else (0.0, 1.0, 0.0)
     clip = {
-        "quadruped": multi_limb.crawl(multi_limb.QUADRUPED, 1.0),
+        "quadruped": multi_limb.locomotion(multi_limb.QUADRUPED, 1.0),
         "climber": multi_limb.climb(1.0),
     }
     clip = clip[animal]
@@ -177,4 +179,4 @@ def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh
 )
 def test_impossible_crawls_are_refused(body, seconds, said):
     with pytest.raises(ValueError, match=said):
-        multi_limb.crawl(body, seconds)
+        multi_limb.locomotion(body, seconds)

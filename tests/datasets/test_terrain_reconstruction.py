@@ -61,14 +61,14 @@ def hurried(monkeypatch):
     """A search for grids in large steps, where no grid is wanted."""
     monkeypatch.setattr(block_grids, "PITCH_STEP", 0.15)
     monkeypatch.setattr(block_grids, "HEADING_STEP", np.radians(15.0))
-    monkeypatch.setattr(block_grids, "WIDE", (-1, 0, 1))
+    monkeypatch.setattr(block_grids, "LATTICE", (-1, 0, 1))
 
 
 @pytest.fixture
 def nearby(monkeypatch):
     """A search among fewer grids."""
     monkeypatch.setattr(block_grids, "PITCHES", (0.35, 1.0))
-    monkeypatch.setattr(block_grids, "PROMISING", 8)
+    monkeypatch.setattr(block_grids, "COARSE_KEPT", 8)
 
 
 # Grids
@@ -76,8 +76,8 @@ def nearby(monkeypatch):
 
 def test_cells_are_where_their_corners_say():
     inside = np.array([[2.0, -3.0], [0.0, 0.0], [-1.0, 4.0]])
-    np.testing.assert_array_equal(TILTED.cells(TILTED.places(inside + [0.01, 0.99])), inside)
-    apart = TILTED.places(np.array([[0.0, 0.0], [1.0, 0.0]]))
+    np.testing.assert_array_equal(TILTED.cells(TILTED.points(inside + [0.01, 0.99])), inside)
+    apart = TILTED.points(np.array([[0.0, 0.0], [1.0, 0.0]]))
     np.testing.assert_allclose(
         apart[1] - apart[0], 0.45 * np.array([np.cos(TILTED.heading), np.sin(TILTED.heading)])
     )
@@ -87,8 +87,8 @@ def test_cells_are_where_their_corners_say():
 def test_a_grid_turned_by_quarters_is_written_in_one_way(quarters):
     points = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
     heading = TILTED.heading + quarters * np.pi / 2
-    corner = TILTED.places(np.zeros((1, 2))) @ block_grids._turn(heading).T
-    grid = block_grids._grid(TILTED.pitch, heading, corner[0])
+    corner = TILTED.points(np.zeros((1, 2))) @ block_grids._uv_from_xz(heading).T
+    grid = block_grids._canonical(TILTED.pitch, heading, corner[0])
     assert grid.heading == pytest.approx(TILTED.heading)
     np.testing.assert_allclose(grid.origin, TILTED.origin, atol=1e-9)
     np.testing.assert_array_equal(grid.cells(points), TILTED.cells(points))
@@ -110,7 +110,7 @@ def test_a_grid_that_nobody_told_of_is_found(grid, nearby):
 
 def test_a_grid_found_in_turned_and_shifted_feet_is_the_grid_turned_and_shifted(nearby):
     feet, angle, shift = footprints(TILTED), np.radians(-13.0), np.array([4.0, -7.0])
-    turn = block_grids._turn(angle)  # by -angle
+    turn = block_grids._uv_from_xz(angle)  # by -angle
     moved = Footprints(
         feet.balls @ turn.T + shift, feet.heights + 1.0, feet.ankles @ turn.T + shift
     )
@@ -133,7 +133,7 @@ def test_a_block_nobody_stepped_on_has_the_mean_of_those_next_to_it():
     found = surfaces.LevelBlocks(square, cells, tops, np.array([1, 2, 1]))
     points = np.array([[0.5, 0.5], [0.5, 1.5], [2.5, 0.5], [3.5, 0.5], [9.5, 0.5]])
     np.testing.assert_allclose(found.heights(points), [0.1, 0.2, 0.3, 0.5, 0.5])
-    np.testing.assert_array_equal(found.shared(points), [True, False, False, False, False])
+    np.testing.assert_array_equal(found.supported(points), [True, False, False, False, False])
 
 
 def test_a_plane_is_not_pulled_by_a_foot_on_a_stool():
@@ -153,7 +153,7 @@ def test_a_plane_below_feet_in_a_line_is_level_across():
 
 def test_errors_of_a_plate_are_those_of_plates_through_all_the_others():
     feet = plate(12)
-    errors = surfaces._errors_of_plates(feet.balls, feet.heights)
+    errors = surfaces._leave_one_out_error(feet.balls, feet.heights)
     for smoothing in (1e-6, 0.01, 1.0):
         each = [
             RBFInterpolator(others.balls, others.heights, smoothing=smoothing)(feet.balls[[i]])[0]
@@ -187,7 +187,7 @@ def test_a_mesh_has_the_heights_of_its_surface(kind, suffix, tmp_path):
     mesh_files.save_mesh(tmp_path / f"ground.{suffix}", mesh.vertices, mesh.faces)
     points = np.random.default_rng(3).uniform(low, high, (500, 2))
     if kind == "blocks":
-        inner = np.abs(np.mod(found.grid._along(points), 1.0) - 0.5).max(axis=1) < 0.49  # pyright: ignore
+        inner = np.abs(np.mod(found.grid.coordinates(points), 1.0) - 0.5).max(axis=1) < 0.49  # pyright: ignore
         points = points[inner]
     origins = np.stack([points[:, 0], np.full(len(points), 9.0), points[:, 1]], axis=-1)
     hit = terrain.cast(
@@ -334,7 +334,7 @@ def test_the_blocks_of_subject_03_come_out_within_a_centimetre(mocap):
         clips.load_clip(mocap / "clips" / "cmu_asfamc" / "03_03.amc")
     )
     assert found.chosen == "blocks" and isinstance(found.surface, surfaces.LevelBlocks)
-    error = found.surface.heights(known.places(cells + 0.5)) - heights
+    error = found.surface.heights(known.points(cells + 0.5)) - heights
     assert np.sqrt(np.mean(error**2)) < 0.01
     assert np.sqrt(np.mean(error[clean] ** 2)) < 0.006
     grid = found.surface.grid
@@ -413,10 +413,10 @@ def test_a_clip_that_is_not_there_or_hardly_stands_is_refused(clip, tmp_path, ca
     out = str(tmp_path / "a.ply")
     assert main.main(["terrain", str(tmp_path / "no.bvh"), "-o", out]) == main.MISTAKE
     assert "no.bvh: no such file" in capsys.readouterr().err
-    short = clips.load_clip(clip).at(slice(0, 40))
+    short = clips.load_clip(clip).select(slice(0, 40))
     clips.save_clip(tmp_path / "short.npz", short)
     assert main.main(["terrain", str(tmp_path / "short.npz"), "-o", out]) == main.MISTAKE
-    assert "stances; wanted 4 or more to tell a ground" in capsys.readouterr().err
+    assert "stances; reconstruction needs 4 or more" in capsys.readouterr().err
     hanging = replace(short, stance=np.zeros((40, 2), bool))
     with pytest.raises(ValueError, match="no foot ever stands; wanted 4"):
         reconstruction.reconstruct(hanging)

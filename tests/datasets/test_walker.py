@@ -6,10 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts, load_clip, save_clip
-from fitting.datasets.clips.recording import local_from_world
+from fitting.datasets.clips.kinematics import local_from_world
 from fitting.datasets.synthetic import gait, speed_profile, walker
 
 FPS = 60.0
+STRAIGHT = walker.WalkStyle(bend=0.0)
 EXACT = 1e-9  # m
 PENETRATION = 0.002  # m, of the heel in the last frames of a swing; standing feet have none
 
@@ -85,7 +86,7 @@ def test_the_legs_are_recognised_with_flat_feet_and_knees_that_bend_forward(clip
 
 
 def test_stride_cadence_and_pelvis_are_those_of_the_measured_walk():
-    clip = walker.walk(12.6, FPS, turn=0.0, variation=0.0)
+    clip = walker.walk(12.6, FPS, style=walker.WalkStyle(bend=0.0, variation=0.0))
     pelvis = clip.positions_ws[:, 0]
     speed = gait.STRIDE / gait.PERIOD
     np.testing.assert_allclose(np.diff(pelvis[:, 2]), speed / FPS, rtol=0, atol=EXACT)
@@ -117,8 +118,8 @@ def test_a_seed_gives_the_same_walk_and_another_one_another():
 
 def test_a_slip_carries_standing_feet_along_by_its_share():
     share, start, end = 0.06, 2.0, 5.0
-    slipping = walker.walk(8.0, FPS, turn=0.0, slips=[speed_profile.Slip(start, end, share)])
-    still = walker.walk(8.0, FPS, turn=0.0)
+    slipping = walker.walk(8.0, FPS, events=[speed_profile.Slip(start, end, share)], style=STRAIGHT)
+    still = walker.walk(8.0, FPS, style=STRAIGHT)
     moved = slipping.positions_ws - still.positions_ws
     np.testing.assert_allclose(moved, moved[:, :1] * np.ones((1, 9, 1)), rtol=0, atol=EXACT)
     assert np.abs(moved[: round(start * FPS)]).max() < EXACT
@@ -127,7 +128,7 @@ def test_a_slip_carries_standing_feet_along_by_its_share():
 
 
 def test_a_slide_freezes_the_walk_with_both_feet_down_and_keeps_the_speed():
-    clip = walker.walk(8.0, FPS, slides=[speed_profile.Slide(3.0, 5.0)])
+    clip = walker.walk(8.0, FPS, events=[speed_profile.Slide(3.0, 5.0)])
     assert clip.slide is not None
     np.testing.assert_array_equal(np.flatnonzero(clip.slide), np.arange(180, 300))
     frozen = slice(round(4.5 * FPS), round(4.85 * FPS))
@@ -143,7 +144,7 @@ def test_a_slide_freezes_the_walk_with_both_feet_down_and_keeps_the_speed():
 def stopping():
     """A walk that stands from 2.5 s to 3.7 s and from 5.8 s to 7.2 s."""
     return walker.walk(
-        9.0, FPS, 4, stops=[speed_profile.Stop(1.6, 3.7), speed_profile.Stop(5.0, 7.2)]
+        9.0, FPS, 4, events=[speed_profile.Stop(1.6, 3.7), speed_profile.Stop(5.0, 7.2)]
     )
 
 
@@ -191,9 +192,9 @@ def test_feet_bones_and_smoothness_of_a_walk_that_stops_are_as_without(stopping)
 
 
 def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
-    clip = walker.walk(6.0, FPS, slides=[speed_profile.Slide(3.0, 5.0)])
+    clip = walker.walk(6.0, FPS, events=[speed_profile.Slide(3.0, 5.0)])
     save_clip(tmp_path / "walk.npz", clip)
-    loaded, trimmed = load_clip(tmp_path / "walk.npz"), clip.at(slice(0, 200))
+    loaded, trimmed = load_clip(tmp_path / "walk.npz"), clip.select(slice(0, 200))
     assert clip.slide is not None and loaded.slide is not None and trimmed.slide is not None
     np.testing.assert_array_equal(loaded.slide, clip.slide)
     assert trimmed.slide.sum() == 20
@@ -205,9 +206,9 @@ def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
     [
         ({"seconds": 0.0}, "above 0, got 0.0 s"),
         ({"fps": -60.0}, "-60.0 fps"),
-        ({"slips": [speed_profile.Slip(1.0, 9.0, 0.1)]}, r"Slip\(start=1.0, end=9.0.*5.0 s"),
-        ({"slides": [speed_profile.Slide(3.0, 2.0)]}, r"Slide\(start=3.0, end=2.0\)"),
-        ({"stops": [speed_profile.Stop(-1.0, 2.0)]}, r"Stop\(start=-1.0, end=2.0\)"),
+        ({"events": [speed_profile.Slip(1.0, 9.0, 0.1)]}, r"Slip\(start=1.0, end=9.0.*5.0 s"),
+        ({"events": [speed_profile.Slide(3.0, 2.0)]}, r"Slide\(start=3.0, end=2.0\)"),
+        ({"events": [speed_profile.Stop(-1.0, 2.0)]}, r"Stop\(start=-1.0, end=2.0\)"),
     ],
 )
 def test_impossible_walks_are_refused(options, said):

@@ -8,7 +8,7 @@ import pytest
 
 import jaxik
 from fitting.datasets.clips import load_clip, save_clip
-from fitting.experiments import experiment
+from fitting.experiments import experiment, experiment_files, problems
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, ROOT, SECOND, UNEVEN_WALK, write
 
@@ -202,7 +202,7 @@ def test_without_a_base_a_flat_one_is_made(tmp_path):
 def test_a_base_of_other_frames_is_refused(tmp_path, change, said):
     clip = load_clip(ROOT / "data/clips/uneven_walk_base.npz")
     if "frames" in change:
-        clip = clip.at(change["frames"])
+        clip = clip.select(change["frames"])
     else:
         clip = dataclasses.replace(clip, fps=change["fps"])
     save_clip(tmp_path / "base.npz", clip)

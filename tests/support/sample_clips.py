@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.formats.npz import clip_from_joints, leg_rotations
+from fitting.datasets.clips.leg_geometry import leg_rotations
 
 FPS = 60.0
 STEP, LIFT, STANDS, SWINGS = 0.6, 0.12, 30, 24  # m, m, frames, frames
@@ -101,7 +102,8 @@ def walker(height_under=stairs, strides: int = 3) -> Clip:
         positions += [hip, knee, ankle, balls[leg]]
         rotations += [*leg_rotations(hip, knee, ankle, left), still, still]
         stance.append((frames + leg * period // 2) % period <= STANDS)
-    return clip_from_joints(
-        tuple(names), tuple(parents), np.stack(positions, 1), np.stack(rotations, 1), FPS,
-        "walker", np.stack(stance, axis=-1),
+    motion = JointMotion(
+        tuple(names), tuple(parents), np.stack(positions, 1), np.stack(rotations, 1),
+        np.stack(stance, axis=-1), FPS,
     )  # fmt: skip
+    return clip_from_joints(motion, "walker")

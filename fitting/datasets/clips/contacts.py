@@ -1,8 +1,8 @@
-"""When a foot stands: contact labels from the motion of the ball of the foot alone.
+"""Contact detection: when each foot stands, from the motion of its ball alone.
 
-A foot stands while its ball is slow, and it was put down: a ball that came up into its slow spell
-and leaves it downwards hangs at the top of a swing or a jump. The ground may lie at any height, so
-no height is compared with a floor.
+A foot stands while its ball is slow, provided that it was put down: a ball that rises into a slow
+spell and falls out of it hangs at the top of a swing or a jump. Heights are not compared with a
+floor, since the ground may be at any height.
 """
 
 from dataclasses import dataclass
@@ -10,37 +10,37 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-SLOW = 0.25  # m/s: the ball of a standing foot is slower; a runner's too
-WINDOW = 0.025  # s, to each side of a frame, over which speed is taken
-GAP = 0.05  # s: shorter breaks of a stance are marker noise
-SHORTEST = 0.06  # s: shorter stances are none; running has 0.075 s
-AROUND = 0.2  # s before and after a slow spell, in which a hanging foot shows
-HANG = 0.03  # m by which a hanging foot is above both its sides
+MAX_SPEED = 0.25  # m/s: the ball of a standing foot is slower, even a runner's
+HALF_WINDOW = 0.025  # s, on each side of a frame, for measuring speed
+MAX_GAP = 0.05  # s: shorter interruptions of a stance are marker noise
+MIN_STANCE = 0.06  # s: shorter slow spells are no stance; runners stand for 0.075 s
+HANG_WINDOW = 0.2  # s before and after a slow spell, in which a hanging foot shows
+HANG_HEIGHT = 0.03  # m by which a hanging foot is higher than before and after
 
 
-def stance_labels(
+def detect_stances(
     ball_ws: Float64[np.ndarray, "frames legs 3"], fps: float
 ) -> Bool[np.ndarray, "frames legs"]:
     """True where a foot stands.
 
     Args:
-        ball_ws: the ball of each foot, m, y up.
+        ball_ws: position of the ball of each foot, m, y up.
         fps: frames per second.
     """
-    slow = speeds(ball_ws, fps) < SLOW
+    slow = speeds(ball_ws, fps) < MAX_SPEED
     stance = np.zeros_like(slow)
     for leg in range(slow.shape[1]):
-        spells = merge_runs(runs(slow[:, leg]), round(GAP * fps))
-        for first, last in spells:
-            long = last - first + 1 >= SHORTEST * fps
-            if long and not _hangs(ball_ws[:, leg, 1], first, last, round(AROUND * fps)):
+        for first, last in merge_runs(runs(slow[:, leg]), round(MAX_GAP * fps)):
+            long_enough = last - first + 1 >= MIN_STANCE * fps
+            window = round(HANG_WINDOW * fps)
+            if long_enough and not _hangs(ball_ws[:, leg, 1], first, last, window):
                 stance[first : last + 1, leg] = True
     return stance
 
 
 def speeds(points_ws: Float64[np.ndarray, "frames *b 3"], fps: float) -> np.ndarray:
-    """Speed of each point, m/s, over 50 ms around each frame, of shape (frames, ...)."""
-    reach = max(1, round(WINDOW * fps))
+    """Speed of each point, m/s, of shape (frames, ...), over 50 ms around each frame."""
+    reach = max(1, round(HALF_WINDOW * fps))
     frames = np.arange(len(points_ws))
     before, after = np.maximum(frames - reach, 0), np.minimum(frames + reach, len(frames) - 1)
     seconds = np.maximum(after - before, 1).reshape(-1, *[1] * (points_ws.ndim - 2)) / fps
@@ -48,15 +48,15 @@ def speeds(points_ws: Float64[np.ndarray, "frames *b 3"], fps: float) -> np.ndar
 
 
 def runs(labels: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:
-    """First and last frame of each spell of True."""
+    """First and last frame of each run of consecutive True values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], labels.astype(np.int8), [0]])))
     return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
 
 
-def merge_runs(spells: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
-    """The spells with breaks of at most `gap` frames closed."""
+def merge_runs(separate: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
+    """The runs, joined where at most `gap` frames lie between them."""
     joined: list[tuple[int, int]] = []
-    for first, last in spells:
+    for first, last in separate:
         if joined and first - joined[-1][1] - 1 <= gap:
             joined[-1] = (joined[-1][0], last)
         else:
@@ -66,14 +66,12 @@ def merge_runs(spells: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Footfalls:
-    """Where one foot stands, and between which stances it is in each frame."""
+    """Where one foot stands, and between which two stances it is in each frame."""
 
-    places_ws: Float64[np.ndarray, "stances 3"]  # m, the median place of the ball
-    last: Int64[np.ndarray, " frames"]  # the stance that it is in or comes from
-    next: Int64[
-        np.ndarray, " frames"
-    ]  # the one after; before the first and after the last the same
-    share: Float64[np.ndarray, " frames"]  # 0..1, of the swing's time that has passed
+    positions_ws: Float64[np.ndarray, "stances 3"]  # m, median position of the ball
+    last: Int64[np.ndarray, " frames"]  # index of the current stance, or of the one it has left
+    next: Int64[np.ndarray, " frames"]  # index of the following one; at both ends of a clip `last`
+    swing_fraction: Float64[np.ndarray, " frames"]  # 0..1, of the swing's duration that has passed
 
 
 def footfalls(
@@ -82,25 +80,25 @@ def footfalls(
     """The footfalls of one foot that stands at least once.
 
     Args:
-        ball_ws: its ball, m.
-        stance: when it stands.
+        ball_ws: position of its ball, m.
+        stance: True where it stands.
     """
-    spells = runs(stance)
+    stances = runs(stance)
     frames = np.arange(len(stance))
-    firsts, lasts = np.array(spells).T
+    firsts, lasts = np.array(stances).T
     last = np.maximum(np.searchsorted(firsts, frames, side="right") - 1, 0)
-    next_ = np.where(frames < firsts[0], 0, np.minimum(last + 1, len(spells) - 1))
+    next_ = np.where(frames < firsts[0], 0, np.minimum(last + 1, len(stances) - 1))
     leaving, arriving = lasts[last], firsts[next_]
     swinging = (frames > leaving) & (next_ > last)
-    share = np.where(swinging, (frames - leaving) / np.maximum(arriving - leaving, 1), 0.0)
-    places = np.array([np.median(ball_ws[a : b + 1], axis=0) for a, b in spells])
-    return Footfalls(places, last, next_, share)
+    fraction = np.where(swinging, (frames - leaving) / np.maximum(arriving - leaving, 1), 0.0)
+    positions = np.array([np.median(ball_ws[a : b + 1], axis=0) for a, b in stances])
+    return Footfalls(positions, last, next_, fraction)
 
 
-def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, around: int) -> bool:
-    """Whether the foot comes up into this spell and leaves it downwards."""
-    before, after = height[max(first - around, 0) : first], height[last + 1 : last + 1 + around]
+def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> bool:
+    """Whether the foot rises into this run of frames and falls out of it."""
+    before, after = height[max(first - window, 0) : first], height[last + 1 : last + 1 + window]
     if not len(before) or not len(after):
         return False
     lowest = max(before.min(), after.min())
-    return bool(np.median(height[first : last + 1]) - lowest > HANG)
+    return bool(np.median(height[first : last + 1]) - lowest > HANG_HEIGHT)

@@ -1,4 +1,8 @@
-"""Which joint of a file is which joint of a leg: recognised by name, or given by hand."""
+"""Joint roles: which joint of a skeleton is the pelvis, and which are hip, knee, ankle and toe.
+
+Roles are recognised by joint name, in one of several naming conventions, or named by the caller. To
+support another convention, add a line to `DIALECTS`.
+"""
 
 import re
 from collections.abc import Mapping
@@ -6,8 +10,10 @@ from dataclasses import dataclass
 
 SIDES = {"l": 1.0, "r": -1.0}
 LEG_NAMES = {"l": "left", "r": "right"}
+LEG_ROLES = ("hip", "knee", "ankle", "toe")
 
-# pelvis, hip, knee, ankle, toe, as `plain` spells them; `l` and `left` stand for either side.
+# Names of pelvis, hip, knee, ankle and toe, as `plain` spells them. {l} and {left} are replaced by
+# the side: l and r, or left and right.
 DIALECTS = {
     "ASF": ("root", "{l}femur", "{l}tibia", "{l}foot", "{l}toes"),
     "cgspeed": ("hips", "{left}hip", "{left}knee", "{left}ankle", "{left}toe"),
@@ -22,7 +28,7 @@ DIALECTS = {
 
 @dataclass(frozen=True)
 class Leg:
-    """One leg's joints, by index; the toe is the ball of the foot, or what comes nearest to it."""
+    """One leg's joints by index; the toe is the ball of the foot, or the joint nearest to it."""
 
     name: str
     side: float  # +1 left, -1 right, 0 neither
@@ -31,15 +37,15 @@ class Leg:
 
 @dataclass(frozen=True)
 class Roles:
-    """The joints that a rig needs."""
+    """The joints of a rig, by index."""
 
-    dialect: str
+    dialect: str  # key of `DIALECTS`, or "by hand"
     pelvis: int
     legs: tuple[Leg, ...]
 
 
 def plain(name: str) -> str:
-    """A joint name without namespace, case and joining marks: `mixamorig:LeftLeg` is `leftleg`."""
+    """A joint name without namespace, case and separators: `mixamorig:LeftLeg` is `leftleg`."""
     last = re.split(r"[:|]", name.strip())[-1].lower()
     return re.sub(r"^mixamorig\d*|[ _.\-]", "", last)
 
@@ -47,32 +53,35 @@ def plain(name: str) -> str:
 def find_roles(
     names: tuple[str, ...], parents: tuple[int, ...], joints: Mapping[str, str] | None = None
 ) -> Roles:
-    """The roles of a file's joints.
+    """The roles of a skeleton's joints.
 
-    A foot without toe joint takes the first child of its ankle, as a rule an end site.
+    A foot without a toe joint uses the first child of its ankle, usually an end site.
 
     Args:
         names: the joints.
-        parents: their parents, -1 at the root.
-        joints: role to joint name, where the names are not to be recognised: `pelvis`, and for any
-            number of legs, each with a suffix of its own, `hip_l`, `knee_l`, `ankle_l` and, if
-            there is one, `toe_l`. A suffix that ends in l or left is a left leg, in r or right a
-            right one.
+        parents: index of each joint's parent, -1 at the root.
+        joints: role to joint name; None recognises the names. Roles are `pelvis` and, for any
+            number of legs, each with its own suffix, `hip_l`, `knee_l`, `ankle_l` and optionally
+            `toe_l`. A suffix that ends in l or left is a left leg, one in r or right a right leg.
 
-    Errors: ValueError, with the list of joints, where no leg is found or a name is not there.
+    Raises:
+        ValueError: no pair of legs is recognised, or `joints` has wrong roles or unknown names; the
+            message lists what exists.
     """
     if joints is not None:
         return _by_hand(names, parents, joints)
-    known = {plain(name): index for index, name in reversed(list(enumerate(names)))}
-    for dialect, (pelvis, *leg) in DIALECTS.items():
+    index_of = {plain(name): index for index, name in reversed(list(enumerate(names)))}
+    for dialect, (pelvis, *leg_names) in DIALECTS.items():
         legs = []
         for letter in SIDES:
-            spelt = [part.format(l=letter, left=LEG_NAMES[letter]) for part in leg]
-            found = [known.get(name) for name in spelt]
-            if None not in found[:3]:
-                legs.append(_leg(names, parents, LEG_NAMES[letter], SIDES[letter], *found))
-        if pelvis in known and len(legs) == len(SIDES):
-            return Roles(dialect, known[pelvis], tuple(legs))
+            spelled = [name.format(l=letter, left=LEG_NAMES[letter]) for name in leg_names]
+            hip, knee, ankle, toe = (index_of.get(name) for name in spelled)
+            if hip is not None and knee is not None and ankle is not None:
+                leg = LEG_NAMES[letter]
+                toe = _end_of_foot(names, parents, leg, ankle) if toe is None else toe
+                legs.append(Leg(leg, SIDES[letter], (hip, knee, ankle, toe)))
+        if pelvis in index_of and len(legs) == len(SIDES):
+            return Roles(dialect, index_of[pelvis], tuple(legs))
     spellings = "; ".join(f"{name}: {', '.join(parts)}" for name, parts in DIALECTS.items())
     raise ValueError(
         f"no pair of legs recognised among the joints {list(names)}; wanted, in any case, one of "
@@ -81,52 +90,41 @@ def find_roles(
 
 
 def _by_hand(names: tuple[str, ...], parents: tuple[int, ...], joints: Mapping[str, str]) -> Roles:
-    known = {name: index for index, name in enumerate(names)}
+    """The roles that the caller named."""
     suffixes = [role.removeprefix("hip_") for role in joints if role.startswith("hip_")]
-    allowed = {"pelvis"} | {
-        f"{part}_{suffix}" for part in ("hip", "knee", "ankle", "toe") for suffix in suffixes
-    }
-    needed = {role for role in allowed if not role.startswith("toe_")}
-    if not suffixes or set(joints) - allowed or needed - set(joints):
+    allowed = {"pelvis"} | {f"{role}_{suffix}" for role in LEG_ROLES for suffix in suffixes}
+    required = {role for role in allowed if not role.startswith("toe_")}
+    if not suffixes or set(joints) - allowed or required - set(joints):
         raise ValueError(
             f"joints has the roles {sorted(joints)}; wanted pelvis and for each leg hip_NAME, "
             f"knee_NAME, ankle_NAME and, if there is one, toe_NAME"
         )
     if unknown := sorted(set(joints.values()) - set(names)):
         raise ValueError(f"no joints named {unknown}; there are {list(names)}")
+    index_of = {role: names.index(name) for role, name in joints.items()}
     legs = []
     for suffix in suffixes:
-        index = [known.get(joints.get(f"{part}_{suffix}", "")) for part in
-                 ("hip", "knee", "ankle", "toe")]  # fmt: skip
+        hip, knee, ankle = (index_of[f"{role}_{suffix}"] for role in LEG_ROLES[:3])
         letter = re.sub(r"(?<=l)eft$|(?<=r)ight$", "", suffix)[-1:]
-        name = LEG_NAMES.get(suffix, suffix)
-        legs.append(_leg(names, parents, name, SIDES.get(letter, 0.0), *index))
-    return Roles("by hand", known[joints["pelvis"]], tuple(legs))
+        leg = LEG_NAMES.get(suffix, suffix)
+        toe = index_of.get(f"toe_{suffix}")
+        toe = _end_of_foot(names, parents, leg, ankle) if toe is None else toe
+        legs.append(Leg(leg, SIDES.get(letter, 0.0), (hip, knee, ankle, toe)))
+    return Roles("by hand", index_of["pelvis"], tuple(legs))
 
 
-def _leg(
-    names: tuple[str, ...],
-    parents: tuple[int, ...],
-    name: str,
-    side: float,
-    hip: int | None,
-    knee: int | None,
-    ankle: int | None,
-    toe: int | None,
-) -> Leg:
-    assert hip is not None and knee is not None and ankle is not None  # both callers looked
-    if toe is None:
-        if ankle not in parents:
-            raise ValueError(
-                f"the {name} foot has neither toe nor end site: nothing hangs on {names[ankle]}; "
-                f"the joints are {list(names)}"
-            )
-        toe = parents.index(ankle)
-    return Leg(name, side, (hip, knee, ankle, toe))
+def _end_of_foot(names: tuple[str, ...], parents: tuple[int, ...], leg: str, ankle: int) -> int:
+    """The first child of an ankle, for a foot without a toe joint."""
+    if ankle not in parents:
+        raise ValueError(
+            f"the {leg} foot has neither toe nor end site: {names[ankle]} has no child; "
+            f"the joints are {list(names)}"
+        )
+    return parents.index(ankle)
 
 
 def partners(names: tuple[str, ...]) -> tuple[int, ...]:
-    """For each joint (or leg) name the index of its other side; itself where it has none."""
+    """For each joint or leg the index of its counterpart on the other side, or its own index."""
     return tuple(
         next((names.index(other) for other in _other_sides(name) if other in names), index)
         for index, name in enumerate(names)
@@ -134,13 +132,13 @@ def partners(names: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _other_sides(name: str) -> list[str]:
-    """How the same joint may be called on the other side."""
-    words = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
-    words |= {right: left for left, right in words.items()}
-    found = re.search(r"left|right", name, re.IGNORECASE)
-    if found and found[0] in words:
-        return [name[: found.start()] + words[found[0]] + name[found.end() :]]
+    """What the same joint may be called on the other side."""
+    opposite = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
+    opposite |= {right: left for left, right in opposite.items()}
+    word = re.search(r"left|right", name, re.IGNORECASE)
+    if word and word[0] in opposite:
+        return [name[: word.start()] + opposite[word[0]] + name[word.end() :]]
     others = []
     for match in re.finditer(r"^[lr]|(?<=[:_ .])[lr](?![a-z])|(?<=[_ .])[lr]$|[lr]$", name, re.I):
-        others.append(name[: match.start()] + words[match[0]] + name[match.end() :])
+        others.append(name[: match.start()] + opposite[match[0]] + name[match.end() :])
     return others

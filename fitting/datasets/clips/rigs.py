@@ -1,4 +1,7 @@
-"""What a leg is, measured from the motion of its joints."""
+"""Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its joints."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,28 +12,35 @@ from scipy.spatial.transform import Rotation
 from jaxik.world.skeleton import Rig
 
 from .joint_roles import Leg, Roles
+from .leg_geometry import Vectors, knee_hinges, unit
+
+Rotations = Float64[np.ndarray, "frames 4"]  # wxyz
 
 UP = np.array([0.0, 1.0, 0.0])
-SWING = np.radians(3.0)  # a knee that turns less, root mean square, tells no axis
-BENT = np.sin(np.radians(3.0))  # sine of the flexion above which a leg's plane tells the axis
-FLAT_SHARE = 0.25  # share of the stance frames, those of the slowest ankle, in which a foot is flat
+KNEE_MOTION = np.radians(3.0)  # RMS knee rotation below which the motion shows no axis
+FLAT_FRACTION = 0.25  # of the stance frames, those with the slowest ankle: the foot is flat
 
 
-def lateral(
-    positions_ws: Float64[np.ndarray, "frames joints 3"],
-    rotations_ws: Float64[np.ndarray, "frames joints 4"],
-    pelvis: int,
-    hips: list[int],
-    side: Float64[np.ndarray, " legs"],
-) -> Float64[np.ndarray, "frames 3"]:
-    """Unit vectors to the character's left, world space.
+@dataclass(frozen=True)
+class LegMotion:
+    """World transforms of one leg's joints over the frames."""
 
-    From the right hips to the left ones; with legs of one side only, the pelvis' own x axis.
-    """
-    at = positions_ws[:, hips]
-    if (side > 0).any() and (side < 0).any():
-        return unit(at[:, side > 0].mean(axis=1) - at[:, side < 0].mean(axis=1))
-    return Rotation.from_quat(rotations_ws[:, pelvis], scalar_first=True).apply([1.0, 0.0, 0.0])
+    hip: Vectors  # m
+    knee: Vectors
+    ankle: Vectors
+    toe: Vectors
+    hip_rot: Rotations  # wxyz
+    knee_rot: Rotations
+    ankle_rot: Rotations
+    left_ws: Vectors  # unit, to the character's left
+
+
+class LegMeasurement(NamedTuple):
+    """What a rig needs to know of one leg."""
+
+    knee_axis_ls: Float64[np.ndarray, "3"]  # unit, knee space
+    ankle_from_foot: Float64[np.ndarray, "4"]  # wxyz
+    lengths: Float64[np.ndarray, "3"]  # m, thigh, shin and foot
 
 
 def measure_rig(
@@ -39,17 +49,23 @@ def measure_rig(
     rotations_ws: Float64[np.ndarray, "frames joints 4"],
     stance: Bool[np.ndarray, "frames legs"],
 ) -> Rig:
-    """The rig of a clip, in float64 whatever JAX's default is.
+    """The rig of a clip, in float64 regardless of JAX's default precision.
 
-    Bone lengths are medians over the frames. The knee axis is the main axis of the knee's turns;
-    where it hardly turns, it stands at right angles to thigh and shin. Foot axes are those of a
-    flat foot: up is the world's, forward goes from ankle to ball in the frames in which both stand.
+    Bone lengths are medians over the frames. The knee axis is the principal axis of the knee's
+    rotations; if the knee hardly moves, it is perpendicular to thigh and shin. Foot axes are those
+    of a flat foot: up is the world's, forward points from ankle to ball.
+
+    Args:
+        roles: which joint is which.
+        positions_ws: m, y up.
+        rotations_ws: wxyz.
+        stance: when each foot stands.
     """
     hips = [leg.joints[0] for leg in roles.legs]
     side = np.array([leg.side for leg in roles.legs])
-    left_ws = lateral(positions_ws, rotations_ws, roles.pelvis, hips, side)
+    left_ws = left_directions(positions_ws[:, hips], side, rotations_ws[:, roles.pelvis])
     legs = [
-        _measure_leg(leg, left_ws, positions_ws, rotations_ws, stance[:, index])
+        _measure_leg(_leg_motion(leg, left_ws, positions_ws, rotations_ws), stance[:, index])
         for index, leg in enumerate(roles.legs)
     ]
     axes, feet, lengths = (np.stack(part) for part in zip(*legs, strict=True))
@@ -68,97 +84,85 @@ def measure_rig(
         )
 
 
-def _measure_leg(
-    leg: Leg,
-    left_ws: np.ndarray,
-    positions_ws: np.ndarray,
-    rotations_ws: np.ndarray,
-    stands: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    hip, knee, ankle, toe = (positions_ws[:, joint] for joint in leg.joints)
-    hip_rot, knee_rot = (
-        Rotation.from_quat(rotations_ws[:, joint], scalar_first=True) for joint in leg.joints[:2]
-    )
-    lengths = [np.median(np.linalg.norm(b - a, axis=-1)) for a, b in
-               ((hip, knee), (knee, ankle), (ankle, toe))]  # fmt: skip
-    axis = knee_axis(hip, knee, ankle, hip_rot, knee_rot, left_ws)
-    still = flat_frames(ankle, toe, stands)
-    ankle_rot = Rotation.from_quat(rotations_ws[still, leg.joints[2]], scalar_first=True)
-    return (
-        axis,
-        foot_axes(ankle[still], toe[still], ankle_rot, left_ws[still]),
-        np.array(lengths),
-    )
+def left_directions(
+    hips_ws: Float64[np.ndarray, "frames legs 3"],
+    side: Float64[np.ndarray, " legs"],
+    pelvis_rotations_ws: Rotations,
+) -> Vectors:
+    """Unit vectors to the character's left, world space.
 
+    They point from the right hips to the left ones. With legs on one side only, they are the
+    pelvis' own x axis.
 
-def knee_axis(
-    hip: np.ndarray,
-    knee: np.ndarray,
-    ankle: np.ndarray,
-    hip_rot: Rotation,
-    knee_rot: Rotation,
-    left_ws: np.ndarray,
-) -> Float64[np.ndarray, "3"]:
-    """Unit axis in knee space about which a positive turn opens the knee."""
-    normals_ws = hinges(hip, knee, ankle, left_ws)
-    flexed_ls = np.mean(knee_rot.inv().apply(normals_ws), axis=0)  # a turn about it flexes
-    local = hip_rot.inv() * knee_rot
-    turns = (local.mean().inv() * local).as_rotvec()
-    if np.sqrt(np.mean(np.sum(turns**2, axis=-1))) < SWING:
-        return -flexed_ls / np.linalg.norm(flexed_ls)
-    axis = np.linalg.svd(turns, full_matrices=False)[2][0]
-    return -axis if axis @ flexed_ls > 0 else axis
-
-
-def hinges(
-    hip: Float64[np.ndarray, "frames 3"],
-    knee: Float64[np.ndarray, "frames 3"],
-    ankle: Float64[np.ndarray, "frames 3"],
-    left_ws: Float64[np.ndarray, "frames 3"],
-) -> Float64[np.ndarray, "frames 3"]:
-    """Unit axes about which a turn of the shin flexes the knee, world space.
-
-    At right angles to thigh and shin; as the leg straightens and loses its plane, it turns
-    smoothly to `left_ws`, at right angles to the leg.
+    Args:
+        hips_ws: m.
+        side: 1 for a left leg, -1 for a right one.
+        pelvis_rotations_ws: wxyz.
     """
-    thigh, shin, leg = unit(knee - hip), unit(ankle - knee), unit(ankle - hip)
-    normal = np.cross(thigh, shin)  # as long as the sine of the flexion; a knee bends forward
-    share = np.clip(np.linalg.norm(normal, axis=-1, keepdims=True) / (3 * BENT), 0.0, 1.0)
-    fade = 1.0 - share**2 * (3.0 - 2.0 * share)
-    side = unit(left_ws - leg * np.sum(left_ws * leg, axis=-1, keepdims=True))
-    return unit(normal + 6 * BENT * fade * side)
+    if (side > 0).any() and (side < 0).any():
+        return unit(hips_ws[:, side > 0].mean(axis=1) - hips_ws[:, side < 0].mean(axis=1))
+    return _rotation(pelvis_rotations_ws).apply([1.0, 0.0, 0.0])
+
+
+def _leg_motion(
+    leg: Leg, left_ws: Vectors, positions_ws: np.ndarray, rotations_ws: np.ndarray
+) -> LegMotion:
+    hip, knee, ankle, toe = (positions_ws[:, joint] for joint in leg.joints)
+    hip_rot, knee_rot, ankle_rot = (rotations_ws[:, joint] for joint in leg.joints[:3])
+    return LegMotion(hip, knee, ankle, toe, hip_rot, knee_rot, ankle_rot, left_ws)
+
+
+def _measure_leg(leg: LegMotion, stance: Bool[np.ndarray, " frames"]) -> LegMeasurement:
+    bones = ((leg.hip, leg.knee), (leg.knee, leg.ankle), (leg.ankle, leg.toe))
+    lengths = [np.median(np.linalg.norm(end - start, axis=-1)) for start, end in bones]
+    flat = flat_frames(leg.ankle, leg.toe, stance)
+    return LegMeasurement(knee_axis(leg), foot_axes(leg, flat), np.array(lengths))
+
+
+def knee_axis(leg: LegMotion) -> Float64[np.ndarray, "3"]:
+    """Unit axis in knee space about which a positive rotation opens the knee."""
+    hinges_ws = knee_hinges(leg.hip, leg.knee, leg.ankle, leg.left_ws)
+    knee_rot = _rotation(leg.knee_rot)
+    flexing_ls = np.mean(knee_rot.inv().apply(hinges_ws), axis=0)
+    local = _rotation(leg.hip_rot).inv() * knee_rot
+    rotations = (local.mean().inv() * local).as_rotvec()
+    if np.sqrt(np.mean(np.sum(rotations**2, axis=-1))) < KNEE_MOTION:
+        return -flexing_ls / np.linalg.norm(flexing_ls)
+    axis = np.linalg.svd(rotations, full_matrices=False)[2][0]
+    return -axis if axis @ flexing_ls > 0 else axis
 
 
 def flat_frames(
-    ankle: np.ndarray, toe: np.ndarray, stands: Bool[np.ndarray, " frames"]
+    ankle: Vectors, toe: Vectors, stance: Bool[np.ndarray, " frames"]
 ) -> Bool[np.ndarray, " frames"]:
-    """The frames in which a foot lies flat: it stands and its ankle is slowest.
+    """True in frames in which a foot lies flat: it stands and its ankle is at its slowest.
 
-    Without a stance, those in which the ball is lowest.
+    Without any stance, the frames in which the ball of the foot is lowest.
+
+    Args:
+        ankle: m, y up.
+        toe: the ball of the foot, m.
+        stance: when the foot stands.
     """
-    if not stands.any():
-        return toe[:, 1] <= np.quantile(toe[:, 1], FLAT_SHARE)
-    moved = np.linalg.norm(np.gradient(ankle, axis=0), axis=-1) if len(ankle) > 1 else np.zeros(1)
-    return stands & (moved <= np.quantile(moved[stands], FLAT_SHARE))
+    if not stance.any():
+        return toe[:, 1] <= np.quantile(toe[:, 1], FLAT_FRACTION)
+    steps = np.linalg.norm(np.gradient(ankle, axis=0), axis=-1) if len(ankle) > 1 else np.zeros(1)
+    return stance & (steps <= np.quantile(steps[stance], FLAT_FRACTION))
 
 
-def foot_axes(
-    ankle: np.ndarray, toe: np.ndarray, ankle_rot: Rotation, left_ws: np.ndarray
-) -> Float64[np.ndarray, "4"]:
-    """`ankle_from_foot`, wxyz: x left, y up, z forward of a flat foot, the mean over the frames.
+def foot_axes(leg: LegMotion, flat: Bool[np.ndarray, " frames"]) -> Float64[np.ndarray, "4"]:
+    """`ankle_from_foot`, wxyz: x left, y up and z forward of a flat foot, averaged over `flat`.
 
     A foot without length points where the pelvis does.
     """
-    along = toe - ankle
-    long = np.linalg.norm(along[:, [0, 2]], axis=-1, keepdims=True) > 1e-3
-    forward = unit(np.where(long, along, np.cross(left_ws, UP)) * [1.0, 0.0, 1.0])
+    foot = leg.toe[flat] - leg.ankle[flat]
+    has_length = np.linalg.norm(foot[:, [0, 2]], axis=-1, keepdims=True) > 1e-3
+    forward = unit(np.where(has_length, foot, np.cross(leg.left_ws[flat], UP)) * [1.0, 0.0, 1.0])
     up = np.broadcast_to(UP, forward.shape)
     axes = np.stack([np.cross(up, forward), up, forward], axis=-1)
-    mean = (ankle_rot.inv() * Rotation.from_matrix(axes)).mean()
+    mean = (_rotation(leg.ankle_rot[flat]).inv() * Rotation.from_matrix(axes)).mean()
     return mean.as_quat(canonical=True, scalar_first=True)
 
 
-def unit(v: Float64[np.ndarray, "*b 3"]) -> np.ndarray:
-    """`v` at length one; zero stays zero."""
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    return np.divide(v, length, out=np.zeros_like(v), where=length > 0)
+def _rotation(wxyz: Rotations) -> Rotation:
+    return Rotation.from_quat(wxyz, scalar_first=True)

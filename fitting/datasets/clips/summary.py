@@ -1,18 +1,60 @@
-"""What a loader understood of a file, as data and as text."""
+"""Summary of a clip: what the loader understood of a file, as data, text or JSON."""
 
 import json
+from typing import TypedDict
 
 import numpy as np
 
 from . import contacts, edit
 from .clip import Clip
 
-JOINTS = ("hip", "knee", "ankle", "toe")
+ROLES = ("hip", "knee", "ankle", "toe")
 
 
-def describe(clip: Clip) -> dict:
-    """What is known of a clip, as plain numbers, texts, lists and dicts; lengths in metres."""
-    told: dict = {
+class LegSummary(TypedDict):
+    """One leg; lengths in metres."""
+
+    side: float  # 1 left, -1 right, 0 neither
+    thigh: float
+    shin: float
+    foot: float
+    knee_axis: list[float]  # unit, knee space
+    ankle_from_foot: list[float]  # wxyz
+    contacts: int  # number of stances
+    contact_share: float  # 0..1, of the frames
+    contacts_from: str  # file or motion
+
+
+class ClipSummary(TypedDict):
+    """A clip; lengths in metres."""
+
+    file: str
+    frames: int
+    seconds: float
+    fps: float
+    raw_frame_time: float  # s
+    raw_fps: float
+    scale: float  # metres per unit of the file
+    up_axis: str
+    body_height: float
+    joints: list[str]
+    dialect: str | None  # joint naming convention
+    joint_map: dict[str, str]  # role to joint name
+    legs: dict[str, LegSummary]
+    warnings: list[str]
+
+
+def describe(clip: Clip) -> ClipSummary:
+    """What is known of a clip, including guesses and defects, as plain data."""
+    warnings = list(clip.remarks)
+    first, last = edit.motion_span(clip)
+    if first:
+        warnings.append(f"starts with a T-pose; the motion begins at frame {first}")
+    if last < clip.frame_count - 1:
+        warnings.append(f"the last frame is repeated {clip.frame_count - 1 - last} times")
+    if clip.measured_rig is not None and (popped := int(edit.pops(clip).sum())):
+        warnings.append(f"markers pop in {popped} frames")
+    return {
         "file": clip.source,
         "frames": clip.frame_count,
         "seconds": clip.seconds,
@@ -24,70 +66,66 @@ def describe(clip: Clip) -> dict:
         "body_height": clip.body_height,
         "joints": list(clip.joint_names),
         "dialect": clip.dialect,
-        "joint_map": {},
-        "legs": {},
-        "warnings": list(clip.remarks),
+        "joint_map": {} if clip.measured_rig is None else _joint_map(clip),
+        "legs": {} if clip.measured_rig is None else _describe_legs(clip),
+        "warnings": warnings,
     }
-    first, last = edit.motion_span(clip)
-    if first:
-        told["warnings"].append(f"starts with a T-pose; the motion begins at frame {first}")
-    if last < clip.frame_count - 1:
-        told["warnings"].append(f"the last frame is repeated {clip.frame_count - 1 - last} times")
-    if clip.measured is not None:
-        told |= _describe_legs(clip)
-        if popped := int(edit.pops(clip).sum()):
-            told["warnings"].append(f"markers pop in {popped} frames")
-    return told
 
 
-def _describe_legs(clip: Clip) -> dict:
+def _joint_map(clip: Clip) -> dict[str, str]:
     rig = clip.rig
-    own = clip.stance is not None
-    stance = clip.stance_labels()
     joint_map = {"pelvis": clip.joint_names[rig.pelvis]}
-    legs = {}
-    for index, name in enumerate(rig.names):
-        for part, joint in zip(JOINTS, rig.joints[index], strict=True):
-            joint_map[f"{part}_{name}"] = clip.joint_names[joint]
-        legs[name] = {
-            "side": float(rig.side[index]),
-            "thigh": float(rig.thigh[index]),
-            "shin": float(rig.shin[index]),
-            "foot": float(rig.foot[index]),
-            "knee_axis": np.asarray(rig.knee_axis_ls[index]).tolist(),
-            "ankle_from_foot": np.asarray(rig.ankle_from_foot[index]).tolist(),
-            "contacts": len(contacts.runs(stance[:, index])),
-            "contact_share": float(stance[:, index].mean()),
-            "contacts_from": "file" if own else "motion",
+    for name, joints in zip(rig.names, rig.joints, strict=True):
+        for role, joint in zip(ROLES, joints, strict=True):
+            joint_map[f"{role}_{name}"] = clip.joint_names[joint]
+    return joint_map
+
+
+def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
+    rig, stance = clip.rig, clip.stance_labels()
+    return {
+        name: {
+            "side": float(rig.side[leg]),
+            "thigh": float(rig.thigh[leg]),
+            "shin": float(rig.shin[leg]),
+            "foot": float(rig.foot[leg]),
+            "knee_axis": np.asarray(rig.knee_axis_ls[leg]).tolist(),
+            "ankle_from_foot": np.asarray(rig.ankle_from_foot[leg]).tolist(),
+            "contacts": len(contacts.runs(stance[:, leg])),
+            "contact_share": float(stance[:, leg].mean()),
+            "contacts_from": "file" if clip.stance is not None else "motion",
         }
-    return {"joint_map": joint_map, "legs": legs}
+        for leg, name in enumerate(rig.names)
+    }
 
 
-def as_text(told: dict) -> str:
-    """The answer of `describe` as text for a terminal."""
+def as_text(summary: ClipSummary) -> str:
+    """The summary as text for a terminal."""
+    joints, joint_map = summary["joints"], summary["joint_map"]
     lines = [
-        f"{told['file']}: {told['frames']} frames, {told['seconds']:.2f} s at {told['fps']:g} Hz "
-        f"(frame time {told['raw_frame_time']:g} s is {told['raw_fps']:.6g} Hz)",
-        f"  scale   {told['scale']:.6g} m per unit, {told['up_axis']} up; "
-        f"body {told['body_height']:.3f} m high",
-        f"  joints  {len(told['joints'])}: {', '.join(told['joints'])}",
+        f"{summary['file']}: {summary['frames']} frames, {summary['seconds']:.2f} s at "
+        f"{summary['fps']:g} Hz (frame time {summary['raw_frame_time']:g} s is "
+        f"{summary['raw_fps']:.6g} Hz)",
+        f"  scale   {summary['scale']:.6g} m per unit, {summary['up_axis']} up; "
+        f"body {summary['body_height']:.3f} m high",
+        f"  joints  {len(joints)}: {', '.join(joints)}",
     ]
-    if told["legs"]:
-        lines.append(f"  map     {told['dialect']}; pelvis {told['joint_map']['pelvis']}")
-    for name, leg in told["legs"].items():
-        joints = ", ".join(f"{part} {told['joint_map'][f'{part}_{name}']}" for part in JOINTS)
+    if summary["legs"]:
+        lines.append(f"  map     {summary['dialect']}; pelvis {joint_map['pelvis']}")
+    for name, leg in summary["legs"].items():
+        names = ", ".join(f"{role} {joint_map[f'{role}_{name}']}" for role in ROLES)
         axis = ", ".join(f"{value:.3f}" for value in leg["knee_axis"])
         lines += [
-            f"  {name:<7} {joints}",
+            f"  {name:<7} {names}",
             f"          thigh {leg['thigh']:.3f} m, shin {leg['shin']:.3f} m, "
             f"foot {leg['foot']:.3f} m; knee opens about ({axis})",
             f"          stands {leg['contacts']} times, {leg['contact_share']:.0%} of the frames "
             f"(from the {leg['contacts_from']})",
         ]
-    lines += [f"  note    {warning}" for warning in told["warnings"]]
+    lines += [f"  note    {warning}" for warning in summary["warnings"]]
     return "\n".join(lines)
 
 
-def as_json(told: dict) -> str:
-    """The answer of `describe` as JSON."""
-    return json.dumps(told, indent=2)
+def as_json(summary: ClipSummary) -> str:
+    """The summary as JSON."""
+    return json.dumps(summary, indent=2)

@@ -1,19 +1,19 @@
-"""Terrain files: anything trimesh reads becomes a `jaxik.world.terrain.Terrain`."""
+"""Terrain files: reads what trimesh reads as `jaxik.world.terrain.Terrain`, and writes meshes."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
 import trimesh
+from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
 
 from jaxik.world import terrain
 
-MESHES = (".ply", ".obj", ".stl")  # what `save_mesh` writes
-# Rows give our x, y, z from the file's. A file with z up is tipped forward about x, as glTF
-# exporters do: its x stays, its z is our y and its y points to our -z.
+MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
+# A file with z up is rotated about x, as glTF exporters do: (x, y, z) becomes (x, z, -y).
 _WORLD_FROM_FILE = {
     "y": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
@@ -28,25 +28,25 @@ def load_terrain(
     file_up: str = "y",
     scale: float = 1.0,
     slack: float = 0.0,
-    dtype=None,
+    dtype: DTypeLike | None = None,
 ) -> terrain.Terrain:
-    """The triangles of a file as terrain.
+    """The triangles of a file as terrain, in metres with y up.
 
-    A scene of several geometries becomes one mesh, each placed by its transform. Vertices keep the
-    file's order where it has one geometry.
+    A scene of several geometries becomes one mesh, with each geometry's transform applied. Vertices
+    of a single geometry keep the file's order.
 
     Args:
         path: PLY, OBJ, STL, GLB, OFF or whatever else trimesh reads.
-        up: the direction against which rays run, in our world; need not be unit.
-        layer: 0 to 31, for all triangles.
-        file_up: the file's up axis. "z" turns the mesh into our world: (x, y, z) to (x, z, -y).
+        up: direction opposite to the rays that probe the ground, world space; any length.
+        layer: 0 to 31, of all triangles.
+        file_up: the file's up axis, "y" or "z"; with "z", (x, y, z) becomes (x, z, -y).
         scale: metres per unit of the file; 0.01 for centimetres.
         slack: m, see `jaxik.world.terrain.mesh`.
         dtype: of the floats; None takes JAX's default.
 
     Raises:
-        ValueError: a file that is not there, that trimesh cannot read or that holds no triangle;
-            vertices that are not finite; an `up` of no length; another `file_up`, `scale`, `layer`.
+        ValueError: no such file, a file that trimesh cannot read or that has no triangles, vertices
+            that are not finite, an `up` of zero length, or another argument out of range.
     """
     if file_up not in _WORLD_FROM_FILE:
         known = " or ".join(repr(axis) for axis in _WORLD_FROM_FILE)
@@ -54,23 +54,23 @@ def load_terrain(
     if not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"scale is metres per unit, above 0; got {scale}")
     vertices, triangles = _read(Path(path))
+    vertices_ws = scale * vertices @ _WORLD_FROM_FILE[file_up].T
     try:
         return terrain.mesh(
-            scale * vertices @ _WORLD_FROM_FILE[file_up].T,
+            vertices_ws if dtype is None else vertices_ws.astype(dtype),
             triangles,
             up=up,
             layer=layer,
             slack=slack,
-            dtype=dtype,
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
 def check_mesh_name(path: str | Path) -> None:
-    """ValueError for a name whose suffix says no format of `save_mesh`."""
-    if Path(path).suffix.lower() not in MESHES:
-        raise ValueError(f"{path}: wanted a name that ends in {', '.join(MESHES)}")
+    """ValueError unless the suffix is that of a format of `save_mesh`."""
+    if Path(path).suffix.lower() not in MESH_SUFFIXES:
+        raise ValueError(f"{path}: wanted a name that ends in {', '.join(MESH_SUFFIXES)}")
 
 
 def save_mesh(
@@ -78,14 +78,17 @@ def save_mesh(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> None:
-    """Writes triangles, m, y up, which `load_terrain` reads; the same bytes always.
+    """Writes a mesh that `load_terrain` reads. The same mesh always gives the same bytes.
 
-    A PLY is text; its vertices are kept to a tenth of a millimetre.
+    A PLY is written as text, with vertices rounded to a tenth of a millimetre.
 
     Args:
-        path: its suffix, of `MESHES`, says the format.
-        vertices: m.
-        faces: their vertices, counterclockwise seen from above.
+        path: its suffix, one of `MESH_SUFFIXES`, selects the format.
+        vertices: m, y up.
+        faces: vertex indices, counterclockwise seen from above.
+
+    Raises:
+        ValueError: another suffix.
     """
     check_mesh_name(path)
     if Path(path).suffix.lower() != ".ply":
@@ -101,50 +104,67 @@ def save_mesh(
     Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
 
 
+@runtime_checkable
+class RayTracer(Protocol):
+    """What is used of a ray intersector of `trimesh.ray`."""
+
+    def intersects_location(
+        self, ray_origins: np.ndarray, ray_directions: np.ndarray, multiple_hits: bool = True
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hit points (hits, 3), and for each the index of its ray and of its triangle."""
+        ...
+
+    def intersects_first(self, ray_origins: np.ndarray, ray_directions: np.ndarray) -> np.ndarray:
+        """Index of the first triangle that each ray hits; -1 for none."""
+        ...
+
+
 def embree_tracer(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Any:
-    """Embree over these triangles, a tracer of `trimesh.ray`; None where it is not installed."""
+) -> RayTracer | None:
+    """Embree, a fast ray tracer, over these triangles; None where it is not installed."""
     if not trimesh.ray.has_embree:
         return None
-    whole = trimesh.Trimesh(vertices, faces, process=False)
-    return trimesh.ray.ray_pyembree.RayMeshIntersector(whole)  # pyright: ignore
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return trimesh.ray.ray_pyembree.RayMeshIntersector(mesh)  # pyright: ignore
 
 
 def _read(
     path: Path,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
-    """Vertices and triangles of all geometries of a file, in the file's world and unit."""
+    """Vertices and triangles of all geometries of a file, in its own unit and axes."""
     if not path.is_file():
         raise ValueError(f"{path}: there is no such file")
     formats = sorted(trimesh.available_formats())
     if not path.name.lower().endswith(tuple(f".{name}" for name in formats)):
         raise ValueError(f"{path}: trimesh reads {', '.join(formats)}; not {path.suffix!r}")
     try:
-        # Unprocessed: trimesh would merge and drop vertices, and a row must stay a row.
+        # Unprocessed, as trimesh would otherwise merge and drop vertices.
         scene = trimesh.load_scene(path, process=False)
-        whole = scene.to_mesh()
+        mesh = scene.to_mesh()
     except Exception as error:  # each format's reader fails in its own way
         raise ValueError(f"{path}: trimesh cannot read it: {error}") from error
-    if not len(whole.faces):
-        held = ", ".join(type(held).__name__ for held in scene.geometry.values()) or "nothing"
-        raise ValueError(f"{path}: terrain needs triangles; the file holds {held}")
-    return np.array(whole.vertices, np.float64), np.array(whole.faces, np.int64)
+    if not len(mesh.faces):
+        content = ", ".join(type(each).__name__ for each in scene.geometry.values()) or "nothing"
+        raise ValueError(f"{path}: terrain needs triangles; the file holds {content}")
+    return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
 
 
 def height_function(
-    ground: terrain.Terrain, above: float = 100.0
+    surface: terrain.Terrain, above: float = 100.0
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Height of the highest ground under points (points, 3), m; NaN where there is none.
+    """A function from points (points, 3), m, to the height of the highest ground below them, m.
+
+    The height is NaN where there is no ground.
 
     Args:
-        ground: with y up.
-        above: m, where the rays start over the points.
+        surface: terrain with y up.
+        above: m, height at which the rays start.
     """
 
-    def under(points_ws: np.ndarray) -> np.ndarray:
+    def height_under(points_ws: np.ndarray) -> np.ndarray:
         origins = jnp.asarray(points_ws) * jnp.array([1.0, 0.0, 1.0]) + jnp.array([0, above, 0])
-        hit = terrain.cast(ground, origins, jnp.asarray(2 * above))
+        hit = terrain.cast(surface, origins, jnp.asarray(2 * above))
         return np.where(hit.found > 0, np.asarray(hit.point)[..., 1], np.nan)
 
-    return under
+    return height_under

@@ -1,8 +1,8 @@
-"""Reconstruction from motion: what a captured clip's stances say of a ground that nobody measured.
+"""Reconstructs the ground below a captured clip from where its feet stood.
 
-Three kinds of ground are put through the stances: a plane, a smooth surface and level blocks on a
-grid. Each is asked for the height of every stance when it knows the others only, and the simplest
-kind that no other predicts clearly better is chosen.
+Three kinds of surface are fitted to the footprints: a plane, a smooth thin plate and level blocks
+on a grid. Each predicts the height of every footprint from the others, and the simplest kind that
+no other predicts clearly better is chosen.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,70 +17,70 @@ from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.rigs import flat_frames
 
 from . import block_grids, surfaces
-from .block_grids import Footprints
+from .block_grids import Footprints, RankedGrids
 from .surfaces import Surface
 
-SOLE = 0.055  # m, ball joint over the sole: subject 03 of the CMU database in his shoes
-# A foot stands on its toes where it is pitched down more than it usually is: by 5 degrees, and by
-# three standard deviations, told from the median deviation, where slopes make the pitch vary.
-TOES, DEVIATIONS = np.radians(5.0), 3.0 * 1.4826
-NEAR = 0.3  # m, about a foot's length: a stance on toes is not asked where a flat one is as near
-FEWEST = 4  # stances: three make a plane, and one tests it
-SURFACE_KINDS = ("plane", "smooth", "blocks")  # the simplest first
-Fit = Callable[[Footprints], Surface]
+SOLE = 0.055  # m, ball joint above the sole: CMU database, subject 03, in his shoes
+# A foot is on its toes where it is pitched down more than usual: by 5 degrees, and by three
+# standard deviations (estimated from the median absolute deviation), as slopes make pitch vary.
+TOE_PITCH, TOE_DEVIATIONS = np.radians(5.0), 3.0 * 1.4826
+NEAR = 0.3  # m, about a foot's length: a stance on toes is not used if a flat one is as near
+MIN_STANCES = 4  # three determine a plane, and one tests it
+SURFACE_KINDS = ("plane", "smooth", "blocks")  # from simple to complex
+SurfaceFit = Callable[[Footprints], Surface]
 
 
 @dataclass(frozen=True)
 class Stances:
-    """Where feet stood, in the order of time."""
+    """Where feet stood, in order of time."""
 
-    leg: Int64[np.ndarray, " stances"]
-    first: Int64[np.ndarray, " stances"]  # frames, both included
-    last: Int64[np.ndarray, " stances"]
+    leg: Int64[np.ndarray, " stances"]  # index
+    first: Int64[np.ndarray, " stances"]  # frame
+    last: Int64[np.ndarray, " stances"]  # frame, included
     points: Float64[np.ndarray, "stances 2"]  # m, (x, z) of the ball
     ankles: Float64[np.ndarray, "stances 2"]  # m, (x, z)
-    heights: Float64[np.ndarray, " stances"]  # m, of the ground below it
-    toes: Bool[np.ndarray, " stances"]  # with the heel in the air
-    used: Bool[np.ndarray, " stances"]
+    heights: Float64[np.ndarray, " stances"]  # m, of the ground below the ball
+    toes: Bool[np.ndarray, " stances"]  # True where the heel is in the air
+    used: Bool[np.ndarray, " stances"]  # True where the surfaces are fitted to it
 
     @property
     def footprints(self) -> Footprints:
-        """Of the stances that are used."""
+        """The stances that are used."""
         used = self.used
         return Footprints(self.points[used], self.heights[used], self.ankles[used])
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """How well a kind of ground predicts each stance from the others."""
+    """How well a kind of surface predicts each used stance from the others."""
 
-    errors: Float64[np.ndarray, " stances"]  # m, predicted - measured, of the used stances
-    alone: Bool[np.ndarray, " stances"]  # on a block of its own: predicted from those next to it
+    errors: Float64[np.ndarray, " stances"]  # m, predicted minus measured
+    alone: Bool[np.ndarray, " stances"]  # no other stance on its block: predicted from neighbours
 
     @property
     def rms(self) -> float:
-        """m, over all stances."""
+        """Root mean square error over all used stances, m."""
         return _rms(self.errors)
 
     @property
     def rms_shared(self) -> float:
-        """m, over the stances that are not alone; NaN without any."""
+        """Root mean square error over stances that share their block, m; NaN without any."""
         return _rms(self.errors[~self.alone])
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The grounds that a clip's stances make, and which of them was chosen."""
+    """The surfaces fitted to a clip's stances, and which of them was chosen."""
 
     stances: Stances
     surfaces: Mapping[str, Surface]  # by kind
-    predictions: Mapping[str, Prediction]
-    grids: block_grids.RankedGrids
-    chosen: str
+    predictions: Mapping[str, Prediction]  # by kind
+    grids: RankedGrids
+    chosen: str  # kind
 
     @property
     def surface(self) -> Surface:
-        """The chosen one."""
+        """The chosen surface."""
         return self.surfaces[self.chosen]
 
     def extent(self, margin: float) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
@@ -93,90 +93,97 @@ def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> R
     """The ground below a captured clip.
 
     Args:
-        clip: over ground of any shape, y up. A stance is where its labels or its motion say so.
-        sole: m, height of the ball joint over the sole. It shifts the whole ground.
-        kind: of ground, of `SURFACE_KINDS`; None chooses by the error of prediction.
+        clip: over ground of any shape, with y up.
+        sole: m, height of the ball joint above the sole; it shifts the whole ground.
+        kind: which of `SURFACE_KINDS` to choose; None chooses by cross-validation.
 
     Raises:
-        ValueError: another kind, a clip without legs, too few stances.
+        ValueError: an unknown kind, a clip without legs, or too few stances.
     """
     if kind not in (None, *SURFACE_KINDS):
         raise ValueError(f"no kind of ground named {kind!r}; there are {list(SURFACE_KINDS)}")
     stances = find_stances(clip, sole)
     feet = stances.footprints
-    if len(feet.balls) < FEWEST:
+    if len(feet.balls) < MIN_STANCES:
         raise ValueError(
-            f"{clip.source}: {len(feet.balls)} stances; wanted {FEWEST} or more to tell a ground"
+            f"{clip.source}: {len(feet.balls)} stances; reconstruction needs {MIN_STANCES} or more"
         )
-    ranked = block_grids.search(feet)
-    fits: dict[str, Fit] = {
+    grids = block_grids.search(feet)
+    fits: dict[str, SurfaceFit] = {
         "plane": surfaces.fit_plane,
         "smooth": surfaces.fit_thin_plate,
-        "blocks": partial(surfaces.fit_blocks, ranked),
+        "blocks": partial(surfaces.fit_blocks, grids),
     }
-    tested = {name: leave_one_out(fit, feet) for name, fit in fits.items()}
-    found = {name: fit(feet) for name, fit in fits.items()}
-    return Reconstruction(stances, found, tested, ranked, choose(tested) if kind is None else kind)
+    predictions = {name: leave_one_out(fit, feet) for name, fit in fits.items()}
+    fitted = {name: fit(feet) for name, fit in fits.items()}
+    chosen = choose(predictions) if kind is None else kind
+    return Reconstruction(stances, fitted, predictions, grids, chosen)
 
 
 def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
-    """Place and height of every stance of a clip.
+    """Position and height of every stance of a clip.
 
-    They are those of the ball while its foot is stillest, the median; frames in which a marker
-    popped are left out. A foot on its toes often leans on an edge, or hangs over one: it is used
-    only where no flat stance is near. ValueError where no foot ever stands.
+    They are medians over the frames in which the foot is stillest, without frames in which a marker
+    popped. A foot on its toes often leans on an edge or hangs over one, so it is used only if no
+    flat stance is near.
+
+    Raises:
+        ValueError: no foot ever stands.
     """
     clip = edit.mask_pops(clip)
-    good = np.ones(clip.frame_count, bool) if clip.mask is None else clip.mask
+    unmasked = np.ones(clip.frame_count, bool) if clip.mask is None else clip.mask
     standing, ankles, balls = clip.stance_labels(), clip.joints_ws(2), clip.joints_ws(3)
-    rows = []
+    records = []
     for leg in range(standing.shape[1]):
         for first, last in contacts.runs(standing[:, leg]):
-            during = good.copy()
-            during[:first] = during[last + 1 :] = False
-            if during.any():
-                still = flat_frames(ankles[:, leg], balls[:, leg], during)
-                ball, ankle = (np.median(one[still, leg], axis=0) for one in (balls, ankles))
+            good = unmasked.copy()
+            good[:first] = good[last + 1 :] = False
+            if good.any():
+                flat = flat_frames(ankles[:, leg], balls[:, leg], good)
+                ball, ankle = (np.median(joint[flat, leg], axis=0) for joint in (balls, ankles))
                 foot = ball - ankle
                 pitch = np.arctan2(foot[1], np.linalg.norm(foot[[0, 2]]))
-                rows.append((first, leg, last, *ball, *ankle[[0, 2]], pitch))
-    if not rows:
-        raise ValueError(f"{clip.source}: no foot ever stands; wanted {FEWEST} stances or more")
-    first, leg, last, x, y, z, *ankle, pitch = np.array(sorted(rows)).reshape(-1, 9).T
-    for one in np.unique(leg):
-        pitch[leg == one] -= np.median(pitch[leg == one])
-    toes = -pitch > np.maximum(TOES, DEVIATIONS * np.median(np.abs(pitch)))
+                records.append((first, leg, last, *ball, *ankle[[0, 2]], pitch))
+    if not records:
+        raise ValueError(
+            f"{clip.source}: no foot ever stands; wanted {MIN_STANCES} stances or more"
+        )
+    first, leg, last, x, y, z, *ankle, pitch = np.array(sorted(records)).reshape(-1, 9).T
+    for index in np.unique(leg):
+        pitch[leg == index] -= np.median(pitch[leg == index])
+    toes = -pitch > np.maximum(TOE_PITCH, TOE_DEVIATIONS * np.median(np.abs(pitch)))
     points, ankles = (np.stack(pair, axis=-1) for pair in ((x, z), ankle))
-    apart = np.linalg.norm(points[:, None] - points[~toes], axis=-1)
-    used = ~toes | (apart > NEAR).all(axis=1)
-    leg, first, last = (part.astype(np.int64) for part in (leg, first, last))
+    distance_to_flat = np.linalg.norm(points[:, None] - points[~toes], axis=-1)
+    used = ~toes | (distance_to_flat > NEAR).all(axis=1)
+    leg, first, last = (column.astype(np.int64) for column in (leg, first, last))
     return Stances(leg, first, last, points, ankles, y - sole, toes, used)
 
 
-def leave_one_out(fit: Fit, feet: Footprints) -> Prediction:
-    """Errors of a kind of ground at each stance when it was fitted to all the others.
+def leave_one_out(fit: SurfaceFit, feet: Footprints) -> Prediction:
+    """How well a kind of surface predicts each footprint when it is fitted to all the others.
 
-    A grid of blocks is chosen anew each time among those around the one that all stances made.
+    For blocks, the grid is chosen anew each time among the candidates found from all footprints.
     """
-    errors, shared = np.zeros(len(feet.balls)), np.zeros(len(feet.balls), bool)
-    for one in range(len(feet.balls)):
-        surface, at = fit(feet.without(one)), feet.balls[[one]]
-        errors[one] = surface.heights(at)[0] - feet.heights[one]
-        shared[one] = surface.shared(at)[0]
-    return Prediction(errors, ~shared)
+    errors, supported = np.zeros(len(feet.balls)), np.zeros(len(feet.balls), bool)
+    for index in range(len(feet.balls)):
+        surface, point = fit(feet.without(index)), feet.balls[[index]]
+        errors[index] = surface.heights(point)[0] - feet.heights[index]
+        supported[index] = surface.supported(point)[0]
+    return Prediction(errors, ~supported)
 
 
-def choose(tested: Mapping[str, Prediction]) -> str:
-    """The simplest kind whose squared error is within one standard error of the least.
+def choose(predictions: Mapping[str, Prediction]) -> str:
+    """The simplest kind whose squared error is within one standard error of the smallest.
 
-    The standard error is that of the mean difference, stance by stance, to the best kind: the rule
-    of Breiman, Friedman, Olshen and Stone (1984), for errors of the same stances.
+    The standard error is that of the mean difference to the best kind, stance by stance: the
+    one-standard-error rule of Breiman, Friedman, Olshen and Stone, "Classification and regression
+    trees" (1984), for paired errors.
     """
-    squares = {kind: tested[kind].errors ** 2 for kind in SURFACE_KINDS}
+    squares = {kind: predictions[kind].errors ** 2 for kind in SURFACE_KINDS}
     best = min(SURFACE_KINDS, key=lambda kind: squares[kind].mean())
     for kind in SURFACE_KINDS:
-        more = squares[kind] - squares[best]
-        if more.mean() <= more.std() / np.sqrt(len(more)):
+        excess = squares[kind] - squares[best]
+        if excess.mean() <= excess.std() / np.sqrt(len(excess)):
             return kind
     return best
 

@@ -1,4 +1,4 @@
-"""Grounds through the heights of stances: a plane, a smooth surface, level blocks."""
+"""Surfaces fitted to footprints: a plane, a smooth thin plate, level blocks."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -10,35 +10,35 @@ from scipy.interpolate import RBFInterpolator
 from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
-from fitting.datasets.synthetic.terrain_meshes import Mesh, quads
-
 from . import block_grids
+from .block_grids import Footprints, Grid, RankedGrids
+from .meshes import Mesh, grid_faces
 
-PLANE_NOISE = 0.01  # m: a stance farther from the plane is trusted less (soft L1)
-SLOPE = 0.05  # m per m, prior deviation: across a straight walk nothing else holds the plane
-SPACING = 0.1  # m, between vertices of a smooth surface
-SMOOTHING = 10.0 ** np.arange(-6.0, 2.1, 0.5)  # m², of a thin plate
+PLANE_NOISE = 0.01  # m: footprints farther from the plane weigh less (soft L1)
+SLOPE_PRIOR = 0.05  # m per m, standard deviation; it fixes the tilt across a straight walk
+VERTEX_SPACING = 0.1  # m, in the mesh of a thin plate
+SMOOTHING = 10.0 ** np.arange(-6.0, 2.1, 0.5)  # m², candidates for a thin plate
 
 
 class Surface(ABC):
-    """A ground over (x, z)."""
+    """Ground height as a function of (x, z)."""
 
     @abstractmethod
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
-        """Of the ground at points, m."""
+        """Ground height at points, m."""
 
     @abstractmethod
-    def shared(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
-        """Where stances tell the height; elsewhere it is their neighbours' mean."""
+    def supported(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+        """Whether a footprint determines the height at each point; else its neighbours do."""
 
     @abstractmethod
     def mesh(self, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]) -> Mesh:
-        """Triangles, m, y up, over all points from `low` to `high`."""
+        """A mesh over all points from `low` to `high`, (x, z), m."""
 
 
 @dataclass(frozen=True)
 class Plane(Surface):
-    """level + slope · (x, z)."""
+    """The plane y = level + slope · (x, z)."""
 
     level: float  # m, at the origin
     slope: tuple[float, float]  # m per m along x and z
@@ -46,46 +46,48 @@ class Plane(Surface):
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
         return self.level + points @ np.array(self.slope)
 
-    def shared(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+    def supported(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
         return np.ones(len(points), bool)
 
     def mesh(self, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]) -> Mesh:
-        return _sheet(self, *(np.array([a, b]) for a, b in zip(low, high, strict=True)))
+        return _grid_mesh(self, *(np.array([a, b]) for a, b in zip(low, high, strict=True)))
 
 
 @dataclass(frozen=True)
 class ThinPlate(Surface):
-    """A thin plate that bends as little as the stances let it (Duchon 1977; Wahba 1990)."""
+    """A thin-plate smoothing spline (Duchon 1977; Wahba, "Spline models", 1990)."""
 
     plate: RBFInterpolator
-    smoothing: float  # m²; 0 goes through every stance
-    lowest: float  # m, and highest: of the stances, beyond which it does not swing
-    highest: float
+    smoothing: float  # m²; 0 interpolates every footprint
+    lowest: float  # m; heights are clipped to those of the footprints
+    highest: float  # m
 
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
         return np.clip(self.plate(points), self.lowest, self.highest)
 
-    def shared(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+    def supported(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
         return np.ones(len(points), bool)
 
     def mesh(self, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]) -> Mesh:
-        count = np.ceil((high - low) / SPACING).astype(int) + 1
-        return _sheet(self, *(np.linspace(*part) for part in zip(low, high, count, strict=True)))
+        count = np.ceil((high - low) / VERTEX_SPACING).astype(int) + 1
+        return _grid_mesh(
+            self, *(np.linspace(*part) for part in zip(low, high, count, strict=True))
+        )
 
 
 @dataclass(frozen=True)
 class LevelBlocks(Surface):
-    """Level blocks; one that nobody stepped on has the mean height of those next to it."""
+    """Level blocks. One without footprints has the mean height of the nearest that have any."""
 
-    grid: block_grids.Grid
-    cells: Int64[np.ndarray, "blocks 2"]  # that somebody stepped on
+    grid: Grid
+    cells: Int64[np.ndarray, "blocks 2"]  # with footprints
     tops: Float64[np.ndarray, " blocks"]  # m
-    stances: Int64[np.ndarray, " blocks"]  # how many told each
+    stances: Int64[np.ndarray, " blocks"]  # number of footprints
 
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
-        return self._tops_of(self.grid.cells(points))
+        return self._heights_of(self.grid.cells(points))
 
-    def shared(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+    def supported(self, points: Float64[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
         return (self._rings(self.grid.cells(points)) == 0).any(axis=1)
 
     def mesh(self, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]) -> Mesh:
@@ -93,96 +95,94 @@ class LevelBlocks(Surface):
         reached = self.grid.cells(box)
         first, shape = reached.min(axis=0), np.ptp(reached, axis=0) + 1
         index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-        tops = self._tops_of((first + index).reshape(-1, 2)).reshape(shape)
-        around = np.array([[0, 0], [0, 1], [1, 1], [1, 0]])  # corners of a block, seen from below
-        places = self.grid.places(((first + index)[..., None, :] + around).astype(np.float64))
-        y = np.broadcast_to(tops[..., None], places.shape[:-1])
-        vertices = np.stack([places[..., 0], y, places[..., 1]], axis=-1)
-        corner = np.arange(4 * tops.size).reshape(*shape, 4)
-        here, there = corner[:-1], corner[1:]
-        along_u = np.stack([here[..., 3], here[..., 2], there[..., 1], there[..., 0]], axis=-1)
-        here, there = corner[:, :-1], corner[:, 1:]
-        along_v = np.stack([here[..., 2], here[..., 1], there[..., 0], there[..., 3]], axis=-1)
-        risers = np.concatenate(
-            [along_u[np.diff(tops, axis=0) != 0], along_v[np.diff(tops, axis=1) != 0]]
-        )
-        quads = np.concatenate([corner.reshape(-1, 4), risers])
+        tops = self._heights_of((first + index).reshape(-1, 2)).reshape(shape)
+        corners = np.array([[0, 0], [0, 1], [1, 1], [1, 0]])  # of a block, seen from below
+        points = self.grid.points(((first + index)[..., None, :] + corners).astype(np.float64))
+        y = np.broadcast_to(tops[..., None], points.shape[:-1])
+        vertices = np.stack([points[..., 0], y, points[..., 1]], axis=-1)
+        vertex = np.arange(4 * tops.size).reshape(*shape, 4)
+        near, far = vertex[:-1], vertex[1:]
+        along_u = np.stack([near[..., 3], near[..., 2], far[..., 1], far[..., 0]], axis=-1)
+        near, far = vertex[:, :-1], vertex[:, 1:]
+        along_v = np.stack([near[..., 2], near[..., 1], far[..., 0], far[..., 3]], axis=-1)
+        risers = [along_u[np.diff(tops, axis=0) != 0], along_v[np.diff(tops, axis=1) != 0]]
+        quads = np.concatenate([vertex.reshape(-1, 4), *risers])
         faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
         return Mesh(vertices.reshape(-1, 3), faces.astype(np.int64))
 
-    def _tops_of(self, cells: np.ndarray) -> np.ndarray:
-        """Heights of blocks: their own, or the mean of the nearest ring that has any."""
+    def _heights_of(self, cells: np.ndarray) -> np.ndarray:
+        """Heights of cells: their own, or the mean over the nearest ring of blocks."""
         rings = self._rings(cells)
         nearest = rings == rings.min(axis=1, keepdims=True)
         return (nearest * self.tops).sum(axis=1) / nearest.sum(axis=1)
 
     def _rings(self, cells: np.ndarray) -> np.ndarray:
-        """How many blocks apart, diagonals counting one, these are from those stepped on."""
+        """Distance of cells to blocks with footprints, in blocks, diagonals counting as one."""
         return np.abs(cells[:, None] - self.cells).max(axis=-1)
 
 
-def fit_plane(feet: block_grids.Footprints) -> Plane:
-    """The plane through heights that a few odd ones cannot pull far.
+def fit_plane(feet: Footprints) -> Plane:
+    """The plane through the footprints by robust least squares (soft L1).
 
-    Least squares under a soft L1 loss; where points do not tell the slope, it is level.
+    Where the footprints do not determine the slope, the plane is level.
     """
     points, heights = feet.balls, feet.heights
-    middle, level = points.mean(axis=0), float(np.median(heights))
+    centre, median = points.mean(axis=0), float(np.median(heights))
 
-    def rows(at: np.ndarray) -> np.ndarray:
-        apart = at[0] + (points - middle) @ at[1:] - (heights - level)
-        return np.concatenate([apart / PLANE_NOISE, at[1:] / SLOPE])
+    def residuals(plane: np.ndarray) -> np.ndarray:
+        error = plane[0] + (points - centre) @ plane[1:] - (heights - median)
+        return np.concatenate([error / PLANE_NOISE, plane[1:] / SLOPE_PRIOR])
 
-    found = least_squares(rows, np.zeros(3), loss="soft_l1").x
-    slope = float(found[1]), float(found[2])
-    return Plane(float(level + found[0] - middle @ found[1:]), slope)
+    level, *slope = least_squares(residuals, np.zeros(3), loss="soft_l1").x
+    return Plane(float(median + level - centre @ slope), (float(slope[0]), float(slope[1])))
 
 
-def fit_thin_plate(feet: block_grids.Footprints) -> ThinPlate:
-    """The thin plate whose smoothing predicts each height best from the others.
+def fit_thin_plate(feet: Footprints) -> ThinPlate:
+    """The thin plate with the smoothing that minimises the leave-one-out error.
 
-    Points in a line bend a plate along it only, and leave it level across.
+    Raises:
+        ValueError: all footprints are in a line.
     """
     points, heights = feet.balls, feet.heights
-    middle = points.mean(axis=0)
-    spread = np.linalg.svd(points - middle, compute_uv=False)
+    centre = points.mean(axis=0)
+    spread = np.linalg.svd(points - centre, compute_uv=False)
     if len(spread) < 2 or spread[1] < 1e-6 * spread[0]:
-        raise ValueError("all stances are in a line; wanted some beside it for a smooth surface")
-    smoothing = min(SMOOTHING, key=_errors_of_plates(points - middle, heights))
+        raise ValueError("all stances are in a line; a smooth surface needs some beside it")
+    smoothing = min(SMOOTHING, key=_leave_one_out_error(points - centre, heights))
     plate = RBFInterpolator(points, heights, smoothing=smoothing)
     return ThinPlate(plate, float(smoothing), float(heights.min()), float(heights.max()))
 
 
-def _errors_of_plates(points: np.ndarray, heights: np.ndarray) -> Callable[[float], float]:
-    """Squared error, m², with which a plate of a smoothing predicts each height from the others."""
+def _leave_one_out_error(points: np.ndarray, heights: np.ndarray) -> Callable[[float], float]:
+    """The squared error, m², of predicting each height from the others, by smoothing, m²."""
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
     log = np.log(np.where(distance > 0, distance, 1.0))
-    bases = null_space(np.column_stack([np.ones(len(points)), points]).T)  # what a plane is not
-    stiffness, modes = np.linalg.eigh(bases.T @ (distance**2 * log) @ bases)
-    modes = bases @ modes
+    not_planar = null_space(np.column_stack([np.ones(len(points)), points]).T)
+    stiffness, modes = np.linalg.eigh(not_planar.T @ (distance**2 * log) @ not_planar)
+    modes = not_planar @ modes
 
     def error(smoothing: float) -> float:
-        # With P the projection on the modes and K the kernel, (P K P + smoothing P)⁻¹ heights over
-        # its own diagonal: what is left at each point by the plate through the others.
-        bent = modes / (np.maximum(stiffness, 0.0) + smoothing) @ modes.T
-        lever = np.diag(bent)
-        known = lever > 1e-9 * lever.max(initial=0.0)  # others tell a height there
-        return float(np.sum(((bent @ heights)[known] / lever[known]) ** 2))
+        # With P the projection on the modes and K the kernel: the leave-one-out residual at each
+        # point is ((P K P + smoothing P)⁻¹ heights) divided by the inverse's own diagonal.
+        inverse = modes / (np.maximum(stiffness, 0.0) + smoothing) @ modes.T
+        diagonal = np.diag(inverse)
+        predicted = diagonal > 1e-9 * diagonal.max(initial=0.0)  # the others determine a height
+        return float(np.sum(((inverse @ heights)[predicted] / diagonal[predicted]) ** 2))
 
     return error
 
 
-def fit_blocks(ranked: block_grids.RankedGrids, feet: block_grids.Footprints) -> LevelBlocks:
-    """Blocks of the likeliest of these grids, each as high as the median of the heights on it."""
-    grid = block_grids.likeliest(ranked, feet)
-    cells, which = np.unique(grid.cells(feet.balls), axis=0, return_inverse=True)
-    which = which.reshape(-1)
-    tops = np.array([np.median(feet.heights[which == one]) for one in range(len(cells))])
-    return LevelBlocks(grid, cells, tops, np.bincount(which).astype(np.int64))
+def fit_blocks(ranked: RankedGrids, feet: Footprints) -> LevelBlocks:
+    """Blocks on the most probable grid, each at the median height of its footprints."""
+    grid = block_grids.most_probable(ranked, feet)
+    cells, block = np.unique(grid.cells(feet.balls), axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    tops = np.array([np.median(feet.heights[block == index]) for index in range(len(cells))])
+    return LevelBlocks(grid, cells, tops, np.bincount(block).astype(np.int64))
 
 
-def _sheet(surface: Surface, x: np.ndarray, z: np.ndarray) -> Mesh:
-    """A surface over a grid of points."""
-    across, along = (part.reshape(-1) for part in np.meshgrid(x, z))
-    y = surface.heights(np.stack([across, along], axis=-1))
-    return Mesh(np.stack([across, y, along], axis=-1), quads(len(z), len(x)))
+def _grid_mesh(surface: Surface, x: np.ndarray, z: np.ndarray) -> Mesh:
+    """A mesh of a surface with vertices at all combinations of `x` and `z`."""
+    grid_x, grid_z = (part.reshape(-1) for part in np.meshgrid(x, z))
+    y = surface.heights(np.stack([grid_x, grid_z], axis=-1))
+    return Mesh(np.stack([grid_x, y, grid_z], axis=-1), grid_faces(len(z), len(x)))

@@ -97,9 +97,9 @@ def _draw_blocks(axes: Axes, blocks: LevelBlocks, points: np.ndarray) -> None:
     low, high = cells.min(axis=0), cells.max(axis=0) + 1
     lines = [[(i, low[1]), (i, high[1])] for i in range(low[0], high[0] + 1)]
     lines += [[(low[0], j), (high[0], j)] for j in range(low[1], high[1] + 1)]
-    edges = blocks.grid.places(np.array(lines, np.float64))
+    edges = blocks.grid.points(np.array(lines, np.float64))
     axes.add_collection(LineCollection(list(edges), colors=GROUND, linewidths=1.0))
-    visited = blocks.shared(points.reshape(-1, 2)).reshape(points.shape[:2])
+    visited = blocks.supported(points.reshape(-1, 2)).reshape(points.shape[:2])
     axes.contourf(
         points[0, :, 0], points[:, 0, 1], ~visited, levels=[0.5, 1.5], colors="none", hatches=["//"]
     )

@@ -1,10 +1,10 @@
-"""Reader of Acclaim ASF (skeleton) and AMC (motion).
+"""Reader of Acclaim ASF (skeleton) and AMC (motion) files.
 
-A bone turns at its start and carries its children at its end: joint `lfemur` here is the hip.
-Each bone has an axis rotation C in the rest pose; its local rotation is C M C⁻¹, where M is of
-the angles of the AMC, turned about x, y and z in the order that the axis names. Leaf bones get a
-last joint `<bone>_end`. Lengths are inches over the file's length unit: metres are
-`value 0.0254 / length`. An AMC says no rate; the CMU files have 120 Hz.
+A bone rotates about its start and carries its children at its end, so the joint `lfemur` is the
+hip. Each bone has an axis rotation C in the rest pose; its local rotation is C M C⁻¹, where M is
+composed of the AMC's angles about x, y and z in the order that the axis line names. Leaf bones get
+a final joint `<bone>_end`. Lengths are in inches divided by the file's length unit: metres are
+`value * 0.0254 / length`. An AMC states no frame rate; the CMU files have 120 Hz.
 """
 
 from dataclasses import dataclass, field
@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets.clips.recording import Recording
+from fitting.datasets.clips.recording import INCH, Recording
 
 AMC_RATE = 120.0  # Hz, by convention of the CMU database
-INCH = 0.0254  # m
 ROTATIONS = ("rx", "ry", "rz")
-MOTIONS = (*ROTATIONS, "tx", "ty", "tz")  # "l", a bone of changing length, is refused
+DEGREES_OF_FREEDOM = (*ROTATIONS, "tx", "ty", "tz")  # "l", a changing bone length, is refused
 
 
 @dataclass
@@ -26,7 +25,7 @@ class _Bone:
     name: str
     direction: np.ndarray = field(default_factory=lambda: np.zeros(3))
     length: float = 0.0
-    axis: tuple[np.ndarray, str] = (np.zeros(3), "XYZ")  # angles, order
+    axis: tuple[np.ndarray, str] = (np.zeros(3), "XYZ")  # angles and their order
     freedoms: list[str] = field(default_factory=list)
     parent: str | None = None
 
@@ -40,16 +39,16 @@ class _Skeleton:
 
 
 class _Lines:
-    """The lines of a file that say something, with their numbers; comments start with #."""
+    """The words of each line with its number, without comments (`#`) and empty lines."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         text = path.read_text(encoding="utf-8-sig", errors="replace")
-        self.rows = [
+        numbered = (
             (number, line.split("#", 1)[0].split())
             for number, line in enumerate(text.splitlines(), 1)
-        ]
-        self.rows = [(number, words) for number, words in self.rows if words]
+        )
+        self.numbered = [(number, words) for number, words in numbered if words]
 
     def error(self, number: int, what: str, words: list[str]) -> ValueError:
         return ValueError(f"{self.path}:{number}: {what}; got {' '.join(words)[:60]!r}")
@@ -65,26 +64,38 @@ class _Lines:
 
 
 def find_asf(amc: Path) -> Path:
-    """The skeleton beside an AMC: of its name, its subject's (`03` of `03_01`), or the only one."""
-    beside = sorted(path for path in amc.parent.iterdir() if path.suffix.lower() == ".asf")
+    """The skeleton in the folder of an AMC file.
+
+    It has the AMC's name, or that of its subject (`03.asf` for `03_01.amc`), or is the only one.
+
+    Raises:
+        ValueError: there is no such file.
+    """
+    skeletons = sorted(path for path in amc.parent.iterdir() if path.suffix.lower() == ".asf")
     for stem in (amc.stem, amc.stem.split("_")[0]):
-        for path in beside:
+        for path in skeletons:
             if path.stem.lower() == stem.lower():
                 return path
-    if len(beside) == 1:
-        return beside[0]
+    if len(skeletons) == 1:
+        return skeletons[0]
     raise ValueError(
         f"{amc}: an AMC needs its ASF; wanted {amc.stem}.asf or {amc.stem.split('_')[0]}.asf "
-        f"beside it, or asf=...; there are {[path.name for path in beside]}"
+        f"beside it, or asf=...; there are {[path.name for path in skeletons]}"
     )
 
 
-def read_asfamc(amc: Path, asf: Path) -> Recording:
+def read_asfamc(amc: Path, asf: Path | None = None) -> Recording:
     """The joints and motion of an ASF/AMC pair, in the files' own units.
 
-    Errors: ValueError with file and line for text that is neither, bones that the skeleton lacks or
-    a frame lacks, and wrong counts of numbers.
+    Args:
+        amc: the motion.
+        asf: the skeleton; None looks for it in the same folder, see `find_asf`.
+
+    Raises:
+        ValueError: with file and line, where the text is neither ASF nor AMC, the skeleton or a
+            frame lacks a bone, or a line has the wrong count of numbers.
     """
+    asf = find_asf(amc) if asf is None else asf
     skeleton = _read_asf(asf)
     values, degrees = _read_amc(amc, skeleton, asf)
     return _assemble(skeleton, values, degrees)
@@ -96,7 +107,7 @@ def _read_asf(path: Path) -> _Skeleton:
     bones: dict[str, _Bone] = {"root": root}
     position, unit, degrees, section = np.zeros(3), 1.0, True, ""
     children: list[tuple[int, list[str]]] = []
-    for number, words in lines.rows:
+    for number, words in lines.numbered:
         key, rest = words[0].lower(), words[1:]
         if key.startswith(":"):
             section = key[1:]
@@ -130,7 +141,7 @@ def _read_asf(path: Path) -> _Skeleton:
 def _bone_line(
     lines: _Lines, number: int, words: list[str], bone: _Bone | None, bones: dict[str, _Bone]
 ) -> _Bone | None:
-    """One line of the bone data; returns the bone that is being told about."""
+    """Reads one line of the bone data; returns the bone that it belongs to, None between bones."""
     key, rest = words[0].lower(), words[1:]
     if key == "begin":
         return _Bone("")
@@ -151,12 +162,12 @@ def _bone_line(
         bone.axis = (lines.numbers(number, rest[:3], 3, "axis"), _order(lines, number, rest[3:]))
     elif key == "dof":
         bone.freedoms = [_freedom(lines, number, words, word) for word in rest]
-    return bone  # id, limits (over any number of lines), masses: nothing that a pose needs
+    return bone  # id, limits (over any number of lines) and masses do not affect the pose
 
 
 def _freedom(lines: _Lines, number: int, words: list[str], word: str) -> str:
-    if word.lower() not in MOTIONS:
-        raise lines.error(number, f"wanted degrees of freedom out of {MOTIONS}", words)
+    if word.lower() not in DEGREES_OF_FREEDOM:
+        raise lines.error(number, f"wanted degrees of freedom out of {DEGREES_OF_FREEDOM}", words)
     return word.lower()
 
 
@@ -167,7 +178,7 @@ def _order(lines: _Lines, number: int, words: list[str]) -> str:
 
 
 def _in_order(path: Path, bones: dict[str, _Bone]) -> dict[str, _Bone]:
-    """The bones with parents before children; every bone must hang on the root."""
+    """The bones with parents before children; every bone must be connected to the root."""
     ordered = {"root": bones["root"]}
     while len(ordered) < len(bones):
         new = {
@@ -176,24 +187,24 @@ def _in_order(path: Path, bones: dict[str, _Bone]) -> dict[str, _Bone]:
             if name not in ordered and bone.parent in ordered
         }
         if not new:
-            loose = [name for name in bones if name not in ordered]
-            raise ValueError(f"{path}: bones without a way to the root in :hierarchy: {loose}")
+            detached = [name for name in bones if name not in ordered]
+            raise ValueError(f"{path}: bones not connected to the root in :hierarchy: {detached}")
         ordered |= new
     return ordered
 
 
 def _read_amc(path: Path, skeleton: _Skeleton, asf: Path) -> tuple[dict[str, np.ndarray], bool]:
-    """The values of each bone that has any, (frames, its degrees of freedom), and their unit."""
+    """Values by bone, (frames, its degrees of freedom), and whether angles are in degrees."""
     lines = _Lines(path)
     degrees, frame, start = skeleton.degrees, 0, 0
     counts = {name: len(bone.freedoms) for name, bone in skeleton.bones.items()}
     values: dict[str, list[list[float]]] = {name: [] for name, count in counts.items() if count}
-    for number, words in lines.rows:
+    for number, words in lines.numbered:
         name = words[0]
         if name.startswith(":"):
             degrees = {":degrees": True, ":radians": False}.get(name.lower(), degrees)
         elif len(words) == 1 and name.isdecimal():
-            _complete(lines, start, values, frame)
+            _check_complete(lines, start, values, frame)
             frame, start = frame + 1, number
         elif name not in values or not frame:
             wanted = f"wanted a frame number, then bones of {asf.name} out of {list(values)}"
@@ -202,31 +213,34 @@ def _read_amc(path: Path, skeleton: _Skeleton, asf: Path) -> tuple[dict[str, np.
             raise lines.error(number, f"wanted {name} once in frame {frame}", words)
         else:
             count = counts[name]
-            try:  # the quick way, 100,000 lines a file
-                row = [float(word) for word in words[1:]]
+            try:  # fast path: a file has some 100,000 lines
+                numbers = [float(word) for word in words[1:]]
             except ValueError:
-                row = []
-            if len(row) != count:
-                lines.numbers(number, words[1:], count, name)
-            values[name].append(row)
-    _complete(lines, start, values, frame)
+                numbers = []
+            if len(numbers) != count:
+                lines.numbers(number, words[1:], count, name)  # raises
+            values[name].append(numbers)
+    _check_complete(lines, start, values, frame)
     if not frame:
         raise ValueError(f"{path}:1: wanted frames: a number alone on a line, then bones; got none")
-    arrays = {name: np.array(rows) for name, rows in values.items()}
-    for name, rows in arrays.items():
-        if not np.isfinite(rows).all():
-            bad = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]) + 1
-            raise ValueError(f"{path}: wanted finite numbers; {name} has others in frame {bad}")
+    arrays = {name: np.array(frames) for name, frames in values.items()}
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0]) + 1
+            raise ValueError(f"{path}: {name} has numbers that are not finite in frame {bad}")
     return arrays, degrees
 
 
-def _complete(lines: _Lines, start: int, values: dict[str, list], frame: int) -> None:
-    if missing := [name for name, rows in values.items() if len(rows) != frame]:
+def _check_complete(
+    lines: _Lines, start: int, values: dict[str, list[list[float]]], frame: int
+) -> None:
+    """ValueError unless every bone has values in this frame, which begins on line `start`."""
+    if missing := [name for name, frames in values.items() if len(frames) != frame]:
         raise lines.error(start, f"wanted all bones in frame {frame}; without {missing}", [])
 
 
 def _assemble(skeleton: _Skeleton, values: dict[str, np.ndarray], degrees: bool) -> Recording:
-    """Joints at the bones' starts, and one at the end of each leaf."""
+    """Joints at the start of every bone, and at the end of each leaf bone."""
     frames = len(values["root"]) if "root" in values else len(next(iter(values.values())))
     bones = list(skeleton.bones.values())
     leaves = [bone for bone in bones[1:] if all(other.parent != bone.name for other in bones)]
@@ -236,11 +250,10 @@ def _assemble(skeleton: _Skeleton, values: dict[str, np.ndarray], degrees: bool)
         parent = skeleton.bones[bone.parent] if bone.parent else None
         parents.append(names.index(bone.parent) if bone.parent else -1)
         offsets.append(parent.direction * parent.length if parent else skeleton.position)
-        moved, turn = _bone_motion(
-            bone, values.get(bone.name, np.zeros((frames, 0))), frames, skeleton, degrees
-        )
-        positions.append(offsets[-1] + moved)
-        rotations.append(turn.as_quat(scalar_first=True))
+        channels = values.get(bone.name, np.zeros((frames, 0)))
+        translation, rot = _bone_motion(bone, channels, skeleton.degrees, degrees)
+        positions.append(offsets[-1] + translation)
+        rotations.append(rot.as_quat(scalar_first=True))
     for bone in leaves:
         names.append(f"{bone.name}_end")
         parents.append(names.index(bone.name))
@@ -250,21 +263,22 @@ def _assemble(skeleton: _Skeleton, values: dict[str, np.ndarray], degrees: bool)
     return Recording(
         tuple(names), tuple(parents), np.array(offsets), np.stack(positions, axis=1),
         np.stack(rotations, axis=1), 1.0 / AMC_RATE, metres_per_unit=INCH / skeleton.unit,
-        remarks=("an AMC says no rate; 120 Hz is the convention",),
+        remarks=("an AMC states no frame rate; taken as 120 Hz, the convention",),
     )  # fmt: skip
 
 
 def _bone_motion(
-    bone: _Bone, rows: np.ndarray, frames: int, skeleton: _Skeleton, degrees: bool
+    bone: _Bone, channels: np.ndarray, axis_in_degrees: bool, channels_in_degrees: bool
 ) -> tuple[np.ndarray, Rotation]:
-    """What a bone's channels add to its place, and its local rotation C M C⁻¹."""
+    """Translation, (frames, 3), and local rotation C M C⁻¹ of a bone, from (frames, channels)."""
     angles, order = bone.axis
-    rest = Rotation.from_euler(order.lower(), angles, degrees=skeleton.degrees)
-    moved, turns = np.zeros((frames, 3)), np.zeros((frames, 3))
+    rest = Rotation.from_euler(order.lower(), angles, degrees=axis_in_degrees)
+    translation, euler = np.zeros((len(channels), 3)), np.zeros((len(channels), 3))
     for column, freedom in enumerate(bone.freedoms):
         if freedom in ROTATIONS:
-            turns[:, order.index(freedom[1].upper())] = rows[:, column]
+            euler[:, order.index(freedom[1].upper())] = channels[:, column]
         else:
-            moved[:, "xyz".index(freedom[1])] = rows[:, column]
-    # Lower-case letters are SciPy's turns about axes at rest: x first, then y, then z for "xyz".
-    return moved, rest * Rotation.from_euler(order.lower(), turns, degrees=degrees) * rest.inv()
+            translation[:, "xyz".index(freedom[1])] = channels[:, column]
+    # Lower-case letters are SciPy's extrinsic rotations: for "xyz" about x first, then y, then z.
+    moving = Rotation.from_euler(order.lower(), euler, degrees=channels_in_degrees)
+    return translation, rest * moving * rest.inv()

@@ -1,12 +1,13 @@
-"""Reader of Biovision BVH.
+"""Reader of Biovision BVH files.
 
-Our own: of the libraries tried on the reference files, pybvh refuses joints with six channels,
-upc-pymotion reads those wrongly without saying so and fails on roots that list rotations first, and
-bvhio 1.5.4 (MIT, by one author) is right but works in float32 and takes 9 s for 994 frames.
+It is lenient where files in circulation differ: any line ending, tabs or blanks, any spacing in
+`End Site` and `Frames:`, any channel and rotation order per joint, and position channels that
+replace the offset of any joint. Angles are in degrees. End sites become joints named
+`<parent>_end`.
 
-Read as found in the wild: any line ends, tabs and blanks, `End Site` and `Frames:` with any space,
-rotation order and channel order per joint, position channels that replace the offset of any joint.
-Angles are degrees. End sites become joints named `<parent>_end`.
+Existing libraries failed on the reference files: pybvh refuses joints with six channels,
+upc-pymotion reads those wrongly without an error and fails on roots that list rotations first, and
+bvhio 1.5.4 is correct but works in float32 and takes 9 s for 994 frames.
 """
 
 import re
@@ -23,23 +24,25 @@ CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)
 def read_bvh(path: Path) -> Recording:
     """The joints and motion of a BVH file, in its own units and axes.
 
-    Errors: ValueError with file and line where the text is not BVH, a number is missing, not
-    finite or too many, or fewer frames follow than are declared. More frames than declared are
-    left out with a remark.
+    Frames beyond the declared count are left out with a remark.
+
+    Raises:
+        ValueError: with file and line, where the text is not BVH, a number is missing, superfluous
+            or not finite, or there are fewer frames than declared.
     """
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return _Reader(path, lines).read()
 
 
 class _Reader:
-    """Walks over the lines of one file; `at` is the index of the line under the eye."""
+    """Parses the lines of one file in order; `index` is that of the current line."""
 
     def __init__(self, path: Path, lines: list[str]) -> None:
-        self.path, self.lines, self.at = path, lines, -1
+        self.path, self.lines, self.index = path, lines, -1
         self.names: list[str] = []
         self.parents: list[int] = []
         self.offsets: list[list[float]] = []
-        self.channels: list[list[tuple[str, str]]] = []  # per joint: (axis, position | rotation)
+        self.channels: list[list[tuple[str, str]]] = []  # per joint, of (axis, position | rotation)
 
     def read(self) -> Recording:
         if self._next("HIERARCHY").upper() != "HIERARCHY":
@@ -54,18 +57,20 @@ class _Reader:
         )  # fmt: skip
 
     def _error(self, what: str) -> ValueError:
-        found = self.lines[self.at].strip() if self.at < len(self.lines) else "the end of the file"
-        shown = found if len(found) <= 60 else found[:57] + "..."
-        return ValueError(f"{self.path}:{min(self.at, len(self.lines)) + 1}: {what}; got {shown!r}")
+        at_end = self.index >= len(self.lines)
+        line = "the end of the file" if at_end else self.lines[self.index].strip()
+        line = line if len(line) <= 60 else line[:57] + "..."
+        number = min(self.index, len(self.lines)) + 1
+        return ValueError(f"{self.path}:{number}: {what}; got {line!r}")
 
     def _next(self, wanted: str) -> str:
-        """The next line that is not empty, stripped."""
-        self.at += 1
-        while self.at < len(self.lines) and not self.lines[self.at].strip():
-            self.at += 1
-        if self.at >= len(self.lines):
+        """Moves to the next line that is not empty and returns it, stripped."""
+        self.index += 1
+        while self.index < len(self.lines) and not self.lines[self.index].strip():
+            self.index += 1
+        if self.index >= len(self.lines):
             raise self._error(f"wanted {wanted}")
-        return self.lines[self.at].strip()
+        return self.lines[self.index].strip()
 
     def _numbers(self, words: list[str], count: int, what: str) -> list[float]:
         try:
@@ -79,10 +84,9 @@ class _Reader:
         return numbers
 
     def _hierarchy(self) -> None:
-        """Reads joints until MOTION; `open_joints` are those whose brace is not closed yet."""
+        """Reads joints up to MOTION; `open_joints` are those whose brace is still open."""
         open_joints: list[int] = []
         while True:
-            # A brace may stand at the end of the line of its joint.
             words = self._next("JOINT, End Site, OFFSET, CHANNELS, } or MOTION").split()
             keyword = words[0].upper()
             if keyword in ("ROOT", "JOINT", "END"):
@@ -104,7 +108,7 @@ class _Reader:
     def _begin(self, keyword: str, words: list[str], open_joints: list[int]) -> None:
         if (keyword == "ROOT") != (not self.names) or (keyword != "ROOT" and not open_joints):
             raise self._error("wanted one ROOT, first, with all other joints inside it")
-        braced = words[-1] == "{"
+        braced = words[-1] == "{"  # on the line of its joint instead of the next one
         name = " ".join(words[1 : -1 if braced else None])
         if keyword == "END":
             name = f"{self.names[open_joints[-1]]}_end"
@@ -140,29 +144,29 @@ class _Reader:
         return frames, frame_time
 
     def _values(self, frames: int) -> tuple[np.ndarray, tuple[str, ...]]:
-        """The channel values, (frames, channels), and what there was to remark."""
+        """The channel values, (frames, channels), and remarks."""
         count = sum(map(len, self.channels))
-        rows = []
+        values = []
         for frame in range(frames):
             words = self._next(f"frame {frame + 1} of {frames} declared").split()
-            rows.append(self._numbers(words, count, f"frame {frame + 1}"))
-        left = sum(bool(line.strip()) for line in self.lines[self.at + 1 :])
-        remark = f"{frames} frames are declared and {frames + left} found; the rest is left out"
-        return np.array(rows, np.float64).reshape(frames, count), (remark,) if left else ()
+            values.append(self._numbers(words, count, f"frame {frame + 1}"))
+        surplus = sum(bool(line.strip()) for line in self.lines[self.index + 1 :])
+        remark = f"{frames} frames are declared and {frames + surplus} found; the rest is left out"
+        return np.array(values, np.float64).reshape(frames, count), (remark,) if surplus else ()
 
     def _motion(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Local positions, in file units, and rotations, wxyz, of all joints."""
+        """Local positions, file units, and local rotations, wxyz, of all joints."""
         frames, joints = len(values), len(self.names)
         positions_ls = np.tile(np.array(self.offsets, np.float64), (frames, 1, 1))
         rotations_ls = np.tile([1.0, 0.0, 0.0, 0.0], (frames, joints, 1))
         column = 0
         for joint, channels in enumerate(self.channels):
-            turn = Rotation.identity(frames)
+            rot = Rotation.identity(frames)
             for axis, kind in channels:
                 if kind == "position":
                     positions_ls[:, joint, "xyz".index(axis)] = values[:, column]
                 else:
-                    turn = turn * Rotation.from_euler(axis, values[:, [column]], degrees=True)
+                    rot = rot * Rotation.from_euler(axis, values[:, [column]], degrees=True)
                 column += 1
-            rotations_ls[:, joint] = turn.as_quat(scalar_first=True)
+            rotations_ls[:, joint] = rot.as_quat(scalar_first=True)
         return positions_ls, rotations_ls

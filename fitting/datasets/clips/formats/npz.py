@@ -1,18 +1,22 @@
-"""Clips in NumPy archives: our own format, and the `blocks` benchmark of joint positions."""
+"""Clips as NumPy archives: this project's own format, and the files of the `blocks` benchmark.
+
+An archive of our own holds every field of a `Clip`, so it loads exactly as it was saved. A `blocks`
+file holds joint positions of two legs, once as captured and once as a flat animation.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.joint_roles import find_roles
-from fitting.datasets.clips.recording import continuous, local_from_world
-from fitting.datasets.clips.rigs import hinges, measure_rig, unit
+from fitting.datasets.clips.leg_geometry import leg_rotations, unit
 from fitting.runtime.files import write
 from jaxik.world.skeleton import Rig
+
+Arrays = dict[str, np.ndarray]
 
 FORMAT = "jaxik clip 1"
 ARRAYS = ("offsets_ls", "positions_ws", "rotations_ws")
@@ -20,23 +24,27 @@ OPTIONAL = ("stance", "mask", "slide")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
 RIG_ARRAYS = ("knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "side", "present")
-VARIANTS = {"captured": "", "base": "base_"}
-BLOCKS = ("fps", "pelvis", "pelvis_rot", "foot_rot", "stance")
-PARTS = ("hip", "knee", "ankle", "ball")
+VARIANTS = {"captured": "", "base": "base_"}  # prefix of their arrays in a blocks file
+BLOCKS_ARRAYS = ("fps", "pelvis", "pelvis_rot", "foot_rot", "stance")
+BLOCKS_JOINTS = ("hip", "knee", "ankle", "ball")
 
 
 def save_clip(
     path: str | Path, clip: Clip, *, joints: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Writes a clip as NPZ, which `load_clip` gives back exactly; never half a file.
+    """Writes a clip as an NPZ archive, from which `load_clip` restores it exactly.
 
-    `joints` are further arrays for other programs, which `load_clip` passes over.
+    The keys are `format`; the clip's fields by name (`stance`, `mask`, `slide` and `dialect` only
+    if they are set); the rig's fields as `rig_<field>`, where `rig_joints` are joint indices of
+    shape (legs, 4). The file appears complete or not at all.
 
-    Keys: `format`; the clip's fields under their own names (`stance`, `mask`, `slide`, `dialect`
-    where there are any); the rig's as `rig_<field>`, `rig_joints` being (legs, 4) joint indices.
+    Args:
+        path: file name.
+        clip: any clip.
+        joints: further arrays for other programs; `load_clip` ignores them.
     """
     path = Path(path)
-    content: dict[str, np.ndarray] = {
+    content: Arrays = {
         "format": np.array(FORMAT),
         "joint_names": np.array(clip.joint_names),
         "parents": np.array(clip.parents),
@@ -45,69 +53,67 @@ def save_clip(
     for name in (*ARRAYS, *OPTIONAL, *TEXTS, *NUMBERS, "dialect"):
         if (value := getattr(clip, name)) is not None:
             content[name] = np.asarray(value)
-    if clip.measured is not None:
-        content |= {f"rig_{name}": np.asarray(getattr(clip.measured, name)) for name in RIG_ARRAYS}
-        content["rig_names"] = np.array(clip.measured.names)
-        content["rig_joints"] = np.array(clip.measured.joints)
-        content["rig_pelvis"] = np.array(clip.measured.pelvis)
+    if (rig := clip.measured_rig) is not None:
+        content |= {f"rig_{name}": np.asarray(getattr(rig, name)) for name in RIG_ARRAYS}
+        content["rig_names"] = np.array(rig.names)
+        content["rig_joints"] = np.array(rig.joints)
+        content["rig_pelvis"] = np.array(rig.pelvis)
     content |= joints or {}
 
     def fill(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # an open file, for NumPy adds a suffix to a name
+        with temporary.open("wb") as file:  # given a name, NumPy would append a suffix
             np.savez_compressed(file, **content)  # pyright: ignore[reportArgumentType]
 
     write(path, fill)
 
 
 def read_npz(path: Path, variant: str) -> Clip:
-    """A clip of our own format, or a variant ("captured", "base") of a `blocks` file."""
+    """The clip in an archive.
+
+    Args:
+        path: an archive written by `save_clip`, or a `blocks` file.
+        variant: of a `blocks` file: "captured" or "base".
+
+    Raises:
+        ValueError: neither kind of file, arrays missing, misshapen or not finite, or no such
+            variant.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             content = dict(archive)
-    except Exception as error:  # zipfile, zlib and NumPy each have their own
+    except Exception as error:  # zipfile, zlib and NumPy each raise their own
         raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({error})") from None
     if "format" in content:
         if variant != "captured":
             raise ValueError(f"{path}: only blocks files have the variant {variant!r}")
-        return _own(path, content)
+        return _read_saved_clip(path, content)
     if "base_pelvis" in content or "leg_lengths" in content:
         if variant not in VARIANTS:
             raise ValueError(f"{path}: no variant {variant!r}; there are {list(VARIANTS)}")
-        return _blocks(path, content, variant)
+        return _read_blocks(path, content, variant)
     raise ValueError(
         f"{path}: wanted a clip saved by save_clip or a blocks file; it has {sorted(content)}"
     )
 
 
 def is_blocks_file(path: str | Path) -> bool:
-    """Whether a file is of the blocks benchmark, which holds a captured clip and its base."""
+    """Whether a file belongs to the `blocks` benchmark, with a captured clip and its flat base."""
     if Path(path).suffix.lower() != ".npz" or not Path(path).is_file():
         return False
     try:
         with np.load(path, allow_pickle=False) as archive:
             return "base_pelvis" in archive.files
-    except Exception:  # whatever is wrong with it, reading it says so
+    except Exception:  # reading the file will report what is wrong with it
         return False
 
 
-def _own(path: Path, content: dict[str, np.ndarray]) -> Clip:
+def _read_saved_clip(path: Path, content: Arrays) -> Clip:
     if str(content["format"]) != FORMAT:
         raise ValueError(f"{path}: wanted the format {FORMAT!r}, got {str(content['format'])!r}")
-    needed = {"joint_names", "parents", "remarks", *ARRAYS, *TEXTS, *NUMBERS}
+    required = {"joint_names", "parents", "remarks", *ARRAYS, *TEXTS, *NUMBERS}
     if "rig_names" in content:
-        needed |= {f"rig_{name}" for name in (*RIG_ARRAYS, "joints", "pelvis")}
-    _check(path, content, needed)
-    rig = None
-    if "rig_names" in content:
-        with jax.enable_x64(True):
-            rig = Rig(
-                **{name: jax.device_put(content[f"rig_{name}"]) for name in RIG_ARRAYS},
-                names=tuple(map(str, content["rig_names"])),
-                joints=tuple(
-                    (int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"]
-                ),
-                pelvis=int(content["rig_pelvis"]),
-            )
+        required |= {f"rig_{name}" for name in (*RIG_ARRAYS, "joints", "pelvis")}
+    _check_arrays(path, content, required)
     return Clip(
         joint_names=tuple(map(str, content["joint_names"])),
         parents=tuple(map(int, content["parents"])),
@@ -120,7 +126,7 @@ def _own(path: Path, content: dict[str, np.ndarray]) -> Clip:
         scale=float(content["scale"]),
         up_axis=str(content["up_axis"]),
         dialect=str(content["dialect"]) if "dialect" in content else None,
-        measured=rig,
+        measured_rig=_read_rig(content) if "rig_names" in content else None,
         stance=content.get("stance"),
         mask=content.get("mask"),
         slide=content.get("slide"),
@@ -128,86 +134,55 @@ def _own(path: Path, content: dict[str, np.ndarray]) -> Clip:
     )
 
 
-def _check(path: Path, content: dict[str, np.ndarray], needed: set[str]) -> None:
-    if missing := sorted(needed - set(content)):
+def _read_rig(content: Arrays) -> Rig:
+    with jax.enable_x64(True):
+        return Rig(
+            **{name: jax.device_put(content[f"rig_{name}"]) for name in RIG_ARRAYS},
+            names=tuple(map(str, content["rig_names"])),
+            joints=tuple((int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"]),
+            pelvis=int(content["rig_pelvis"]),
+        )
+
+
+def _check_arrays(path: Path, content: Arrays, required: set[str]) -> None:
+    if missing := sorted(required - set(content)):
         raise ValueError(f"{path}: without the arrays {missing}; it has {sorted(content)}")
-    for name in needed:
+    for name in required:
         if content[name].dtype.kind == "f" and not np.isfinite(content[name]).all():
             raise ValueError(f"{path}: {name} has numbers that are not finite")
 
 
-def _blocks(path: Path, content: dict[str, np.ndarray], variant: str) -> Clip:
-    """Joint positions of two legs, left first, with the rotations that they imply."""
+def _read_blocks(path: Path, content: Arrays, variant: str) -> Clip:
+    """Joint positions of two legs, left first; thigh and shin get the rotations they imply."""
     prefix = VARIANTS[variant]
-    keys = [f"{prefix}{part}" for part in PARTS]
-    _check(path, content, {*BLOCKS, f"{prefix}pelvis", *keys})
+    keys = [f"{prefix}{joint}" for joint in BLOCKS_JOINTS]
+    _check_arrays(path, content, {*BLOCKS_ARRAYS, f"{prefix}pelvis", *keys})
     pelvis = content[f"{prefix}pelvis"].astype(np.float64)
     frames = len(pelvis)
-    wanted = {key: (frames, 2, 3) for key in keys}
-    wanted |= {"pelvis_rot": (frames, 4), "foot_rot": (frames, 2, 4), "stance": (frames, 2)}
-    for key, shape in wanted.items():
+    shapes = {key: (frames, 2, 3) for key in keys}
+    shapes |= {"pelvis_rot": (frames, 4), "foot_rot": (frames, 2, 4), "stance": (frames, 2)}
+    for key, shape in shapes.items():
         if content[key].shape != shape:
             raise ValueError(f"{path}: {key} is {content[key].shape}; wanted {shape}")
     hip, knee, ankle, ball = (content[key].astype(np.float64) for key in keys)
-    pelvis_rot = _unit_rotations(content["pelvis_rot"])
-    foot_rot = _unit_rotations(content["foot_rot"])
+    pelvis_rot = _normalised(content["pelvis_rot"])
+    foot_rot = _normalised(content["foot_rot"])
     names, parents, positions, rotations = ["pelvis"], [-1], [pelvis], [pelvis_rot]
     left_ws = unit(hip[:, 0] - hip[:, 1])
     for leg, side in enumerate(("left", "right")):
-        names += [f"{side}_{part}" for part in ("hip", "knee", "ankle", "toe")]
+        names += [f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "toe")]
         parents += [0, len(names) - 4, len(names) - 3, len(names) - 2]
-        positions += [part[:, leg] for part in (hip, knee, ankle, ball)]
+        positions += [joint[:, leg] for joint in (hip, knee, ankle, ball)]
         rotations += leg_rotations(hip[:, leg], knee[:, leg], ankle[:, leg], left_ws)
         rotations += [foot_rot[:, leg], foot_rot[:, leg]]
-    return clip_from_joints(
+    motion = JointMotion(
         tuple(names), tuple(parents), np.stack(positions, axis=1), np.stack(rotations, axis=1),
-        float(content["fps"]), path.name, content["stance"].astype(bool),
+        content["stance"].astype(bool), float(content["fps"]),
     )  # fmt: skip
+    return clip_from_joints(motion, path.name)
 
 
-def _unit_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Float64 quaternions at length one, the norms of stored float32 being a little off."""
+def _normalised(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions in float64; the norms of stored float32 values are slightly off."""
     rotations = rotations.astype(np.float64)
     return rotations / np.linalg.norm(rotations, axis=-1, keepdims=True)
-
-
-def leg_rotations(
-    hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, left_ws: np.ndarray
-) -> list[np.ndarray]:
-    """World rotations, wxyz, of thigh and shin known by their ends, each of shape (frames, 4).
-
-    Joint axes: y from the child up to the joint, x left along the hinge of the knee, z forward; so
-    a turn about +x flexes the knee.
-    """
-    hinge = hinges(hip, knee, ankle, left_ws)
-    turns = []
-    for upper, lower in ((hip, knee), (knee, ankle)):
-        y = unit(upper - lower)
-        x = unit(hinge - y * np.sum(hinge * y, axis=-1, keepdims=True))
-        axes = np.stack([x, y, np.cross(x, y)], axis=-1)
-        turns.append(Rotation.from_matrix(axes).as_quat(scalar_first=True))
-    return turns
-
-
-def clip_from_joints(
-    names: tuple[str, ...],
-    parents: tuple[int, ...],
-    positions_ws: np.ndarray,
-    rotations_ws: np.ndarray,
-    fps: float,
-    source: str,
-    stance: np.ndarray,
-    joints: Mapping[str, str] | None = None,
-) -> Clip:
-    """A clip in our units from joints in world space.
-
-    Its legs are named as in the dialect "jaxik", or by `joints`, see `find_roles`.
-    """
-    rotations_ws = continuous(rotations_ws)
-    positions_ls, _ = local_from_world(parents, positions_ws, rotations_ws)
-    roles = find_roles(names, parents, joints)
-    rig = measure_rig(roles, positions_ws, rotations_ws, stance)
-    return Clip(
-        names, parents, np.median(positions_ls, axis=0), positions_ws, rotations_ws, fps, 1.0 / fps,
-        source, 1.0, "y", roles.dialect, rig, stance=stance,
-    )  # fmt: skip

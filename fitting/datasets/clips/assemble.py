@@ -1,0 +1,179 @@
+"""Builds a `Clip` from the contents of a file: finds legs, scale, up axis and frame rate.
+
+There are two ways in: `clip_from_recording` for motion files, whose units and axes must be guessed,
+and `clip_from_joints` for joint transforms that are in metres with y up already.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from . import contacts
+from .clip import Clip
+from .joint_roles import Roles, find_roles
+from .kinematics import continuous, local_from_world, world_from_local
+from .recording import INCH, Y_UP_FROM_Z_UP, Recording
+from .rigs import measure_rig
+
+RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
+RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": INCH, "ft": 12 * INCH, "ASF unit": INCH / 0.45}
+ADULT_LEG = 0.84  # m, thigh and shin
+PLAUSIBLE_RATIO = 1.5  # to an adult's leg; beyond it the guessed unit is called doubtful
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """What the caller knows better than the file; None leaves it to be read or guessed."""
+
+    scale: float | None = None  # metres per unit of the file
+    fps: float | None = None  # frames per second
+    up: str | None = None  # "y" or "z"
+    joints: Mapping[str, str] | None = None  # role to joint name, see `joint_roles.find_roles`
+
+    def __post_init__(self) -> None:
+        if self.up not in (None, "y", "z"):
+            raise ValueError(f"up is {self.up!r}; wanted 'y' or 'z'")
+        for name, value in (("scale", self.scale), ("fps", self.fps)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}; wanted a number above 0")
+
+
+def clip_from_recording(
+    recording: Recording, source: str, overrides: Overrides = Overrides()
+) -> Clip:
+    """The recording in metres with y up, with its legs recognised and measured.
+
+    Every guess is noted in the clip's `remarks`. Without recognised legs the clip has no rig.
+
+    Args:
+        recording: the contents of a motion file.
+        source: the file's name, for messages.
+        overrides: what must not be guessed.
+
+    Raises:
+        ValueError: `overrides.joints` names joints that do not exist.
+    """
+    remarks = list(recording.remarks)
+    roles: Roles | None = None
+    try:
+        roles = find_roles(recording.names, recording.parents, overrides.joints)
+    except ValueError as error:
+        if overrides.joints is not None:
+            raise ValueError(f"{source}: {error}") from None
+        remarks.append("no legs recognised; name them with joints=...")
+    scale = overrides.scale
+    if scale is None:
+        scale = recording.metres_per_unit or _guess_scale(recording, roles, remarks)
+    recording = recording.scaled(scale)
+    up = overrides.up or _guess_up(recording, roles, remarks)
+    if up == "z":
+        recording = recording.rotated(Y_UP_FROM_Z_UP)
+    rate = overrides.fps or _common_rate(recording.frame_time, remarks)
+    positions_ws, rotations_ws = world_from_local(
+        recording.parents, recording.positions_ls, recording.rotations_ls
+    )
+    rig = None
+    if roles is not None:
+        toes = [leg.joints[3] for leg in roles.legs]
+        stance = contacts.detect_stances(positions_ws[:, toes], rate)
+        for leg, stands in zip(roles.legs, stance.T, strict=True):
+            if not stands.any():
+                remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
+        rig = measure_rig(roles, positions_ws, rotations_ws, stance)
+    return Clip(
+        recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
+        float(rate), recording.frame_time, source, float(scale), up,
+        roles.dialect if roles else None, rig, remarks=tuple(remarks),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Joints in world space, metres, y up, with contact labels."""
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]  # -1 at the root; parents before children
+    positions_ws: Float64[np.ndarray, "frames joints 3"]  # m
+    rotations_ws: Float64[np.ndarray, "frames joints 4"]  # wxyz
+    stance: Bool[np.ndarray, "frames legs"]  # when each foot stands
+    fps: float
+
+
+def clip_from_joints(
+    motion: JointMotion, source: str, joints: Mapping[str, str] | None = None
+) -> Clip:
+    """A clip from joint transforms that need no conversion.
+
+    Args:
+        motion: joints and contact labels.
+        source: name of the clip.
+        joints: role to joint name, see `joint_roles.find_roles`; None recognises the names.
+    """
+    rotations_ws = continuous(motion.rotations_ws)
+    positions_ls, _ = local_from_world(motion.parents, motion.positions_ws, rotations_ws)
+    roles = find_roles(motion.names, motion.parents, joints)
+    rig = measure_rig(roles, motion.positions_ws, rotations_ws, motion.stance)
+    return Clip(
+        motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
+        rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
+        stance=motion.stance,
+    )  # fmt: skip
+
+
+def _common_rate(frame_time: float, remarks: list[str]) -> float:
+    """The common frame rate nearest to a frame time, or the exact rate if none is near."""
+    rate = 1.0 / frame_time
+    common = min(RATES, key=lambda candidate: abs(candidate - rate))
+    if abs(common - rate) > RATE_TOLERANCE * common:
+        remarks.append(f"the rate {rate:.6g} Hz is not a usual one and was kept")
+        return rate
+    if abs(common - rate) > 0.0005 * common:
+        remarks.append(f"the frame time {frame_time:g} s is {rate:.6g} Hz; taken as {common} Hz")
+    return float(common)
+
+
+def _leg_length(recording: Recording, roles: Roles | None) -> float:
+    """Thigh plus shin in file units; without legs, the longest chain from the root to a leaf."""
+    lengths = np.median(np.linalg.norm(recording.positions_ls, axis=-1), axis=0)
+    if roles is not None:
+        legs = [lengths[list(leg.joints[1:3])].sum() for leg in roles.legs]
+        return float(np.mean(legs))
+    reach = np.zeros(len(lengths))
+    for joint, parent in enumerate(recording.parents):
+        reach[joint] = 0.0 if parent < 0 else reach[parent] + lengths[joint]
+    return float(reach.max())
+
+
+def _guess_scale(recording: Recording, roles: Roles | None, remarks: list[str]) -> float:
+    """Metres per unit, from the unit that makes the legs most similar to an adult's."""
+    leg = _leg_length(recording, roles)
+    if leg == 0.0:
+        remarks.append("scale not recognised, as no bone has a length; taken as metres")
+        return 1.0
+    unit = min(UNITS, key=lambda name: abs(np.log(leg * UNITS[name] / ADULT_LEG)))
+    metres = leg * UNITS[unit]
+    plausible = 1 / PLAUSIBLE_RATIO < metres / ADULT_LEG < PLAUSIBLE_RATIO
+    doubt = "" if roles is not None and plausible else "; doubtful, give scale=..."
+    remarks.append(f"scale guessed: legs of {leg:.4g} units in {unit} are {metres:.3f} m{doubt}")
+    return UNITS[unit]
+
+
+def _guess_up(recording: Recording, roles: Roles | None, remarks: list[str]) -> str:
+    """The axis, y or z, along which the pelvis is above the ankles.
+
+    Without legs it is z if the skeleton is more than twice as long along z as along y.
+    """
+    positions, _ = world_from_local(
+        recording.parents, recording.positions_ls, recording.rotations_ls
+    )
+    if roles is None:
+        extent = np.median(np.ptp(positions, axis=1), axis=0)
+        return "z" if extent[2] > 2 * extent[1] else "y"
+    ankles = positions[:, [leg.joints[2] for leg in roles.legs]].mean(axis=1)
+    rise = np.median(positions[:, roles.pelvis] - ankles, axis=0)
+    if max(rise[1], rise[2]) < 0.5 * np.linalg.norm(rise):
+        remarks.append("the pelvis is not above the feet along y or z; give up=...")
+    return "z" if rise[2] > rise[1] else "y"
