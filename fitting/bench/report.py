@@ -1,183 +1,172 @@
-"""What `jaxik bench` tells: the machine, a line a figure, all of it as JSON, curves."""
+"""The report of `jaxik bench`: a table with a line for each figure, JSON, and curves."""
 
 import dataclasses
 import json
-import os
-import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import jax
+from jaxtyping import PyTree
 
 from fitting.report import formatting
 from fitting.report.plots import style
 from fitting.runtime import files
-from fitting.runtime.threads import usable_cores
 
-from . import plots
-from .measure import Figure, Report, Row, load, medians
-
-MEMORY = Path("/proc/meminfo")
-CPU = Path("/proc/cpuinfo")
-
-
-def hardware() -> dict[str, Any]:
-    """What the figures are measured on."""
-    device = jax.devices()[0]
-    return {
-        "cpu": _told(CPU, "model name") or platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": usable_cores(),
-        "memory_gb": _memory_gb(),
-        "device": f"{device.platform}: {device.device_kind}",
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
-    }
-
-
-def _memory_gb() -> float | None:
-    """All memory of the machine; None where the system does not tell."""
-    told = _told(MEMORY, "MemTotal")
-    return float(told.split()[0]) / 1e6 if told else None
-
-
-def _told(path: Path, key: str) -> str:
-    """What a file of the system says first under a key; nothing where there is no such file."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
+from . import scaling_plot
+from .host import hardware, load_average
+from .measurement import Figure, Measurement, medians
+from .runner import Report
 
 
 def to_json(report: Report) -> str:
-    """All of it: medians with their samples, s a call, and whether each figure is reached.
+    """Everything as JSON: figures, and for each call all samples, s, with their medians.
 
-    What is not a number is null.
+    Numbers that are not finite are null.
     """
-    whole = {
-        "machine": hardware() | {"load": [row.load for row in report.rows] + [load()]},
+    content = {
+        "machine": {**hardware(), "load": _loads(report)},
         "quick": report.quick,
         "interrupted": report.interrupted,
-        "rows": [_row(row) for row in report.rows],
+        "rows": [_numbers(measurement) for measurement in report.measurements],
     }
-    return json.dumps(_finite(whole), indent=1, allow_nan=False) + "\n"
+    return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
 
 
-def _row(row: Row) -> dict[str, Any]:
+def _loads(report: Report) -> list[float]:
+    """Load averages at the start of each benchmark, and now."""
+    return [measurement.load for measurement in report.measurements] + [load_average()]
+
+
+def _numbers(measurement: Measurement) -> dict[str, object]:
     plain = {
-        field.name: getattr(row, field.name)
-        for field in dataclasses.fields(row)
-        if field.name not in ("tell", "figures", "series", "work")
+        field.name: getattr(measurement, field.name)
+        for field in dataclasses.fields(measurement)
+        if field.name not in ("progress", "figures", "series", "work")
     }
     figures = [
-        dataclasses.asdict(one) | {"met": one.met, "closeness": one.closeness}
-        for one in row.figures
+        dataclasses.asdict(figure) | {"met": figure.met, "closeness": figure.closeness}
+        for figure in measurement.figures
     ]
     series = [
-        dataclasses.asdict(one) | {"slopes": {name: one.slope(name) for name in one.seconds}}
-        for one in row.series
+        dataclasses.asdict(curves)
+        | {"slopes": {name: curves.slope(name) for name in curves.seconds}}
+        for curves in measurement.series
     ]
-    work = {name: dataclasses.asdict(one) for name, one in row.work.items()}
-    more = {"figures": figures, "series": series, "work": work, "medians": medians(row.samples)}
-    return plain | more
+    work = {name: dataclasses.asdict(work) for name, work in measurement.work.items()}
+    return plain | {
+        "figures": figures,
+        "series": series,
+        "work": work,
+        "medians": medians(measurement.samples),
+    }
 
 
-def _finite(value: Any) -> Any:
-    """The same with None for what JSON has no number for."""
+def _finite(value: PyTree) -> PyTree:
+    """The same with None for numbers that are not finite, which JSON has no form for."""
     if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not abs(value) < float("inf") else value
 
 
 def text(report: Report) -> str:
-    """The machine, a table with a line a figure, compile times, notes."""
+    """The machine, a table with a line for each figure, compile times and notes."""
     machine = hardware()
-    loads = [row.load for row in report.rows] + [load()]
+    loads = _loads(report)
     memory = f"{machine['memory_gb']:.0f} GB, " if machine["memory_gb"] else ""
     lines = [
         f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, {memory}"
         f"{machine['device']}; JAX {machine['jax']}, Python {machine['python']}; "
         f"load average {min(loads):.1f} to {max(loads):.1f}",
-        "Medians of several runs; CPU: by the time of CPU, shared out over the threads that work; "
-        "limit: what memory, arithmetic or dispatch alone would allow, and the share reached.",
+        "Medians of several runs. CPU: by CPU time, divided by the number of threads that work. "
+        "Limit: what memory, arithmetic or dispatch alone would allow, and the fraction reached.",
     ]
     if report.quick:
         lines.append(
-            "Quick: smaller sizes, fewer runs and rows than the figures to be reached ask for."
+            "Quick: smaller sizes, fewer runs and fewer rows than the targets are meant for."
         )
     if report.interrupted:
-        lines.append("Interrupted: this is what was measured until then.")
+        lines.append("Interrupted: this is what was measured before.")
     compiled = [
-        f"{row.name}: " + ", ".join(f"{name} {took:.1f} s" for name, took in row.compile_s.items())
-        for row in report.rows
-        if row.compile_s
+        f"{measurement.name}: "
+        + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in measurement.compile_s.items())
+        for measurement in report.measurements
+        if measurement.compile_s
     ]
     notes = [
-        f"{row.name}: {note}"
-        for row in report.rows
-        for note in (*_notes(row.figures), *row.notes, *row.failures)
+        f"{measurement.name}: {note}"
+        for measurement in report.measurements
+        for note in (*_notes(measurement.figures), *measurement.notes, *measurement.failures)
     ]
     parts = ["\n".join(lines), formatting.aligned(table(report))]
     if compiled:
-        parts.append("Compile time, which is in no figure but cold ones\n" + "\n".join(compiled))
+        parts.append("Compile time, which counts in cold figures only\n" + "\n".join(compiled))
     if notes:
         parts.append("Notes\n" + "\n".join(notes))
     return "\n\n".join(parts)
 
 
 def table(report: Report) -> formatting.Table:
-    """A line a figure."""
-    made = [["row", "what", "measured", "runs", "CPU", "to reach", "met", "limit", "share"]]
-    for row in report.rows:
-        for one in row.figures:
-            met = {True: "yes", False: "no", None: ""}[one.met]
-            runs = formatting.interval(*(_short(end) for end in one.spread)) if one.spread else ""
-            busy = "" if one.busy is None else formatting.number(one.busy)
-            limit = "" if one.limit is None else f"{_short(one.limit):g}, {one.bound}"
-            close = "" if one.closeness is None else formatting.percent(one.closeness)
-            measured = f"{formatting.number(one.value)} {one.unit}".rstrip()
-            made.append([row.name, one.what, measured, runs, busy, one.reach, met, limit, close])
-    return made
+    """A row for each figure."""
+    rows = [["row", "what", "measured", "runs", "CPU", "target", "met", "limit", "reached"]]
+    for measurement in report.measurements:
+        for figure in measurement.figures:
+            met = {True: "yes", False: "no", None: ""}[figure.met]
+            runs = (
+                formatting.interval(*(_short(end) for end in figure.spread))
+                if figure.spread
+                else ""
+            )
+            busy = "" if figure.busy is None else formatting.number(figure.busy)
+            limit = "" if figure.limit is None else f"{_short(figure.limit):g}, {figure.bound}"
+            closeness = "" if figure.closeness is None else formatting.percent(figure.closeness)
+            value = f"{formatting.number(figure.value)} {figure.unit}".rstrip()
+            cells = [figure.what, value, runs, busy, figure.target, met, limit, closeness]
+            rows.append([measurement.name, *cells])
+    return rows
 
 
 def _notes(figures: Sequence[Figure]) -> list[str]:
-    return [f"{one.what}: {one.note}" for one in figures if one.note]
+    return [f"{figure.what}: {figure.note}" for figure in figures if figure.note]
 
 
 def _short(value: float) -> float:
-    """Three digits."""
+    """A number with three significant digits."""
     return float(f"{value:.3g}")
 
 
-def check_places(numbers: Path | None, plot: Path | None) -> Path | None:
-    """Where the curves are drawn: at `plot`, else beside the numbers, else nowhere.
+def check_output_files(numbers: Path | None, plot: Path | None) -> Path | None:
+    """The file for the curves: `plot`, or else one beside the numbers, or None.
 
     Raises:
-        ValueError: where nothing can be written, or a plot that is not to be a PNG.
+        ValueError: if a file cannot be written, or the plot is not a PNG.
     """
-    drawn = numbers.with_suffix(".png") if plot is None and numbers is not None else plot
+    curves = numbers.with_suffix(".png") if plot is None and numbers is not None else plot
     if plot is not None and plot.suffix.lower() != ".png":
         raise ValueError(f"{plot}: wanted a name that ends in .png")
-    if numbers is not None and numbers == drawn:
+    if numbers is not None and numbers == curves:
         raise ValueError(f"{numbers}: the numbers and the curves cannot be one file")
-    for place in (numbers, drawn):
-        if place is not None:
-            files.check_output_file(place)
-    return drawn
+    for path in (numbers, curves):
+        if path is not None:
+            files.check_output_file(path)
+    return curves
 
 
-def write(report: Report, numbers: Path | None, drawn: Path | None) -> list[Path]:
-    """Writes the numbers and the curves; the files that were written."""
+def write(report: Report, numbers: Path | None, curves: Path | None) -> list[Path]:
+    """Writes the numbers and the curves; returns the files that were written."""
     written = []
     if numbers is not None:
         files.write_text(numbers, to_json(report))
         written.append(numbers)
-    series = [one for row in report.rows for one in row.series if one.sizes]
-    if drawn is not None and series:
+    series = [
+        one_size
+        for measurement in report.measurements
+        for one_size in measurement.series
+        if one_size.sizes
+    ]
+    if curves is not None and series:
         machine = hardware()
         title = f"{machine['cpu']}, {machine['threads']} threads"
-        style.save(drawn, plots.curves(series, title))
-        written.append(drawn)
+        style.save(curves, scaling_plot.curves(series, title))
+        written.append(curves)
     return written

@@ -11,7 +11,7 @@ from jax import lax
 from jax.extend.core import jaxprs_in_params
 
 import jaxik
-from fitting.bench import setup
+from fitting.bench import workloads
 from jaxik import Smooth, lanes, presets
 from jaxik.maths import quat, vec
 from jaxik.world.terrain import plane
@@ -287,14 +287,14 @@ def test_a_batched_result_needs_an_output_axis():
     ("preset", "ground", "gate"),
     [
         ("record", "mesh", jaxik.HARD),
-        ("mec", "plane", setup.single(Smooth(0.1))),
+        ("mec", "plane", workloads.single(Smooth(0.1))),
     ],
 )
 def test_a_crowd_moves_as_its_members_do_alone(preset, ground, gate):
-    crowd = dataclasses.replace(setup.crowd(3, 8), drawn={})
-    flat = setup.single(plane(normal=(0.1, 1.0, 0.05)))
-    terrain = flat if ground == "plane" else setup.ground(setup.field(30))
-    ik = setup.single(getattr(presets, preset)())
+    crowd = dataclasses.replace(workloads.crowd(3, 8), drawn={})
+    flat = workloads.single(plane(normal=(0.1, 1.0, 0.05)))
+    terrain = flat if ground == "plane" else workloads.ground(workloads.mesh_field(30))
+    ik = workloads.single(getattr(presets, preset)())
 
     def run(row):
         return jaxik.run(ik, crowd.rig, terrain, crowd.member(row)[1], gate, block=4)

@@ -247,14 +247,14 @@ def test_a_fit_in_another_process_traces_nothing_large(tmp_path):
 import sys, jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", sys.argv[1])
-from fitting.bench import setup
+from fitting.bench import workloads
 from fitting.runtime import program_cache
 from fitting.inference.optimisation.levenberg_marquardt import evaluate
 from fitting.inference.optimisation.models import HardModel
 traced = []
 real = program_cache._trace
 program_cache._trace = lambda *args: traced.append(args[0].__name__) or real(*args)
-problem = setup.problem(60)
+problem = workloads.problem(60)
 at = evaluate(HardModel(problem, problem.space.u0), problem.space.u0)
 print(float(at.cost), *traced)
 """

@@ -1,0 +1,1 @@
+"""The benchmarks: functions that get a `Measurement` and the `Sizes`, and fill the measurement."""

@@ -1,0 +1,149 @@
+"""Benchmarks of fits: the Jacobian, a warm and a cold fit, and the posterior, in 64 bits."""
+
+import dataclasses
+import itertools
+import statistics
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.bench import workloads
+from fitting.bench.measurement import Call, FigureSpec, Measurement
+from fitting.bench.sizes import Sizes
+from fitting.inference.optimisation.search import find_best_fit
+from fitting.inference.optimisation.solution import Solution
+from fitting.inference.sampling.posterior import WalkerStart, sample_posterior
+from fitting.inference.sampling.settings import SamplerSettings
+from fitting.problem.problem import Problem
+from fitting.runtime.threads import usable_cores
+
+from . import baselines, cold_fit
+
+SCIPY = {"SciPy with our slopes": True, "SciPy with differences": False}  # our Jacobian or not
+FULL_POSTERIOR = 64 * 1000  # log-probabilities for which there is a target; fewer have none
+
+
+def _residuals(problem: Problem, u: jax.Array) -> jax.Array:
+    return problem.residuals(u)
+
+
+def residuals_and_jacobian(problem: Problem, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The residuals of a problem and their Jacobian."""
+    return problem.residuals_and_jacobian(u)
+
+
+def jacobian(measurement: Measurement, sizes: Sizes) -> None:
+    """Residuals and their Jacobian for twenty parameters, against the residuals alone."""
+    problem64 = workloads.problem(sizes.frames)
+    calls = {}
+    for floats in sizes.floats:
+        problem = problem64 if floats == "float64" else workloads.single(problem64)
+        u = problem.space.u0
+        rows, slopes = f"rows, {floats}", f"slopes, {floats}"
+        calls[rows] = measurement.compile_call(rows, _residuals, problem, u)
+        calls[slopes] = measurement.compile_call(slopes, residuals_and_jacobian, problem, u)
+    measurement.time_in_turns(calls)
+    for floats in sizes.floats:
+        rows, slopes = f"rows, {floats}", f"slopes, {floats}"
+        spec = FigureSpec(what=rows, unit="ms", scale=1e3, floats=floats)
+        measurement.add_timing(rows, spec)
+        what = f"rows and slopes, {floats}"
+        measurement.add_timing(slopes, dataclasses.replace(spec, what=what, at_most=25.0))
+        operations = measurement.work[slopes].operations / measurement.work[rows].operations
+        note = f"by operations {operations:.1f} times"
+        ratio = FigureSpec(what=f"in evaluations, {floats}", at_most=8.0, note=note)
+        measurement.add_ratio(slopes, rows, ratio)
+
+
+def fit(measurement: Measurement, sizes: Sizes) -> None:
+    """The whole search for twenty parameters: warm, cold, and SciPy's."""
+    problem = workloads.problem(sizes.frames)
+    solutions: list[Solution] = []
+    descents: dict[str, baselines.Descent] = {}
+
+    def ours() -> None:
+        solution = find_best_fit(
+            problem, progress=lambda now: measurement.progress(f"fit: {now.stage}")
+        )
+        if solution.interrupted:  # the search keeps Ctrl-C to itself; half a run is no figure
+            raise KeyboardInterrupt
+        solutions.append(solution)
+
+    def scipy(name: str) -> Call:
+        descend = baselines.least_squares_with_scipy(problem, our_jacobian=SCIPY[name])
+        return lambda: descents.update({name: descend()})
+
+    u0 = problem.space.u0
+    measurement.compile("rows and slopes", residuals_and_jacobian, problem, u0)
+    calls: dict[str, Call] = {"ours": ours}
+    calls |= {name: scipy(name) for name in list(SCIPY)[: 2 if sizes.cold else 1]}
+    measurement.time_in_turns(calls, sizes.fits)
+    solution = solutions[-1]
+    measurement.work["ours"] = measurement.work["rows and slopes"] * solution.steps
+    note = f"{solution.steps} steps, of which the limit is; cost reached {solution.cost:.1f}"
+    measurement.add_timing("ours", FigureSpec(what="warm", unit="s", at_most=2.0, note=note))
+    measurement.notes.append(f"seconds by stage: {_stages(solution)}; {solution.message}")
+    for name, descent in descents.items():
+        measurement.add_ratio(name, "ours", FigureSpec(what=f"{name}: its time in ours"))
+        counts = f"{descent.evaluations} evaluations and {descent.jacobians} Jacobians"
+        note = f"cost {descent.cost:.1f}; {counts}"
+        measurement.add_timing(name, FigureSpec(what=name, unit="s", note=note))
+    if not sizes.cold:
+        measurement.notes.append("cold fits, and SciPy with differences, are left out")
+        return
+    cold_fit.sample(measurement, sizes)
+    for cache, target in (("empty", 20.0), ("persistent", 5.0)):
+        search = statistics.median(measurement.samples[f"its search, {cache} cache"])
+        note = f"a process of its own, imports and clip included; the search in it {search:.1f} s"
+        name = f"cold, {cache} cache"
+        measurement.add_timing(name, FigureSpec(what=name, unit="s", at_most=target, note=note))
+
+
+def _stages(solution: Solution) -> str:
+    """Seconds that a fit spent in each stage, from its progress reports."""
+    seconds: dict[str, float] = {}
+    for before, after in itertools.pairwise(solution.history):
+        seconds[after.stage] = seconds.get(after.stage, 0.0) + after.seconds - before.seconds
+    return ", ".join(f"{stage} {spent:.2f}" for stage, spent in seconds.items())
+
+
+def posterior(measurement: Measurement, sizes: Sizes) -> None:
+    """The sampler around the best fit, for a fixed number of steps."""
+    problem = workloads.problem(sizes.frames)
+    centre = np.asarray(problem.space.pack(workloads.TRUTH))
+    slopes = np.asarray(jax.jit(residuals_and_jacobian)(problem, jnp.asarray(centre))[1])
+    sd = np.clip(np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))), 1e-3, 0.5)
+
+    def sample(steps: int) -> None:
+        sampled = sample_posterior(
+            problem, WalkerStart(centre, sd),
+            SamplerSettings(walkers=sizes.walkers, max_steps=steps, stop_at=1e9),
+            progress=lambda now: measurement.progress(
+                f"posterior: step {now.step} of {now.max_steps}"
+            ),
+        )  # fmt: skip
+        if sampled.interrupted:
+            raise KeyboardInterrupt
+
+    start = time.perf_counter()
+    sample(1)
+    measurement.compile_s["log-probability, and one step"] = time.perf_counter() - start
+    measurement.compile("rows", _residuals, problem, problem.space.u0)
+    calls = {"chain": lambda: sample(sizes.steps)}
+    measurement.time_in_turns(calls, sizes.chains, warm_up=False)
+    evaluations = sizes.steps * sizes.walkers
+    work = measurement.work["rows"]  # all walkers of a step read the clip once
+    measurement.work["chain"] = dataclasses.replace(
+        work * evaluations, moved=work.moved * sizes.steps
+    )
+    milliseconds, cores = 1e3 * measurement.samples["chain"][0] / evaluations, usable_cores()
+    measurement.add_timing(
+        "chain",
+        FigureSpec(
+            what=f"{sizes.walkers} walkers, {sizes.steps} steps", unit="s", threads=cores,
+            at_most=60.0 if evaluations >= FULL_POSTERIOR else None,
+            note=f"{milliseconds:.2f} ms a log-probability; {cores} cores",
+        ),
+    )  # fmt: skip

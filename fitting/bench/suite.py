@@ -1,0 +1,52 @@
+"""All benchmarks of `jaxik bench`, in the order of the table."""
+
+from collections.abc import Mapping
+
+from .benchmarks import ceilings, crowd, inference, kernels, scaling
+from .runner import Benchmark
+
+CEILINGS = "machine"  # the benchmark of the machine's limits, with which the others are compared
+BENCHMARKS = {
+    CEILINGS: Benchmark("memory, arithmetic and dispatch at their best", "", ceilings.machine),
+    "start": Benchmark("import of jaxik", "", ceilings.start),
+    "legs": Benchmark("two-bone legs, corrections out", "float32", kernels.legs),
+    "feet": Benchmark("feet: two-bone, ankle, updated transforms", "float32", kernels.feet),
+    "step": Benchmark("one frame of one character, dispatch included", "float32", kernels.step),
+    "rays": Benchmark("rays against Embree", "float32", kernels.rays),
+    "crowd": Benchmark("the record pipeline for a crowd", "float32", crowd.crowd),
+    "gradient": Benchmark("its gradient, in reverse", "float32", crowd.gradient),
+    "jacobian": Benchmark(
+        "residuals of twenty parameters and their slopes", "", inference.jacobian, x64=True
+    ),
+    "fit": Benchmark(
+        "a fit of twenty parameters to a clip of 10 s", "float64", inference.fit,
+        x64=True, long=True,
+    ),
+    "posterior": Benchmark("the posterior of that fit", "float64", inference.posterior, x64=True),
+    "scaling": Benchmark("time against sizes", "float32", scaling.scaling, long=True),
+}  # fmt: skip
+
+
+def choose(
+    benchmarks: Mapping[str, Benchmark], only: str | None, quick: bool = False
+) -> dict[str, Benchmark]:
+    """The benchmarks of these names, and always that of the ceilings, in the order of the table.
+
+    Args:
+        benchmarks: to choose from.
+        only: names with commas between them; None for all.
+        quick: whether None leaves the long ones out.
+
+    Raises:
+        ValueError: for an unknown name, or no name.
+    """
+    if only is None:
+        return {
+            name: benchmarks[name] for name in benchmarks if not (quick and benchmarks[name].long)
+        }
+    names = [name.strip() for name in only.split(",") if name.strip()]
+    if unknown := [name for name in names if name not in benchmarks]:
+        raise ValueError(f"--only: no rows named {unknown}; there are {list(benchmarks)}")
+    if not names:
+        raise ValueError(f"--only: wanted names of rows; there are {list(benchmarks)}")
+    return {name: benchmarks[name] for name in benchmarks if name in names or name == CEILINGS}

@@ -1,0 +1,288 @@
+"""What the benchmarks run on: a walk, terrains, a batch of legs, a crowd, a fit."""
+
+import dataclasses
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+import jaxik
+from fitting.datasets import clip_frames
+from fitting.datasets.clips.clip import Clip
+from fitting.datasets.synthetic import terrain_meshes, walker
+from fitting.datasets.synthetic.speed_profile import Slide, Slip
+from fitting.datasets.terrain import meshes
+from fitting.experiments.problems import ClipData, make_scene
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.space import make_space
+from jaxik.maths import parameter_tree, quat
+from jaxik.world import terrain
+from jaxik.world.frame import Sensed
+
+Tree = TypeVar("Tree", bound=PyTree)
+
+FPS, SEED = 60.0, 2
+EXTENT = 64.0  # m, side of the mesh field
+POSITION_NOISE, ROTATION_NOISE = 0.002, 0.0087  # m, rad
+SIGMAS = {"ankle": 0.002, "knee": 0.002, "pelvis": 0.002, "foot": 0.0087, "body": 0.0087}
+# Twenty smooth parameters, with the values that made the clip to be fitted.
+TRUTH = {
+    "target.rise_half_life": 0.04, "target.fall_half_life": 0.07,
+    "lean.forward_rate": -0.55, "lean.side_rate": 0.25,
+    "lean.forward_rate_slide": 0.55, "lean.side_rate_slide": 0.85,
+    "lean.gain": 0.12, "lean.gain_slide": 0.15,
+    "lean.slide_on_gain": 0.08, "lean.slide_off_gain": 0.07,
+    "lock.lock_half_life": 0.025, "lock.unlock_half_life": 0.06,
+    "pelvis.limit": 0.22, "pelvis.on_gain": 0.15,
+    "leg.max_knee_angle": 2.85, "leg.soften": 0.96,
+    "foot.max_pitch": 0.26, "foot.min_pitch": -0.3,
+    "foot.max_roll": 0.12, "foot.min_roll": -0.2,
+}  # fmt: skip
+# Parameters that differ within a crowd, and the ranges from which they are drawn.
+DRAWN = {
+    "pelvis.on_gain": (0.05, 0.5),
+    "pelvis.limit": (0.1, 0.35),
+    "lean.forward_rate": (-0.8, 0.4),
+    "target.rise_half_life": (0.005, 0.12),
+    "target.fall_half_life": (0.005, 0.12),
+    "lock.release_distance": (0.0, 0.3),
+    "contact.planted_height": (0.09, 0.14),
+}
+
+
+def single(tree: Tree) -> Tree:
+    """The tree with its floats in 32 bits."""
+    return jax.tree.map(
+        lambda leaf: (
+            jnp.asarray(leaf, jnp.float32)
+            if eqx.is_array_like(leaf) and jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+            else leaf
+        ),
+        tree,
+    )
+
+
+def walk(frame_count: int, *, uneven_pace: bool = False) -> Clip:
+    """A synthetic walk; with an uneven pace its feet slip and the character slides."""
+    seconds = frame_count / FPS
+    if not uneven_pace:
+        return walker.walk(seconds, FPS, SEED)
+    events = (
+        Slip(0.06 * seconds, 0.4 * seconds, 0.06),
+        Slip(0.5 * seconds, 0.74 * seconds, -0.06),
+        Slide(0.78 * seconds, 0.92 * seconds),
+    )
+    return walker.walk(seconds, FPS, SEED, events)
+
+
+def mesh_field(cells: int, seed: int = 0) -> meshes.Mesh:
+    """A square of hills and rubble, EXTENT a side: 2 cells² triangles of about one size."""
+    random = np.random.default_rng(seed)
+    pitch = EXTENT / cells
+    lines = np.arange(cells + 1) * pitch
+    x, z = np.meshgrid(lines, lines, indexing="ij")
+    y = 0.15 * np.sin(x) + random.normal(0.0, min(0.03, 0.1 * pitch), x.shape)
+    x = x + random.uniform(-0.2, 0.2, x.shape) * pitch
+    z = z + random.uniform(-0.2, 0.2, z.shape) * pitch
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    a, b, c, d = corner, corner + 1, corner + cells + 1, corner + cells + 2
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)])
+    return meshes.Mesh(np.stack([x, y, z], -1).reshape(-1, 3), faces.astype(np.int64))
+
+
+def ground(mesh: meshes.Mesh) -> terrain.Terrain:
+    """The terrain of a mesh, in 32 bits."""
+    return terrain.mesh(np.asarray(mesh.vertices, np.float32), mesh.faces)
+
+
+def ray_origins(count: int, seed: int = 1) -> Float[np.ndarray, "rays 3"]:
+    """Random points above the mesh field, m."""
+    origins = np.random.default_rng(seed).uniform(0.0, EXTENT, (count, 3))
+    origins[:, 1] = 5.0
+    return origins.astype(np.float32)
+
+
+def tiled(motion: jaxik.Frame, count: int) -> jaxik.Frame:
+    """The first `count` frames of an endless repetition."""
+    return jax.tree.map(lambda leaf: leaf[jnp.arange(count) % leaf.shape[0]], motion)
+
+
+def with_legs(rig: jaxik.Rig, motion: jaxik.Frame, legs: int) -> tuple[jaxik.Rig, jaxik.Frame]:
+    """The same character with its two legs repeated until there are `legs`."""
+    source = np.arange(legs) % len(rig.side)
+
+    def repeated(tree: Tree, axis: int) -> Tree:
+        return jax.tree.map(lambda leaf: jnp.take(jnp.asarray(leaf), source, axis=axis), tree)
+
+    many_rig = dataclasses.replace(
+        repeated(rig, 0),
+        names=tuple(f"{rig.names[i]} {n}" for n, i in enumerate(source)),
+        joints=tuple(rig.joints[i] for i in source),
+    )
+    # Only the axis of legs has length two: positions have three components, rotations four.
+    many_motion = jax.tree.map(
+        lambda leaf: repeated(leaf, 1) if leaf.shape[1:2] == (len(rig.side),) else leaf, motion
+    )
+    return many_rig, many_motion
+
+
+class LegBatch(eqx.Module):
+    """Legs after the sensing stages, on one axis, as the leg and foot rules read them."""
+
+    ik: jaxik.FootIK
+    rig: jaxik.Rig
+    frame: jaxik.Frame  # what belongs to a character is repeated for each of its legs
+    sensed: Sensed
+    target_ms: Float[Array, "legs 3"]  # m, of the ankles
+
+    @property
+    def count(self) -> int:
+        """How many legs there are."""
+        return len(self.target_ms)
+
+    @property
+    def lanes(self) -> tuple:
+        """Everything but the system, with the legs on the last axis, for `jaxik.lanes`."""
+        parts = (self.rig, self.frame, self.sensed, self.target_ms)
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[None], parts)
+
+
+@jax.jit
+def _sensed(
+    ik: jaxik.FootIK, rig: jaxik.Rig, ground: terrain.Terrain, motion: jaxik.Frame
+) -> Sensed:
+    trace = jaxik.run(ik, rig, ground, motion).trace
+    assert trace is not None  # `run` always returns it
+    return trace.sensed
+
+
+def leg_batch(legs: int) -> LegBatch:
+    """Legs on a tilted plane, two to a character, each with its own ankle target."""
+    clip = walk(600)
+    rig = single(clip.rig)
+    motion = single(tiled(clip_frames.frames_from_clip(clip), max(legs // 2, 1)))
+    ik = single(jaxik.presets.record())
+    tilted = single(terrain.plane(normal=(0.1, 1.0, 0.05)))
+    sensed = _sensed(ik, rig, tilted, motion)
+    offset = np.random.default_rng(0).uniform(-0.06, 0.06, motion.pose.ankle.pos.shape)
+    target = motion.pose.ankle.pos + jnp.asarray(offset, jnp.float32)
+    rigs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(target), *leaf.shape)), rig)
+    return jax.block_until_ready(LegBatch(ik, *_by_leg((rigs, motion, sensed, target))))
+
+
+def _by_leg(tree: Tree) -> Tree:
+    """Leaves (frames, 2 legs, ...) and (frames, ...) as (legs, ...)."""
+
+    def flat(leaf: Array) -> Array:
+        per_leg = leaf if leaf.shape[1:2] == (2,) else jnp.repeat(leaf[:, None], 2, axis=1)
+        return per_leg.reshape(-1, *per_leg.shape[2:])
+
+    return jax.tree.map(flat, tree)
+
+
+class Member(NamedTuple):
+    """What is different about one character of a crowd, or about several."""
+
+    drawn: dict[str, Float[Array, "*characters"]]  # parameters by name
+    place_ws: Float[Array, "*characters 3"]  # m, of the first frame
+    first: Int[Array, "*characters"]  # frame of the crowd's `motion` with which it starts
+
+
+class Crowd(eqx.Module):
+    """Characters with different parameters, places and starting frames, in one shared clip."""
+
+    ik: jaxik.FootIK  # shared, except for the parameters in `drawn`
+    rig: jaxik.Rig
+    motion: jaxik.Frame  # twice as long as each character needs
+    drawn: dict[str, Float[Array, " characters"]]
+    place_ws: Float[Array, "characters 3"]  # m, of the first frame
+    first: Int[Array, " characters"]  # frame of `motion` with which each starts
+    frame_count: int = eqx.field(static=True)  # of each
+
+    def character(self, member: Member) -> tuple[jaxik.FootIK, jaxik.Frame]:
+        """The system and the frames of one character."""
+        drawn, place_ws, first = member
+        frames = jax.tree.map(
+            lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, self.frame_count), self.motion
+        )
+        world = frames.world_from_model
+        moved = world.pos + (place_ws - world.pos[0]) * jnp.array([1.0, 0.0, 1.0], place_ws.dtype)
+        return parameter_tree.replace(self.ik, drawn), eqx.tree_at(
+            lambda frame: frame.world_from_model.pos, frames, moved
+        )
+
+    @property
+    def members(self) -> Member:
+        """All characters, on the first axis."""
+        return Member(self.drawn, self.place_ws, self.first)
+
+
+def crowd(characters: int, frame_count: int, seed: int = 0) -> Crowd:
+    """Characters that walk on the mesh field for so many frames each."""
+    random = np.random.default_rng(seed)
+    clip = walk(2 * frame_count)
+    drawn = {
+        name: jnp.asarray(random.uniform(low, high, characters))
+        for name, (low, high) in DRAWN.items()
+    }
+    place = random.uniform([4.0, 0.0, 2.0], [EXTENT - 4.0, 0.0, EXTENT - 20.0], (characters, 3))
+    return Crowd(
+        single(jaxik.presets.record()),
+        single(clip.rig),
+        single(clip_frames.frames_from_clip(clip)),
+        single(drawn),
+        jnp.asarray(place, jnp.float32),
+        jnp.asarray(random.integers(0, frame_count, characters), jnp.int32),
+        frame_count,
+    )
+
+
+def parameter_names(count: int) -> tuple[str, ...]:
+    """Names of parameters to fit: those of `TRUTH`, then others, the smooth ones first."""
+    declared = parameter_tree.declarations(jaxik.presets.record())
+    others = [name for name in declared if name not in TRUTH and name != "probe.toe_ls"]
+    others.sort(key=lambda name: declared[name].kind)
+    return (*TRUTH, *others, "probe.toe_ls[2]")[:count]
+
+
+def recording(frame_count: int) -> tuple[Clip, Clip, meshes.Mesh]:
+    """A clip that known parameters made, plus noise; its flat animation; and its ground."""
+    random = np.random.default_rng(SEED)
+    base, mesh = walk(frame_count, uneven_pace=True), terrain_meshes.uneven_walk()
+    truth = parameter_tree.replace(jaxik.presets.record(), TRUTH)
+    uneven = terrain.mesh(mesh.vertices, mesh.faces)
+    solved = clip_frames.clip_from_result(
+        base, jaxik.run(truth, base.rig, uneven, clip_frames.frames_from_clip(base))
+    )
+    reference = solved.with_motion(
+        solved.positions_ws + random.normal(0.0, POSITION_NOISE, solved.positions_ws.shape),
+        _with_noise(solved.rotations_ws, random),
+    )
+    return reference, base, mesh
+
+
+def problem_from_clip(clip: ClipData, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
+    """The fit of these parameters to a recording."""
+    ik = jaxik.presets.record()
+    space = make_space(ik, [free_parameter(ik, name) for name in names])
+    return Problem(space, (make_scene(clip, SIGMAS),), residuals_of_scenes)
+
+
+def problem(frame_count: int, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
+    """The fit of these parameters to a recording of so many frames."""
+    reference, base, mesh = recording(frame_count)
+    ground = terrain.mesh(mesh.vertices, mesh.faces)
+    return problem_from_clip(ClipData(reference, base, ground), names)
+
+
+def _with_noise(wxyz: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Rotations with noise, which is that of their quaternions as long as angles are small."""
+    noise = random.normal(0.0, ROTATION_NOISE / 2, (*wxyz.shape[:-1], 3))
+    small = np.concatenate([np.ones((*noise.shape[:-1], 1)), noise], axis=-1)
+    noisy = np.asarray(quat.multiply(jnp.asarray(small), jnp.asarray(wxyz)))
+    return noisy / np.linalg.norm(noisy, axis=-1, keepdims=True)
