@@ -1,4 +1,4 @@
-"""Stage 1: how far each foot of the animation stands."""
+"""Stage 1: which feet of the animation stand."""
 
 from abc import abstractmethod
 
@@ -13,12 +13,12 @@ from jaxik.world.skeleton import Rig
 
 from .inputs import Inputs, Moment
 
-HEIGHT_BAND = 0.01  # m over which a softened height decision turns
-SPEED_BAND = 0.05  # m/s, likewise
+HEIGHT_BAND = 0.01  # m, width of softened height decisions
+SPEED_BAND = 0.05  # m/s, width of softened speed decisions
 
 
 class AbstractContact(Rule):
-    """Reads contact from the animation."""
+    """Decides from the animation which feet stand."""
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:
@@ -26,15 +26,15 @@ class AbstractContact(Rule):
 
     @abstractmethod
     def sense(self, inputs: Inputs) -> Contact:
-        """Lift and contact of each foot as this frame alone shows them."""
+        """Lift and contact of each foot from this frame alone."""
 
     @abstractmethod
     def advance(self, now: Moment, contact: Contact, state: PyTree) -> tuple[PyTree, Contact]:
-        """Memory after this frame, and the contact with it."""
+        """Memory after this frame, and the contact that it and `contact` give."""
 
 
 class AbstractInstantContact(AbstractContact):
-    """Reads contact from the present frame alone."""
+    """Contact without memory: `sense` decides."""
 
     def init(self, rig: Rig) -> None:
         return None
@@ -44,7 +44,7 @@ class AbstractInstantContact(AbstractContact):
 
 
 class HeightContact(AbstractInstantContact):
-    """By the ankle's height: 1 below `planted_height`, 0 above `raised_height`, linear between."""
+    """Contact by ankle height: 1 up to `planted_height`, 0 from `raised_height`, linear between."""
 
     ground_height: Leaf = parameter(
         0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
@@ -73,14 +73,14 @@ class HeightContact(AbstractInstantContact):
         planted = gate.below(lift, self.planted_height, band=HEIGHT_BAND)
         lifted = gate.above(lift, self.raised_height, band=HEIGHT_BAND)
         span = self.raised_height - self.planted_height
-        share = vec.safe_divide(self.raised_height - lift, span)
+        fraction = vec.safe_divide(self.raised_height - lift, span)
         zero, one = jnp.zeros_like(lift), jnp.ones_like(lift)
-        ramp = gate.clip(share, zero, one, band=0.1)
+        ramp = gate.clip(fraction, zero, one, band=0.1)
         return Contact(lift, jnp.where(span > 0, ramp, planted), planted, lifted)
 
 
 class StandingContact(AbstractInstantContact):
-    """Every foot always stands: where there is ground, foot IK works (ozz and Mec)."""
+    """All feet always stand, so that foot IK works wherever there is ground (ozz, Mec)."""
 
     def sense(self, inputs: Inputs) -> Contact:
         lift = inputs.frame.pose.ankle.pos[..., 1]
@@ -89,7 +89,7 @@ class StandingContact(AbstractInstantContact):
 
 
 class IdleContact(AbstractInstantContact):
-    """All feet stand while the character does, none while it moves (Unreal, seed 001)."""
+    """All feet stand while the character stands still, none while it moves (Unreal)."""
 
     idle_speed: Leaf = parameter(
         0.0,
@@ -108,7 +108,7 @@ class IdleContact(AbstractInstantContact):
 
 
 class LabelContact(AbstractInstantContact):
-    """As the animation is labelled (`Stride.standing`): what its author or a capture says."""
+    """Contact from the labels that come with the animation (`Stride.standing`)."""
 
     ground_height: Leaf = parameter(
         0.0, unit="m", low=-0.5, high=0.5, doc="Height of the animation's floor in model space."
@@ -122,19 +122,20 @@ class LabelContact(AbstractInstantContact):
 
 @struct
 class SpeedState:
-    """Which feet stand."""
+    """Contact after a frame."""
 
     standing: Float[Array, " legs"]  # 0 or 1
-    weight: Float[Array, " legs"]  # 0..1, follows it
+    weight: Float[Array, " legs"]  # 0..1, smoothed `standing`
 
 
 class SpeedContact(AbstractContact):
-    """By speed and height of the ball, with hysteresis.
+    """Contact by height and speed of the ball of the foot, with hysteresis.
 
-    A foot begins to stand once its ball is both low and slow, and stops once it is either high or
-    fast, by thresholds of their own: a foot on the border does not flicker. Gait labs find contact
-    so (foot velocity algorithms; O'Connor et al. 2007 take the foot's centre). A standing foot's
-    ball is slower than 0.25 m/s, a swinging one's hardly ever.
+    A foot starts to stand when its ball is both low and slow. It stops when its ball is either high
+    or fast, by larger thresholds, so that a foot near a threshold does not flicker. Gait
+    laboratories detect contact in this way (foot velocity algorithm, O'Connor et al. 2007, there
+    with the centre of the foot). The ball of a standing foot is slower than 0.25 m/s; that of a
+    swinging foot rarely is.
     """
 
     ground_height: Leaf = parameter(
@@ -188,10 +189,10 @@ class SpeedContact(AbstractContact):
         height, speed = frame.pose.toe.pos[..., 1] - self.ground_height, frame.toe_speed
         low = gate.below(height, self.planted_height, band=HEIGHT_BAND)
         slow = gate.below(speed, self.planted_speed, band=SPEED_BAND)
-        lowish = gate.below(height, self.raised_height, band=HEIGHT_BAND)
-        slowish = gate.below(speed, self.raised_speed, band=SPEED_BAND)
+        not_raised = gate.below(height, self.raised_height, band=HEIGHT_BAND)
+        not_fast = gate.below(speed, self.raised_speed, band=SPEED_BAND)
         planted = low * slow
-        return Contact(lift, planted, planted, 1.0 - lowish * slowish)
+        return Contact(lift, planted, planted, 1.0 - not_raised * not_fast)
 
     def advance(
         self, now: Moment, contact: Contact, state: SpeedState

@@ -1,4 +1,4 @@
-"""Stage 3: rays that look for ground under each foot."""
+"""Stage 3: rays that find the ground under each foot."""
 
 import dataclasses
 from abc import abstractmethod
@@ -19,19 +19,19 @@ from .inputs import Inputs
 
 HEIGHT_BAND = 0.01  # m
 SPEED_BAND = 0.05  # m/s
-MARGIN = 0.1  # m by which a ray is cast beyond its reach, so that a softened end has two sides
+MARGIN = 0.1  # m that rays are cast too far, so that a softened reach has ground on both sides
 
 
 class AbstractProbe(Rule):
-    """Looks for ground."""
+    """Finds the ground under the feet."""
 
     @abstractmethod
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
-        """What the rays of each leg see in this frame; `foot_height`, m, is sole to ankle."""
+        """The ground under each leg in this frame; `foot_height` is from sole to ankle, m."""
 
 
 class FootProbe(AbstractProbe):
-    """A ray at the ankle and, if wanted, one at the toe (record: useFootEndRay; ozz without it)."""
+    """One ray at the ankle and, with `use_toe`, one at the toe (the record; ozz has no toe ray)."""
 
     ray_up: Leaf = parameter(
         0.50,
@@ -68,16 +68,16 @@ class FootProbe(AbstractProbe):
         ankle_ws = animated_ankles(frame).pos
         toe_ws = frame.world_from_model.apply(toe_point(inputs.rig, frame, self.toe_ls))
         ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
-        toe = seen_if(toe, jnp.where(self.use_toe, toe.found, 0.0))
-        rays = rays_of(ankle, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(ankle, toe, unseen(ankle), rays)
+        toe = with_weight(toe, jnp.where(self.use_toe, toe.found, 0.0))
+        rays = make_rays(ankle, self.ray_up, self.ray_down, self.layers)
+        return GroundHits(ankle, toe, no_hit(ankle), rays)
 
 
 class RootProbe(AbstractProbe):
-    """A ray over each ankle's place on the ground plan, between two heights over the root.
+    """One vertical ray through each ankle, between two heights relative to the root.
 
-    Unreal's trace (seed 001): from the capsule's centre, `ray_up` (its half-height) over the root,
-    to `ray_down` (the trace distance) under it.
+    This is the trace of Unreal's foot IK: it starts at the height of the capsule's centre, `ray_up`
+    (the half-height) above the root, and ends `ray_down` (the trace distance) below the root.
     """
 
     ray_up: Leaf = parameter(
@@ -104,16 +104,17 @@ class RootProbe(AbstractProbe):
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
         start = ankle_ws + vec.scale(up, self.ray_up - over_root)
         hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
-        rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(hit, unseen(hit), unseen(hit), rays)
+        rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
+        return GroundHits(hit, no_hit(hit), no_hit(hit), rays)
 
 
 class CornerProbe(AbstractProbe):
-    """Three rays: at the foot, ahead of it for the pitch, and to its right for the roll (Mec).
+    """Three rays: at the foot, ahead of it for pitch, and to its right for roll (Mec).
 
-    The toe's and the corner's rays start over the detected foot, along the animated foot's heading.
-    Rays end `foot_height` and an extra distance under the foot. That extra is fixed, or set by how
-    stable the foot is: the longer one while it is low, slow, or both, as the switches ask.
+    The rays for toe and corner start from where the first ray placed the foot, in the directions of
+    the animated foot. All rays end `foot_height` and an extra distance below the foot: `extra`, or,
+    with `by_height` or `by_speed` on, `extra_max` for a stable foot (low, slow, or both) and
+    `extra_min` for others.
     """
 
     active: Leaf = switch(
@@ -190,31 +191,33 @@ class CornerProbe(AbstractProbe):
         below = foot_height + self._extra(inputs, foot.pos, up)
         reach = self.ray_up + below
 
-        def look(*points_ws: Array) -> list[Hit]:
-            starts = [place + vec.scale(up, self.ray_up) for place in points_ws]
+        def hits_below(*points_ws: Array) -> list[Hit]:
+            starts = [point + vec.scale(up, self.ray_up) for point in points_ws]
             hits = cast_each(inputs.terrain, starts, reach + MARGIN, self.layers)
-            seen = (gate.below(hit.distance, reach, band=HEIGHT_BAND) for hit in hits)
-            return [seen_if(hit, hit.found * near) for hit, near in zip(hits, seen, strict=True)]
+            near = (gate.below(hit.distance, reach, band=HEIGHT_BAND) for hit in hits)
+            return [
+                with_weight(hit, hit.found * weight) for hit, weight in zip(hits, near, strict=True)
+            ]
 
-        (ankle,) = look(foot.pos)
-        ankle = seen_if(ankle, jnp.where(self.active, ankle.found, 0.0))
+        (ankle,) = hits_below(foot.pos)
+        ankle = with_weight(ankle, jnp.where(self.active, ankle.found, 0.0))
         sole = gate.choose(
             ankle.found[..., None], ankle.point, foot.pos - vec.scale(up, foot_height)
         )
         ahead, right = foot_heading(inputs, up)
         over = sole + vec.scale(up, foot_height)
-        level_toe = vec.scale(ahead, self.foot_length)
-        level_corner = vec.scale(right, self.half_width)
-        sides = (level_toe, level_corner)
+        sides = (vec.scale(ahead, self.foot_length), vec.scale(right, self.half_width))
         toe, corner = (
-            on_level(hit, ankle.found, sole + aside, gate)
-            for hit, aside in zip(look(*(over + aside for aside in sides)), sides, strict=True)
+            or_level(hit, ankle.found, sole + offset, gate)
+            for hit, offset in zip(
+                hits_below(*(over + offset for offset in sides)), sides, strict=True
+            )
         )
-        rays = rays_of(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
+        rays = make_rays(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
         return GroundHits(ankle, toe, corner, rays)
 
     def _extra(self, inputs: Inputs, foot_ws: Array, up_ws: Array) -> Array:
-        """How far under a standing sole each foot's rays end, m."""
+        """How far below a standing sole the rays of each foot end, m."""
         frame, gate = inputs.frame, inputs.gate
         height = vec.dot(foot_ws - frame.world_from_model.pos, up_ws)
         low = gate.below(height, self.stable_height, band=HEIGHT_BAND)
@@ -227,15 +230,15 @@ class CornerProbe(AbstractProbe):
 def cast_each(
     terrain: Terrain | LegTerrains, starts_ws: Sequence[Array], reach: Array, mask: Array
 ) -> list[Hit]:
-    """What rays from several places of each leg meet; one search, which is much of a program."""
+    """The hits of several rays per leg, by one search: each search adds much to a program."""
     hits = cast(terrain, jnp.stack(starts_ws), reach, mask)
     return [jax.tree.map(lambda x: x[i], hits) for i in range(len(starts_ws))]  # noqa: B023
 
 
 def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
-    """The toe of each leg, m, model space, for a toe given in the foot's axes from the ankle.
+    """Toe of each leg, m, model space.
 
-    Its sideways component is meant for a left foot and mirrors on a right one (A16).
+    `toe_ls` is the toe of a left foot relative to its ankle, in foot axes; right feet mirror it.
     """
     x, y, z = vec.components(toe_ls)
     foot = quat.multiply(frame.pose.ankle.rot, rig.ankle_from_foot)
@@ -243,9 +246,9 @@ def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
 
 
 def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
-    """Forward and right of each animated foot, unit, at right angles to up, world space.
+    """Forward and right of each animated foot, unit, perpendicular to up, world space.
 
-    A foot that points along up has the character's.
+    A foot that points along up gets those of the character.
     """
     frame = inputs.frame
     foot = quat.multiply(animated_ankles(frame).rot, inputs.rig.ankle_from_foot)
@@ -254,24 +257,24 @@ def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
     return ahead, vec.cross(ahead, up_ws)
 
 
-def seen_if(hit: Hit, found: Array) -> Hit:
-    """The hit with another weight."""
+def with_weight(hit: Hit, found: Array) -> Hit:
+    """The hit with another weight `found`."""
     return dataclasses.replace(hit, found=found)
 
 
-def unseen(like: Hit) -> Hit:
-    """Hits of rays that were not cast."""
-    return seen_if(like, jnp.zeros_like(like.found))
+def no_hit(like: Hit) -> Hit:
+    """Misses, for rays that were not cast."""
+    return with_weight(like, jnp.zeros_like(like.found))
 
 
-def on_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit:
-    """A hit beside a foot that was `found`; a miss lies on the level at that foot."""
-    seen = hit.found * found
-    point = gate.choose(seen[..., None], hit.point, level_ws)
-    return Hit(point, hit.normal, hit.distance, seen)
+def or_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit:
+    """The hit where its foot was `found` too; else a miss at `level_ws`, level with the foot."""
+    weight = hit.found * found
+    point = gate.choose(weight[..., None], hit.point, level_ws)
+    return Hit(point, hit.normal, hit.distance, weight)
 
 
-def rays_of(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
-    """Rays as many as hits, all of the same reach, m."""
+def make_rays(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
+    """One ray per hit in `like`, all of the same reach, m."""
     shape = like.found.shape
     return Rays(jnp.broadcast_to(above, shape), jnp.broadcast_to(below, shape), layers)

@@ -1,4 +1,4 @@
-"""Stage 2: the character's height over the ground at its root."""
+"""Stage 2: the height of the whole character."""
 
 from abc import abstractmethod
 
@@ -17,7 +17,7 @@ class AbstractRoot(Rule):
 
     @abstractmethod
     def sense(self, inputs: Inputs) -> Float[Array, ""]:
-        """How far along up the character is moved in this frame, m."""
+        """How far the character moves along up in this frame, m."""
 
 
 class KeepRoot(AbstractRoot):
@@ -28,9 +28,9 @@ class KeepRoot(AbstractRoot):
 
 
 class GroundRoot(AbstractRoot):
-    """The origin of the character goes to the ground below it (ozz: "auto character height").
+    """Puts the character's origin on the ground below it (ozz's "auto character height").
 
-    Where no ground is found, or with `enabled` off, it stays.
+    Without ground below, or with `enabled` off, the character stays where it is.
     """
 
     enabled: Leaf = switch(True, doc="Whether the character is placed on the ground.")

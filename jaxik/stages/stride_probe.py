@@ -1,4 +1,4 @@
-"""Stage 3 with foresight: the ground as a stride will meet it."""
+"""Stage 3 with lookahead: the ground between the last and the next foothold of each foot."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,34 +10,34 @@ from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
 
 from .inputs import Inputs
-from .probe import AbstractProbe, rays_of, unseen
+from .probe import AbstractProbe, make_rays, no_hit
 
 HEIGHT_BAND = 0.01  # m
-STEP_FADE = 0.10  # m over which a step becomes too high
-SLOPE_FADE = 0.10  # rad over which a slope becomes too steep
-WAY = 8  # rays between two footholds
-ENDS = 0.15  # share of a swing, at either end, in which nothing is stepped over any more
-NOWHERE = -1e6  # m, below any ground
+STEP_FADE = 0.10  # m, over which a step becomes too high
+SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
+PATH_RAYS = 8  # between two footholds
+ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
+FAR_BELOW = -1e6  # m, below any ground
 
 
 class StrideProbe(AbstractProbe):
-    """Rays at the last and the next foothold; between them the ground is a smooth curve.
+    """Rays at the last and at the next foothold, joined by a smooth curve.
 
-    A swinging foot leaves the ground of its last stance and is to arrive on that of its next, so
-    the ground under it goes from the one height to the other: `s = x^k / (x^k + (1 - x)^k)` of the
-    way, with `x` the share of the swing between `rise_start` and `rise_end` and `k` the
-    `steepness` (1.875 has the middle slope of the quintic of least jerk; Flash and Hogan 1985). A
-    foot thus begins to rise before the block is under it.
+    A swinging foot leaves the ground of its last foothold and arrives on that of its next, so the
+    ground under it goes from one height to the other along `s = x^k / (x^k + (1 - x)^k)`. Here `x`
+    is the time of the swing between `rise_start` and `rise_end` and `k` the `steepness`; 1.875
+    gives the middle slope of the minimum-jerk quintic (Flash and Hogan 1985). The foot thus starts
+    to rise before the obstacle is under it.
 
-    The animation may tell where its feet stood and will stand (`Frame.stride`). Where it does not,
-    both follow from the character's velocity: feet stand for `stance_time` and swing for
-    `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986).
+    The animation may provide the footholds (`Frame.stride`). If not, they are predicted from the
+    character's velocity: feet stand for `stance_time` and swing for `swing_time`, from as far ahead
+    of the hip to as far behind it (Raibert 1986).
 
-    A next foothold more than `max_step` off the last, or steeper than `max_slope`, loses its say by
-    and by, so that a foot neither drops off a ledge nor snaps onto a wall. Rays between the
-    footholds lift the foot over edges up to `max_step` above them, on a slope of `way_slope`
-    towards each: where the ground stands out of the curve, heel and ball clear it by as much as the
-    animation lifts them, less `clearance`.
+    A next foothold more than `max_step` above or below the last, or on ground steeper than
+    `max_slope`, counts less and less, so that a foot neither drops off a ledge nor snaps onto a
+    wall. Rays along the path lift the foot over edges up to `max_step` high, on slopes of
+    `way_slope` before and after each edge. Where the ground is above the curve, heel and ball clear
+    it by as much as the animation lifts them, less `clearance`.
     """
 
     ray_up: Leaf = parameter(
@@ -133,8 +133,8 @@ class StrideProbe(AbstractProbe):
         terrain, frame = inputs.terrain, inputs.frame
         level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
         stride = self._stride(inputs, contact, level)
-        last, low = self._look(terrain, level, stride.last_ws)
-        next_, high = self._look(terrain, level, stride.next_ws)
+        last, low = self._ground_at(terrain, level, stride.last_ws)
+        next_, high = self._ground_at(terrain, level, stride.next_ws)
         found = jnp.where(last.found > next_.found, last.found, next_.found)
         low = jnp.where(last.found > 0, low, jnp.where(next_.found > 0, high, 0.0))
         normal = jnp.where(last.found[..., None] > 0, last.normal, next_.normal)
@@ -142,123 +142,122 @@ class StrideProbe(AbstractProbe):
         rise = trust * (high - low)
         normal_rise = vec.scale(next_.normal - normal, trust)
 
-        share = vec.safe_divide(stride.fraction - self.rise_start, self.rise_end - self.rise_start)
-        share = s_curve(share, self.steepness)
-        height = low + rise * share
+        since_start = stride.fraction - self.rise_start
+        fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
+        fraction = s_curve(fraction, self.steepness)
+        height = low + rise * fraction
         top = low + jnp.where(rise > 0, rise, 0.0)
-        feet = self._feet(inputs, level, foot_height)
-        height += self._over_edges(inputs, stride, feet, height, top)
+        soles = self._soles(inputs, level, foot_height)
+        height += self._clearance_over_edges(inputs, stride, soles, height, top)
         height = jnp.where(found > 0, height, 0.0)
 
-        ankle_ws = level.at(animated_ankles(frame).pos) + vec.scale(level.up_ws, height)
-        tilted = normal + vec.scale(normal_rise, share)
+        ankle_ws = level.project(animated_ankles(frame).pos) + vec.scale(level.up_ws, height)
+        tilted = normal + vec.scale(normal_rise, fraction)
         hit = Hit(ankle_ws, vec.normalize(tilted, level.up_ws), self.ray_up - height, found)
-        rays = rays_of(hit, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(hit, unseen(hit), unseen(hit), rays)
+        rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
+        return GroundHits(hit, no_hit(hit), no_hit(hit), rays)
 
     def _stride(self, inputs: Inputs, contact: Contact, level: "Level") -> Stride:
-        """The stride as it is told, or else as velocity foretells it."""
-        frame, gate = inputs.frame, inputs.gate
-        told = frame.stride
+        """The stride of the animation where it is known, else one predicted from velocity."""
+        frame, gate, labelled = inputs.frame, inputs.gate, inputs.frame.stride
         velocity = vec.reject(frame.velocity_ws, level.up_ws)
-        ball = level.at(frame.world_from_model.apply(frame.pose.toe.pos))
+        ball = level.project(frame.world_from_model.apply(frame.pose.toe.pos))
         ankle, hip = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.hip.pos)
         half = 0.5 * self.stance_time
         ahead = vec.safe_divide(vec.dot(ankle - hip, velocity), vec.dot(velocity, velocity))
         ahead = gate.clip(ahead, -half, half, band=0.02)
-        share = 0.5 + ahead / self.stance_time
-        zero = jnp.zeros_like(share)
-        share = gate.choose(contact.planted, zero, share)
-        past = gate.choose(contact.planted, zero, half + ahead + share * self.swing_time)
-        left = half - ahead + (1.0 - share) * self.swing_time
-        left = gate.choose(contact.planted, zero + self.stance_time + self.swing_time, left)
-        known = told.known > 0
+        fraction = 0.5 + ahead / self.stance_time
+        zero = jnp.zeros_like(fraction)
+        fraction = gate.choose(contact.planted, zero, fraction)
+        since_last = half + ahead + fraction * self.swing_time
+        since_last = gate.choose(contact.planted, zero, since_last)
+        until_next = half - ahead + (1.0 - fraction) * self.swing_time
+        cycle = zero + self.stance_time + self.swing_time
+        until_next = gate.choose(contact.planted, cycle, until_next)
+        known = labelled.known > 0
         last_ws, next_ws = (
-            jnp.where(known[..., None], place, ball + vec.scale(velocity, time))
-            for place, time in ((told.last_ws, -past), (told.next_ws, left))
+            jnp.where(known[..., None], label, ball + vec.scale(velocity, time))
+            for label, time in ((labelled.last_ws, -since_last), (labelled.next_ws, until_next))
         )
-        share = jnp.where(known, told.fraction, share)
-        return Stride(told.standing, last_ws, next_ws, share, told.known)
+        fraction = jnp.where(known, labelled.fraction, fraction)
+        return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known)
 
-    def _look(
-        self, terrain: Terrain | LegTerrains, level: "Level", places_ws: Array
+    def _ground_at(
+        self, terrain: Terrain | LegTerrains, level: "Level", points_ws: Array
     ) -> tuple[Hit, Array]:
-        """What lies at these places of the ground plan, and its height over the level, m."""
-        above = level.at(places_ws) + vec.scale(level.up_ws, self.ray_up)
+        """The ground above or below these points, and its height over the level, m."""
+        above = level.project(points_ws) + vec.scale(level.up_ws, self.ray_up)
         hit = cast(terrain, above, self.ray_up + self.ray_down, self.layers)
         return hit, level.height(hit.point)
 
     def _trust(self, normal: Array, step: Array, level: "Level") -> Array:
-        """0..1, how much of a step to ground with this normal is taken."""
+        """0..1, how much a step of this height to ground with this normal counts."""
         cosine = vec.dot(normal, level.up_ws)
         slope = vec.safe_arctan2(vec.length(vec.cross(normal, level.up_ws)), cosine)
-        low = 1.0 - smooth_share((jnp.abs(step) - self.max_step) / STEP_FADE)
-        return low * (1.0 - smooth_share((slope - self.max_slope) / SLOPE_FADE))
+        low_enough = 1.0 - smoothstep((jnp.abs(step) - self.max_step) / STEP_FADE)
+        return low_enough * (1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE))
 
-    def _feet(self, inputs: Inputs, level: "Level", foot_height: Array) -> Array:
-        """The soles' heels and balls as animated, (2 legs 3), m, world space."""
+    def _soles(self, inputs: Inputs, level: "Level", foot_height: Array) -> Array:
+        """Animated heels and balls at sole height, (2 legs 3), m, world space."""
         frame = inputs.frame
         ankle = animated_ankles(frame)
         foot = quat.multiply(ankle.rot, inputs.rig.ankle_from_foot)
-        under = vec.stack(jnp.zeros_like(self.heel_length), -foot_height, -self.heel_length)
-        heel = ankle.pos + quat.rotate(foot, under)
+        heel_ls = vec.stack(jnp.zeros_like(self.heel_length), -foot_height, -self.heel_length)
+        heel = ankle.pos + quat.rotate(foot, heel_ls)
         ball = frame.world_from_model.apply(frame.pose.toe.pos)
         return jnp.stack([heel, ball - vec.scale(level.up_ws, self.ball_height)])
 
-    def _over_edges(
-        self, inputs: Inputs, stride: Stride, feet: Array, height: Array, top: Array
+    def _clearance_over_edges(
+        self, inputs: Inputs, stride: Stride, soles: Array, height: Array, top: Array
     ) -> Float[Array, " legs"]:
-        """How much higher, m, each foot goes so as not to touch what lies between its footholds."""
+        """How much higher each foot goes to clear what lies between its footholds, m."""
         terrain, gate = inputs.terrain, inputs.gate
         level = Level(inputs.frame.world_from_model.pos, terrain.leg_up_ws)
-        shares = (jnp.arange(WAY, dtype=height.dtype) + 0.5) / WAY
-        way_ws = stride.last_ws + vec.scale(
-            stride.next_ws - stride.last_ws, shares[:, None]
-        )  # (way legs 3)
-        hit, ground = self._look(terrain, level, way_ws)
-        fade = 1.0 - smooth_share((ground - top - self.max_step) / STEP_FADE)
-        away = vec.length(vec.reject(way_ws[:, None] - feet, level.up_ws))  # (way 2 legs)
-        over = fade[:, None] * (ground[:, None] - self.way_slope * away - height)
-        # What the animation itself does over its floor is not to be mended.
-        lift = level.height(feet) - self.clearance
+        fractions = (jnp.arange(PATH_RAYS, dtype=height.dtype) + 0.5) / PATH_RAYS
+        path_ws = stride.last_ws + vec.scale(
+            stride.next_ws - stride.last_ws, fractions[:, None]
+        )  # (rays legs 3)
+        hit, ground = self._ground_at(terrain, level, path_ws)
+        fade = 1.0 - smoothstep((ground - top - self.max_step) / STEP_FADE)
+        away = vec.length(vec.reject(path_ws[:, None] - soles, level.up_ws))  # (rays 2 legs)
+        excess = fade[:, None] * (ground[:, None] - self.way_slope * away - height)
+        # A sole that the animation sinks into its own floor needs no correction.
+        lift = level.height(soles) - self.clearance
         lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
-        need = over - lift
-        need = jnp.where(hit.found[:, None] > 0, need, NOWHERE)
-        most = gate.maximum(jnp.moveaxis(need.reshape(-1, *height.shape), 0, -1), band=HEIGHT_BAND)
+        rise = excess - lift
+        rise = jnp.where(hit.found[:, None] > 0, rise, FAR_BELOW)
+        most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *height.shape), 0, -1), band=HEIGHT_BAND)
         zero = jnp.zeros_like(most)
         most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)
-        return (
-            most
-            * smooth_share(stride.fraction / ENDS)
-            * smooth_share((1.0 - stride.fraction) / ENDS)
-        )
+        fade_in = smoothstep(stride.fraction / ENDS)
+        return most * fade_in * smoothstep((1.0 - stride.fraction) / ENDS)
 
 
 @struct
 class Level:
-    """The level of a character's root, at right angles to each leg's up."""
+    """The plane through the character's root, perpendicular to each leg's up."""
 
     origin_ws: Float[Array, "3"]  # m
     up_ws: Float[Array, "*legs 3"]
 
     def height(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs"]:
-        """Of points over the level, m."""
+        """Height of points above the plane, m."""
         return vec.dot(points_ws - self.origin_ws, self.up_ws)
 
-    def at(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs 3"]:
-        """The points' places on the level, m."""
+    def project(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs 3"]:
+        """Points projected onto the plane, m."""
         return points_ws - vec.scale(self.up_ws, self.height(points_ws))
 
 
-def s_curve(share: Array, steepness: Array) -> Array:
-    """From 0 to 1 with `share`, `steepness` times as fast in the middle: 1 / (1 + (1/x - 1)^k)."""
-    inside = (share > 0) & (share < 1)
-    x = jnp.where(inside, share, 0.5)
+def s_curve(fraction: Array, steepness: Array) -> Array:
+    """Curve from 0 to 1 with slope `steepness` in the middle: `1 / (1 + (1/x - 1)^k)`."""
+    inside = (fraction > 0) & (fraction < 1)
+    x = jnp.where(inside, fraction, 0.5)
     odds = jnp.exp(steepness * (jnp.log1p(-x) - jnp.log(x)))
-    return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(share < 0.5, 0.0, 1.0))
+    return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(fraction < 0.5, 0.0, 1.0))
 
 
-def smooth_share(x: Array) -> Array:
-    """`3x² - 2x³` between 0 and 1, which goes from 0 to 1 without a kink; flat outside."""
+def smoothstep(x: Array) -> Array:
+    """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
     x = jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
     return x * x * (3.0 - 2.0 * x)
