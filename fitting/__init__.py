@@ -1,4 +1,13 @@
-"""Fits the parameters of foot IK to captured motion, and says how sure it is."""
+"""Fits the parameters of `jaxik` to captured motion, and says how certain they are.
+
+It reads clips and terrain, builds a least-squares problem, searches for the best fit, samples the
+posterior, and writes reports; the command `jaxik` does the same from a shell. It is no foot IK
+(that is `jaxik`), no motion editor and no renderer.
+
+Start with `fit`: it takes an experiment, which `load_experiment` reads from a file. The wings, each
+importing only those before it: `runtime`, `datasets`, `problem`, `inference`, `analysis`,
+`experiments`, `studies`, `report`, `jobs`, `bench`, `cli`.
+"""
 
 import lazy_loader
 

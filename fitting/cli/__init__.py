@@ -1,1 +1,4 @@
-"""The command line."""
+"""The command `jaxik`: words and options, one function per command, progress on stderr.
+
+Nothing is computed here; the commands call `fitting.jobs`. Start with `commands`.
+"""

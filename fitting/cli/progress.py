@@ -1,4 +1,4 @@
-"""What a command tells on stderr while it works, and how it minds Ctrl-C meanwhile."""
+"""Progress on stderr while a command works, and Ctrl-C that is never lost meanwhile."""
 
 import signal
 import sys
@@ -6,31 +6,35 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
+from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress
 
+Report = TypeVar("Report")
+Handler: TypeAlias = Callable[[int, FrameType | None], object] | int | None  # of a signal
 
-class Line:
-    """Progress on one line of a terminal, on a line every ten seconds elsewhere.
 
-    Within it no Ctrl-C is lost: one that comes while Python collects garbage ends in a hook of JAX,
-    which goes on; it is raised again at the next report.
+class ProgressLine(Generic[Report]):
+    """Shows reports: on one line of a terminal, or as a new line every ten seconds elsewhere.
+
+    Inside this context no Ctrl-C is lost. One that arrives while Python collects garbage ends in a
+    hook of JAX that swallows it; it is raised again at the next report.
     """
 
-    def __init__(self, show: Callable):
+    def __init__(self, show: Callable[[Report], str]):
         self.show = show
         self.live = sys.stderr.isatty()
         self.last = -1e9
-        self.handler: Any = None
+        self.handler: Handler = None
         self.interrupted = False
 
-    def __enter__(self) -> "Line":
-        own = threading.current_thread() is threading.main_thread()
-        if own and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    def __enter__(self) -> "ProgressLine[Report]":
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             self.handler = signal.signal(signal.SIGINT, self._interrupt)
         return self
 
@@ -42,14 +46,14 @@ class Line:
         self.interrupted = True
         raise KeyboardInterrupt
 
-    def __call__(self, progress: object) -> None:
+    def __call__(self, report: Report) -> None:
         if self.interrupted:
             raise KeyboardInterrupt
         now = time.monotonic()
         if now - self.last < (0.1 if self.live else 10.0):
             return
         self.last = now
-        text = self.show(progress)
+        text = self.show(report)
         print(
             f"\r{text:<100}" if self.live else text,
             end="" if self.live else "\n",
@@ -59,7 +63,7 @@ class Line:
 
 
 def fit_line(progress: Progress) -> str:
-    """A fit's progress in one line."""
+    """The progress of a search in one line."""
     return (
         f"{progress.seconds:6.1f} s  start {progress.start + 1}  {progress.stage:<9} step "
         f"{progress.step:<4} cost {progress.cost:.6g}  best {progress.best:.6g}"
@@ -67,27 +71,27 @@ def fit_line(progress: Progress) -> str:
 
 
 def sample_line(progress: SamplingProgress) -> str:
-    """A sampling's progress in one line."""
-    time_now = progress.autocorrelation_time
-    slowest = "" if np.isnan(time_now) else f"  slowest autocorrelation {time_now:.0f} steps"
+    """The progress of a sampling in one line."""
+    slowest = progress.autocorrelation_time
+    ending = "" if np.isnan(slowest) else f"  slowest autocorrelation {slowest:.0f} steps"
     return (
         f"{progress.elapsed:6.1f} s  step {progress.step} of at most {progress.max_steps}  "
-        f"acceptance {progress.acceptance:.2f}  log p {progress.log_probability:.1f}{slowest}"
+        f"acceptance {progress.acceptance:.2f}  log p {progress.log_probability:.1f}{ending}"
     )
 
 
 @contextmanager
 def timed(name: str) -> Iterator[None]:
-    """Tells on stderr what is being run, and then how long it took."""
+    """Prints on stderr what is running, and then how long it took."""
     print(f"{name} ... ", end="", file=sys.stderr, flush=True)
-    began, took = time.perf_counter(), "stopped"
+    start, result = time.perf_counter(), "stopped"
     try:
         yield
-        took = f"{time.perf_counter() - began:.1f} s"
+        result = f"{time.perf_counter() - start:.1f} s"
     finally:
-        print(took, file=sys.stderr, flush=True)
+        print(result, file=sys.stderr, flush=True)
 
 
-def say(line: str) -> None:
-    """A line on stderr that stays, over whatever a terminal shows there."""
+def print_line(line: str) -> None:
+    """Prints a line on stderr that stays, over the progress that a terminal shows there."""
     print(f"\r{line:<100}" if sys.stderr.isatty() else line, file=sys.stderr, flush=True)

@@ -1,1 +1,6 @@
-"""What an experiment file asks for."""
+"""What the user asks for in files: experiments, systems with their parameters, ablations.
+
+Reading a file checks every key and value and says what is wrong, where, and what would be right;
+`problems` then loads the clips and builds the `Problem` that is minimised. Nothing is computed or
+written here. Start with `experiment.Experiment`, then `experiment_files` for the file format.
+"""

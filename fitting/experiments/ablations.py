@@ -1,9 +1,9 @@
-"""Variants of an experiment, each without something that it has: what its `[[without]]` says.
+"""Ablations: an experiment with something left out, as each of its [[without]] tables says.
 
 [[without]]
 name = "support"
 rules = { pelvis = "LowestPelvis" }     # other rules, by stage
-parameters = { lock.enabled = false }   # fixed at these values, also if they are free
+parameters = { lock.enabled = false }   # fixed at these values, even if they are free otherwise
 free = { pelvis.limit = {} }            # fitted in addition
 """
 
@@ -14,56 +14,56 @@ from typing import Any
 import jaxik
 from fitting.runtime import validation
 
-from .systems import free_table, leaf_names, rules_of, with_parameters, with_rules
+from .systems import leaf_names, read_free_table, rule_names, with_parameters, with_rules
 
-WHOLE = "all rules"  # the name of the experiment as it is
+COMPLETE = "all rules"  # the name of the experiment with nothing left out
 
 
 @dataclass(frozen=True)
-class Variant:
-    """What is otherwise, under a name."""
+class Ablation:
+    """What differs from the experiment, under a name."""
 
     name: str
-    rules: Mapping[str, str] = field(default_factory=dict)
+    rules: Mapping[str, str] = field(default_factory=dict)  # by stage
     parameters: Mapping[str, Any] = field(default_factory=dict)  # by dotted name
-    free: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # likewise
+    free: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by dotted name
 
 
-KINDS = {"name": validation.TEXT} | dict.fromkeys(("rules", "parameters", "free"), validation.TABLE)
+KEYS = {"name": validation.TEXT} | dict.fromkeys(("rules", "parameters", "free"), validation.TABLE)
 
 
-def read_variants(given: Sequence[Any], ik: jaxik.FootIK, where: str) -> tuple[Variant, ...]:
-    """The variants in tables of TOML.
+def read_ablations(tables: Sequence[object], ik: jaxik.FootIK, where: str) -> tuple[Ablation, ...]:
+    """The ablations in TOML tables.
 
     Args:
-        given: the tables.
+        tables: the tables.
         ik: the system from which they differ.
-        where: they stand, for the error.
+        where: the tables' place in their file, for error messages.
 
     Raises:
-        ValueError: for an unknown key, stage, rule or parameter, a wrong value, a name that is
-            missing, empty or taken, a variant that changes nothing.
+        ValueError: a key, stage, rule or parameter is unknown; a value is wrong; a name is missing,
+            empty or taken; an ablation changes nothing.
     """
-    made: list[Variant] = []
-    for table in given:
-        made.append(_read(validation.check_table(table, KINDS, where), ik, where))
-        names = [WHOLE, *(one.name for one in made)]
-        if names[-1] in names[:-1]:
-            raise ValueError(f"{where}: there already is a variant named {names[-1]!r}")
-    return tuple(made)
+    ablations: list[Ablation] = []
+    for table in tables:
+        ablation = _read(validation.check_table(table, KEYS, where), ik, where)
+        if ablation.name in (COMPLETE, *(earlier.name for earlier in ablations)):
+            raise ValueError(f"{where}: there already is a variant named {ablation.name!r}")
+        ablations.append(ablation)
+    return tuple(ablations)
 
 
-def _read(table: Mapping[str, Any], ik: jaxik.FootIK, where: str) -> Variant:
+def _read(table: validation.Table, ik: jaxik.FootIK, where: str) -> Ablation:
     name = table.get("name", "")
     if not name.strip():
         raise ValueError(f"{where}: a variant without a name; wanted name = 'what is left out'")
     parameters = validation.flatten(table.get("parameters", {}), 2)
-    free = free_table(table.get("free", {}), f"{where} {name}: free")
-    variant = Variant(name, dict(table.get("rules", {})), parameters, free)
-    other = with_rules(ik, variant.rules, f"{where} {name}: rules")
-    with_parameters(other, parameters, f"{where} {name}: parameters")
-    leaves = {one.partition("[")[0]: None for one in free}  # a leg's own element has its index
-    validation.check_keys(leaves, leaf_names(other), f"{where} {name}: free")
-    if not parameters and not free and rules_of(other) == rules_of(ik):
-        raise ValueError(f"{where} {name}: nothing is otherwise; wanted other rules or parameters")
-    return variant
+    free = read_free_table(table.get("free", {}), f"{where} {name}: free")
+    rules = dict(table.get("rules", {}))
+    changed = with_rules(ik, rules, f"{where} {name}: rules")
+    with_parameters(changed, parameters, f"{where} {name}: parameters")
+    leaves = {full.partition("[")[0]: None for full in free}  # one leg's element has an index
+    validation.check_keys(leaves, leaf_names(changed), f"{where} {name}: free")
+    if not parameters and not free and rule_names(changed) == rule_names(ik):
+        raise ValueError(f"{where} {name}: changes nothing; wanted other rules or parameters")
+    return Ablation(name, rules, parameters, free)

@@ -27,17 +27,18 @@ from typing import Any, get_args
 
 import tomli_w
 
-from fitting.inference import settings
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
+from fitting.inference.settings import Settings, describe
 from fitting.problem.loss import Loss
 from fitting.runtime import validation
 from fitting.runtime.validation import Constraint, Table, check_table, flatten, nest
 
 from .ablations import read_ablations
-from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions, SampleOptions
+from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
 from .systems import preset_system, read_free_table, with_rules
 
+USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
 FILE_KEYS = ("reference", "terrain", "base", "truth")
 CLIP_KEYS: dict[str, Constraint] = {
     **dict.fromkeys((*FILE_KEYS, "label"), validation.TEXT),
@@ -47,16 +48,31 @@ CLIP_KEYS: dict[str, Constraint] = {
 }
 SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
 SIGMA_KEYS |= {"correlation": validation.FRACTION}
+
+
+def _tuple(value: Any) -> Any:
+    """TOML's lists as the tuples that settings hold."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _constraints(settings_class: type[Settings]) -> dict[str, Constraint]:
+    return {
+        name: Constraint(declared.range, lambda value, one=declared: one.allows(_tuple(value)))
+        for name, declared in describe(settings_class).items()
+    }
+
+
 FIT_KEYS: dict[str, Constraint] = {
     **dict.fromkeys(("starts", "max_steps"), validation.COUNT),
     "search": validation.TABLE,
 }
 SEARCH_KEYS = {
-    name: Constraint(setting.range, lambda value, setting=setting: setting.allows(_tuple(value)))
-    for name, setting in settings.describe(SearchSettings).items()
+    name: constraint
+    for name, constraint in _constraints(SearchSettings).items()
     if name != "max_steps"  # which is a key of [fit]
 }
 SAMPLE_KEYS: dict[str, Constraint] = {
+    **_constraints(SamplerSettings),
     **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
     "stop_at": validation.POSITIVE,
 }
@@ -102,7 +118,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "parameters": flatten(content.get("parameters", {}), 2),
         "without": read_ablations(content.get("without", []), ik, f"{path} [[without]]"),
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
-        "sample": _sample_options(content.get("sample", {}), len(free), f"{path} [sample]"),
+        "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
     return Experiment(**{"path": path, "name": path.stem, **content, **tables})
 
@@ -117,17 +133,12 @@ def _fit_options(value: object, where: str) -> FitOptions:
     return FitOptions(table.get("starts", 1), search)
 
 
-def _tuple(value: Any) -> Any:
-    """TOML's lists as the tuples that settings hold."""
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _sample_options(value: object, free_count: int, where: str) -> SampleOptions:
+def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSettings:
     table = check_table(value, SAMPLE_KEYS, where)
-    if "walkers" in table:
-        with validation.error_context(where):
-            SamplerSettings(walkers=table["walkers"]).walkers_for(free_count)
-    return SampleOptions(**table)
+    with validation.error_context(where):
+        sampler = SamplerSettings(**table)
+        sampler.walkers_for(free_count)
+    return sampler
 
 
 def _clip_entry(value: object, path: Path) -> ClipEntry:
@@ -150,16 +161,25 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
 
     Paths inside `folder` are written relative to it: those files move with it.
     """
-    content = _plain(dataclasses.asdict(experiment), folder and folder.resolve())
-    del content["path"]
-    search = content["fit"].pop("search")
-    content["fit"]["max_steps"] = search.pop("max_steps")
-    defaults = dataclasses.asdict(SearchSettings())
-    if changed := {key: search[key] for key in search if search[key] != defaults[key]}:
-        content["fit"]["search"] = _plain(changed, None)
+    fit, sampler = experiment.fit, dataclasses.asdict(experiment.sample)
+    fit_table: dict[str, Any] = {"starts": fit.starts, "max_steps": fit.search.max_steps}
+    search = dataclasses.replace(fit.search, max_steps=SearchSettings().max_steps)
+    if changed := _changed(search):
+        fit_table["search"] = changed
+    usual = {key: sampler[key] for key in USUAL_SAMPLE_KEYS}
+    content = dataclasses.asdict(experiment)
+    content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
     for name in ("free", "parameters"):
         content[name] = nest(content[name])
-    return tomli_w.dumps(content)
+    del content["path"]
+    return tomli_w.dumps(_plain(content, folder and folder.resolve()))
+
+
+def _changed(settings: Settings) -> dict[str, Any]:
+    """The settings that do not have their default value."""
+    defaults = dataclasses.asdict(type(settings)())
+    values = dataclasses.asdict(settings)
+    return {key: value for key, value in values.items() if value != defaults[key]}
 
 
 def _plain(value: Any, folder: Path | None) -> Any:

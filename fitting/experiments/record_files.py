@@ -1,4 +1,4 @@
-"""Files that hold the game's record: bytes, CSV, and parameters in TOML."""
+"""Files that hold the game's parameter record: binary, CSV, or parameters in TOML."""
 
 import csv
 from pathlib import Path
@@ -10,8 +10,8 @@ from jaxik.maths import parameter_tree
 from . import parameter_files, systems
 
 
-def read_bytes(path: Path) -> record.Record:
-    """The record in a binary file; ValueError for none."""
+def read_binary(path: Path) -> record.Record:
+    """The record in a binary file; ValueError if there is none."""
     if not path.is_file():
         raise ValueError(f"{path}: {validation.why_missing(path)}, wanted a record")
     with validation.error_context(path):
@@ -19,50 +19,50 @@ def read_bytes(path: Path) -> record.Record:
 
 
 def read(path: Path, reading: record.Reading, base: record.Record | None) -> list[record.Record]:
-    """The records of a file, binary, CSV or TOML.
+    """The records in a binary, CSV or TOML file.
 
     Args:
-        path: of the file.
+        path: the file.
         reading: how the record's fields are meant.
         base: completes a record that is made from parameters.
 
     Raises:
-        ValueError: what is not there or cannot be read, parameters of another preset than `record`
-            or of other rules, a base for a record that is whole.
+        ValueError: the file does not exist or cannot be read; the parameters have another preset
+            than `record`, or other rules; a base is given for a record that is complete.
     """
-    kind = path.suffix.lower()
-    if kind == ".toml":
+    suffix = path.suffix.lower()
+    if suffix == ".toml":
         ik, preset = parameter_files.load_system(path)
         if preset != "record":
             raise ValueError(f"{path}: parameters of {preset!r}; only those of 'record' make one")
-        if other := systems.changed_rules(ik, systems.preset_system(preset)):
-            raise ValueError(f"{path}: rules {other}; only those of 'record' make one")
+        if rules := systems.changed_rules(ik, systems.preset_system(preset)):
+            raise ValueError(f"{path}: rules {rules}; only those of 'record' make one")
         return [record.from_ik(ik, base, reading)]
     if base is not None:
         raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
-    if kind != ".csv" or not path.is_file():
-        return [read_bytes(path)]
+    if suffix != ".csv" or not path.is_file():
+        return [read_binary(path)]
     try:
-        rows = record.from_csv(path.read_text(encoding="utf-8"))
+        records = record.from_csv(path.read_text(encoding="utf-8"))
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{path}: {error}") from None
-    if not rows:
+    if not records:
         raise ValueError(f"{path}: the CSV has no row")
-    return rows
+    return records
 
 
-def shown(one: record.Record, reading: record.Reading) -> str:
-    """A record under its own names and ours, a line a field."""
-    ik = record.to_ik(one, reading)
+def describe(entry: record.Record, reading: record.Reading) -> str:
+    """A record with its own names and ours, a line for each field."""
+    ik = record.to_ik(entry, reading)
     declared = parameter_tree.declarations(ik)
-    axis = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")[one.knee_axis_type]
-    lines = [f"{'kneeAxisType':30} {one.knee_axis_type} ({axis})"]
+    axis = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")[entry.knee_axis_type]
+    lines = [f"{'kneeAxisType':30} {entry.knee_axis_type} ({axis})"]
     for _, name, ours in record.FLAGS:
-        lines.append(f"{name:30} {'on' if one.flag(name) else 'off':>12}   {ours}")
+        lines.append(f"{name:30} {'on' if entry.flag(name) else 'off':>12}   {ours}")
     for name, ours, _ in record.FLOATS:
         leaf, _, index = ours.partition("[")
         value = parameter_tree.get(ik, leaf)
         value = float(value[int(index[:-1])] if index else value)
         meaning = f"{ours} = {value:.6g} {declared[leaf].unit}"
-        lines.append(f"{name:30} {one.value(name):12.6g}   {meaning}")
+        lines.append(f"{name:30} {entry.value(name):12.6g}   {meaning}")
     return "\n".join(lines)

@@ -1,95 +1,125 @@
-"""Systems by name: presets, other rules for some of their stages, parameters fixed or free."""
+"""Systems by name: presets, other rules for some stages, parameters fixed or free."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import numpy as np
 
 import jaxik
 from fitting.runtime import validation
-from fitting.runtime.validation import check_keys, check_table, flatten
+from fitting.runtime.validation import Table, check_keys, check_table, flatten
 from jaxik import presets
 from jaxik.maths import parameter_tree
 
 
-def _rules_under(stage: type[eqx.Module]) -> list[type[eqx.Module]]:
-    """The classes under a stage that nothing is left to be said of."""
-    children = [child for child in stage.__subclasses__() if child.__module__.startswith("jaxik.")]
-    return [made for child in children for made in _rules_under(child)] or [stage]
+def _concrete_rules(rule: type[eqx.Module]) -> list[type[eqx.Module]]:
+    """All subclasses of an abstract rule that have no subclasses themselves."""
+    children = [child for child in rule.__subclasses__() if child.__module__.startswith("jaxik.")]
+    return [leaf for child in children for leaf in _concrete_rules(child)] or [rule]
 
 
-STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules that each stage may have, by name
-    one.name: {made.__name__: made for made in _rules_under(one.type)}  # type: ignore[arg-type]
-    for one in fields(jaxik.FootIK)
+STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules to choose from, by stage and name
+    stage.name: {rule.__name__: rule for rule in _concrete_rules(stage.type)}  # type: ignore[arg-type]
+    for stage in fields(jaxik.FootIK)
 }
 
-FREE: dict[str, validation.Constraint] = dict.fromkeys(
-    ("low", "high", "prior_mean"), validation.NUMBER
-)
-FREE |= {"prior_sd": validation.POSITIVE, "kind": validation.TEXT, "scale": validation.TEXT}
+Rule = TypeVar("Rule", bound=eqx.Module)
 
 
-def name_preset(name: object) -> jaxik.FootIK:
-    """The preset of this name; ValueError with the list of names."""
-    known = sorted(n for n, made in vars(presets).items() if _makes_ik(made))
+def register_rule(rule: type[Rule]) -> type[Rule]:
+    """Makes a rule of your own known by its name to experiments and parameter files.
+
+    Call it, or put `@register_rule` above the class, before a file that names the rule is read.
+
+    Returns:
+        The rule itself.
+
+    Raises:
+        ValueError: a class that derives from no stage's abstract rule.
+    """
+    for stage in fields(jaxik.FootIK):
+        if isinstance(stage.type, type) and issubclass(rule, stage.type):
+            STAGES[stage.name][rule.__name__] = rule
+            return rule
+    raise ValueError(f"{rule.__name__} is no rule of a stage; the stages are {list(STAGES)}")
+
+
+FREE_KEYS: dict[str, validation.Constraint] = {
+    **dict.fromkeys(("low", "high", "prior_mean"), validation.NUMBER),
+    "prior_sd": validation.POSITIVE,
+    **dict.fromkeys(("kind", "scale"), validation.TEXT),
+}
+
+
+def preset_system(name: object) -> jaxik.FootIK:
+    """The system of a preset; ValueError with the list of presets for an unknown name."""
+    known = sorted(n for n, value in vars(presets).items() if _is_preset(value))
     if name not in known:
         raise ValueError(f"no preset named {name!r}; there are {known}")
     return getattr(presets, str(name))()
 
 
-def _makes_ik(made: Any) -> bool:
-    return getattr(made, "__module__", "") == presets.__name__ and callable(made)
+def _is_preset(value: object) -> bool:
+    return getattr(value, "__module__", "") == presets.__name__ and callable(value)
 
 
-def rules_of(ik: jaxik.FootIK) -> dict[str, str]:
+def rule_names(ik: jaxik.FootIK) -> dict[str, str]:
     """The name of the rule at each stage."""
-    return {stage: type(part).__name__ for stage, part in vars(ik).items()}
+    return {stage: type(rule).__name__ for stage, rule in vars(ik).items()}
 
 
-def with_rules(ik: jaxik.FootIK, names: Mapping[str, Any], where: str) -> jaxik.FootIK:
-    """The system with the rules of these names at these stages.
+def with_rules(ik: jaxik.FootIK, names: Table, where: str) -> jaxik.FootIK:
+    """The system with other rules at some stages.
 
-    A rule that the system has already keeps its values; another one comes with its defaults.
+    A rule that the system has already keeps its values; a new one has its defaults.
 
     Args:
         ik: the system.
-        names: of rules, by stage.
-        where: the names stand, for the error.
+        names: names of rules, by stage.
+        where: place of the names in their file, for the error message.
 
     Raises:
-        ValueError: for an unknown stage, or a rule that the stage does not have.
+        ValueError: a stage is unknown, or does not have the rule.
     """
     check_keys(names, list(STAGES), where)
-    present = rules_of(ik)
+    present = rule_names(ik)
     for stage, name in names.items():
         if name not in list(STAGES[stage]):
             known = list(STAGES[stage])
             raise ValueError(f"{where}: {stage} has no rule {name!r}; it has {known}")
-    other = {stage: name for stage, name in names.items() if name != present[stage]}
-    return replace(ik, **{stage: STAGES[stage][name]() for stage, name in other.items()})
+    changed = {stage: name for stage, name in names.items() if name != present[stage]}
+    return replace(ik, **{stage: STAGES[stage][name]() for stage, name in changed.items()})
 
 
-def exchanged(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:
-    """The rules of a system by stage, where they are others than its preset's."""
-    there = rules_of(preset)
-    return {stage: name for stage, name in rules_of(ik).items() if name != there[stage]}
+def changed_rules(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:
+    """The names of a system's rules, by stage, where they differ from its preset's."""
+    originals = rule_names(preset)
+    return {stage: name for stage, name in rule_names(ik).items() if name != originals[stage]}
 
 
-def with_parameters(ik: jaxik.FootIK, values: Mapping[str, Any], where: str) -> jaxik.FootIK:
-    """The system with these values by dotted name, switches too; ValueError for a wrong one."""
-    leaves = leaf_names(ik)
-    check_keys(values, leaves, where)
+def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK:
+    """The system with other values of parameters, conventions and switches.
+
+    Args:
+        ik: the system.
+        values: values by dotted name.
+        where: place of the values in their file, for the error message.
+
+    Raises:
+        ValueError: a name is unknown, or a value has the wrong type or shape.
+    """
+    check_keys(values, leaf_names(ik), where)
     for name, value in values.items():
         old = parameter_tree.get(ik, name)
         try:
             new = np.asarray(value)
-        except ValueError:  # lists of unlike lengths
+        except ValueError:  # lists of different lengths
             new = np.asarray(None)
         if new.dtype.kind not in ("b" if old.dtype == bool else "if") or np.isnan(new).any():
-            kind = "true or false" if old.dtype == bool else "a number"
-            raise ValueError(f"{where}: {name} is {value!r}; wanted {kind}")
+            wanted = "true or false" if old.dtype == bool else "a number"
+            raise ValueError(f"{where}: {name} is {value!r}; wanted {wanted}")
         if new.shape != old.shape and (old.ndim, new.ndim, new.size > 0) != (0, 1, True):
             raise ValueError(f"{where}: {name} has shape {new.shape}; wanted {old.shape}")
     return parameter_tree.replace(ik, dict(values))
@@ -97,10 +127,10 @@ def with_parameters(ik: jaxik.FootIK, values: Mapping[str, Any], where: str) -> 
 
 def leaf_names(ik: jaxik.FootIK) -> list[str]:
     """Dotted names of all parameters, conventions and switches of a system."""
-    return [f"{stage}.{one.name}" for stage, part in vars(ik).items() for one in fields(part)]
+    return [f"{stage}.{leaf.name}" for stage, rule in vars(ik).items() for leaf in fields(rule)]
 
 
-def free_table(given: Mapping[str, Any], where: str) -> dict[str, Mapping[str, Any]]:
-    """What a [free] table says of each parameter, by dotted name."""
-    named = flatten(given, 2)
-    return {name: check_table(one, FREE, f"{where} {name}") for name, one in named.items()}
+def read_free_table(table: Table, where: str) -> dict[str, Mapping[str, Any]]:
+    """The entries of a [free] table by dotted name; ValueError for a wrong key or value."""
+    named = flatten(table, 2)
+    return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in named.items()}

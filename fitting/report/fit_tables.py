@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
-from typing import Literal, NotRequired, TypeAlias, TypedDict
+from typing import TypeAlias
 
 from fitting.analysis.accuracy import Accuracy
 from fitting.analysis.limit_activity import ClipActivity
 from fitting.inference.threshold_profile import Profile
+from fitting.studies.fit import FittedParameter
 
 from .formatting import Table, interval, number, percent
 from .labels import ACCURACY, headings
@@ -15,25 +16,7 @@ CLOSE = 0.05  # fraction of its range within which a parameter counts as recover
 Truth: TypeAlias = Mapping[str, float] | None  # known parameter values by name
 
 
-class ParameterRow(TypedDict):
-    """A free parameter after a fit, as `fit.json` holds it."""
-
-    name: str
-    kind: str  # smooth or threshold
-    unit: str
-    value: float
-    low: float
-    high: float
-    interval: tuple[float, float] | list[float]  # 95 %
-    contraction: float  # 0 where only the prior is known, 1 where the clips decide
-    determined: bool
-    at_bound: Literal["low", "high"] | None
-    half_life: NotRequired[float]  # s, of a gain
-    gain_at_30_hz: NotRequired[float]
-    gain_at_60_hz: NotRequired[float]
-
-
-def parameter_table(rows: Sequence[ParameterRow], truth: Truth) -> Table:
+def parameter_table(rows: Sequence[FittedParameter], truth: Truth) -> Table:
     """Free parameters: value, interval, range, remarks; truth and error where they are known."""
     heading = ["parameter", "value", "unit", "95 % interval", "range"]
     table = [heading + (["truth", "error"] if truth else []) + ["remarks"]]
@@ -51,7 +34,7 @@ def parameter_table(rows: Sequence[ParameterRow], truth: Truth) -> Table:
     return table
 
 
-def gain_table(rows: Sequence[ParameterRow]) -> Table:
+def gain_table(rows: Sequence[FittedParameter]) -> Table:
     """Gains: their half-lives, and the gains per tick that these mean at 30 and 60 Hz."""
     table = [["gain", "half-life", "gain at 30 Hz", "gain at 60 Hz"]]
     for row in rows:
@@ -61,7 +44,7 @@ def gain_table(rows: Sequence[ParameterRow]) -> Table:
     return table
 
 
-def recovered(rows: Sequence[ParameterRow], truth: Mapping[str, float]) -> str:
+def recovered(rows: Sequence[FittedParameter], truth: Mapping[str, float]) -> str:
     """How many of the determined parameters are close to their true values."""
     known = [row for row in rows if row["determined"] and row["name"] in truth]
     close = sum(error(row, truth[row["name"]]) <= CLOSE for row in known)
@@ -70,12 +53,12 @@ def recovered(rows: Sequence[ParameterRow], truth: Mapping[str, float]) -> str:
     )
 
 
-def error(row: ParameterRow, true: float) -> float:
+def error(row: FittedParameter, true: float) -> float:
     """Distance of a fitted value from the true one, as a fraction of the parameter's range."""
     return abs(row["value"] - true) / (row["high"] - row["low"])
 
 
-def contraction_table(rows: Sequence[ParameterRow]) -> Table:
+def contraction_table(rows: Sequence[FittedParameter]) -> Table:
     """Free parameters by how well the clips determine them, the worst first."""
     table = [["parameter", "kind", "contraction", "verdict"]]
     for row in sorted(rows, key=lambda row: row["contraction"]):

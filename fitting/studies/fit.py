@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
 import jax.numpy as jnp
@@ -71,6 +72,7 @@ class Fit:
     solution: Solution
     identifiability: Identifiability
     known_values: Mapping[str, float] | None = None  # what made a synthetic reference
+    run: Path | None = None  # the folder where it is written
 
     @cached_property
     def ik(self) -> jaxik.FootIK:

@@ -1,11 +1,9 @@
 """Sampling the posterior around a fit."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 import jaxik
 from fitting.experiments.experiment import Experiment
@@ -15,32 +13,13 @@ from fitting.inference.sampling.posterior import (
     WalkerStart,
     sample_posterior,
 )
-from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.problem import Problem
 
 from .fit import FittedParameter
 
 
-@dataclass(frozen=True)
-class SamplingStart:
-    """The ball around a fit in which the walkers start."""
-
-    names: tuple[str, ...]
-    u: Float[np.ndarray, " free"]
-    sd: Float[np.ndarray, " free"]
-
-    @classmethod
-    def around(cls, parameters: Sequence[FittedParameter]) -> "SamplingStart":
-        """The ball around fitted parameters."""
-        return cls(
-            tuple(row["name"] for row in parameters),
-            np.array([row["u"] for row in parameters]),
-            np.array([row["start_sd"] for row in parameters]),
-        )
-
-
 def sample_around(
-    start: SamplingStart,
+    parameters: Sequence[FittedParameter],
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
     chain: Path | None = None,
@@ -49,31 +28,24 @@ def sample_around(
     """Samples the posterior of a problem.
 
     Args:
-        start: where the walkers start.
+        parameters: the fit, around which the walkers start.
         problem: the problem of the experiment.
         experiment: its settings of the sampler.
         chain: file that keeps the chain; one that is there is continued. None keeps it in memory.
         progress: called as the sampling goes on; KeyboardInterrupt keeps the chain so far.
 
     Raises:
-        ValueError: the start is that of other parameters, or the file holds another chain.
+        ValueError: the fit has other parameters than the problem, or the file holds another chain.
     """
-    if start.names != problem.space.names:
+    names = [row["name"] for row in parameters]
+    if names != list(problem.space.names):
         raise ValueError(
-            f"the fit has the parameters {list(start.names)}, the experiment "
-            f"{list(problem.space.names)}"
+            f"the fit has the parameters {names}, the experiment {list(problem.space.names)}"
         )
-    options = experiment.sample
+    start = WalkerStart(
+        np.array([row["u"] for row in parameters]),
+        np.array([row["start_sd"] for row in parameters]),
+    )
     return sample_posterior(
-        problem,
-        WalkerStart(start.u, start.sd),
-        SamplerSettings(
-            walkers=options.walkers,
-            max_steps=options.max_steps,
-            thin_by=options.thin_by,
-            stop_at=options.stop_at,
-        ),
-        seed=experiment.seed,
-        path=chain,
-        progress=progress,
+        problem, start, experiment.sample, seed=experiment.seed, path=chain, progress=progress
     )

@@ -1,18 +1,17 @@
 """The picture of several systems on one clip."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Literal, TypeAlias, TypedDict
 
 import numpy as np
-from jaxtyping import Float64
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from fitting.analysis.measures import Measures
-from fitting.analysis.playback import Motion
 from fitting.report.labels import MEASURES
+from fitting.studies.comparison import Comparison
 
 from .style import BEFORE, CAPTURED, EARTH, GROUND, STAGES, earth, legend, styled, whole_and_part
 
@@ -31,50 +30,43 @@ class LineStyle(TypedDict):
 
 
 @styled
-def overview(
-    time: Float64[np.ndarray, " frames"],
-    legs: Sequence[str],
-    ground: Float64[np.ndarray, "frames legs"],
-    motions: Mapping[str, Motion],
-    measures: Mapping[str, Measures],
-    title: str,
-) -> Figure:
-    """Heights of ankles and pelvis under every system, with the ground, and bars of the measures.
-
-    Args:
-        time: of each frame, s.
-        legs: their names.
-        ground: height under the animated ankles, m; NaN without.
-        motions: by system, the animation first.
-        measures: of the same systems.
-        title: of the figure.
-    """
-    styles = _line_styles(motions)
-    bars = -(-len(MEASURES) // BAR_PANELS)
-    heights = 3.4 * (len(legs) + 1) + 0.6, bars * (0.42 * len(motions) + 1.0)
+def overview(comparison: Comparison) -> Figure:
+    """Heights of ankles and pelvis under every system, with the ground, and bars of measures."""
+    styles = _line_styles(comparison.motions)
+    bar_rows = -(-len(MEASURES) // BAR_PANELS)
+    heights = 3.4 * (len(comparison.legs) + 1) + 0.6, bar_rows * (0.42 * len(styles) + 1.0)
     figure = Figure(figsize=(17, sum(heights) + 1.6), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(comparison.title)
     (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)
+    _draw_heights(upper, comparison, styles)
+    grid = lower.subplots(bar_rows, BAR_PANELS, squeeze=False, sharey=True)
+    for axes, key in zip(grid.flat, MEASURES, strict=False):
+        _bars(axes, key, comparison.measures, styles)
+    lines = [Line2D([], [], label=name, **style) for name, style in styles.items()]
+    legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
+    return figure
+
+
+def _draw_heights(
+    figure: FigureBase, comparison: Comparison, styles: Mapping[str, LineStyle]
+) -> None:
+    """Heights over time, a panel for each leg and one for the pelvis."""
+    ground, motions = comparison.ground, comparison.motions
+    time = np.arange(len(ground)) / comparison.fps
     pelvis = np.mean([motion.pelvis[:, 1] for motion in motions.values()], axis=0)
-    columns = whole_and_part(upper, time, pelvis, len(legs) + 1)
-    for shown in columns:
-        for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
+    columns = whole_and_part(figure, time, pelvis, len(comparison.legs) + 1)
+    for panels in columns:
+        for leg, (axes, name) in enumerate(zip(panels, comparison.legs, strict=False)):
             for system, motion in motions.items():
                 axes.plot(time, 100 * motion.ankle[:, leg, 1], **styles[system])
             earth(axes, time, 100 * ground[:, leg])
             axes.set_title(f"{_title(name)} ankle, with the ground under the animated one")
         for system, motion in motions.items():
-            shown[-1].plot(time, 100 * motion.pelvis[:, 1], **styles[system])
-        earth(shown[-1], time, 100 * ground.mean(axis=1))
-        shown[-1].set_title("Pelvis, with the mean ground under the animated feet")
+            panels[-1].plot(time, 100 * motion.pelvis[:, 1], **styles[system])
+        earth(panels[-1], time, 100 * ground.mean(axis=1))
+        panels[-1].set_title("Pelvis, with the mean ground under the animated feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
-    grid = lower.subplots(bars, BAR_PANELS, squeeze=False, sharey=True)
-    for axes, key in zip(grid.flat, MEASURES, strict=False):
-        _bars(axes, key, measures, styles)
-    lines = [Line2D([], [], label=name, **style) for name, style in styles.items()]
-    legend(figure, *lines, Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"), columns=6)
-    return figure
 
 
 def _line_styles(systems: Iterable[str]) -> dict[str, LineStyle]:

@@ -1,0 +1,159 @@
+"""From an experiment to the problem that is minimised: loads clips, makes flat animations, checks.
+
+A clip's reference, flat animation and terrain are cut and resampled alike, so that frame by frame
+they belong together.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import jaxik
+from fitting.datasets.clip_frames import frames_from_clip
+from fitting.datasets.clips import Clip, edit, load_clip
+from fitting.datasets.flat_animation import flatten_clip, load_flat_animation
+from fitting.datasets.terrain import mesh_files
+from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.scene import Reference, Scene, Sigmas
+from fitting.problem.space import make_space
+from fitting.runtime.validation import error_context
+from jaxik.world.skeleton import Transform
+from jaxik.world.terrain import Terrain
+
+from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment
+
+
+class ClipData(NamedTuple):
+    """What an entry of an experiment loads, over the same frames."""
+
+    reference: Clip
+    base: Clip  # the flat animation
+    terrain: Terrain
+
+
+def make_problem(experiment: Experiment) -> Problem[jaxik.FootIK]:
+    """Loads the clips of an experiment and builds its problem.
+
+    Raises:
+        ValueError: something in the experiment does not fit its clips or its preset.
+    """
+    data = (load_clip_data(entry, experiment.fps) for entry in experiment.clips)
+    return problem_from_clips(experiment, data)
+
+
+def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Problem[jaxik.FootIK]:
+    """The problem of an experiment whose clips are loaded already, in the order of its entries.
+
+    Raises:
+        ValueError: as `make_problem`.
+    """
+    ik = experiment.starting_system()
+    parameters = experiment.free_parameters(ik)
+    with error_context(f"{experiment.path} [free]"):
+        space = make_space(ik, parameters)
+    scenes = []
+    for entry, data in zip(experiment.clips, clips, strict=True):
+        scene = make_scene(data, experiment.sigmas, entry.label)
+        with error_context(f"{experiment.path} [parameters]"):
+            check_shapes(ik, scene.rig, scene.terrain, scene.frames)
+        scenes.append(scene)
+    dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
+    independent = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
+    return Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, independent)
+
+
+def load_clip_data(entry: ClipEntry, fps: float | None) -> ClipData:
+    """Loads one clip of an experiment; `fps` resamples it, None keeps its rate."""
+    terrain = mesh_files.load_terrain(entry.terrain, file_up=entry.file_up)
+    captured = load_clip(entry.reference)
+    if entry.mask_pops:
+        with error_context(entry.reference):
+            captured = edit.mask_pops(captured)  # before resampling, which would smear a pop
+    reference = _cut(captured, entry.reference, entry, fps)
+    if entry.base is None:
+        base = flatten_clip(reference, mesh_files.height_function(terrain))
+        return ClipData(reference, base, terrain)
+    base = _cut(load_flat_animation(entry.base), entry.base, entry, fps)
+    if _outline(base) != _outline(reference):
+        raise ValueError(
+            f"{entry.base}: the base has {_outline(base)}; the reference has {_outline(reference)}"
+        )
+    return ClipData(reference, base, terrain)
+
+
+def _outline(clip: Clip) -> str:
+    return f"{clip.frame_count} frames at {clip.fps:g} Hz of the legs {list(clip.rig.names)}"
+
+
+def _cut(clip: Clip, path: Path, entry: ClipEntry, fps: float | None) -> Clip:
+    with error_context(path):
+        clip = edit.trim(clip, entry.start, entry.end)
+    return clip if fps is None else edit.resample(clip, fps)
+
+
+def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captured") -> Scene:
+    """One clip as residuals need it; `sigmas` override the defaults, plots show the label."""
+    reference, base, terrain = data
+    frames = frames_from_clip(base)
+    legs = reference.leg_pose_ws()
+    stance = reference.stance
+    labels = np.zeros(legs.ankle.pos.shape[:2]) if stance is None else stance.astype(float)
+    observed = np.ones(reference.frame_count, bool) if reference.mask is None else reference.mask
+    all_sigmas = DEFAULT_SIGMAS | dict(sigmas)
+    if stance is None:
+        all_sigmas["contact"] = float("inf")
+    return Scene(
+        rig=base.rig,
+        terrain=terrain,
+        frames=frames,
+        pelvis=_into(frames.world_from_model, _joint_ws(base, base.rig.pelvis)),
+        reference=Reference(
+            pelvis=_joint_ws(reference, reference.rig.pelvis),
+            knee_ws=legs.knee.pos,
+            ankle=legs.ankle,
+            contact=jax.device_put(labels),
+            observed=jax.device_put(observed),
+            label=label,
+        ),
+        sigmas=Sigmas(**{kind: jax.device_put(np.float64(s)) for kind, s in all_sigmas.items()}),
+    )
+
+
+def _joint_ws(clip: Clip, joint: int) -> Transform:
+    return Transform(*jax.device_put((clip.positions_ws[:, joint], clip.rotations_ws[:, joint])))
+
+
+@jax.jit  # without jit this compiles twelve programs instead of one
+def _into(space: Transform, joint: Transform) -> Transform:
+    return space.inverse() @ joint
+
+
+def check_shapes(ik: jaxik.FootIK, rig: jaxik.Rig, terrain: Terrain, frames: jaxik.Frame) -> None:
+    """Checks that parameters with several values have one for each leg of the rig.
+
+    Raises:
+        ValueError: a parameter has another number of values than the rig has legs.
+    """
+    changed_shapes = {
+        f"{stage}.{leaf.name}": getattr(rule, leaf.name).shape
+        for stage, rule in vars(ik).items()
+        for leaf in fields(rule)
+        if getattr(rule, leaf.name).shape != getattr(type(rule)(), leaf.name).shape
+    }
+    if not changed_shapes:
+        return  # the usual case, which need not wait for a trace
+    try:
+        jax.eval_shape(jaxik.run, ik, rig, terrain, frames)
+    except (TypeError, ValueError):
+        counts = ", ".join(
+            f"{name} has {shape[0]} values" for name, shape in changed_shapes.items()
+        )
+        raise ValueError(
+            f"{counts}; wanted one for all legs or, where legs may differ, {len(rig.side)} for the "
+            f"legs {list(rig.names)}"
+        ) from None

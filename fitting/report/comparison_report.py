@@ -1,0 +1,74 @@
+"""The report of a comparison: a table with its explanation, the numbers, and a figure."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from fitting.runtime import files
+from fitting.studies.comparison import ANIMATED, Comparison
+
+from .formatting import Table, markdown, percent
+from .labels import MEASURES, explanations, headings
+from .plots import comparison_plots, style
+
+TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
+
+
+def write(folder: Path, comparison: Comparison) -> None:
+    """Writes compare.md, compare.json and compare.png into a folder, which is made if needed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    style.save(folder / FIGURE, comparison_plots.overview(comparison))
+    files.write_text(folder / NUMBERS, json.dumps(_numbers(comparison), indent=2) + "\n")
+    files.write_text(folder / TABLE, _summary(comparison))
+
+
+def table(comparison: Comparison) -> Table:
+    """The measures, a row for each system."""
+    rows = [
+        [name, *(MEASURES[key].format(value) for key, value in asdict(measures).items())]
+        for name, measures in comparison.measures.items()
+    ]
+    return [["system", *headings(MEASURES)], *rows]
+
+
+def transposed(rows: Table) -> Table:
+    """The table with its rows as columns, which fits a terminal."""
+    return [list(column) for column in zip(*rows, strict=True)]
+
+
+def _numbers(comparison: Comparison) -> dict[str, object]:
+    """The content of compare.json: SI units, radians and fractions of 1; null for NaN."""
+    return {
+        "title": comparison.title,
+        "frames": len(comparison.ground),
+        "fps": comparison.fps,
+        "soles_without_ground": comparison.groundless,
+        "systems": [
+            {"name": name}
+            | {key: None if np.isnan(value) else value for key, value in asdict(measures).items()}
+            for name, measures in comparison.measures.items()
+        ],
+    }
+
+
+def _summary(comparison: Comparison) -> str:
+    count = len(comparison.ground)
+    parts = [
+        f"# {comparison.title}",
+        f"{count} frames, {(count - 1) / comparison.fps:.2f} s at {comparison.fps:g} Hz. "
+        f"`{ANIMATED}` is the animation without foot IK, on its flat floor.",
+        markdown(table(comparison)),
+        f"![Feet and pelvis over the ground, and the measures]({FIGURE})",
+        "## What the columns mean",
+        explanations(MEASURES),
+        "Presets that leave the character's height to their game (`unreal`, `mec`) have the root "
+        "on the ground below it, unless `--roots animated` was given.",
+        "A foot stands where the animation says so: by its contact labels or, without them, by its "
+        "motion. The ground under a point is what a ray from above meets first.",
+    ]
+    if comparison.groundless:
+        fraction = percent(comparison.groundless)
+        parts.append(f"{fraction} of the soles' points have no ground under them and are left out.")
+    return "\n\n".join(parts) + "\n"
