@@ -1,19 +1,24 @@
-"""Traced programs kept on disk beside the compiled ones, so that the next process traces nothing.
+"""Traced programs kept on disk beside the compiled ones, so that the next process need not trace.
 
-JAX's own cache finds compiled code by a program's text, and to have that text it traces: for a fit
-that takes longer than the search. Here the text itself is kept, by what it was traced from: the
-function, what is static in its arguments, shapes and types of their arrays, the source of this
-project and the versions of the libraries below.
+JAX's own cache finds compiled code by the text of a program, and has to trace to get that text; for
+a fit, tracing takes longer than the search. Here the text itself is kept. Its key is everything it
+was traced from: the function, the static part of its arguments, the shapes and types of their
+arrays, the source of this project and the versions of the libraries below.
+
+A cache file is trusted no further than needed: it must belong to the user who runs the program, and
+reading it may construct classes that only store their fields, but calls no function.
 """
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import io
+import os
 import pickle
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any, ParamSpec, TypeAlias, TypeVar
@@ -21,56 +26,67 @@ from typing import Any, ParamSpec, TypeAlias, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import export
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 import jaxik
 
 from . import files
 
-OWN = ("jaxik", "fitting")
+PROJECT = ("jaxik", "fitting")
 LIBRARIES = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
-PLAIN = ("builtins", "collections", "copyreg", "enum", "functools", "pathlib", "types", "typing")
-FOLDER = "traced"  # in that of JAX's cache
-# LAPACK's names may change with jaxlib, whose version is part of what a program is found by.
+STANDARD = ("builtins", "collections", "copyreg", "enum", "functools", "pathlib", "types", "typing")
+FOLDER = "traced"  # inside the folder of JAX's cache
+# JAX refuses to export these calls because LAPACK's names may change with jaxlib, whose version is
+# part of the key here.
 UNSTABLE = tuple(
     export.DisabledSafetyCheck.custom_call(f"lapack_{letter}{routine}_ffi")
     for letter in "sd"
-    for routine in ("geqrf", "ormqr", "orgqr", "gesdd")  # of a step's and an ensemble's equations
+    for routine in ("geqrf", "ormqr", "orgqr", "gesdd")  # the least-squares solves of a fit
 )
-TRACING = threading.RLock()  # two threads would take turns anyway, and trace twice what they share
+# What outputs are described by, besides modules and dataclasses.
+PYTREE_PARTS = (
+    jax.ShapeDtypeStruct,
+    jax.tree_util.PyTreeDef,
+    jax.tree_util.default_registry,
+    np.dtype,
+)
+TRACING = threading.RLock()  # parallel tracing gains nothing, and shared parts are traced once
 
-Given = ParamSpec("Given")
-Made = TypeVar("Made")
-# Itself, what it makes with 0 for each array, and what of that is static.
-Program: TypeAlias = tuple[export.Exported, Any, Any]
+Inputs = ParamSpec("Inputs")
+Output = TypeVar("Output")
+Arguments: TypeAlias = tuple[tuple[object, ...], Mapping[str, object]]
+# The program, its output with 0 in place of each array, and the static part of its output.
+Program: TypeAlias = tuple[export.Exported, PyTree, PyTree]
 
 
-class _Unknown(Exception):
-    """Something whose source may change without our knowing."""
+class _UnknownSource(Exception):
+    """A function or class from outside the project, whose source may change unnoticed."""
 
 
-def cached(function: Callable[Given, Made]) -> Callable[Given, Made]:
-    """`equinox.filter_jit`, and where JAX keeps compiled programs the traced one is kept too.
+def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
+    """`equinox.filter_jit` that also keeps the traced program, wherever JAX keeps compiled ones.
 
-    Arrays of the arguments are traced and everything else is static. A program is only kept if all
-    that is static comes from this project or the libraries, by name: a function of the user's may
-    change and keep its name. Inside another program this is `filter_jit`.
+    Arrays among the arguments are traced; everything else is static. A program is kept only if all
+    static arguments come from this project or its libraries: a user's function may change and keep
+    its name. Called inside another traced program, this is plain `filter_jit`.
     """
 
-    def read_or_traced(*args: Given.args, **named: Given.kwargs) -> Any:
-        given = (args, named)
-        if (program := _program(function, given)) is None:
+    def from_cache(*args: Inputs.args, **named: Inputs.kwargs) -> Any:
+        arguments = (args, named)
+        if (program := _load_or_trace(function, arguments)) is None:
             return function(*args, **named)
         exported, blank, constants = program
-        made = exported.call(*jax.tree.leaves(eqx.filter(given, eqx.is_array)))
-        return eqx.combine(jax.tree.unflatten(jax.tree.structure(blank), made), constants)
+        arrays = exported.call(*jax.tree.leaves(eqx.filter(arguments, eqx.is_array)))
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(blank), arrays), constants)
 
     inside = eqx.filter_jit(function)
-    outside = eqx.filter_jit(functools.wraps(function)(read_or_traced))
+    outside = eqx.filter_jit(functools.wraps(function)(from_cache))
 
     @functools.wraps(function)
-    def call(*args: Given.args, **named: Given.kwargs) -> Made:
+    def call(*args: Inputs.args, **named: Inputs.kwargs) -> Output:
         leaves = jax.tree.leaves((args, named))
         traced = any(isinstance(leaf, Tracer) for leaf in leaves)
         return (inside if traced else outside)(*args, **named)
@@ -78,104 +94,143 @@ def cached(function: Callable[Given, Made]) -> Callable[Given, Made]:
     return call
 
 
-def _program(function: Callable, given: Any) -> Program | None:
-    """The program for arguments of this kind, read or traced; None if it is not to be kept."""
+def _load_or_trace(function: Callable, arguments: Arguments) -> Program | None:
+    """The program for arguments of these types; None if it must not be kept."""
     config: Any = jax.config
     folder = config.jax_compilation_cache_dir
     if not folder or not config.jax_enable_compilation_cache or jax.device_count() > 1:
         return None
     try:
-        path = Path(folder, FOLDER, _name(function, given))
+        path = Path(folder, FOLDER, _file_name(function, arguments))
         if (program := _read(path)) is None:
-            program = _trace(function, given)
+            program = _trace(function, arguments)
             _write(path, program)
         return program
-    except (_Unknown, pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError):
-        return None  # what is wrong with the call itself, it will tell when it is made
+    except (
+        _UnknownSource, pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError
+    ):  # fmt: skip
+        return None  # if the call itself is wrong, calling the function will raise the error
 
 
-def _name(function: Callable, given: Any) -> str:
-    """The file of a program: what it is, and a digest of all that it is traced from."""
-    dynamic, static = eqx.partition(given, eqx.is_array)
-    kinds = jax.tree.map(_kind, dynamic)
+def _file_name(function: Callable, arguments: Arguments) -> str:
+    """The function's name and a digest of everything the program is traced from."""
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    array_types = jax.tree.map(_array_type, dynamic)
     config: Any = jax.config
     settings = (jax.default_backend(), config.jax_enable_x64, config.jax_default_matmul_precision)
-    _check_known(function)
-    which = (function.__module__, function.__qualname__)
-    described = io.BytesIO()
-    describer = _Describer(described)
-    describer.fast = True  # or it would matter which equal things are one and the same
-    describer.dump((which, kinds, static, settings))
-    digest = hashlib.sha256(_sources() + described.getvalue()).hexdigest()
+    _check_source(function)
+    function_name = (function.__module__, function.__qualname__)
+    description = io.BytesIO()
+    describer = _Describer(description)
+    describer.fast = True  # no memo: otherwise equal and identical objects would differ
+    describer.dump((function_name, array_types, static, settings))
+    digest = hashlib.sha256(_sources() + description.getvalue()).hexdigest()
     return f"{function.__name__}-{digest}"
 
 
-def _kind(leaf: Any) -> tuple[tuple[int, ...], str, bool]:
+def _array_type(leaf: object) -> tuple[tuple[int, ...], str, bool]:
     aval = jax.typeof(leaf)
     return aval.shape, str(aval.dtype), aval.weak_type
 
 
 class _Describer(pickle.Pickler):
-    """Writes what a program is traced from; functions and classes count by their names."""
+    """Writes down what a program is traced from, functions and classes by their names."""
 
-    def reducer_override(self, obj: Any) -> Any:
+    def reducer_override(self, obj: object) -> object:
         if isinstance(obj, type) or (callable(obj) and hasattr(obj, "__qualname__")):
-            _check_known(obj)
+            _check_source(obj)
         return NotImplemented
 
 
-def _check_known(named: Any) -> None:
-    if named.__module__.partition(".")[0] not in {*OWN, *LIBRARIES, *PLAIN}:
-        raise _Unknown(f"{named.__module__}.{named.__qualname__}")
+def _check_source(named: Callable) -> None:
+    if named.__module__.partition(".")[0] not in {*PROJECT, *LIBRARIES, *STANDARD}:
+        raise _UnknownSource(f"{named.__module__}.{named.__qualname__}")
 
 
 @functools.cache
 def _sources() -> bytes:
-    """A digest of this project's source, and of the libraries' versions."""
+    """A digest of this project's source and of the libraries' versions."""
     digest = hashlib.sha256(sys.version.encode())
-    for package in OWN:
-        room = Path(str(sys.modules[package].__file__)).parent
-        for path in sorted(room.rglob("*.py")):
-            digest.update(f"{path.relative_to(room)}".encode() + path.read_bytes())
+    for package in PROJECT:
+        root = Path(str(sys.modules[package].__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}".encode() + path.read_bytes())
     for name in LIBRARIES:
         digest.update(f"{name} {metadata.version(name)}".encode())
     return digest.digest()
 
 
-def _trace(function: Callable, given: Any) -> Program:
-    dynamic, static = eqx.partition(given, eqx.is_array)
+def _trace(function: Callable, arguments: Arguments) -> Program:
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
     leaves, structure = jax.tree.flatten(dynamic)
-    kinds = [jax.ShapeDtypeStruct(*kind[:2], weak_type=kind[2]) for kind in map(_kind, leaves)]
-    made: list[Any] = []
+    types = [
+        jax.ShapeDtypeStruct(shape, dtype, weak_type=weak)
+        for shape, dtype, weak in map(_array_type, leaves)
+    ]
+    static_output: list[PyTree] = []
 
-    def flat(*leaves: Any) -> list[Any]:
+    def flat(*leaves: jax.Array) -> list[jax.Array]:
         args, named = eqx.combine(jax.tree.unflatten(structure, leaves), static)
         arrays, constants = eqx.partition(function(*args, **named), eqx.is_array)
-        made[:] = [jax.tree.map(lambda _: 0, arrays), constants]
-        # Of the very type it has when read again, or the next program's name would differ.
+        static_output[:] = [jax.tree.map(lambda _: 0, arrays), constants]
+        # Drops weak types, which export would drop: the next program's key must not change.
         return [jnp.asarray(leaf, leaf.dtype) for leaf in jax.tree.leaves(arrays)]
 
     with TRACING:
-        exported = export.export(jax.jit(flat), disabled_checks=UNSTABLE)(*kinds)
-    return exported, *made
+        exported = export.export(jax.jit(flat), disabled_checks=UNSTABLE)(*types)
+    blank, constants = static_output
+    return exported, blank, constants
+
+
+class _SafeUnpickler(pickle.Unpickler):
+    """Reads values that consist of plain data and of classes that only store their fields.
+
+    A pickle may name any function to be called; this finds no functions, and imports nothing.
+    """
+
+    def find_class(self, module: str, name: str) -> object:
+        found: object = sys.modules.get(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        known = module.partition(".")[0] in {*PROJECT, *LIBRARIES}
+        if not known or not (_only_stores(found) or any(found is part for part in PYTREE_PARTS)):
+            raise pickle.UnpicklingError(f"{module}.{name} is not part of an output")
+        return found
+
+
+def _only_stores(found: object) -> bool:
+    if not isinstance(found, type):
+        return False
+    own = found.__module__.partition(".")[0] in PROJECT and dataclasses.is_dataclass(found)
+    return own or issubclass(found, eqx.Module | eqx.Enumeration)
 
 
 def _read(path: Path) -> Program | None:
-    """What was kept in a file; None where there is none, or a damaged one."""
+    """The program in a cache file; None if there is none, or it is damaged or someone else's."""
     try:
-        text, blank, constants = pickle.loads(path.read_bytes())
+        if not _is_own(path):
+            return None
+        text, blank, constants = _SafeUnpickler(io.BytesIO(path.read_bytes())).load()
         return export.deserialize(text), blank, constants
-    except Exception:  # whatever is wrong with it, it can be made anew
+    except Exception:  # whatever is wrong with the file, the program can be traced again
         return None
 
 
+def _is_own(path: Path) -> bool:
+    """Whether nobody but this user can have written the file, as far as the system knows owners."""
+    status = path.stat()
+    return not hasattr(os, "getuid") or (
+        status.st_uid == os.getuid() and not status.st_mode & 0o002
+    )
+
+
 def _write(path: Path, program: Program) -> None:
-    """Keeps a program, where the folder may be written."""
-    exported, *made = program
-    kept_as = pickle.dumps((exported.serialize(), *made))
+    """Keeps a program if the folder can be written to."""
+    exported, blank, constants = program
+    content = pickle.dumps((bytes(exported.serialize()), blank, constants))
     with contextlib.suppress(OSError, ValueError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write(path, lambda temporary: temporary.write_bytes(kept_as))
+        files.write(path, lambda temporary: temporary.write_bytes(content))
 
 
 run = cached(jaxik.run)

@@ -22,8 +22,9 @@ def _number_in(accepts: Callable[[float], bool]) -> Callable[[object], bool]:
     """A test for numbers that are not NaN and for which `accepts` holds."""
 
     def test(value: object) -> bool:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return is_number and not math.isnan(value) and accepts(value)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return False
+        return not math.isnan(value) and accepts(value)
 
     return test
 
