@@ -187,6 +187,7 @@ def size_of_png(path: Path) -> tuple[int, int]:
     return struct.unpack(">II", path.read_bytes()[16:24])
 
 
+@pytest.mark.slow
 def test_the_terminal_shows_the_table_and_how_long_each_system_took(folder, compared, capsys):
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
     assert main.main([*map(str, words), "-o", str(folder / "again")]) == 0
@@ -211,7 +212,7 @@ def test_an_interrupt_leaves_nothing(folder, tmp_path, monkeypatch, capsys):
 
 def test_a_figure_tells_more_systems_apart_than_there_are_colours():
     names = [f"system {index}" for index in range(15)]
-    looks = comparison_plots._looks(names)
+    looks = comparison_plots._line_styles(names)
     assert len({(look["color"], look["linestyle"]) for look in looks.values()}) == len(names)
     assert looks["system 0"]["color"] == style.BEFORE
 
@@ -222,10 +223,11 @@ def test_a_figure_has_a_panel_a_leg_one_for_the_pelvis_and_one_a_measure(legs):
     motion = Motion(np.zeros((300, 3)), *still)
     unknown = Measures(**{key: float("nan") for key in MEASURES})
     zero = Measures(**{key: 0.0 for key in MEASURES})
-    figure = comparison_plots.overview(
-        np.arange(300) / 30.0, [f"leg {leg}" for leg in range(legs)], np.full((300, legs), np.nan),
-        {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero}, "title",
+    compared = comparison.Comparison(
+        "title", tuple(f"leg {leg}" for leg in range(legs)), 30.0, np.full((300, legs), np.nan), 0.0,
+        {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero},
     )  # fmt: skip
+    figure = comparison_plots.overview(compared)
     upper, lower = figure.subfigs
     assert len(upper.axes) == 2 * (legs + 1) and len(lower.axes) == len(MEASURES)
     assert [text.get_text() for text in lower.axes[0].texts] == ["–", "0.00"]
