@@ -65,7 +65,7 @@ def test_static_fields_belong_to_the_structure():
 
 def test_a_struct_is_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        Transform.identity().pos = jnp.ones(3)
+        Transform.identity().pos = jnp.ones(3)  # pyright: ignore[reportAttributeAccessIssue]
     replaced = dataclasses.replace(Transform.identity(), pos=jnp.ones(3))
     np.testing.assert_array_equal(replaced.pos, 1.0)
 

@@ -142,7 +142,7 @@ def test_an_angle_is_told_to_the_last_digits_all_around_and_at_every_size():
         exact = np.arctan2(y.astype(np.float64), x.astype(np.float64))
         answer = vec.safe_arctan2(jnp.asarray(y), jnp.asarray(x))
         assert answer.dtype == dtype
-        assert_allclose(answer, exact, rtol=6 * np.finfo(dtype).eps)
+        assert_allclose(answer, exact, rtol=6 * float(np.finfo(dtype).eps))
 
 
 def test_cosines_and_sines_are_told_to_the_last_digits_all_around():
