@@ -132,7 +132,7 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
     """The solved legs."""
     rig, frame, effector = inputs.rig, inputs.frame, advanced.effector
     offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
-    body = body_transform(inputs, advanced.lean.turn_ws, offset_ws)
+    body = body_transform(inputs, advanced.lean.rot_ws, offset_ws)
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
         moved = frame.pose.transformed(body.repeat(rig.side.size))

@@ -1,4 +1,4 @@
-"""Stage 8: where each leg is sent once the body has moved, and how much of foot IK it gets."""
+"""Stage 8: where each leg goes once the body has moved, and how much foot IK it gets."""
 
 from abc import abstractmethod
 
@@ -22,12 +22,12 @@ class Effector:
     """What the legs are solved for."""
 
     target_ws: Float[Array, "legs 3"]  # m, of the ankles
-    rot_ws: Float[Array, "legs 4"]  # of the ankles, as the foot's rule takes it
-    weight: Float[Array, " legs"]  # 0..1, share of foot IK
+    rot_ws: Float[Array, "legs 4"]  # of the ankles, for the foot rule
+    weight: Float[Array, " legs"]  # 0..1, how much foot IK each leg gets
 
 
 class AbstractEffector(Rule):
-    """Follows the targets."""
+    """Turns the targets of the feet into those of the legs."""
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:
@@ -35,17 +35,24 @@ class AbstractEffector(Rule):
 
     @abstractmethod
     def awake(self, now: SensedMoment, state: PyTree) -> Float[Array, ""]:
-        """0 while the body shall stay as it is, else 1."""
+        """0 while the body is to stay where it is, else 1."""
 
     @abstractmethod
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: PyTree
     ) -> tuple[PyTree, Effector]:
-        """Memory after this frame, and where the legs go."""
+        """Memory after this frame, and where the legs go.
+
+        Args:
+            now: the sensed frame.
+            target: where the ankles are to go (legs), world space.
+            pelvis: the body's offset in this frame.
+            state: memory after the frame before.
+        """
 
 
 class AbstractInstantEffector(AbstractEffector):
-    """Follows by the present frame alone."""
+    """Effectors without memory."""
 
     def init(self, rig: Rig) -> None:
         return None
@@ -55,7 +62,7 @@ class AbstractInstantEffector(AbstractEffector):
 
 
 class DirectEffector(AbstractInstantEffector):
-    """The targets as they are; a foot without ground goes where it was animated."""
+    """The targets themselves; a foot without ground goes to its animated place."""
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -64,7 +71,7 @@ class DirectEffector(AbstractInstantEffector):
 
 
 class FoundEffector(AbstractInstantEffector):
-    """The targets of feet that found ground; other legs stay as the body carries them (ozz)."""
+    """The targets of feet with ground; other legs move with the body (ozz)."""
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -74,11 +81,11 @@ class FoundEffector(AbstractInstantEffector):
 
 
 class HeelEffector(AbstractInstantEffector):
-    """Lifts a heel where its leg would otherwise be too long, as a walker's trailing foot does.
+    """Lifts the heel of a leg that would be over-stretched, as the trailing foot of a walker.
 
-    The foot turns about its ball, toes down, until the ankle is within `extension` of the leg's
-    length of the hip, or within the animated distance where that is longer, by `max_lift` at most
-    (as the heel lift of locomotion systems after Johansen, 2009).
+    The foot turns about its ball, toes down, until the distance from hip to ankle is `extension`
+    times the length of the leg, or the animated distance if that is longer. It turns by at most
+    `max_lift`. Locomotion systems after Johansen (2009) lift heels in the same way.
     """
 
     extension: Leaf = parameter(
@@ -96,27 +103,35 @@ class HeelEffector(AbstractInstantEffector):
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
         sensed = now.sensed
-        turn = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
-        arm = quat.rotate(turn, sensed.ankle_ws - sensed.ball_ws)
+        from_animated = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
+        arm = quat.rotate(from_animated, sensed.ankle_ws - sensed.ball_ws)
         ball = target.pos - arm
         axis = vec.cross(sensed.ahead_ws, sensed.leg_up_ws)
-        spare = vec.length(sensed.ankle_ws - sensed.hip_ws)
+        animated = vec.length(sensed.ankle_ws - sensed.hip_ws)
         longest = self.extension * (sensed.thigh + sensed.shin)
-        longest = jnp.where(spare > longest, spare, longest)
+        longest = jnp.where(animated > longest, animated, longest)
         hip = sensed.hip_ws + pelvis.offset_ws
         angle = heel_angle(ball - hip, arm, axis, longest)
-        level = jnp.zeros_like(angle)
-        angle = now.gate.clip(angle, level, level + self.max_lift, band=ANGLE_BAND)
+        zero = jnp.zeros_like(angle)
+        angle = now.gate.clip(angle, zero, zero + self.max_lift, band=ANGLE_BAND)
         lift = quat.from_axis_angle(axis, -angle)
         rot_ws = quat.multiply(lift, target.rot)
         return None, Effector(ball + quat.rotate(lift, arm), rot_ws, sensed.weight)
 
 
 def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[Array, " legs"]:
-    """Turn of `arm`, rad, toes down about `axis`, after which `to_ball + arm` is `length` long.
+    """Angle by which the heel has to rise for the leg to have a given length, rad.
 
-    Below 0 where it is shorter as it is; where it never gets so short, the turn that comes nearest;
-    0 where it would only get longer. The squared length is `c + P cos + Q sin` of the turn.
+    It turns `arm` about `axis`, toes down, so that `to_ball + arm` has the length `length`. It is
+    negative if the leg is shorter already. If the leg cannot become so short, it is the angle that
+    comes nearest; if rising would only lengthen the leg, it is 0. The squared length is
+    `c + P cos + Q sin` of the angle.
+
+    Args:
+        to_ball: from hip to ball, m.
+        arm: from ball to ankle, m.
+        axis: unit.
+        length: wanted from hip to ankle, m.
     """
     along = vec.scale(axis, vec.dot(arm, axis))
     across = arm - along
@@ -125,31 +140,31 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
     cos_part = 2.0 * vec.dot(start, across)
     sin_part = 2.0 * vec.dot(start, vec.cross(across, axis))
     size = vec.safe_sqrt(cos_part**2 + sin_part**2)
-    helps = sin_part < 0
+    shortens = sin_part < 0
     cosine = vec.safe_divide(length**2 - constant, size)
     inside = (cosine > -1) & (cosine < 1)
-    edge = jnp.where(cosine < 0, jnp.pi, 0.0)
+    limit = jnp.where(cosine < 0, jnp.pi, 0.0)
     safe = jnp.where(inside, cosine, 0.0)
-    turned = jnp.where(inside, vec.safe_arctan2(vec.safe_sqrt(1.0 - safe**2), safe), edge)
-    phase = vec.safe_arctan2(jnp.where(helps, sin_part, -1.0), cos_part)
-    return jnp.where(helps, turned + phase, 0.0)
+    angle = jnp.where(inside, vec.safe_arctan2(vec.safe_sqrt(1.0 - safe**2), safe), limit)
+    phase = vec.safe_arctan2(jnp.where(shortens, sin_part, -1.0), cos_part)
+    return jnp.where(shortens, angle + phase, 0.0)
 
 
 @struct
 class BodyState:
-    """Feet relative to the body."""
+    """Heights of the feet relative to the body."""
 
-    height: Float[Array, " legs"]  # m, of the ankles over the moved body's animation
+    height: Float[Array, " legs"]  # m, of the ankles above their animation on the moved body
     asleep: Float[Array, ""]  # 0 or 1
 
 
 class BodyEffector(AbstractEffector):
-    """Smooths each foot's height relative to the body, after the body has moved (Unreal, seed 001).
+    """Smooths each foot's height relative to the body, after the body has moved (Unreal).
 
-    The height goes to the asked one less the pelvis' goal by the clamped-speed law, and the foot
-    moves with the pelvis. With `latch` on everything stops once all feet are within
-    `latch_distance` of their goals, until the character moves: a pelvis slower than the feet then
-    freezes short of its goal, which is the original's trap. Off is recommended.
+    The height goes to the requested height less the pelvis' goal, by the clamped-speed law of
+    Unreal's interp-to, and the foot moves with the pelvis. With `latch` on, as in the original,
+    everything stops once all feet are within `latch_distance` of their goals, until the character
+    moves. A pelvis slower than the feet then freezes short of its goal, so better leave it off.
     """
 
     speed: Leaf = parameter(
@@ -183,30 +198,32 @@ class BodyEffector(AbstractEffector):
         return BodyState(jnp.zeros_like(rig.side), jnp.zeros((), rig.side.dtype))
 
     def awake(self, now: SensedMoment, state: BodyState) -> Float[Array, ""]:
-        return 1.0 - state.asleep * self._still(now)
+        return 1.0 - state.asleep * self._stands(now)
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: BodyState
     ) -> tuple[BodyState, Effector]:
         sensed = now.sensed
         awake = self.awake(now, state)
-        asked = requested_heights(sensed, target.pos)
-        goal = asked - pelvis.goal
-        share = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
-        share = awake * now.progress(share)
-        height = smoothing.lerp(state.height, goal, share)
+        requested = requested_heights(sensed, target.pos)
+        goal = requested - pelvis.goal
+        fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
+        fraction = awake * now.progress(fraction)
+        height = smoothing.lerp(state.height, goal, fraction)
 
         near = now.gate.below(jnp.abs(goal - height), self.latch_distance, band=HEIGHT_BAND)
         arrived = jnp.prod(jnp.where(sensed.weight > 0, near, 1.0))
-        falls = jnp.where(self.latch, self._still(now), 0.0)
-        asleep = falls * (1.0 - awake * (1.0 - arrived))
+        may_sleep = jnp.where(self.latch, self._stands(now), 0.0)
+        asleep = may_sleep * (1.0 - awake * (1.0 - arrived))
 
-        moved = vec.scale(sensed.leg_up_ws, height / self.mesh_scale - asked) + pelvis.offset_ws
-        effector = Effector(target.pos + moved, target.rot, sensed.weight)
+        offset_ws = (
+            vec.scale(sensed.leg_up_ws, height / self.mesh_scale - requested) + pelvis.offset_ws
+        )
+        effector = Effector(target.pos + offset_ws, target.rot, sensed.weight)
         return BodyState(height, asleep), effector
 
-    def _still(self, now: SensedMoment) -> Float[Array, ""]:
-        """1 while all feet stand."""
+    def _stands(self, now: SensedMoment) -> Float[Array, ""]:
+        """1 while all feet with foot IK stand."""
         sensed = now.sensed
         standing = jnp.where(sensed.weight > 0, sensed.contact.planted, 1.0)
         return now.gate.minimum(standing, band=0.1)
@@ -214,18 +231,18 @@ class BodyEffector(AbstractEffector):
 
 @struct
 class FadeState:
-    """How far each leg has come, and what its last ground asked of it."""
+    """How far each leg has faded in, and where its last ground put it."""
 
-    share: Float[Array, " legs"]  # 0..1
+    weight: Float[Array, " legs"]  # 0..1
     offset_ws: Float[Array, "legs 3"]  # m, from the animated ankle to the target
-    turn_ws: Float[Array, "legs 4"]  # from the animated ankle's rotation to the wanted one
+    rot_ws: Float[Array, "legs 4"]  # from the animated rotation of the ankle to the target
 
 
 class FadeEffector(AbstractEffector):
-    """Fades each leg in while it finds ground and out while it does not, at one pace (Mec).
+    """Fades each leg in while it finds ground and out while it does not, linearly (Mec).
 
-    On the way out the leg keeps what the last ground asked of it: the same offset from its
-    animation, and the same turn.
+    While it fades out, a leg keeps the offset and the rotation, relative to the animation, that the
+    last ground gave it.
     """
 
     transition_time: Leaf = parameter(
@@ -233,8 +250,8 @@ class FadeEffector(AbstractEffector):
     )
 
     def init(self, rig: Rig) -> FadeState:
-        upright = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
-        return FadeState(jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls), upright)
+        identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
+        return FadeState(jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls), identity)
 
     def awake(self, now: SensedMoment, state: FadeState) -> Float[Array, ""]:
         return jnp.ones_like(now.dt)
@@ -245,14 +262,14 @@ class FadeEffector(AbstractEffector):
         sensed = now.sensed
         found = sensed.foothold.found
         step = now.progress(smoothing.step_of_time(self.transition_time, now.dt))
-        share = smoothing.move_towards(state.share, found, step)
-        asked = target.pos - sensed.ankle_ws
-        offset_ws = now.gate.choose(found[..., None], asked, state.offset_ws)
-        turn = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
-        turn_ws = quat.nlerp(state.turn_ws, turn, found)
+        weight = smoothing.move_towards(state.weight, found, step)
+        offset_ws = target.pos - sensed.ankle_ws
+        offset_ws = now.gate.choose(found[..., None], offset_ws, state.offset_ws)
+        rot_ws = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
+        rot_ws = quat.nlerp(state.rot_ws, rot_ws, found)
         effector = Effector(
             sensed.ankle_ws + offset_ws,
-            quat.multiply(turn_ws, sensed.ankle_rot_ws),
-            sensed.weight * share,
+            quat.multiply(rot_ws, sensed.ankle_rot_ws),
+            sensed.weight * weight,
         )
-        return FadeState(share, offset_ws, turn_ws), effector
+        return FadeState(weight, offset_ws, rot_ws), effector

@@ -1,4 +1,4 @@
-"""Stage 5: the body's lean against the slope under the feet (the record's "undulation")."""
+"""Stage 5: how the body leans on slopes."""
 
 from abc import abstractmethod
 
@@ -16,14 +16,14 @@ from .inputs import Inputs, SensedMoment
 
 @struct
 class Lean:
-    """What the slope does to the body."""
+    """How the body leans."""
 
-    turn_ws: Float[Array, "4"]  # rotation of the body about its pivot, world axes
+    rot_ws: Float[Array, "4"]  # rotation of the body about its pivot, world axes
     normal_ws: Float[Array, "3"]  # unit, the smoothed ground normal
 
 
 class AbstractLean(Rule):
-    """Leans the body."""
+    """Leans the body on slopes."""
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:
@@ -31,31 +31,31 @@ class AbstractLean(Rule):
 
     @abstractmethod
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
-        """The slope that this frame alone shows."""
+        """The slope under the feet from this frame alone; `weight` (0..1) is that of each leg."""
 
     @abstractmethod
     def advance(self, now: SensedMoment, state: PyTree) -> tuple[PyTree, Lean]:
-        """The lean after memory."""
+        """Memory after this frame, and the lean."""
 
 
 @struct
 class LeanState:
-    """Smoothed slope and slide weight."""
+    """Smoothed slope and sliding weight."""
 
     forward: Float[Array, ""]  # rad
     side: Float[Array, ""]  # rad
-    slide: Float[Array, ""]  # 0..1
-    forward_speed: Float[Array, ""]  # rad/s, of a spring
+    slide: Float[Array, ""]  # 0..1, smoothed `Frame.slide`
+    forward_speed: Float[Array, ""]  # rad/s; 0 unless it follows as a spring
     side_speed: Float[Array, ""]  # rad/s, likewise
 
 
 class SlopeLean(AbstractLean):
-    """Leans by a rate times the smoothed slope, with other rates and gains while sliding.
+    """Leans in proportion to the smoothed slope, with other rates while sliding (the record).
 
-    The slope comes from the normals under the feet that stand. Rate +1 lays the body's up on the
-    normal, a negative rate leans into the hill. The slope is smoothed before the rates are applied,
-    so that the smoothed normal exists by itself; with `spring` on critically damped, with the
-    half-lives of the same gains.
+    The record calls this "undulation". The slope is that of the mean normal under the standing
+    feet. A rate of 1 aligns the body with the normal, a negative rate leans it into the hill. The
+    slope is smoothed before rates apply, so that the smoothed normal is available to the pelvis;
+    with `spring` on by a critically damped spring with the half-lives of the same gains.
     """
 
     forward_rate: Leaf = parameter(
@@ -108,9 +108,9 @@ class SlopeLean(AbstractLean):
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
         up_ws = inputs.terrain.up_ws
         forward_ws, right_ws = heading(inputs.frame.world_from_model, up_ws)
-        share = contact.weight * ground.ankle.found * weight
-        normal = vec.sum_vectors(vec.scale(ground.ankle.normal, share))
-        normal = jnp.where(vec.sum_last(share) > 0, normal, up_ws)
+        standing = contact.weight * ground.ankle.found * weight
+        normal = vec.sum_vectors(vec.scale(ground.ankle.normal, standing))
+        normal = jnp.where(vec.sum_last(standing) > 0, normal, up_ws)
         up = vec.dot(normal, up_ws)
         return Slope(
             vec.safe_arctan2(-vec.dot(normal, forward_ws), up),
@@ -123,31 +123,33 @@ class SlopeLean(AbstractLean):
         gate, dt, slope, slide = now.gate, now.dt, now.sensed.slope, now.sensed.slide
         entering = gate.above(slide - state.slide, jnp.zeros_like(slide), band=0.1)
         slide_gain = gate.choose(entering, self.slide_on_gain, self.slide_off_gain)
-        slide_share = smoothing.fraction_of_gain(slide_gain, dt, self.tick_hz)
-        sliding = smoothing.lerp(state.slide, slide, now.progress(slide_share))
+        slide_fraction = smoothing.fraction_of_gain(slide_gain, dt, self.tick_hz)
+        sliding = smoothing.lerp(state.slide, slide, now.progress(slide_fraction))
 
         gain = smoothing.lerp(self.gain, self.gain_slide, sliding)
-        share = now.progress(smoothing.fraction_of_gain(gain, dt, self.tick_hz))
+        fraction = now.progress(smoothing.fraction_of_gain(gain, dt, self.tick_hz))
         forward, forward_speed = smoothing.follow(
             smoothing.Motion(state.forward, state.forward_speed),
             slope.forward,
-            share,
+            fraction,
             dt,
             self.spring,
         )
         side, side_speed = smoothing.follow(
-            smoothing.Motion(state.side, state.side_speed), slope.side, share, dt, self.spring
+            smoothing.Motion(state.side, state.side_speed), slope.side, fraction, dt, self.spring
         )
 
         lean_forward = forward * smoothing.lerp(self.forward_rate, self.forward_rate_slide, sliding)
         lean_side = side * smoothing.lerp(self.side_rate, self.side_rate_slide, sliding)
-        turn = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
-        lean = Lean(quat.from_rotvec(turn), _normal(slope, now.sensed.up_ws, forward, side))
+        rotvec = vec.scale(slope.right_ws, lean_forward) - vec.scale(slope.forward_ws, lean_side)
+        lean = Lean(
+            quat.from_rotvec(rotvec), _ground_normal(slope, now.sensed.up_ws, forward, side)
+        )
         return LeanState(forward, side, sliding, forward_speed, side_speed), lean
 
 
 class NoLean(AbstractLean):
-    """The body stays as upright as it was animated."""
+    """The body does not lean."""
 
     def init(self, rig: Rig) -> None:
         return None
@@ -163,9 +165,9 @@ class NoLean(AbstractLean):
 
 
 @vec.remat
-def _normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
-    """Unit normal of ground that rises by these angles, rad, ahead and to the right."""
-    (level, rising), (across, tilted) = vec.cos_sin(forward), vec.cos_sin(side)
-    ahead = vec.scale(slope.forward_ws, rising * across)
-    aside = vec.scale(slope.right_ws, level * tilted)
-    return vec.normalize(vec.scale(up_ws, level * across) - ahead - aside, up_ws)
+def _ground_normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
+    """Unit normal of ground that rises by these angles ahead and to the right, rad."""
+    (forward_cos, forward_sin), (side_cos, side_sin) = vec.cos_sin(forward), vec.cos_sin(side)
+    ahead = vec.scale(slope.forward_ws, forward_sin * side_cos)
+    aside = vec.scale(slope.right_ws, forward_cos * side_sin)
+    return vec.normalize(vec.scale(up_ws, forward_cos * side_cos) - ahead - aside, up_ws)

@@ -1,4 +1,4 @@
-"""Stage 6: feet that keep their place in the world while they stand."""
+"""Stage 6: locks that keep standing feet in place in the world."""
 
 from abc import abstractmethod
 
@@ -21,15 +21,15 @@ FACTOR_BAND = 0.05
 
 @struct
 class Hold:
-    """What locks make of the footholds."""
+    """How locks change the footholds."""
 
-    offset_ws: Float[Array, "legs 3"]  # m, kept from the foothold
+    offset_ws: Float[Array, "legs 3"]  # m, from the foothold
     rot_ws: Float[Array, "legs 4"]  # of the ankles
     locked: Float[Array, " legs"]  # 1 where the foot keeps its place
 
 
 class AbstractLock(Rule):
-    """Keeps feet in place."""
+    """Keeps standing feet in place."""
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:
@@ -39,11 +39,18 @@ class AbstractLock(Rule):
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PyTree
     ) -> tuple[PyTree, Hold]:
-        """Memory after this frame, and what each foot keeps."""
+        """Memory after this frame, and how locks change the footholds.
+
+        Args:
+            now: the sensed frame.
+            foothold_ws: where each foot would stand without a lock, m.
+            hip_ws: the hips on the body as last placed, m.
+            state: memory after the frame before.
+        """
 
 
 class NoLock(AbstractLock):
-    """Feet follow their footholds."""
+    """No locks: feet follow their footholds."""
 
     def init(self, rig: Rig) -> None:
         return None
@@ -58,31 +65,35 @@ class NoLock(AbstractLock):
 
 @struct
 class LockState:
-    """Which feet are locked, and how far from the animation that holds them."""
+    """Which feet are locked, and how far that holds them from their footholds."""
 
     locked: Float[Array, " legs"]  # 0 or 1
     factor: Float[Array, " legs"]  # 0..1, rises while locked, decays after release
-    offset: Float[Array, "legs 3"]  # m, along the platform's axes
-    foothold: Float[Array, "legs 3"]  # m, of the frame before, in the platform's space
+    offset: Float[Array, "legs 3"]  # m, platform axes
+    foothold: Float[Array, "legs 3"]  # m, of the frame before, platform space
     ball: Float[Array, "legs 3"]  # m, likewise
-    ahead: Float[Array, "legs 3"]  # unit, where the foot pointed as it locked, platform's axes
+    ahead: Float[Array, "legs 3"]  # unit, foot direction when it locked, platform axes
 
 
 class OffsetLock(AbstractLock):
-    """Takes the foothold's own displacement out of the target while the foot is locked.
+    """Cancels the motion of the foothold while its foot is locked (the record).
 
-    The target is the foothold plus an offset. Locked, the offset loses the foothold's displacement
-    since the frame before (as seen from a moving platform), so the foot stays while its lift still
-    follows the animation; released, the offset decays. Neither edge pops. With `hold_ball` on it is
-    the ball's displacement along the ground that is taken out, so that the ball stays while the
-    heel rises.
+    The target is the foothold plus an offset. While the foot is locked, the foothold's motion since
+    the frame before, as seen from a moving platform, is subtracted from the offset: the foot stays
+    but its lift still follows the animation. After release the offset decays, so that neither locks
+    nor releases jump. With `hold_ball` on, the motion of the ball along the ground is cancelled
+    instead, so that the ball stays while the heel rises.
 
-    A foot locks when the contact says planted and it is slower than `max_speed`; it is released
-    when the contact says lifted, or early: when staying would bend or straighten the knee too far,
-    when hip to place leaves hip to animated ankle by more than `release_cone`, when the offset
-    grows beyond `release_distance`, when the animated foot points elsewhere by `release_heading`,
-    or when it would move faster than `release_speed`. A released foot locks again once its factor
-    is at most `relock_threshold`.
+    A foot locks when its contact is planted and it moves slower than `max_speed`. It is released
+    when its contact is lifted, or earlier for any of these reasons:
+
+    - Staying would bend or open the knee too far (`release_min_angle`, `release_max_angle`).
+    - The leg would leave its animated direction by more than `release_cone`.
+    - The offset would exceed `release_distance`.
+    - The animated foot points away by more than `release_heading`.
+    - The foothold moves faster than `release_speed`.
+
+    A released foot can lock again once `factor` has decayed to `relock_threshold`.
     """
 
     enabled: Leaf = switch(True, doc="Whether planted feet are locked in place.")
@@ -161,9 +172,8 @@ class OffsetLock(AbstractLock):
     )
 
     def init(self, rig: Rig) -> LockState:
-        each = jnp.zeros_like(rig.side)
-        spread = jnp.zeros_like(rig.knee_axis_ls)
-        return LockState(each, each, spread, spread, spread, spread)
+        zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)
+        return LockState(zero, zero, zeros, zeros, zeros, zeros)
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: LockState
@@ -171,39 +181,40 @@ class OffsetLock(AbstractLock):
         sensed, gate = now.sensed, now.gate
         up, platform = sensed.leg_up_ws, sensed.platform
         moved = foothold_ws - platform.apply(state.foothold)
-        slid = vec.reject(sensed.ball_ws - platform.apply(state.ball), up)
-        slid += vec.scale(up, vec.dot(moved, up))
-        moved = jnp.where(now.started, jnp.where(self.hold_ball, slid, moved), 0.0)
+        ball_moved = vec.reject(sensed.ball_ws - platform.apply(state.ball), up)
+        ball_moved += vec.scale(up, vec.dot(moved, up))
+        moved = jnp.where(now.started, jnp.where(self.hold_ball, ball_moved, moved), 0.0)
         before = quat.rotate(platform.rot, state.offset)
-        pointed = quat.rotate(platform.rot, state.ahead)
-        pointed = gate.choose(state.locked[..., None], pointed, sensed.ahead_ws)
+        locked_ahead = quat.rotate(platform.rot, state.ahead)
+        locked_ahead = gate.choose(state.locked[..., None], locked_ahead, sensed.ahead_ws)
         stays = self._may_stay(now, foothold_ws, hip_ws, before - moved)
-        stays = stays * self._goes_along(now, moved, pointed)
+        stays = stays * self._follows_animation(now, moved, locked_ahead)
         starts = stays * self._may_start(now, moved, state.factor)
 
         one, zero = jnp.ones_like(state.locked), jnp.zeros_like(state.locked)
         locked = gate.choose(starts, one, state.locked)
         locked = gate.choose(stays, locked, zero)
 
-        on = smoothing.fraction_of_half_life(self.lock_half_life, now.dt)
-        off = smoothing.fraction_of_half_life(self.unlock_half_life, now.dt)
-        risen = smoothing.lerp(state.factor, one, on)
-        factor = gate.choose(locked, risen, smoothing.lerp(state.factor, zero, off))
-        held = before - vec.scale(moved, risen)
-        decayed = vec.scale(before, 1.0 - off)
-        offset_ws = gate.choose(locked[..., None], held, decayed)
-        into_platform = platform.inverse()
+        lock_fraction = smoothing.fraction_of_half_life(self.lock_half_life, now.dt)
+        unlock_fraction = smoothing.fraction_of_half_life(self.unlock_half_life, now.dt)
+        risen = smoothing.lerp(state.factor, one, lock_fraction)
+        factor = gate.choose(locked, risen, smoothing.lerp(state.factor, zero, unlock_fraction))
+        kept = before - vec.scale(moved, risen)
+        decayed = vec.scale(before, 1.0 - unlock_fraction)
+        offset_ws = gate.choose(locked[..., None], kept, decayed)
+        platform_from_world = platform.inverse()
         after = LockState(
             locked,
             factor,
-            quat.rotate(into_platform.rot, offset_ws),
-            into_platform.apply(foothold_ws),
-            into_platform.apply(sensed.ball_ws),
-            quat.rotate(into_platform.rot, pointed),
+            quat.rotate(platform_from_world.rot, offset_ws),
+            platform_from_world.apply(foothold_ws),
+            platform_from_world.apply(sensed.ball_ws),
+            quat.rotate(platform_from_world.rot, locked_ahead),
         )
         return after, Hold(offset_ws, sensed.rot_ws, locked)
 
     def _may_start(self, now: SensedMoment, moved: Array, factor: Array) -> Array:
+        """1 where a foot that is free may lock."""
         sensed, gate = now.sensed, now.gate
         speed = vec.safe_divide(vec.length(moved), now.dt)
         calm = gate.below(speed, self.max_speed, band=SPEED_BAND)
@@ -213,34 +224,34 @@ class OffsetLock(AbstractLock):
     def _may_stay(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, offset_ws: Array
     ) -> Array:
-        """1 where nothing releases a foot that would keep its place."""
+        """1 where a foot may keep its place as far as contact, knee and offset are concerned."""
         sensed, gate = now.sensed, now.gate
-        place = foothold_ws + offset_ws + vec.scale(sensed.leg_up_ws, sensed.foothold.lift)
-        leg = place - hip_ws
+        ankle_ws = foothold_ws + offset_ws + vec.scale(sensed.leg_up_ws, sensed.foothold.lift)
+        leg = ankle_ws - hip_ws
         squares = sensed.thigh**2 + sensed.shin**2
         cosine = vec.safe_divide(squares - vec.dot(leg, leg), 2.0 * sensed.thigh * sensed.shin)
         cosine = gate.clip(cosine, -jnp.ones_like(cosine), jnp.ones_like(cosine), band=COSINE_BAND)
-        bent = gate.below(cosine, jnp.cos(self.release_min_angle), band=COSINE_BAND)
-        short = gate.above(cosine, jnp.cos(self.release_max_angle), band=COSINE_BAND)
+        not_folded = gate.below(cosine, jnp.cos(self.release_min_angle), band=COSINE_BAND)
+        not_straight = gate.above(cosine, jnp.cos(self.release_max_angle), band=COSINE_BAND)
 
         animated = sensed.ankle_ws - sensed.hip_ws
-        spans = vec.length(leg) * vec.length(animated)
-        alignment = vec.safe_divide(vec.dot(leg, animated), spans, otherwise=1.0)
-        ahead = gate.above(alignment, jnp.cos(self.release_cone), band=COSINE_BAND)
+        lengths = vec.length(leg) * vec.length(animated)
+        alignment = vec.safe_divide(vec.dot(leg, animated), lengths, otherwise=1.0)
+        aligned = gate.above(alignment, jnp.cos(self.release_cone), band=COSINE_BAND)
 
         near = gate.below(vec.length(offset_ws), self.release_distance, band=DISTANCE_BAND)
-        works = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
-        return bent * short * ahead * near * works * (1.0 - sensed.contact.lifted)
+        enabled = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
+        return not_folded * not_straight * aligned * near * enabled * (1.0 - sensed.contact.lifted)
 
-    def _goes_along(self, now: SensedMoment, moved: Array, pointed: Array) -> Array:
-        """1 where the animated foot turns and moves little enough for one that keeps its place."""
+    def _follows_animation(self, now: SensedMoment, moved: Array, locked_ahead: Array) -> Array:
+        """1 where the animated foot has not turned away and does not move too fast."""
         sensed, gate = now.sensed, now.gate
-        alignment = vec.dot(pointed, sensed.ahead_ws)
-        along = gate.above(alignment, jnp.cos(self.release_heading), band=COSINE_BAND)
-        # Half a turn is as far as a foot can point elsewhere.
-        along = jnp.where(self.release_heading < jnp.pi, along, 1.0)
+        alignment = vec.dot(locked_ahead, sensed.ahead_ws)
+        aligned = gate.above(alignment, jnp.cos(self.release_heading), band=COSINE_BAND)
+        # No foot points away by more than half a turn.
+        aligned = jnp.where(self.release_heading < jnp.pi, aligned, 1.0)
         speed = vec.safe_divide(vec.length(moved), now.dt)
-        return along * gate.below(speed, self.release_speed, band=SPEED_BAND)
+        return aligned * gate.below(speed, self.release_speed, band=SPEED_BAND)
 
 
 @struct
@@ -248,18 +259,18 @@ class PlantState:
     """Where planted feet stand."""
 
     locked: Float[Array, " legs"]  # 0 or 1
-    share: Float[Array, " legs"]  # 0..1, how much planting counts
-    foothold: Float[Array, "legs 3"]  # m, in the platform's space
-    clearance: Float[Array, " legs"]  # m, of that foothold over the ground below it
-    rot: Float[Array, "legs 4"]  # of the ankles, along the platform's axes
+    weight: Float[Array, " legs"]  # 0..1, how much planting planting
+    foothold: Float[Array, "legs 3"]  # m, platform space
+    clearance: Float[Array, " legs"]  # m, of that foothold above the ground below it
+    rot: Float[Array, "legs 4"]  # of the ankles, platform axes
 
 
 class PlantLock(AbstractLock):
     """Keeps a foot where and how it first found ground until its ray finds none (Mec).
 
-    The place follows the ground below it, looked at again in every frame. How much planting counts
-    moves at `plant_speed` towards `plant_weight`: set that to 0 or 1 between steps to disable or
-    enable planting over time, or leave the speed endless to set it at once. Follows a platform.
+    The kept foothold follows the ground below it, which is probed again in every frame, and a
+    moving platform. The weight of planting moves to `plant_weight` at `plant_speed`: set it to 0
+    or 1 between steps to turn planting off or on over time, at once if the speed is infinite.
     """
 
     plant: Leaf = switch(True, doc="Whether a foot stays where it first found ground.")
@@ -276,10 +287,9 @@ class PlantLock(AbstractLock):
     )
 
     def init(self, rig: Rig) -> PlantState:
-        each = jnp.zeros_like(rig.side)
-        spread = jnp.zeros_like(rig.knee_axis_ls)
-        upright = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
-        return PlantState(each, each, spread, each, upright)
+        zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)
+        identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
+        return PlantState(zero, zero, zeros, zero, identity)
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
@@ -293,26 +303,26 @@ class PlantLock(AbstractLock):
         hit = cast(
             now.terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
         )
-        over_ground = vec.dot(kept_ws - hit.point, up)
-        clearance = gate.choose(before, state.clearance, over_ground * hit.found)
-        followed = hit.point + vec.scale(up, clearance)
-        planted_ws = gate.choose(hit.found[..., None], followed, kept_ws)
+        height = vec.dot(kept_ws - hit.point, up)
+        clearance = gate.choose(before, state.clearance, height * hit.found)
+        on_ground = hit.point + vec.scale(up, clearance)
+        planted_ws = gate.choose(hit.found[..., None], on_ground, kept_ws)
 
         locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
         step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
-        share = smoothing.move_towards(state.share, self.plant_weight, step)
-        counts = locked * share
-        held = Hold(
-            vec.scale(planted_ws - foothold_ws, counts),
-            quat.nlerp(sensed.rot_ws, kept_rot, counts),
+        weight = smoothing.move_towards(state.weight, self.plant_weight, step)
+        planting = locked * weight
+        hold = Hold(
+            vec.scale(planted_ws - foothold_ws, planting),
+            quat.nlerp(sensed.rot_ws, kept_rot, planting),
             locked,
         )
-        into_platform = platform.inverse()
+        platform_from_world = platform.inverse()
         after = PlantState(
             locked,
-            share,
-            into_platform.apply(planted_ws),
+            weight,
+            platform_from_world.apply(planted_ws),
             clearance,
-            into_platform.apply_rot(kept_rot),
+            platform_from_world.apply_rot(kept_rot),
         )
-        return after, held
+        return after, hold

@@ -1,4 +1,4 @@
-"""Stage 7: how far the body sinks or rises so that the legs can reach."""
+"""Stage 7: how far the body sinks or rises so that its legs can reach the ground."""
 
 import dataclasses
 from abc import abstractmethod
@@ -31,23 +31,23 @@ FAR = 1e6  # m, beyond any leg
 
 @struct
 class PelvisState:
-    """The body's offset."""
+    """The offset of the body from its animation."""
 
     height: Float[Array, ""]  # m
-    velocity: Float[Array, ""]  # m/s, of a spring; 0 where a rule has none
-    goal: Float[Array, ""]  # m, that the height follows
+    velocity: Float[Array, ""]  # m/s; 0 unless it follows as a spring
+    goal: Float[Array, ""]  # m, where the height is going
     offset_ws: Float[Array, "3"]  # m
-    half_height: Float[Array, ""]  # m, of the character's capsule; 0 where a rule has none
+    half_height: Float[Array, ""]  # m, of the capsule; 0 where a rule has none
 
     @classmethod
     def level(cls, rig: Rig) -> "PelvisState":
-        """Nothing moved."""
+        """No offset."""
         zero = jnp.zeros((), rig.side.dtype)
         return cls(zero, zero, zero, jnp.zeros(3, rig.side.dtype), zero)
 
     @classmethod
     def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
-        """At a height along up, without memory of anything else."""
+        """An offset of `height`, m, along `up_ws`, at rest."""
         zero = jnp.zeros_like(height)
         return cls(height, zero, goal, vec.scale(up_ws, height), zero)
 
@@ -61,7 +61,7 @@ class PelvisMoment(SensedMoment):
 
 
 class AbstractPelvis(Rule):
-    """Moves the body."""
+    """Moves the body up and down."""
 
     def init(self, rig: Rig) -> PelvisState:
         """Memory before the first frame."""
@@ -69,15 +69,21 @@ class AbstractPelvis(Rule):
 
     @abstractmethod
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
-        """The offset after this frame, for ankles that are to go to `target`."""
+        """Memory after this frame, which holds the offset.
+
+        Args:
+            now: the sensed frame. With `now.awake` 0 the body is to stay where it is.
+            target: where the ankles are to go (legs), world space.
+            state: memory after the frame before.
+        """
 
 
 class LowestPelvis(AbstractPelvis):
-    """Follows the standing foot that asks for the lowest body (the record's "height offset").
+    """Follows the standing foot that requests the lowest body (the record's "height offset").
 
-    Each foot asks for the height from its animated ankle to its target. A foot that does not stand
-    counts, by its contact weight, as the highest of those that take part; with no foot standing the
-    goal is 0. Without a limit and with gains of 1 it is ozz's pelvis correction.
+    Each foot requests the height from its animated ankle to its target. A foot that does not stand
+    is blended, by its contact weight, into the highest request of all. With no foot standing the
+    goal is 0. Without a limit and with gains of 1 this is ozz's pelvis correction.
     """
 
     enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
@@ -97,32 +103,32 @@ class LowestPelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        asked = requested_heights(sensed, target.pos)
+        requested = requested_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
-        taking_part = sensed.weight > 0
-        top = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
-        asked = jnp.where(taking_part, smoothing.lerp(top, asked, weight), top)
-        lowest = gate.minimum(asked, band=HEIGHT_BAND)
+        active = sensed.weight > 0
+        highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)
+        requested = jnp.where(active, smoothing.lerp(highest, requested, weight), highest)
+        lowest = gate.minimum(requested, band=HEIGHT_BAND)
         standing = gate.maximum(weight, band=0.1)
         goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, goal, 0.0)
-        share = smoothing.lerp(
+        fraction = smoothing.lerp(
             smoothing.fraction_of_gain(self.off_gain, now.dt, self.tick_hz),
             smoothing.fraction_of_gain(self.on_gain, now.dt, self.tick_hz),
             standing,
         )
-        share = now.awake * now.progress(share)
-        height = smoothing.lerp(state.height, goal, share)
-        along = jnp.where(self.vertical_only, sensed.up_ws, now.lean.normal_ws)
-        return PelvisState.at(height, goal, along)
+        fraction = now.awake * now.progress(fraction)
+        height = smoothing.lerp(state.height, goal, fraction)
+        direction_ws = jnp.where(self.vertical_only, sensed.up_ws, now.lean.normal_ws)
+        return PelvisState.at(height, goal, direction_ws)
 
 
 class CapsulePelvis(AbstractPelvis):
-    """Sinks to the lowest foot and never rises; the character's capsule shrinks (Unreal, seed 001).
+    """Sinks to the lowest foot and never rises, and shrinks the capsule (Unreal).
 
-    The offset follows the lowest height that a foot asks for, or 0 if that is above it, and the
-    capsule's half-height goes to its full one less half of that depth, both by the clamped-speed
-    law. With `enabled` off both go back.
+    The goal is the lowest height that a foot requests, or 0 if that is above 0. The capsule's
+    half-height goes to its full value less half of that depth. Both follow by the clamped-speed law
+    of Unreal's interp-to. With `enabled` off both go back.
     """
 
     enabled: Leaf = switch(True, doc="Whether the pelvis sinks.")
@@ -140,28 +146,29 @@ class CapsulePelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        asked = jnp.where(sensed.weight > 0, requested_heights(sensed, target.pos), 0.0)
-        lowest = gate.minimum(asked, band=HEIGHT_BAND)
+        requested = jnp.where(sensed.weight > 0, requested_heights(sensed, target.pos), 0.0)
+        lowest = gate.minimum(requested, band=HEIGHT_BAND)
         zero = jnp.zeros_like(lowest)
         sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, sunk, 0.0)
 
         def follow(value: Array, goal: Array) -> Array:
-            share = smoothing.fraction_of_speed(self.speed, now.dt, goal - value)
-            return smoothing.lerp(value, goal, now.awake * now.progress(share))
+            fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - value)
+            return smoothing.lerp(value, goal, now.awake * now.progress(fraction))
 
         height = follow(state.height, goal)
         half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
-        level = PelvisState.at(height, goal, sensed.up_ws)
-        return dataclasses.replace(level, half_height=half_height)
+        after = PelvisState.at(height, goal, sensed.up_ws)
+        return dataclasses.replace(after, half_height=half_height)
 
 
 class LegLengthPelvis(AbstractPelvis):
-    """Keeps the distance from each hip to its foot's goal within what a leg has (Mec).
+    """Keeps the distance from each hip to its foot within the leg's limits (Mec).
 
-    Of the heights that do so the one nearest to the animation; where one leg would have to be
-    longer and another shorter, none is over-stretched. A foot too far aside to be reached from any
-    height asks for the one that comes nearest. Damped, the offset follows by the clamped-speed law.
+    Of all heights that do, it takes the one nearest to the animation. Where one leg needs the body
+    higher and another needs it lower, it takes the lower, so that no leg is over-stretched. A foot
+    too far aside to be reached requests the height that comes nearest. With `damp` on the offset
+    follows by the clamped-speed law of Unreal's interp-to.
     """
 
     enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
@@ -196,21 +203,24 @@ class LegLengthPelvis(AbstractPelvis):
         sensed, gate = now.sensed, now.gate
         lowest = rise_to_length(sensed, target.pos, self.min_length)
         highest = rise_to_length(sensed, target.pos, self.max_length)
-        asks = (sensed.foothold.found > 0) & (sensed.weight > 0)
+        active = (sensed.foothold.found > 0) & (sensed.weight > 0)
         zero = jnp.zeros_like(lowest[:1])
-        lifted = jnp.concatenate([jnp.where(asks, lowest, -FAR), zero])
-        lift = gate.maximum(lifted, band=HEIGHT_BAND)
-        bounds = jnp.concatenate([jnp.where(asks, highest, FAR), lift[None]])
-        goal = jnp.where(self.enabled, gate.minimum(bounds, band=HEIGHT_BAND), 0.0)
+        floors = jnp.concatenate([jnp.where(active, lowest, -FAR), zero])
+        floor = gate.maximum(floors, band=HEIGHT_BAND)
+        ceilings = jnp.concatenate([jnp.where(active, highest, FAR), floor[None]])
+        goal = jnp.where(self.enabled, gate.minimum(ceilings, band=HEIGHT_BAND), 0.0)
 
-        share = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
-        share = now.awake * jnp.where(now.started & self.damp, share, 1.0)
-        height = smoothing.lerp(state.height, goal, share)
+        fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
+        fraction = now.awake * jnp.where(now.started & self.damp, fraction, 1.0)
+        height = smoothing.lerp(state.height, goal, fraction)
         return PelvisState.at(height, goal, sensed.up_ws)
 
 
 class AbstractFollowingPelvis(AbstractPelvis):
-    """Follows a goal by one half-life up and one down, as an exponential or a spring."""
+    """Follows a goal, with one half-life up and one down, as an exponential or a spring.
+
+    A rule of this kind only has to say where to go: the three fields and `goal`.
+    """
 
     rise_half_life: eqx.AbstractVar[Array]
     fall_half_life: eqx.AbstractVar[Array]
@@ -218,22 +228,22 @@ class AbstractFollowingPelvis(AbstractPelvis):
 
     @abstractmethod
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
-        """Height over the animation to go to, m; `resting` where no foot asks for one."""
+        """The height above the animation to go to, m; `resting` if no foot requests one."""
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        asked = requested_heights(sensed, target.pos)
-        resting = jnp.where(now.started, state.goal, mean_height(sensed, asked))
+        requested = requested_heights(sensed, target.pos)
+        resting = jnp.where(now.started, state.goal, mean_height(sensed, requested))
         goal = self.goal(now, target, resting)
         gap = goal - state.height
-        share = gate.choose(
+        fraction = gate.choose(
             gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
             smoothing.fraction_of_half_life(self.rise_half_life, now.dt),
             smoothing.fraction_of_half_life(self.fall_half_life, now.dt),
         )
-        share = now.progress(share)
+        fraction = now.progress(fraction)
         height, velocity = smoothing.follow(
-            smoothing.Motion(state.height, state.velocity), goal, share, now.dt, self.spring
+            smoothing.Motion(state.height, state.velocity), goal, fraction, now.dt, self.spring
         )
         height = smoothing.lerp(state.height, height, now.awake)
         after = PelvisState.at(height, goal, sensed.up_ws)
@@ -241,12 +251,11 @@ class AbstractFollowingPelvis(AbstractPelvis):
 
 
 class SupportPelvis(AbstractFollowingPelvis):
-    """Follows the feet that stand, with a share of the lowest foot.
+    """Follows the mean of the standing feet, pulled towards the lowest foot.
 
-    The goal is the mean of what the standing feet ask, by their contact weights, pulled by
-    `lowest_share` towards the lowest of all. With no foot standing it stays where it was. The
-    human pelvis rides on its support: of the pelvis rules of games this one was nearest to capture
-    before reach was thought of (the blocks benchmark's table).
+    The goal is the mean of what standing feet request, weighted by contact, blended by
+    `lowest_share` with the lowest request of all. With no foot standing the goal stays. Of the
+    pelvis rules that do not consider reach it comes nearest to captured people on uneven blocks.
     """
 
     lowest_share: Leaf = parameter(
@@ -266,23 +275,24 @@ class SupportPelvis(AbstractFollowingPelvis):
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
-        asked = requested_heights(sensed, target.pos)
+        requested = requested_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         total = vec.sum_last(weight)
-        taking_part = sensed.weight > 0
-        lowest = gate.minimum(jnp.where(taking_part, asked, FAR), band=HEIGHT_BAND)
-        support = vec.safe_divide(vec.sum_last(weight * asked), total)
+        active = sensed.weight > 0
+        lowest = gate.minimum(jnp.where(active, requested, FAR), band=HEIGHT_BAND)
+        support = vec.safe_divide(vec.sum_last(weight * requested), total)
         return jnp.where(total > 0, smoothing.lerp(support, lowest, self.lowest_share), resting)
 
 
 class ReachPelvis(AbstractFollowingPelvis):
-    """Goes where the feet want it, as far as the legs reach: human pelvis height on uneven ground.
+    """Goes where the feet want it, as far as the legs reach: people on uneven ground.
 
-    The feet want a mix of the mean and the highest of what they ask. No leg is to become longer
-    than `extension` times its length: of the wanted height and those at which each leg is that long
-    a soft least is taken, `-k log Σ exp(-x / k)` with `k = softness`. The same of the animation is
-    taken away, so that on the ground for which it was made nothing moves, whatever its legs do.
-    Found on the blocks benchmark, where reach explains most of a walker's pelvis height.
+    The feet want a blend of the mean and the highest of their requests. No leg is to become longer
+    than `extension` times its length. So the goal is the soft minimum `-k log Σ exp(-x / k)`, with
+    `k = softness`, of the wanted height and the heights at which each leg has that length. The same
+    soft minimum of the animation is subtracted, so that nothing moves on ground like that of the
+    animation, however straight its legs are. On captured people on uneven blocks, reach explains
+    most of the pelvis height.
     """
 
     highest_share: Leaf = parameter(
@@ -317,37 +327,37 @@ class ReachPelvis(AbstractFollowingPelvis):
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
-        asked = requested_heights(sensed, target.pos)
-        taking_part = sensed.weight > 0
-        mean = mean_height(sensed, asked)
-        highest = gate.maximum(jnp.where(taking_part, asked, -FAR), band=HEIGHT_BAND)
-        highest = jnp.where(jnp.any(taking_part), highest, mean)
+        requested = requested_heights(sensed, target.pos)
+        active = sensed.weight > 0
+        mean = mean_height(sensed, requested)
+        highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)
+        highest = jnp.where(jnp.any(active), highest, mean)
         wanted = smoothing.lerp(mean, highest, self.highest_share)
         longest = self.extension * (sensed.thigh + sensed.shin)
 
-        def reachable(ankle_ws: Array, wanted: Array) -> Array:
-            rises = jnp.where(taking_part, rise_to_length(sensed, ankle_ws, longest), FAR)
-            rises = jnp.concatenate([rises, wanted[None]])
-            return -self.softness * jax.nn.logsumexp(-rises / self.softness)
+        def reachable_height(ankle_ws: Array, wanted: Array) -> Array:
+            heights = jnp.where(active, rise_to_length(sensed, ankle_ws, longest), FAR)
+            heights = jnp.concatenate([heights, wanted[None]])
+            return -self.softness * jax.nn.logsumexp(-heights / self.softness)
 
-        animated = reachable(sensed.ankle_ws, jnp.zeros_like(wanted))
-        return reachable(target.pos, wanted) - animated
+        animated = reachable_height(sensed.ankle_ws, jnp.zeros_like(wanted))
+        return reachable_height(target.pos, wanted) - animated
 
 
-def mean_height(sensed: Sensed, asked: Array) -> Float[Array, ""]:
-    """Mean of what legs ask for, m, by their share of foot IK; 0 where none takes part."""
-    return vec.safe_divide(vec.sum_last(sensed.weight * asked), vec.sum_last(sensed.weight))
+def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
+    """Mean of requested heights, m, weighted by foot IK of each leg; 0 if all weights are 0."""
+    return vec.safe_divide(vec.sum_last(sensed.weight * requested), vec.sum_last(sensed.weight))
 
 
 def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:
-    """How far the body would rise until each hip is `length`, m, from its ankle.
+    """How far the body has to rise until each hip is `length` from its ankle, m.
 
-    Where an ankle is further aside than that, the height at which it is nearest.
+    For an ankle further aside than that, the height at which it is nearest.
     """
     leg = ankle_ws - sensed.hip_ws
-    along = vec.dot(leg, sensed.up_ws)
-    across2 = vec.dot(leg, leg) - along**2
-    return along + vec.safe_sqrt(length**2 - across2)
+    height = vec.dot(leg, sensed.up_ws)
+    aside2 = vec.dot(leg, leg) - height**2
+    return height + vec.safe_sqrt(length**2 - aside2)
 
 
 def requested_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:

@@ -1,4 +1,4 @@
-"""Stage 4: where each foot would stand, with the ground's height smoothed over time."""
+"""Stage 4: the foothold of each foot, with the height of the ground smoothed over time."""
 
 from abc import abstractmethod
 
@@ -19,7 +19,7 @@ HEIGHT_BAND = 0.01  # m
 
 
 class AbstractTarget(Rule):
-    """Places footholds."""
+    """Places each foot's foothold."""
 
     foot_height: eqx.AbstractVar[Array]  # m, sole to ankle
 
@@ -29,15 +29,15 @@ class AbstractTarget(Rule):
 
     @abstractmethod
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
-        """The foothold that this frame alone asks for."""
+        """The foothold from this frame alone."""
 
     @abstractmethod
     def advance(self, now: SensedMoment, state: PyTree) -> tuple[PyTree, Float[Array, " legs"]]:
-        """How far along up each foothold is moved by memory and limits, m."""
+        """Memory after this frame, and how far it and limits move each foothold along up, m."""
 
 
 class AbstractInstantTarget(AbstractTarget):
-    """Places footholds by the present frame alone."""
+    """Places footholds without memory: `sense` decides."""
 
     def init(self, rig: Rig) -> None:
         return None
@@ -48,20 +48,21 @@ class AbstractInstantTarget(AbstractTarget):
 
 @struct
 class TargetState:
-    """Smoothed height of the ground under each foot."""
+    """Smoothed height of each foothold."""
 
     height: Float[Array, " legs"]  # m, along up
-    velocity: Float[Array, " legs"]  # m/s, of a spring
+    velocity: Float[Array, " legs"]  # m/s; 0 unless it follows as a spring
 
 
 class SlopeTarget(AbstractTarget):
-    """Keeps the animated lift over the ground and the sole exact on a slope.
+    """Keeps the animated lift above the ground, and the sole flat on slopes.
 
-    The ankle goes to `I + u (l + h (1/(n·u) - 1))` (ozz's construction with the animated lift `l`
-    added): on a slope the ankle of a sole that lies flat is `h / (n·u)` above the hit. The height
-    follows the ground with one half-life up and one down, as an exponential or, with `spring` on,
-    critically damped; the ankle stays between two heights in model space. Where no ground was found
-    the foothold is the animation's own.
+    The ankle goes to `I + u (l + h (1/(n·u) - 1))`, where I is the hit, u up, n the ground's
+    normal, h `foot_height` and l the animated lift. This is ozz's construction, a flat sole has its
+    ankle `h / (n·u)` above the hit, plus the lift. The height follows the ground with one half-life
+    up and one down, as an exponential or, with `spring` on, as a critically damped spring. The
+    ankle then stays between two heights in model space. Without ground the foothold is that of the
+    animation.
     """
 
     min_ankle_height: Leaf = parameter(
@@ -97,10 +98,10 @@ class SlopeTarget(AbstractTarget):
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         hit, up_ws = ground.ankle, inputs.terrain.leg_up_ws
         frame, gate = inputs.frame, inputs.gate
-        over = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
-        standing = hit.point + vec.scale(up_ws, over - self.foot_height)
+        ankle_height = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
+        standing = hit.point + vec.scale(up_ws, ankle_height - self.foot_height)
         point_ws = gate.choose(
-            hit.found[..., None], standing, _under(animated_ankles(frame).pos, up_ws, contact.lift)
+            hit.found[..., None], standing, _below(animated_ankles(frame).pos, up_ws, contact.lift)
         )
         return foothold(frame, up_ws, point_ws, contact.lift, hit.found)
 
@@ -110,7 +111,7 @@ class SlopeTarget(AbstractTarget):
         foothold, gate, dt = now.sensed.foothold, now.gate, now.dt
         gap = foothold.height - state.height
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
-        share = gate.choose(
+        fraction = gate.choose(
             rising,
             smoothing.fraction_of_half_life(self.rise_half_life, dt),
             smoothing.fraction_of_half_life(self.fall_half_life, dt),
@@ -118,7 +119,7 @@ class SlopeTarget(AbstractTarget):
         height, velocity = smoothing.follow(
             smoothing.Motion(state.height, state.velocity),
             foothold.height,
-            now.progress(share),
+            now.progress(fraction),
             dt,
             self.spring,
         )
@@ -129,9 +130,10 @@ class SlopeTarget(AbstractTarget):
 
 
 class SoleTarget(AbstractInstantTarget):
-    """The sole on the ground, whatever lift the animation has: `C = I + u h / (n·u)` (ozz).
+    """Puts the sole on the ground whatever the animated lift: `ankle = I + u h / (n·u)` (ozz).
 
-    Where no ground was found the foothold is the animation's own.
+    I is the hit, u up, n the ground's normal and h `foot_height`. Without ground the foothold is
+    that of the animation.
     """
 
     foot_height: Leaf = parameter(
@@ -149,15 +151,15 @@ class SoleTarget(AbstractInstantTarget):
         frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit = ground.ankle
         lift = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
-        bare = _under(animated_ankles(frame).pos, up_ws, lift)
-        point_ws = gate.choose(hit.found[..., None], hit.point, bare)
+        without_ground = _below(animated_ankles(frame).pos, up_ws, lift)
+        point_ws = gate.choose(hit.found[..., None], hit.point, without_ground)
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 
 class ContactTarget(AbstractInstantTarget):
-    """The ankle `foot_height` over the ground along up, on slopes too: `I + u h` (Mec).
+    """Puts the ankle `foot_height` above the ground along up, on slopes too: `I + u h` (Mec).
 
-    Where no ground was found the foothold is the animation's own.
+    Without ground the foothold is that of the animation.
     """
 
     foot_height: Leaf = parameter(
@@ -172,17 +174,16 @@ class ContactTarget(AbstractInstantTarget):
         frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit = ground.ankle
         lift = jnp.broadcast_to(self.foot_height, hit.found.shape)
-        bare = _under(animated_ankles(frame).pos, up_ws, lift)
-        point_ws = gate.choose(hit.found[..., None], hit.point, bare)
+        without_ground = _below(animated_ankles(frame).pos, up_ws, lift)
+        point_ws = gate.choose(hit.found[..., None], hit.point, without_ground)
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 
 class RootTarget(AbstractInstantTarget):
-    """Moves a standing foot by the ground's height over the root, and `adjust` (Unreal, seed 001).
+    """Moves a standing foot by the ground's height above the root, plus `adjust` (Unreal).
 
-    The animated height over the root is kept, so that what is found is how far the ground lies
-    above or below the one the animation was made for. A foot that sees no ground, or does not
-    stand, stays where it is.
+    The animated height above the root is kept: the animation was made for ground at root height. A
+    foot that finds no ground or does not stand keeps its place.
     """
 
     adjust: Leaf = parameter(
@@ -191,33 +192,33 @@ class RootTarget(AbstractInstantTarget):
 
     @property
     def foot_height(self) -> Array:
-        """0: heights are those of ankles."""
+        """0: ankles, not soles, are placed."""
         return jnp.zeros_like(self.adjust)
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
         hit, ankle_ws = ground.ankle, animated_ankles(frame).pos
-        over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up_ws)
+        height_above_root = vec.dot(ankle_ws - frame.world_from_model.pos, up_ws)
         standing = contact.weight * hit.found
-        lift = over_root + standing * self.adjust
-        bare = _under(ankle_ws, up_ws, over_root)
-        point_ws = gate.choose(standing[..., None], hit.point, bare)
+        lift = height_above_root + standing * self.adjust
+        without_ground = _below(ankle_ws, up_ws, height_above_root)
+        point_ws = gate.choose(standing[..., None], hit.point, without_ground)
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 
 def slope_height(
     foot_height: Array, max_slope: Array, normal: Array, up_ws: Array, gate: AbstractGate
 ) -> Array:
-    """Height, m, along up of the ankle of a sole that lies flat on this slope: `h / (n·u)`.
+    """Height of the ankle above ground along up, m, if the sole is flat on a slope: `h / (n·u)`.
 
-    Slopes steeper than `max_slope`, rad, count as that. Equal to ozz's construction with similar
-    triangles.
+    Slopes steeper than `max_slope`, rad, count as that steep. ozz-animation's foot IK sample gets
+    the same height from similar triangles.
     """
     steepest = jnp.cos(max_slope)
     cosine = gate.clip(vec.dot(normal, up_ws), steepest, jnp.ones_like(steepest), band=0.01)
     return foot_height / cosine
 
 
-def _under(ankle_ws: Array, up_ws: Array, lift: Array) -> Array:
-    """The foothold of an animated ankle."""
+def _below(ankle_ws: Array, up_ws: Array, lift: Array) -> Array:
+    """The point `lift` below an animated ankle, m."""
     return ankle_ws - vec.scale(up_ws, lift)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from reference import maths, mec, ozz, poses, things, unreal
+from reference import characters, maths, sample_poses
+from reference.systems import mec, ozz, unreal
 from reference.terrain import LegTerrains
 from reference.terrain import Terrain as PlainTerrain
 from support.clips import to_frames, to_ik, to_leg_terrains, to_rig, to_terrain, wandering
@@ -117,8 +118,8 @@ OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # what only this s
     "mec": {
         "extra": lambda result: result.trace.sensed.ground.rays.below,
         "planted": lambda result: result.trace.advanced.hold.locked,
-        "plant_weight": lambda result: result.trace.advanced.state.lock.share,
-        "fade": lambda result: result.trace.advanced.state.effector.share,
+        "plant_weight": lambda result: result.trace.advanced.state.lock.weight,
+        "fade": lambda result: result.trace.advanced.state.effector.weight,
     },
 }
 
@@ -140,15 +141,15 @@ def test_the_defaults_are_those_of_the_reference(name):
 )
 def test_600_frames_agree_with_the_reference(name, values, legs):
     rng = np.random.default_rng(7)
-    ground = poses.rough(rng, cells=14, size=4.5)
+    ground = sample_poses.rough(rng, cells=14, size=4.5)
     compare(name, values, legs, rng, ground, to_terrain(ground))
 
 
 @pytest.mark.parametrize(("name", "values", "legs"), UNLIKE_CASES)
 def test_feet_with_an_up_of_their_own_agree_with_the_reference(name, values, legs):
     rng = np.random.default_rng(8)
-    triangles = poses.rough(rng, cells=14, size=4.5).triangles
-    tilts = [maths.turn(axis, 0.25) for axis in (maths.X, -maths.Z, maths.Z)]
+    triangles = sample_poses.rough(rng, cells=14, size=4.5).triangles
+    tilts = [maths.from_axis_angle(axis, 0.25) for axis in (maths.X, -maths.Z, maths.Z)]
     ups = [maths.Y, *(maths.rotate(tilt, maths.Y) for tilt in tilts)]
     body, *each = [PlainTerrain(up, triangles=triangles) for up in ups]
     under_legs = LegTerrains(body, each[:legs])
@@ -159,11 +160,11 @@ def compare(
     name: str, values: dict[str, Any], legs: int, rng: np.random.Generator, plain: Any, ours: Any
 ) -> None:
     """Every output of 600 frames."""
-    rig = poses.make_rig(rng, legs)
+    rig = sample_poses.make_rig(rng, legs)
     frames = wandering(rig, rng, FRAMES, stand=STANDS)
     system = SYSTEMS[name]
     arrays = {k: np.asarray(v) if isinstance(v, list) else v for k, v in values.items()}
-    parameters = things.Parameters(arrays, defaults=system.DEFAULTS)
+    parameters = characters.Parameters(arrays, defaults=system.DEFAULTS)
     expected = system.run(parameters, rig, plain, frames)
     result = jaxik.run(to_ik(values, name), to_rig(rig), ours, to_frames(frames))
 
@@ -192,5 +193,5 @@ def compare(
         np.testing.assert_allclose(np.asarray(came), wanted, rtol=0, atol=POSITION, err_msg=key)
     for joint in JOINTS:
         rot = np.asarray(getattr(result.pose, joint).rot)
-        assert poses.turn_angle(rot, expected[f"{joint}_rot"]) < ANGLE, joint
+        assert sample_poses.rotation_angle(rot, expected[f"{joint}_rot"]) < ANGLE, joint
     np.testing.assert_array_equal(np.asarray(result.reached) > 0.5, expected["reached"] > 0.5)
