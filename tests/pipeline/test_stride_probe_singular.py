@@ -81,7 +81,7 @@ SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any]]] = {
     "straight and too far": (held(*STRAIGHT), planes((0, 0, -0.3)), {}),
     "folded": (held(*FOLDED), FLAT, {}),
     "target on the hip": (held(*BENT), planes((0, 0, 0.75)), {}),
-    "no bones": (held(*[[0, 0.5, 0]] * 3), FLAT, {}),
+    "no bones": (held([0, 0.5, 0], [0, 0.5, 0], [0, 0.5, 0]), FLAT, {}),
     "no thigh": (held([0, 0.5, 0], [0, 0.5, 0], [0, 0.1, 0]), FLAT, {}),
     "no foot": (held([0, 0.9, 0], [0, 0.5, 0.1], [0.0, 0.1, 0]), STEEP, {}),
     "no rise of the heel": (standing(), STEEP, {"effector.max_lift": 0.0}),

@@ -135,13 +135,13 @@ def test_one_bad_member_does_not_spoil_the_others_of_a_batch(preset: str):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_other_values_are_no_new_program(preset: str):
     crowded(preset)
-    programs = crowd_run._cache_size()
+    programs = crowd_run._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     ik, rig, ground, frames = crowd(preset)
     ik = jax.tree.map(lambda leaf: ~leaf if leaf.dtype == bool else leaf, ik)
     crowd_run(
         parameter_tree.replace(ik, {"leg.twist": jnp.array([0.1, 0.2, 0.3])}), rig, ground, frames
     )
-    assert crowd_run._cache_size() == programs
+    assert crowd_run._cache_size() == programs  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
