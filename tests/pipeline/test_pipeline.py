@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from reference import poses
-from reference import record as reference
+from reference import sample_poses
+from reference.systems import record as reference
 from support.clips import ODD, to_frames, to_ik, to_rig, to_terrain, wandering
 
 POSITION = 1e-5  # m
@@ -26,9 +26,9 @@ ADULT: dict = {}
 )
 def test_600_frames_agree_with_the_reference(name, values, legs):
     rng = np.random.default_rng(len(name))
-    rig = poses.make_rig(rng, legs)
+    rig = sample_poses.make_rig(rng, legs)
     frames = wandering(rig, rng, FRAMES)
-    ground = poses.rough(rng, cells=14, size=4.5)
+    ground = sample_poses.rough(rng, cells=14, size=4.5)
     expected = reference.run(
         reference.Parameters(
             {k: np.asarray(v) if isinstance(v, list) else v for k, v in values.items()}
@@ -67,6 +67,6 @@ def test_600_frames_agree_with_the_reference(name, values, legs):
     np.testing.assert_allclose(slope, expected["slope"], atol=ANGLE)
     for joint in ("hip", "knee", "ankle", "toe"):
         ours = np.asarray(getattr(result.pose, joint).rot)
-        assert poses.turn_angle(ours, expected[f"{joint}_rot"]) < ANGLE, joint
-    assert poses.turn_angle(np.asarray(result.body.rot), expected["body_rot"]) < ANGLE
+        assert sample_poses.rotation_angle(ours, expected[f"{joint}_rot"]) < ANGLE, joint
+    assert sample_poses.rotation_angle(np.asarray(result.body.rot), expected["body_rot"]) < ANGLE
     np.testing.assert_array_equal(np.asarray(result.reached) > 0.5, expected["reached"] > 0.5)

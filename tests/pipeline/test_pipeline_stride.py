@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from reference import maths, poses, stride, things
+from reference import characters, maths, sample_poses
+from reference.systems import stride
 from reference.terrain import LegTerrains
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import QUICK
@@ -91,8 +92,8 @@ compiled = jax.jit(jaxik.run, compiler_options=QUICK)
 
 
 @functools.cache
-def rig_of(legs: int = 2) -> things.Rig:
-    return poses.make_rig(np.random.default_rng(4), legs)
+def rig_of(legs: int = 2) -> characters.Rig:
+    return sample_poses.make_rig(np.random.default_rng(4), legs)
 
 
 @functools.cache
@@ -100,15 +101,15 @@ def uneven() -> PlainTerrain:
     return blocks(np.random.default_rng(3))
 
 
-def carousel(time: float) -> things.Transform:
+def carousel(time: float) -> characters.Transform:
     """A platform that drifts and turns."""
     pos = np.array([0.3, 0.1, -0.2]) + time * np.array([0.05, 0.01, 0.08])
-    return maths.Transform(pos, maths.turn(maths.Y, 0.4 + 0.11 * time))
+    return maths.Transform(pos, maths.from_axis_angle(maths.Y, 0.4 + 0.11 * time))
 
 
 def clip(
     legs: int = 2, told: bool = True, rides: bool = False, leaps: bool = False
-) -> list[things.Frame]:
+) -> list[characters.Frame]:
     """A walk across all the blocks and beyond, with slipping and turning feet and odd weights.
 
     Told, the stride is unknown for a while; the labels are doubtful for another. It may ride on a
@@ -129,9 +130,13 @@ def clip(
             known = 0.0 * known
         if 0.3 < share < 0.4:
             standing = 0.2 + 0.6 * standing
-        wobble = maths.turn(maths.unit(rng.normal(size=3), maths.Y), rng.uniform(0.0, 0.1))
+        wobble = maths.from_axis_angle(
+            maths.unit(rng.normal(size=3), maths.Y), rng.uniform(0.0, 0.1)
+        )
         slip = frame.world_from_model.pos + [0.02 * np.sin(7 * time), 0.01 * np.sin(5 * time), 0.0]
-        rot = maths.multiply(frame.world_from_model.rot, maths.turn(maths.Y, 0.1 * np.sin(time)))
+        rot = maths.multiply(
+            frame.world_from_model.rot, maths.from_axis_angle(maths.Y, 0.1 * np.sin(time))
+        )
         changed.append(
             dataclasses.replace(
                 frame,
@@ -144,7 +149,7 @@ def clip(
                 platform=carousel(time) if rides else frame.platform,
             )
         )
-    timed = poses.with_speeds(changed)
+    timed = sample_poses.with_speeds(changed)
     airborne = [leaps and (i < 12 or 400 < i < 440) for i in range(FRAMES)]
     return [
         dataclasses.replace(frame, toe_speed=frame.toe_speed + 3.0 * flies)
@@ -173,7 +178,7 @@ def test_600_frames_agree_with_the_reference(preset, values, how):
 
 @pytest.mark.slow
 def test_feet_with_an_up_of_their_own_agree_with_the_reference():
-    tilts = [maths.turn(axis, 0.2) for axis in (maths.X, -maths.Z, maths.Z)]
+    tilts = [maths.from_axis_angle(axis, 0.2) for axis in (maths.X, -maths.Z, maths.Z)]
     ups = [maths.Y, *(maths.rotate(tilt, maths.Y) for tilt in tilts)]
     body, *each = [PlainTerrain(up, triangles=uneven().triangles) for up in ups]
     under_legs = LegTerrains(body, each)
@@ -181,12 +186,12 @@ def test_feet_with_an_up_of_their_own_agree_with_the_reference():
 
 
 def compare(
-    preset: str, values: dict[str, Any], frames: Sequence[things.Frame], plain: Any, ours: Any
+    preset: str, values: dict[str, Any], frames: Sequence[characters.Frame], plain: Any, ours: Any
 ) -> None:
     """Every output of 600 frames."""
     rules = RULES[preset]
     rig = rig_of(len(frames[0].weight))
-    parameters = things.Parameters(values, defaults=stride.defaults(*rules))
+    parameters = characters.Parameters(values, defaults=stride.defaults(*rules))
     expected = stride.run(parameters, rig, plain, frames, *rules)
     result = compiled(to_ik(values, preset), to_rig(rig), ours, to_frames(frames))
 
@@ -229,4 +234,4 @@ def compare(
         )
     for joint in JOINTS:
         rot = np.asarray(getattr(result.pose, joint).rot)
-        assert poses.turn_angle(rot, expected[f"{joint}_rot"]) < ANGLE, joint
+        assert sample_poses.rotation_angle(rot, expected[f"{joint}_rot"]) < ANGLE, joint

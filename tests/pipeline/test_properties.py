@@ -16,8 +16,8 @@ from fitting.datasets.synthetic import walker
 from jaxik import Smooth, Transform
 from jaxik.maths import parameter_tree, quat
 from jaxik.world.skeleton import bone_lengths
-from reference import maths, poses
-from reference import record as reference
+from reference import maths, sample_poses
+from reference.systems import record as reference
 from reference.terrain import Terrain as PlainTerrain
 from support.clips import (
     BROKEN,
@@ -198,8 +198,8 @@ def some_move(kind: str) -> reference.Transform:
     if kind == "moved":
         return reference.Transform(pos, maths.IDENTITY)
     if kind == "turned about up":
-        return reference.Transform(np.zeros(3), maths.turn(maths.Y, 2.1))
-    return reference.Transform(pos, poses.random_rot(rng))
+        return reference.Transform(np.zeros(3), maths.from_axis_angle(maths.Y, 2.1))
+    return reference.Transform(pos, sample_poses.random_rot(rng))
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
@@ -505,7 +505,7 @@ def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
         np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-5)
         assert_same_rot(came.rot, wanted.rot, 1e-4)
     thigh = np.linalg.norm(result.pose.knee.pos - result.pose.hip.pos, axis=-1)
-    np.testing.assert_allclose(thigh, poses.THIGH, atol=1e-6)
+    np.testing.assert_allclose(thigh, sample_poses.THIGH, atol=1e-6)
 
 
 # Programs.

@@ -14,7 +14,7 @@ import jaxik
 from jaxik import record
 from jaxik.maths import parameter_tree
 from jaxik.record import FLAG_NAMES, FLOAT_NAMES, Reading, Record
-from reference import poses
+from reference import sample_poses
 from support.clips import to_rig
 from support.records import ADULT, packed
 
@@ -203,7 +203,7 @@ def test_the_knee_axis_is_the_enums():
 
 
 def test_a_games_rig_takes_the_records_knee_axis_and_keeps_the_rest():
-    rig = to_rig(poses.make_rig(np.random.default_rng(0)))
+    rig = to_rig(sample_poses.make_rig(np.random.default_rng(0)))
     turned = record.with_knee_axis(rig, Record(knee_axis_type=3))
     np.testing.assert_array_equal(turned.knee_axis_ls, [[-1, 0, 0]] * 2)
     assert turned.knee_axis_ls.dtype == rig.knee_axis_ls.dtype

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from reference import maths
-from reference.poses import (
+from reference.sample_poses import (
     ANKLE,
     STILL,
     make_frame,
     make_rig,
     plane,
     random_rot,
+    rotation_angle,
     rough,
     standing,
     stepping,
-    turn_angle,
 )
-from reference.record import Frame, Parameters, Rig, Transform, run, step
+from reference.systems.record import Frame, Parameters, Rig, Transform, run, step
 from reference.terrain import Terrain
 
 EXACT = 1e-9  # m and rad
@@ -39,7 +39,7 @@ def assert_unchanged(output: dict[str, np.ndarray], frames: list[Frame]) -> None
     for name in ("hip", "knee", "ankle", "toe"):
         animated = [getattr(frame, name) for frame in frames]
         assert np.allclose(output[f"{name}_pos"], [a.pos for a in animated], atol=EXACT)
-        assert turn_angle(output[f"{name}_rot"], np.array([a.rot for a in animated])) < EXACT
+        assert rotation_angle(output[f"{name}_rot"], np.array([a.rot for a in animated])) < EXACT
 
 
 def test_flat_ground_leaves_a_standing_pose_unchanged():
@@ -65,11 +65,13 @@ def test_the_ankle_arrives_at_a_reachable_target_and_no_bone_changes():
     for _ in range(60):
         rig = make_rig(rng, legs=3)
         ankles = standing((ANKLE, 0.15, 0.1)) + rng.uniform(-0.05, 0.05, size=(3, 3))
-        root = Transform(rng.normal(size=3) * [1, 0, 1], maths.turn(maths.Y, rng.uniform(-3, 3)))
+        root = Transform(
+            rng.normal(size=3) * [1, 0, 1], maths.from_axis_angle(maths.Y, rng.uniform(-3, 3))
+        )
         frame = make_frame(rig, ankles, 0.9, rng.uniform(-0.4, 0.4), world_from_model=root)
         # Tilt the hinge, so that it is no more at right angles to thigh and shin.
         frame.knee.rot[:] = [
-            maths.multiply(maths.turn(maths.Z, rng.uniform(-0.3, 0.3)), rot)
+            maths.multiply(maths.from_axis_angle(maths.Z, rng.uniform(-0.3, 0.3)), rot)
             for rot in frame.knee.rot
         ]
         changes = {"leg.max_knee_angle": math.pi, "leg.min_knee_angle": 0.0}
@@ -128,7 +130,7 @@ def test_the_sole_takes_the_slope_of_the_ground_when_limits_are_wide(use_toe):
         rig = make_rig(rng)
         slopes = rng.uniform(-0.5, 0.5, size=2)
         ground = plane(*slopes)
-        root = Transform(np.zeros(3), maths.turn(maths.Y, rng.uniform(-3, 3)))
+        root = Transform(np.zeros(3), maths.from_axis_angle(maths.Y, rng.uniform(-3, 3)))
         frame = make_frame(rig, standing(), world_from_model=root)
         _, output = step(
             Parameters(UNLIMITED | {"probe.use_toe": use_toe}), rig, ground, None, frame
@@ -336,7 +338,7 @@ def test_turning_and_tilting_the_world_turns_nothing_in_model_space():
     assert np.abs(plain["ankle_pos"] - [f.ankle.pos for f in frames]).max() > 0.02
     for name in ("hip", "knee", "ankle", "toe"):
         assert np.allclose(plain[f"{name}_pos"], moved[f"{name}_pos"], atol=EXACT)
-        assert turn_angle(plain[f"{name}_rot"], moved[f"{name}_rot"]) < 1e-8
+        assert rotation_angle(plain[f"{name}_rot"], moved[f"{name}_rot"]) < 1e-8
     offsets = [maths.rotate(turned.rot, o) for o in plain["offset_ws"].reshape(-1, 3)]
     assert np.allclose(offsets, moved["offset_ws"].reshape(-1, 3), atol=EXACT)
 
@@ -379,7 +381,7 @@ def test_mirroring_the_world_mirrors_the_answer():
     for name in ("hip", "knee", "ankle", "toe"):
         assert np.allclose(plain[f"{name}_pos"] * flip, mirror[f"{name}_pos"][:, ::-1], atol=EXACT)
         rot = plain[f"{name}_rot"] * flip_rot
-        assert turn_angle(rot, np.ascontiguousarray(mirror[f"{name}_rot"][:, ::-1])) < 1e-8
+        assert rotation_angle(rot, np.ascontiguousarray(mirror[f"{name}_rot"][:, ::-1])) < 1e-8
     assert (plain["locked"] == mirror["locked"][:, ::-1]).all()
 
 
@@ -427,8 +429,8 @@ def test_a_raised_foot_takes_nothing_from_the_ground_but_height():
     frame = make_frame(rig, standing((0.2, 0.2)))
     _, output = step(Parameters(UNLIMITED), rig, plane(0.3, 0.3), None, frame)
     assert (output["contact"] == 0.0).all()
-    assert turn_angle(output["ankle_rot"], frame.ankle.rot) < EXACT
-    assert turn_angle(output["body_rot"], maths.IDENTITY) < EXACT
+    assert rotation_angle(output["ankle_rot"], frame.ankle.rot) < EXACT
+    assert rotation_angle(output["body_rot"], maths.IDENTITY) < EXACT
     assert output["pelvis_height"] == 0.0
     assert (np.abs(output["ankle_pos"] - frame.ankle.pos)[:, 1] > 0.005).all()
 
@@ -441,7 +443,7 @@ def test_the_body_leans_about_the_middle_of_the_hips_and_sinks_along_the_normal_
         changes = {"pelvis.vertical_only": vertical_only, "lean.forward_rate": 0.7}
         _, output = step(Parameters(changes), rig, plane(0.3, 0.2, -0.1), None, frame)
         assert output["pelvis_height"] < -0.05
-        assert turn_angle(output["body_rot"], maths.IDENTITY) > 0.1
+        assert rotation_angle(output["body_rot"], maths.IDENTITY) > 0.1
         moved = np.mean(output["hip_pos"] - frame.hip.pos, axis=0)
         assert np.allclose(moved, output["pelvis_height"] * direction, atol=EXACT)
 

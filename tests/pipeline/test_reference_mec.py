@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reference import maths, mec
+from reference import maths
+from reference.characters import Frame, Ground, Parameters
 from reference.maths import Array, Transform
-from reference.poses import ANKLE, make_frame, make_rig, plane, standing
+from reference.sample_poses import ANKLE, make_frame, make_rig, plane, standing
+from reference.systems import mec
 from reference.terrain import LegTerrains, Terrain
-from reference.things import Frame, Ground, Parameters
 
 EXACT = 1e-9  # m and rad
 DT = 1 / 60  # s, of the frames
@@ -158,7 +159,7 @@ def test_the_weight_moves_linearly_over_the_transition_time_and_the_last_goal_is
         assert np.allclose(outputs[index]["target_ws"], wanted, atol=EXACT)
     heights = [output["ankle_pos"][0, 1] - output["pelvis_height"] for output in outputs[:13]]
     assert (np.diff(heights) < 0.0).all() and heights[12] == pytest.approx(ANKLE)
-    turned = [Transform(np.zeros(3), maths.turn(maths.Y, angle)) for angle in (0.3, 0.5)]
+    turned = [Transform(np.zeros(3), maths.from_axis_angle(maths.Y, angle)) for angle in (0.3, 0.5)]
     frames = [stand(world_from_model=root) for root in turned]
     changes = {"probe__forward": maths.rotate(maths.inverse(turned[0].rot), maths.Z)}
     first, last = follow([plane(0.3, 0.0), DEEP], frames, **changes)
@@ -210,7 +211,7 @@ def test_a_planted_foot_keeps_its_turn_and_its_place_on_a_platform_and_follows_t
     half = follow(grounds[:2], [stand(), stand(0.09)], lock__plant_weight=0.5)[1]
     assert angle_of(half["goal_rot"][0]) == pytest.approx(math.atan(0.3) / 2)
     assert not outputs[2]["planted"].any()  # ground over the ray's start is no hit
-    turned = Transform(np.array([0.1, 0.0, 0.2]), maths.turn(maths.Y, 0.5))
+    turned = Transform(np.array([0.1, 0.0, 0.2]), maths.from_axis_angle(maths.Y, 0.5))
     moved = follow([slope, FLAT], [stand(), stand(platform=turned)])[1]
     for leg in range(2):
         stood = maths.apply(turned, np.array([(0.1, -0.1)[leg], 0.0, 0.05]))
@@ -263,7 +264,7 @@ def test_the_pelvis_is_damped_by_the_clamped_speed_law():
 
 def test_the_knee_looks_at_the_toes_moved_by_the_calf_and_the_offset():
     offset = np.array([0.2, 0.1, 0.0])
-    root = Transform(np.array([0.3, 0.0, 0.2]), maths.turn(maths.Y, 0.4))
+    root = Transform(np.array([0.3, 0.0, 0.2]), maths.from_axis_angle(maths.Y, 0.4))
     frame = stand(world_from_model=root)
     ground, changes = plane(0.0, 0.0, -0.1), {"pelvis.max_length": 0.8}
     _, output = step(ground, frame, changes | {"leg.hint_offset": offset})

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reference import maths, mec, ozz, unreal
+from reference import maths
+from reference.characters import Frame, Ground, Parameters, Rig
 from reference.maths import Array, Transform
-from reference.poses import ANKLE, make_frame, make_rig, plane, standing, turn_angle
+from reference.sample_poses import ANKLE, make_frame, make_rig, plane, rotation_angle, standing
+from reference.systems import mec, ozz, unreal
 from reference.terrain import Terrain
-from reference.things import Frame, Ground, Parameters, Rig
 from support import clips
 
 EXACT = 1e-9  # m and rad
@@ -69,7 +70,7 @@ def test_flat_ground_leaves_a_standing_pose_unchanged(system):
     _, output = step(system, FLAT, frame)
     for name in ("hip", "knee", "ankle", "toe"):
         assert np.allclose(output[f"{name}_pos"], getattr(frame, name).pos, atol=EXACT)
-        assert turn_angle(output[f"{name}_rot"], getattr(frame, name).rot) < 1e-7
+        assert rotation_angle(output[f"{name}_rot"], getattr(frame, name).rot) < 1e-7
     assert output["reached"].all() and (output["weight"] == 1.0).all()
 
 
@@ -164,7 +165,7 @@ def test_ozz_leaves_a_leg_without_ground_as_animated_but_for_the_bodys_move():
     assert output["pelvis_height"] == pytest.approx(-0.03, abs=EXACT)
     assert output["weight"].tolist() == [1.0, 0.0] and not output["reached"][1]
     assert np.allclose(output["knee_pos"], frame.knee.pos - 0.13 * maths.Y, atol=EXACT)
-    assert turn_angle(output["ankle_rot"], frame.ankle.rot) < 1e-7
+    assert rotation_angle(output["ankle_rot"], frame.ankle.rot) < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -196,7 +197,7 @@ def test_ozz_switches_leg_and_foot_off_each_by_itself(leg, foot):
     changes = {"leg.enabled": leg, "foot.enabled": foot, "pelvis.enabled": False}
     _, output = step(ozz, plane(0.3, 0.0, 0.05), frame, changes | {"root.enabled": False})
     assert np.allclose(output["ankle_pos"], frame.ankle.pos, atol=EXACT) == (not leg)
-    turned = turn_angle(output["ankle_rot"], frame.ankle.rot) > 1e-3
+    turned = rotation_angle(output["ankle_rot"], frame.ankle.rot) > 1e-3
     assert turned == (leg or foot) and output["foot_reached"].all() == foot
 
 
@@ -212,7 +213,7 @@ def test_ozz_aims_from_an_offset_and_leaves_the_foot_where_the_offset_is_too_far
     _, output = step(ozz, slope, stand(), far)
     _, carried = step(ozz, slope, stand(), {"foot.enabled": False})
     assert not output["foot_reached"].any()
-    assert turn_angle(output["ankle_rot"], carried["ankle_rot"]) < EXACT
+    assert rotation_angle(output["ankle_rot"], carried["ankle_rot"]) < EXACT
 
 
 # unreal.
@@ -223,7 +224,7 @@ def test_unreal_is_on_its_goals_in_the_first_frame_of_a_stand():
     assert output["hip"] == pytest.approx(-0.1) and output["half_height"] == pytest.approx(0.85)
     assert np.allclose(output["effector"], [0.0, 0.1], atol=EXACT) and output["asleep"]
     assert np.allclose(output["ankle_pos"][:, 1], [ANKLE - 0.1, ANKLE], atol=EXACT)
-    assert turn_angle(output["ankle_rot"], stand().ankle.rot) < 1e-7
+    assert rotation_angle(output["ankle_rot"], stand().ankle.rot) < 1e-7
 
 
 def test_unreal_moves_by_the_clamped_speed_law_and_its_latch_freezes_the_hip_short():

@@ -15,7 +15,7 @@ import pytest
 
 import jaxik
 from jaxik import HARD, Smooth
-from reference import poses
+from reference import sample_poses
 from support.cases import QUICK, RIG, Inputs, measured, posed, read
 from support.clips import FLAT, FRAMES, animate, padded, planes, to_frames, to_ik, to_rig
 from support.clips import to_terrain as to_ground
@@ -58,7 +58,7 @@ def hint(below: float) -> dict[str, Any]:
         np.asarray(getattr(standing().pose, joint).pos[0, 0])
         for joint in ("hip", "knee", "ankle", "toe")
     )
-    toe = ankle + np.array([0.0, -poses.ANKLE, 0.20])
+    toe = ankle + np.array([0.0, -sample_poses.ANKLE, 0.20])
     down = (ankle - hip) / np.linalg.norm(ankle - hip)
     return {"mec": STIFF | {"leg.hint_offset": hip + below * down - toe - (knee - ankle)}}
 
@@ -68,7 +68,7 @@ SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any], dict[str, dict[str, 
     "straight": (held(*STRAIGHT), FLAT, {}, {}),
     "straight and too far": (held(*STRAIGHT), planes((0, 0, -0.3)), STIFF, {}),
     "straight and at its length": (
-        held([0, 0.88, 0], [0, poses.SHIN, 0], [0, 0, 0]),
+        held([0, 0.88, 0], [0, sample_poses.SHIN, 0], [0, 0, 0]),
         FLAT,
         STIFF,
         BAREFOOT,
@@ -77,7 +77,7 @@ SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any], dict[str, dict[str, 
     "folded and too near": (held(*FOLDED), planes((0, 0, 0.02)), HIGH_RAY, BAREFOOT),
     "target on the hip": (held(*BENT), planes((0, 0, 0.75)), HIGH_RAY, BAREFOOT),
     "target above the hip": (held(*BENT), planes((0, 0, 1.25)), HIGH_RAY, BAREFOOT),
-    "no bones": (held(*[[0, 0.5, 0]] * 3), FLAT, {}, {}),
+    "no bones": (held([0, 0.5, 0], [0, 0.5, 0], [0, 0.5, 0]), FLAT, {}, {}),
     "no thigh": (held([0, 0.5, 0], [0, 0.5, 0], [0, 0.1, 0]), FLAT, {}, {}),
     "no shin": (held([0, 0.5, 0], [0, 0.1, 0], [0, 0.1, 0]), FLAT, {}, {}),
     "misses": (standing(), FLAT, {"probe.layers": 0, "root.layers": 0}, {}),

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 # A vector shorter than this (in its own unit) has no direction.
 DIRECTIONLESS = 1e-9
 
-# Gap in m that the clamped-speed law jumps over.
+# The clamped-speed law closes smaller gaps, m, at once.
 JUMP = 1e-4
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -23,14 +23,14 @@ X, Y, Z = np.eye(3)
 
 
 class Transform(NamedTuple):
-    """A rigid placement, pos (3) in m and rot (4); or one a leg, (legs, 3) and (legs, 4)."""
+    """A rigid transform, pos (3) in m and rot (4); or one per leg, (legs, 3) and (legs, 4)."""
 
     pos: Array
     rot: Array
 
 
-class Eased(NamedTuple):
-    """A number that follows its goal, and how fast it moves, per second; 0 but for springs."""
+class Motion(NamedTuple):
+    """A smoothed number and its velocity, per second, which is 0 except for springs."""
 
     value: float
     velocity: float
@@ -50,7 +50,7 @@ def unit(v: Array, fallback: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Right-handed vector product."""
+    """Right-handed cross product."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
@@ -68,7 +68,7 @@ def angle_between(a: Array, b: Array) -> float:
 
 
 def signed_angle(a: Array, b: Array, axis: Array) -> float:
-    """Angle in -pi..pi of the turn about the unit `axis` that brings `a` to `b` in projection."""
+    """Angle in -pi..pi of the rotation about the unit `axis` from `a` to `b` in projection."""
     a, b = across(a, axis), across(b, axis)
     if length(a) < DIRECTIONLESS or length(b) < DIRECTIONLESS:
         return 0.0
@@ -76,7 +76,7 @@ def signed_angle(a: Array, b: Array, axis: Array) -> float:
 
 
 def interior_angle(a: float, b: float, distance_squared: float) -> float:
-    """Angle between sides `a` and `b` over the third side; pi where a side is missing."""
+    """Angle between the sides `a` and `b` of a triangle; pi where a side has no length."""
     if 2.0 * a * b < DIRECTIONLESS**2:
         return math.pi
     return math.acos(clip((a * a + b * b - distance_squared) / (2.0 * a * b), -1.0, 1.0))
@@ -96,53 +96,53 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def inverse(q: Array) -> Array:
-    """The opposite rotation of a unit quaternion."""
+    """The inverse of a unit quaternion."""
     return np.array([q[0], -q[1], -q[2], -q[3]])
 
 
 def rotate(q: Array, v: Array) -> Array:
-    """`v` turned by `q`."""
+    """`v` rotated by `q`."""
     w, xyz = q[0], q[1:]
     twice = 2.0 * cross(xyz, v)
     return v + w * twice + cross(xyz, twice)
 
 
 def conjugate(q: Array, by: Array) -> Array:
-    """`by` q `by`^-1: the turn `q`, stated in the space that `by` leads to."""
+    """`by` q `by`^-1: the rotation `q`, expressed in the space that `by` leads to."""
     return multiply(multiply(by, q), inverse(by))
 
 
-def turn(axis: Array, angle: float) -> Array:
+def from_axis_angle(axis: Array, angle: float) -> Array:
     """Rotation by `angle` about the unit `axis`."""
     return np.concatenate([[math.cos(angle / 2)], math.sin(angle / 2) * axis])
 
 
-def turn_by_vector(vector: Array) -> Array:
+def from_rotvec(vector: Array) -> Array:
     """Rotation about `vector` by its length in radians."""
     angle = length(vector)
     if angle == 0.0:
         return IDENTITY
-    return turn(vector / angle, angle)
+    return from_axis_angle(vector / angle, angle)
 
 
 def shortest_arc(a: Array, b: Array, spare_axis: Array) -> Array:
-    """Smallest turn from unit `a` to unit `b`; opposite ones turn about `spare_axis` made square.
+    """Shortest rotation from unit `a` to unit `b`; opposite ones rotate about `spare_axis`.
 
-    Where `spare_axis` lies along `a` too, any axis at right angles does.
+    Of `spare_axis` the part at right angles to `a` is used; if it has none, any such axis.
     """
     axis = cross(a, b)
     if length(axis) >= DIRECTIONLESS:
-        return turn(axis / length(axis), angle_between(a, b))
+        return from_axis_angle(axis / length(axis), angle_between(a, b))
     if a @ b > 0.0:
         return IDENTITY
     square = across(spare_axis, a)
     if length(square) < DIRECTIONLESS:
         square = across(np.eye(3)[np.argmin(np.abs(a))], a)
-    return turn(square / length(square), math.pi)
+    return from_axis_angle(square / length(square), math.pi)
 
 
 def nlerp(a: Array, b: Array, weight: float) -> Array:
-    """Normalised straight blend from `a` to `b`, along the shorter way."""
+    """Normalized linear interpolation from `a` to `b`, the shorter way."""
     if a @ b < 0.0:
         b = -b
     blend = a + weight * (b - a)
@@ -155,26 +155,26 @@ def lerp(a: float, b: float, weight: float) -> float:
 
 
 def clip(value: float, low: float, high: float) -> float:
-    """`value` kept within [low, high]; where the limits cross, the upper one wins."""
+    """`value` limited to [low, high]; where the limits cross, the upper one wins."""
     return min(max(value, low), high)
 
 
 def fraction_of_gain(gain: float, tick_hz: float, dt: float) -> float:
-    """Part of the way covered in `dt` s by a gain per tick; a gain of 1 or more jumps."""
+    """Fraction of the gap closed in `dt` s by a gain per tick; a gain of 1 or more jumps."""
     if gain >= 1.0:
         return 1.0
     return 1.0 - (1.0 - gain) ** (dt * tick_hz)
 
 
 def fraction_of_half_life(half_life: float, dt: float) -> float:
-    """Part of the way covered in `dt` s; a half-life <= 0 s jumps, an infinite one stays."""
+    """Fraction of the gap closed in `dt` s; a half-life <= 0 s jumps, an infinite one stays."""
     if half_life <= 0.0:
         return 1.0
     return 1.0 - 2.0 ** (-dt / half_life)
 
 
-def ease_by_speed(value: float, goal: float, speed: float, dt: float) -> float:
-    """The clamped-speed law: `value` after `dt` s, `dt * speed` of the way to `goal`, at most all.
+def move_by_speed(value: float, goal: float, speed: float, dt: float) -> float:
+    """The clamped-speed law: `value` moved by `dt * speed`, at most 1, of the way to `goal`.
 
     A speed <= 0 jumps, and so does a gap below `JUMP` m.
     """
@@ -184,7 +184,7 @@ def ease_by_speed(value: float, goal: float, speed: float, dt: float) -> float:
 
 
 def half_life_of_gain(gain: float, tick_hz: float) -> float:
-    """Half-life in s of a gain per tick; 0 for a gain of 1 or more, endless for one of 0."""
+    """Half-life in s of a gain per tick; 0 for a gain of 1 or more, infinite for 0."""
     if gain >= 1.0:
         return 0.0
     if gain == 0.0:
@@ -192,31 +192,31 @@ def half_life_of_gain(gain: float, tick_hz: float) -> float:
     return math.log(0.5) / math.log(1.0 - gain) / tick_hz
 
 
-def follow(before: Eased | None, goal: float, half_life: float, dt: float, spring: bool) -> Eased:
-    """The number after `dt` s: exponential, or a critically damped spring to a goal that is still.
+def follow(before: Motion | None, goal: float, half_life: float, dt: float, spring: bool) -> Motion:
+    """The number after `dt` s: an exponential, or a critically damped spring to a fixed goal.
 
-    The spring is `goal + (a + b t) e^(-w t)` with `w = 2 ln 2 / half_life`. On the goal, at rest,
-    without a number before; a half-life <= 0 s jumps.
+    The spring is `goal + (a + b t) e^(-w t)` with `w = 2 ln 2 / half_life`. Without a number
+    before, it starts on the goal at rest. A half-life <= 0 s jumps.
     """
     if before is None or half_life <= 0.0:
-        return Eased(goal, 0.0)
+        return Motion(goal, 0.0)
     if not spring:
-        return Eased(lerp(before.value, goal, fraction_of_half_life(half_life, dt)), 0.0)
+        return Motion(lerp(before.value, goal, fraction_of_half_life(half_life, dt)), 0.0)
     w = 2.0 * math.log(2.0) / half_life
     a = before.value - goal
     b = before.velocity + w * a
     left = math.exp(-w * dt)
-    return Eased(goal + (a + b * dt) * left, (b - w * (a + b * dt)) * left)
+    return Motion(goal + (a + b * dt) * left, (b - w * (a + b * dt)) * left)
 
 
 def smooth01(x: float) -> float:
-    """The cubic from 0 at 0 to 1 at 1, flat at either and beyond them."""
+    """The smoothstep cubic from 0 at 0 to 1 at 1, constant beyond."""
     x = clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 def move_towards(value: float, goal: float, step: float) -> float:
-    """`value` after at most `step` straight towards `goal`."""
+    """`value` moved towards `goal` by at most `step`."""
     if abs(goal - value) <= step:
         return goal
     return value + step if goal > value else value - step

@@ -1,4 +1,4 @@
-"""Rays down onto planes and triangle lists, by trying every surface."""
+"""Rays cast down onto planes and lists of triangles, by testing every surface."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .maths import Array
+from reference.maths import Array
 
 # Cosine between a surface's normal and up below which a vertical ray runs along the surface.
 EDGE_ON = 1e-9

@@ -14,7 +14,7 @@ from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, effector, target
 from jaxik.world.skeleton import bone_lengths
-from reference import poses
+from reference import sample_poses
 from support.cases import QUICK, RIG
 from support.clips import (
     BROKEN,
@@ -162,7 +162,7 @@ def test_standing_on_flat_ground_moves_hips_and_ankles_by_the_sole_at_most(name:
     where = BLENDS[name].target
     sole = 0.0
     if isinstance(where, target.SoleTarget | target.ContactTarget):
-        sole = abs(float(where.foot_height) - poses.ANKLE)
+        sole = abs(float(where.foot_height) - sample_poses.ANKLE)
     for joint in ("hip", "ankle"):
         moved = getattr(result.pose, joint).pos - getattr(frames.pose, joint).pos
         assert np.linalg.norm(moved, axis=-1).max() < sole + 1e-9, joint

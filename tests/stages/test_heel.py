@@ -11,7 +11,7 @@ from scipy.optimize import brentq, minimize_scalar
 import jaxik
 from jaxik.maths import quat
 from jaxik.stages import effector
-from reference import maths, poses
+from reference import maths, sample_poses
 from support.cases import QUICK, RIG
 from support.clips import to_frames, to_ik, to_rig, to_terrain
 from support.gradients import finite_jacobian
@@ -29,7 +29,7 @@ def searched(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: flo
     """
 
     def distance(angle: float) -> float:
-        return maths.length(to_ball + maths.rotate(maths.turn(axis, -angle), arm))
+        return maths.length(to_ball + maths.rotate(maths.from_axis_angle(axis, -angle), arm))
 
     if distance(0.0) <= length or distance(1e-5) > distance(0.0):
         return 0.0
@@ -98,7 +98,9 @@ def heels() -> dict[str, np.ndarray]:
     before = advanced.foothold_ws + advanced.hold.offset_ws + lift - hip
     after = advanced.effector.target_ws - hip
     animated = np.linalg.norm(sensed.ankle_ws - sensed.hip_ws, axis=-1)
-    longest = np.maximum(VALUES["effector.extension"] * (poses.THIGH + poses.SHIN), animated)
+    longest = np.maximum(
+        VALUES["effector.extension"] * (sample_poses.THIGH + sample_poses.SHIN), animated
+    )
 
     arm = sensed.ankle_ws - sensed.ball_ws
     axis = -np.asarray(quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X)))

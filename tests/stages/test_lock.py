@@ -7,7 +7,7 @@ import pytest
 
 import jaxik
 from reference import maths
-from reference import record as reference
+from reference.systems import record as reference
 from support.clips import FLAT, animate, make_rig, stepping, to_frames, to_ik, to_rig, to_terrain
 
 RIG = make_rig()
@@ -85,7 +85,7 @@ def test_a_foot_locked_firmly_does_not_move_at_all():
 def carousel(time: float) -> reference.Transform:
     """A platform that drives off and turns about its own middle, 0.4 m beside the feet."""
     pos = np.array([0.4 + 0.05 * time, 0.3, -0.1 + 0.04 * time])
-    return reference.Transform(pos, maths.turn(maths.Y, 1.0 + 0.1 * time))
+    return reference.Transform(pos, maths.from_axis_angle(maths.Y, 1.0 + 0.1 * time))
 
 
 @pytest.mark.parametrize("root", ["stands", "rides"])

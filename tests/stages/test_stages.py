@@ -14,7 +14,7 @@ import jaxik
 from jaxik import HARD, Smooth, presets
 from jaxik import record as game
 from jaxik.maths import parameter_tree
-from reference import poses
+from reference import sample_poses
 from support.cases import (
     ANKLE_DEEP,
     KINK,
@@ -313,7 +313,7 @@ def test_slopes_with_respect_to_the_animation_and_the_ground_are_difference_quot
 
 # Where slopes go wrong. One frame each, so that the whole is also a clip of one frame.
 
-THIGH, SHIN = poses.THIGH, poses.SHIN
+THIGH, SHIN = sample_poses.THIGH, sample_poses.SHIN
 ON_HIP = {"probe.ray_up": 2.0, "target.max_ankle_height": 2.0, "pelvis.limit": 0.0}
 SINGULAR: dict[str, tuple[dict[str, Any], jaxik.Frame, Any]] = {
     "straight": ({}, posed([0, 0.9, 0], [0, 0.45, 0], [0, 0.02, 0]), FLAT),

@@ -11,7 +11,7 @@ import pytest
 import jaxik
 from jaxik import HARD
 from jaxik.stages.inputs import Inputs
-from reference import maths, poses, things
+from reference import characters, maths, sample_poses
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import QUICK, RIG
 from support.clips import (
@@ -49,7 +49,9 @@ def stepped(*tops: tuple[float, float, float]) -> PlainTerrain:
 def test_nothing_at_all_changes_on_a_flat_floor(told: bool):
     frames = to_frames(walk(RIG, FRAMES, told=told, heading=0.4, start=(0.3, 0.0, -0.2)))
     legs = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
-    assert legs.max() > 0.99 * (poses.THIGH + poses.SHIN), "knees are straight, heels rise"
+    assert legs.max() > 0.99 * (sample_poses.THIGH + sample_poses.SHIN), (
+        "knees are straight, heels rise"
+    )
     ik = to_ik({"lock.enabled": True}, "stride")
     result = run(ik, to_rig(RIG), to_terrain(FLAT), frames)
     assert 0.3 < np.asarray(result.trace.advanced.state.lock.locked).mean() < 0.9
@@ -60,7 +62,9 @@ def test_nothing_at_all_changes_on_a_flat_floor(told: bool):
     for joint in JOINTS:
         came, wanted = (getattr(pose, joint) for pose in (result.pose, frames.pose))
         np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-9, err_msg=joint)
-        assert poses.turn_angle(np.asarray(came.rot), np.asarray(wanted.rot)) < 1e-7, joint
+        assert sample_poses.rotation_angle(np.asarray(came.rot), np.asarray(wanted.rot)) < 1e-7, (
+            joint
+        )
 
 
 # The ground under a swinging foot.
@@ -72,7 +76,7 @@ def swing(shares: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jaxik.
     frames = []
     for share, start, end in np.broadcast(shares, last, following):
         sideways = frame.toe.pos * [1.0, 0.0, 0.0]
-        stride = things.Stride(
+        stride = characters.Stride(
             standing=np.zeros(2),
             last_ws=sideways + start * maths.Z,
             next_ws=sideways + end * maths.Z,
@@ -146,7 +150,7 @@ def drifting_walk() -> jaxik.Frame:
         root = frame.world_from_model
         slipped = root._replace(pos=root.pos + 0.08 * index / 60 * maths.X)
         frames.append(dataclasses.replace(frame, world_from_model=slipped))
-    return to_frames(poses.with_speeds(frames))
+    return to_frames(sample_poses.with_speeds(frames))
 
 
 def ball_slip(hold_ball: bool) -> np.ndarray:

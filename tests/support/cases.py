@@ -13,13 +13,15 @@ import numpy as np
 import jaxik
 from jaxik import HARD
 from jaxik.maths import parameter_tree, quat, vec
-from reference import poses, things
+from reference import characters, sample_poses
 from support.clips import FRAMES, animate, make_rig, padded, planes, to_frames, to_ik, to_rig
 from support.clips import to_terrain as to_ground
 from support.strides import walk
 
 RIG = make_rig()
-QUICK = {"xla_backend_optimization_level": 0}  # these programs compile far longer than they run
+QUICK: dict[str, Any] = {
+    "xla_backend_optimization_level": 0
+}  # compiling takes far longer than running
 FORWARD, UP, LEFT = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 
 # What is read off a result: one number each, over all frames.
@@ -105,11 +107,11 @@ def drifting(speed: float) -> Callable[[float], list[float]]:
 
 
 def hovering(time: float) -> np.ndarray:
-    return poses.standing((0.13, 0.13))
+    return sample_poses.standing((0.13, 0.13))
 
 
 def stepping_up(time: float) -> np.ndarray:
-    return poses.standing((0.08, 0.08) if time < 1.0 else (0.3, 0.3))
+    return sample_poses.standing((0.08, 0.08) if time < 1.0 else (0.3, 0.3))
 
 
 def limping(time: float) -> np.ndarray:
@@ -146,17 +148,17 @@ def speeding_up(time: float) -> list[float]:
 
 
 def rising(time: float) -> np.ndarray:
-    return poses.standing((0.08 + 0.03 * time, 0.08 + 0.03 * time))
+    return sample_poses.standing((0.08 + 0.03 * time, 0.08 + 0.03 * time))
 
 
-def swinging(share: float, told: bool = True) -> list[things.Frame]:
+def swinging(share: float, told: bool = True) -> list[characters.Frame]:
     """Feet half way from the last place to the next, in plan, when `share` of the time is over.
 
     Untold, they are where they are by the speed of the character.
     """
-    frame = animate(RIG, poses.standing((0.15, 0.15)), count=1)[0]
+    frame = animate(RIG, sample_poses.standing((0.15, 0.15)), count=1)[0]
     half_way = 0.4 * np.asarray(FORWARD)
-    stride = things.Stride(
+    stride = characters.Stride(
         standing=np.zeros(2),
         last_ws=frame.toe.pos - half_way,
         next_ws=frame.toe.pos + half_way,
@@ -172,7 +174,7 @@ CLIPS |= {
     "lifts its feet slowly": {"ankles": rising},
     "turns": {"heading": lambda time: 0.2 * time},
 }
-STRIDES: dict[str, Callable[[], list[things.Frame]]] = {
+STRIDES: dict[str, Callable[[], list[characters.Frame]]] = {
     "walks": lambda: walk(RIG, FRAMES),
     "lifts off": lambda: swinging(0.25),
     "comes down": lambda: swinging(0.75),

@@ -16,8 +16,8 @@ import jaxik
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, pelvis
 from jaxik.world import terrain
-from reference import maths, poses, things
-from reference import record as reference
+from reference import characters, maths, sample_poses
+from reference.systems import record as reference
 from reference.terrain import LegTerrains
 from reference.terrain import Terrain as PlainTerrain
 
@@ -84,8 +84,8 @@ def to_rig(rig: reference.Rig) -> jaxik.Rig:
     return jaxik.Rig(
         knee_axis_ls=jnp.asarray(rig.knee_axis_ls),
         ankle_from_foot=jnp.asarray(rig.ankle_from_foot),
-        thigh=ones * poses.THIGH,
-        shin=ones * poses.SHIN,
+        thigh=ones * sample_poses.THIGH,
+        shin=ones * sample_poses.SHIN,
         foot=ones * 0.15,
         side=jnp.asarray(rig.side, float),
         present=jnp.ones(legs, bool),
@@ -118,7 +118,7 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
         stride=jaxik.world.frame.Stride(
             **{
                 field.name: stacked(getattr(frame.stride, field.name) for frame in frames)
-                for field in dataclasses.fields(things.Stride)
+                for field in dataclasses.fields(characters.Stride)
             }
         ),
         dt=jnp.asarray([float(frame.dt) for frame in frames]),
@@ -159,7 +159,7 @@ def to_leg_terrains(ground: LegTerrains) -> terrain.LegTerrains:
 
 def make_rig(seed: int = 0, legs: int = 2) -> reference.Rig:
     """Joint spaces drawn at random."""
-    return poses.make_rig(np.random.default_rng(seed), legs)
+    return sample_poses.make_rig(np.random.default_rng(seed), legs)
 
 
 def planes(*tilts: tuple[float, float, float]) -> PlainTerrain:
@@ -194,7 +194,7 @@ def animate(
     foot: Any = 0.0,
     slide: Any = 0.0,
     weight: Any = 1.0,
-    platform: Any = poses.STILL,
+    platform: Any = sample_poses.STILL,
 ) -> list[reference.Frame]:
     """Frames of two legs from what may each be a number, or a function of time, s.
 
@@ -219,11 +219,11 @@ def animate(
     for index in range(count):
         time = index / hz
         root = reference.Transform(
-            np.asarray(at(place, time), float), maths.turn(maths.Y, at(heading, time))
+            np.asarray(at(place, time), float), maths.from_axis_angle(maths.Y, at(heading, time))
         )
-        frame = poses.make_frame(
+        frame = sample_poses.make_frame(
             rig,
-            np.asarray(at(poses.standing() if ankles is None else ankles, time), float),
+            np.asarray(at(sample_poses.standing() if ankles is None else ankles, time), float),
             hip_height=at(hip_height, time),
             world_from_model=root,
             slide=at(slide, time),
@@ -231,10 +231,10 @@ def animate(
             dt=1.0 / hz,
             platform=at(platform, time),
         )
-        tilt = maths.turn(-maths.X, at(foot, time))
+        tilt = maths.from_axis_angle(-maths.X, at(foot, time))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
         frames.append(dataclasses.replace(frame, ankle=frame.ankle._replace(rot=rot)))
-    return poses.with_speeds(frames)
+    return sample_poses.with_speeds(frames)
 
 
 def stepping(rig: reference.Rig, drift: float = 0.0, **changes: Any) -> list[reference.Frame]:
@@ -259,7 +259,7 @@ def _step(cycles: float, leg: int) -> list[float]:
     swing = min(max((phase - 0.65) / 0.2, 0.0), 1.0)
     lifted = min(max((phase - 0.5) / 0.15, 0.0), 1.0, (1.0 - phase) / 0.15)
     stride = 0.3 * (cycle + swing - 0.5 * leg) - 0.3 * cycles + 0.05
-    return [0.1 - 0.2 * leg, poses.ANKLE + 0.12 * lifted, stride]
+    return [0.1 - 0.2 * leg, sample_poses.ANKLE + 0.12 * lifted, stride]
 
 
 def padded(frames: list, count: int = FRAMES) -> list:
@@ -293,7 +293,7 @@ def wandering(
             phase += dt / 1.05
             heading += 0.25 * dt * np.sin(phase)
             place = place + dt * 0.6 * np.array([np.sin(heading), 0.0, np.cos(heading)])
-        turned = maths.turn(maths.Y, heading)
+        turned = maths.from_axis_angle(maths.Y, heading)
         ankles, swung = [], []
         for leg in range(legs):
             cycle = (phase + leg / legs) % 1.0
@@ -308,7 +308,7 @@ def wandering(
             weight[0] = 0.5
         if 0.77 < share < 0.78:
             weight[-1] = 0.0
-        frame = poses.make_frame(
+        frame = sample_poses.make_frame(
             rig,
             np.array(ankles),
             hip_height=0.86 + 0.02 * np.sin(4 * np.pi * phase),
@@ -319,19 +319,19 @@ def wandering(
             dt=dt,
         )
         axis = rng.normal(size=3)
-        tilt = maths.turn(axis / np.linalg.norm(axis), rng.uniform(0.0, 0.2))
+        tilt = maths.from_axis_angle(axis / np.linalg.norm(axis), rng.uniform(0.0, 0.2))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
         stride = _strides(frame, np.array(swung), known=share < 0.5)
         ankle = frame.ankle._replace(rot=rot)
         frames.append(dataclasses.replace(frame, ankle=ankle, stride=stride))
-    return poses.with_speeds(frames)
+    return sample_poses.with_speeds(frames)
 
 
-def _strides(frame: reference.Frame, share: np.ndarray, known: bool) -> things.Stride:
+def _strides(frame: reference.Frame, share: np.ndarray, known: bool) -> characters.Stride:
     """Strides of half a metre forward, of which each foot has come the share (legs)."""
     balls = np.array([maths.apply(frame.world_from_model, pos) for pos in frame.toe.pos])
     forward = 0.5 * maths.rotate(frame.world_from_model.rot, maths.Z)
-    return things.Stride(
+    return characters.Stride(
         standing=(share == 0.0).astype(float),
         last_ws=balls - share[:, None] * forward,
         next_ws=balls + (1.0 - share[:, None]) * forward,

@@ -1,4 +1,4 @@
-"""Experiment files for tests: the embedded walk, or a second of it, with few parameters free."""
+"""Experiment files for tests: the uneven walk, or a second of it, with two free parameters."""
 
 from pathlib import Path
 
@@ -20,12 +20,12 @@ foot.max_pitch = { low = 0.1 }
 def text(
     top: str = "", clip: str = "", free: str = FREE, rest: str = "", clips: str = CLIP + SECOND
 ) -> str:
-    """An experiment as TOML, valid unless a part makes it wrong."""
+    """An experiment as TOML; valid unless one of the parts is wrong."""
     return f"{top}\n{clips}{clip}\n[free]\n{free}\n{rest}\n"
 
 
 def write(folder: Path, name: str = "experiment.toml", **parts: str) -> Path:
-    """The file of an experiment; `parts` as in `text`."""
+    """Writes the file of an experiment; `parts` are the arguments of `text`."""
     path = folder / name
     path.write_text(text(**parts), encoding="utf-8")
     return path

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reference import maths, poses
+from reference import maths, sample_poses
+from reference.characters import Frame, Rig, Stride
 from reference.maths import Transform
 from reference.terrain import Terrain
-from reference.things import Frame, Rig, Stride
 
 HZ = 60.0
 SPEED = 0.9  # m/s
@@ -21,7 +21,9 @@ LANDED = 0.04  # of the cycle for which the ball already rests before the foot c
 SWING_HEIGHT = 0.12  # m
 BALL_HEIGHT = 0.055  # m, of a standing foot's toe joint
 BALL_AHEAD = 0.10  # m, of the root in the middle of a stance
-BALL_REACH = np.array([0.0, BALL_HEIGHT - poses.ANKLE, 0.15])  # m, from the ankle of a flat foot
+BALL_REACH = np.array(
+    [0.0, BALL_HEIGHT - sample_poses.ANKLE, 0.15]
+)  # m, from the ankle of a flat foot
 
 
 class Step(NamedTuple):
@@ -78,7 +80,7 @@ def walk(
         hip_height: m.
         changes: of every frame.
     """
-    turned = maths.turn(maths.Y, heading)
+    turned = maths.from_axis_angle(maths.Y, heading)
     legs = len(rig.side)
     frames = []
     for index in range(count):
@@ -93,7 +95,7 @@ def walk(
             known=np.full(legs, float(told)),
         )
         frames.append(_posed(rig, steps, speed * time, root, stride, hip_height, 1.0 / hz))
-    return [dataclasses.replace(frame, **changes) for frame in poses.with_speeds(frames)]
+    return [dataclasses.replace(frame, **changes) for frame in sample_poses.with_speeds(frames)]
 
 
 def _places(aheads: Sequence[float], rig: Rig, turned: np.ndarray, start: Any) -> np.ndarray:
@@ -120,9 +122,9 @@ def _posed(
             for side, step in zip(rig.side, steps, strict=True)
         ]
     )
-    pitches = [maths.turn(maths.X, step.pitch) for step in steps]
+    pitches = [maths.from_axis_angle(maths.X, step.pitch) for step in steps]
     ankles = balls - np.array([maths.rotate(pitch, BALL_REACH) for pitch in pitches])
-    frame = poses.make_frame(
+    frame = sample_poses.make_frame(
         rig, ankles, hip_height=hip_height, world_from_model=root, stride=stride, dt=dt
     )
     rots = [maths.multiply(p, rot) for p, rot in zip(pitches, frame.ankle.rot, strict=True)]

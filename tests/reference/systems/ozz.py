@@ -1,7 +1,8 @@
-"""The `ozz` pipeline in plain NumPy float64, after the foot IK sample of ozz-animation.
+"""The `ozz` system in plain NumPy float64, after the foot IK sample of ozz-animation.
 
-One character, one leg, one frame at a time, written from the rules alone. Metres, radians; suffixes
-_ws world, _ms model. `up` is the body's, and of a leg's rays and ankle height the leg's own.
+One character, one leg, one frame at a time, written from the description of the rules and not from
+the code that is tested. Metres, radians, seconds; suffixes _ws world, _ms model.
+`up` is that of the body; the rays and ankle height of a leg use its own.
 """
 
 import math
@@ -11,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from . import ground, limb, maths, pole, things
-from .maths import Array, Transform, apply, cross, length, rotate, turn, unit
-from .terrain import Hit
-from .things import Frame, Ground, Parameters, Rig
+from reference import characters, maths
+from reference.characters import Frame, Ground, Parameters, Rig
+from reference.maths import Array, Transform, apply, cross, from_axis_angle, length, rotate, unit
+from reference.stages import ground, limb, pole
+from reference.terrain import Hit
 
 DEFAULTS: dict[str, Any] = {
     "root.enabled": True,
@@ -66,7 +68,7 @@ def step(
     lift = root_lift(parameters, terrain, frame)
     shares = ground.taking_part(parameters, frame)
     feet = [
-        sense(parameters, things.under(terrain, leg), frame, leg, up * lift, shares[leg])
+        sense(parameters, characters.under(terrain, leg), frame, leg, up * lift, shares[leg])
         for leg in legs
     ]
     pelvis = pelvis_height(parameters, feet, up, state, frame)
@@ -98,14 +100,14 @@ def step(
         "reached": np.array(reached),
         "foot_reached": np.array(foot_reached),
     }
-    return State(pelvis), output | things.joints(solved)
+    return State(pelvis), output | characters.joints(solved)
 
 
 def run(
     parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
 ) -> dict[str, Array]:
-    """A clip from its first frame: every output of `step`, stacked over the frames."""
-    return things.run(step, parameters, rig, terrain, frames)
+    """All outputs of `step` for a whole clip, stacked over the frames."""
+    return characters.run(step, parameters, rig, terrain, frames)
 
 
 def root_lift(parameters: Parameters, terrain: Ground, frame: Frame) -> float:
@@ -239,5 +241,5 @@ def aim(
     direction = target / distance
     reach = offset + forward * (math.sqrt(root) - along)
     arc = maths.shortest_arc(unit(reach, direction), direction, up)
-    to_pole = turn(direction, maths.signed_angle(rotate(arc, up), pole, direction))
-    return maths.multiply(turn(direction, twist), maths.multiply(to_pole, arc)), True
+    to_pole = from_axis_angle(direction, maths.signed_angle(rotate(arc, up), pole, direction))
+    return maths.multiply(from_axis_angle(direction, twist), maths.multiply(to_pole, arc)), True

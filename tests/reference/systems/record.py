@@ -1,17 +1,19 @@
-"""The `record` pipeline in plain NumPy float64: one character, one leg, one frame at a time.
+"""The `record` system in plain NumPy float64: one character, one leg, one frame at a time.
 
-An oracle for the JAX stages, written from the rules alone (if/else, loops, acos and atan2), so that
-an error would have to be made twice to stay unseen. Metres, radians, seconds, wxyz; suffixes _ws
-world, _ms model, _ls local. Model up is +Y, forward +Z, left +X; `up` is the terrain's.
+An oracle for the JAX stages. It is written from the description of the rules, with if/else, loops,
+acos and atan2, so that an error would have to be made twice to go unnoticed. Metres, radians,
+seconds, wxyz; suffixes _ws world, _ms model, _ls local. Model up is +Y, forward +Z, left +X; `up`
+is that of the terrain.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from . import ground, limb, maths, things
-from .maths import Transform
-from .things import DEFAULTS, Frame, Ground, Parameters, Rig, State
+from reference import characters, maths
+from reference.characters import DEFAULTS, Frame, Ground, Parameters, Rig, State
+from reference.maths import Transform
+from reference.stages import ground, limb
 
 __all__ = ["DEFAULTS", "Frame", "Ground", "Parameters", "Rig", "State", "Transform", "run", "step"]
 
@@ -88,12 +90,12 @@ def step(
         "pelvis_height": np.array(pelvis),
         "pelvis_offset_ws": pelvis_offset_ws,
     }
-    output |= things.joints([row[:4] for row in solved])
+    output |= characters.joints([row[:4] for row in solved])
     return state, output
 
 
 def run(
     parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
 ) -> dict[str, np.ndarray]:
-    """A clip from its first frame: every output of `step`, stacked over the frames."""
-    return things.run(step, parameters, rig, terrain, frames)
+    """All outputs of `step` for a whole clip, stacked over the frames."""
+    return characters.run(step, parameters, rig, terrain, frames)

@@ -1,7 +1,8 @@
-"""The `stride` pipeline in plain NumPy float64: feet that meet the ground where they will stand.
+"""The `stride` system in plain NumPy float64: feet reach the ground where they will stand.
 
-One character, one leg, one frame at a time, written from the rules alone. Metres, radians, seconds;
-suffixes _ws world, _ms model. Every foot has its own up, which its terrain says; the body has one.
+One character, one leg, one frame at a time, written from the description of the rules and not from
+the code that is tested. Metres, radians, seconds; suffixes _ws world, _ms model.
+Each foot has an up of its own, that of its terrain; the body has another.
 """
 
 import functools
@@ -12,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from . import ground, heel, limb, maths, record, things, way
-from .maths import Array, Eased, Transform, apply, length, lerp
-from .terrain import ALL_LAYERS
-from .things import Foot, Frame, Ground, Hold, Parameters, Rig
+from reference import characters, maths
+from reference.characters import Foot, Frame, Ground, Hold, Parameters, Rig
+from reference.maths import Array, Motion, Transform, apply, length, lerp
+from reference.stages import ground, heel, limb, stride_probe
+from reference.systems import record
+from reference.terrain import ALL_LAYERS
 
 # The rules that may stand in the stages which have two.
 CONTACTS: dict[str, dict[str, Any]] = {
@@ -92,9 +95,9 @@ class State:
     """What the next frame needs; of the lists one each for a leg."""
 
     standing: list[Standing]
-    ground: list[Eased]
+    ground: list[Motion]
     holds: list[Hold]
-    pelvis: Eased
+    pelvis: Motion
     pelvis_goal: float
     pelvis_offset_ws: Array
 
@@ -110,7 +113,7 @@ def step(
 ) -> tuple[State, dict[str, Array]]:
     """One frame. Without a state it is the first: smoothed values start on their goals."""
     legs = range(len(frame.weight))
-    ups = [things.under(terrain, leg).up for leg in legs]
+    ups = [characters.under(terrain, leg).up for leg in legs]
     offset_before = np.zeros(3) if state is None else state.pelvis_offset_ws
     standing, feet, heights, holds, footholds, targets = [], [], [], [], [], []
     swings = []
@@ -121,7 +124,7 @@ def step(
         else:
             label = float(frame.stride.standing[leg])
             stands = Standing(label > 0.5, label)
-        below = things.under(terrain, leg)
+        below = characters.under(terrain, leg)
         foot, swing = sense(parameters, rig, below, frame, leg, stands)
 
         eased = ground.smooth_height(
@@ -166,7 +169,7 @@ def step(
         "contact": np.array([stands.weight for stands in standing]),
         "standing": np.array([stands.standing for stands in standing]),
         "found": np.array([foot.hit.found for foot in feet]),
-        "share": np.array([swing.share for swing in swings]),
+        "fraction": np.array([swing.fraction for swing in swings]),
         "hit_ws": np.array([foot.hit.point for foot in feet]),
         "normal": np.array([foot.hit.normal for foot in feet]),
         "ground_height": np.array([eased.value for eased in heights]),
@@ -184,7 +187,7 @@ def step(
         "stretch": np.array(stretches),  # by which the target is farther than animated
     }
     after = State(standing, heights, holds, eased, goal, offset_ws)
-    return after, output | things.joints(solved)
+    return after, output | characters.joints(solved)
 
 
 def run(
@@ -195,9 +198,9 @@ def run(
     contact: str = "label",
     pelvis: str = "reach",
 ) -> dict[str, Array]:
-    """A clip from its first frame: every output of `step`, stacked over the frames."""
+    """All outputs of `step` for a whole clip, stacked over the frames."""
     exchanged = functools.partial(step, contact=contact, pelvis=pelvis)
-    return things.run(exchanged, parameters, rig, terrain, frames)
+    return characters.run(exchanged, parameters, rig, terrain, frames)
 
 
 def stand_by_speed(
@@ -226,11 +229,13 @@ def stand_by_speed(
 
 def sense(
     parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, stands: Standing
-) -> tuple[Foot, way.Swing]:
+) -> tuple[Foot, stride_probe.Swing]:
     """One leg's readings of this frame, and where it is in its stride."""
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
     lift = float(frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg))
-    hit, swing = way.ground_of_stride(parameters, rig, terrain, frame, leg, stands.standing)
+    hit, swing = stride_probe.ground_of_stride(
+        parameters, rig, terrain, frame, leg, stands.standing
+    )
     foot = Foot(
         hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
         ankle_ws=ankle_ws,
@@ -277,7 +282,7 @@ def support_goal(
 ) -> float:
     """What the standing feet ask for, and a share of what the lowest foot does."""
     asking = [gap for gap, share in zip(asked, shares, strict=True) if share > 0.0]
-    weights = [foot.seen * share for foot, share in zip(feet, shares, strict=True)]
+    weights = [foot.grounded * share for foot, share in zip(feet, shares, strict=True)]
     if sum(weights) == 0.0:
         if state is not None:
             return state.pelvis_goal
@@ -324,10 +329,10 @@ def soft_least(values: list[float], softness: float) -> float:
     return least - softness * math.log(sum(math.exp((least - x) / softness) for x in values))
 
 
-def follow_goal(parameters: Parameters, state: State | None, goal: float, dt: float) -> Eased:
+def follow_goal(parameters: Parameters, state: State | None, goal: float, dt: float) -> Motion:
     """The body's height on its way to the goal, m."""
     if state is None:
-        return Eased(goal, 0.0)
+        return Motion(goal, 0.0)
     way = "rise" if goal > state.pelvis.value else "fall"
     half_life = parameters[f"pelvis.{way}_half_life"]
     return maths.follow(state.pelvis, goal, half_life, dt, parameters["pelvis.spring"])

@@ -1,7 +1,6 @@
-"""The probe of the `stride` reference: the ground between a foot's last place and its next.
+"""The probe of the `stride` reference: the ground between a foot's last and next position.
 
-One leg, one frame at a time, written from the rules alone. Everything is in world space; heights
-are over the root, along the leg's up, m.
+One leg, one frame at a time. World space; heights are above the root along the up of the leg, m.
 """
 
 import math
@@ -9,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
-from .terrain import Hit
-from .things import Frame, Ground, Parameters, Rig, world_from_foot
+from reference.characters import Frame, Ground, Parameters, Rig, world_from_foot
+from reference.maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
+from reference.terrain import Hit
 
 WAY_POINTS = 8
 FADE = 0.10  # m or rad over which what goes beyond a limit ceases to count
-EDGE_SHARE = 0.15  # share of the swing's time in which the way ceases to count at either end
+EDGE_FRACTION = 0.15  # share of the swing's time in which the way ceases to count at either end
 
 
 class Swing(NamedTuple):
@@ -23,7 +22,7 @@ class Swing(NamedTuple):
 
     last: Array
     next: Array
-    share: float
+    fraction: float
 
 
 def level(frame: Frame, up: Array, point: Array) -> Array:
@@ -64,10 +63,10 @@ def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bo
     ahead = clip(ahead, -stance_time / 2.0, stance_time / 2.0)
     if planted:
         return Swing(here, here + velocity * (stance_time + swing_time), 0.0)
-    share = 0.5 + ahead / stance_time
-    to_come = (stance_time / 2.0 - ahead) + (1.0 - share) * swing_time
-    gone = (stance_time / 2.0 + ahead) + share * swing_time
-    return Swing(here - velocity * gone, here + velocity * to_come, share)
+    fraction = 0.5 + ahead / stance_time
+    to_come = (stance_time / 2.0 - ahead) + (1.0 - fraction) * swing_time
+    gone = (stance_time / 2.0 + ahead) + fraction * swing_time
+    return Swing(here - velocity * gone, here + velocity * to_come, fraction)
 
 
 def ground_of_stride(
@@ -103,7 +102,8 @@ def ground_of_stride(
     normal = unit(last.normal + risen * (next_normal - last.normal), up)
 
     need = lift_over_edges(parameters, rig, terrain, frame, leg, stride, ground, max(low, high))
-    window = smooth01(stride.fraction / EDGE_SHARE) * smooth01((1.0 - stride.fraction) / EDGE_SHARE)
+    passed, left = stride.fraction, 1.0 - stride.fraction
+    window = smooth01(passed / EDGE_FRACTION) * smooth01(left / EDGE_FRACTION)
     return Hit(True, here + up * (ground + window * need), normal), stride
 
 

@@ -1,7 +1,8 @@
-"""The `mec` pipeline in plain NumPy float64: three rays a foot, planting, hints, fades.
+"""The `mec` system in plain NumPy float64: three rays per foot, planting, hints, fades.
 
-One character, one leg, one frame at a time, written from the rules alone. Metres, radians, seconds;
-suffixes _ws world, _ms model. Every foot has its own up, which its terrain says; the body has one.
+One character, one leg, one frame at a time, written from the description of the rules and not from
+the code that is tested. Metres, radians, seconds; suffixes _ws world, _ms model.
+Each foot has an up of its own, that of its terrain; the body has another.
 """
 
 import math
@@ -11,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from . import ground, limb, maths, pole, sole, things
-from .maths import Array, Transform, apply, rotate
-from .sole import Foot
-from .terrain import ALL_LAYERS
-from .things import Frame, Ground, Parameters, Rig
+from reference import characters, maths
+from reference.characters import Frame, Ground, Parameters, Rig
+from reference.maths import Array, Transform, apply, rotate
+from reference.stages import ground, limb, pole, three_ray_probe
+from reference.stages.three_ray_probe import Foot
+from reference.terrain import ALL_LAYERS
 
 DEFAULTS: dict[str, Any] = {
     "probe.ray_up": 0.5,
@@ -79,8 +81,8 @@ def step(
     shares = ground.taking_part(parameters, frame)
     feet, memory, goals = [], [], []
     for leg in legs:
-        below = things.under(terrain, leg)
-        foot = sole.sense(parameters, rig, below, frame, leg, shares[leg])
+        below = characters.under(terrain, leg)
+        foot = three_ray_probe.sense(parameters, rig, below, frame, leg, shares[leg])
         before = None if state is None else state.legs[leg]
         after, point, rot = plant(parameters, below, frame, leg, foot, before)
         height = parameters.of_leg("target.foot_height", leg)
@@ -129,14 +131,14 @@ def step(
         "hint_ws": np.array(hints),
         "reached": np.array(reached),
     }
-    return State(pelvis, memory), output | things.joints(solved)
+    return State(pelvis, memory), output | characters.joints(solved)
 
 
 def run(
     parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
 ) -> dict[str, Array]:
-    """A clip from its first frame: every output of `step`, stacked over the frames."""
-    return things.run(step, parameters, rig, terrain, frames)
+    """All outputs of `step` for a whole clip, stacked over the frames."""
+    return characters.run(step, parameters, rig, terrain, frames)
 
 
 def plant(
@@ -157,7 +159,7 @@ def plant(
 
     point, rot = foot.point, foot.animated_rot
     if foot.found:
-        rot = sole.flat_foot(parameters, leg, foot)
+        rot = three_ray_probe.flat_foot(parameters, leg, foot)
     planted = bool(foot.found and parameters.of_leg("lock.plant", leg))
     kept_point, kept_rot = np.zeros(3), maths.IDENTITY
     if planted:
@@ -232,7 +234,7 @@ def pelvis_height(
         goal = min(max(0.0, max(lows)), min(highs))
     if state is None or not parameters["pelvis.damp"]:
         return goal
-    return maths.ease_by_speed(state.pelvis_height, goal, parameters["pelvis.speed"], frame.dt)
+    return maths.move_by_speed(state.pelvis_height, goal, parameters["pelvis.speed"], frame.dt)
 
 
 def knee_hint(parameters: Parameters, frame: Frame, leg: int, foot: Foot) -> Array:

@@ -1,13 +1,10 @@
-"""The heels of the `stride` reference: they rise where a leg would be too long.
-
-One leg, one frame, written from the rules alone.
-"""
+"""The heels of the `stride` reference: they rise where a leg would be too long."""
 
 import math
 
-from . import maths
-from .maths import Array, across, clip, cross, length, rotate
-from .things import Foot, Frame, Parameters
+from reference import maths
+from reference.characters import Foot, Frame, Parameters
+from reference.maths import Array, across, clip, cross, length, rotate
 
 
 def leg_length(frame: Frame, leg: int) -> float:
@@ -47,5 +44,5 @@ def raised(
         angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
         angle += math.atan2(by_sine, by_cosine)
         lift = clip(angle, 0.0, parameters.of_leg("effector.max_lift", leg))
-    turn = maths.turn(axis, -lift)
+    turn = maths.from_axis_angle(axis, -lift)
     return ball + rotate(turn, from_ball), maths.multiply(turn, rot_ws), lift

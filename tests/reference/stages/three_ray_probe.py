@@ -1,13 +1,14 @@
-"""Three rays under a foot of the `mec` reference, and the foot laid on what they meet; world."""
+"""Three rays under a foot of the `mec` reference, and the foot laid flat on their hits; world."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from . import ground, maths, things
-from .maths import Array, across, apply, cross, rotate, turn, unit
-from .things import Frame, Ground, Parameters, Rig
+from reference import characters, maths
+from reference.characters import Frame, Ground, Parameters, Rig
+from reference.maths import Array, across, apply, cross, from_axis_angle, rotate, unit
+from reference.stages import ground
 
 
 @dataclass
@@ -50,7 +51,7 @@ def sense(
     """The foot's three rays, and what they say of its tilt."""
     up = terrain.up
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
-    animated_rot = things.world_from_foot(rig, frame, leg)
+    animated_rot = characters.world_from_foot(rig, frame, leg)
     looking = rotate(animated_rot, np.asarray(parameters.of_leg("probe.forward", leg)))
     ahead = unit(across(looking, up), ground.forward(frame.world_from_model.rot, up))
     right = cross(ahead, up)
@@ -96,16 +97,16 @@ def sense(
 
 def flat_foot(parameters: Parameters, leg: int, foot: Foot) -> Array:
     """Rotation from the foot's axes to the world that lays it on the ground, its yaw kept."""
-    pitch = turn(cross(foot.ahead, foot.up), foot.pitch)
+    pitch = from_axis_angle(cross(foot.ahead, foot.up), foot.pitch)
     tilt = limited(
-        maths.multiply(pitch, turn(foot.ahead, -foot.roll)),
+        maths.multiply(pitch, from_axis_angle(foot.ahead, -foot.roll)),
         parameters.of_leg("foot.max_tilt", leg),
     )
     upright = maths.shortest_arc(maths.Y, foot.up, maths.X)
     forward = np.asarray(parameters.of_leg("probe.forward", leg))
     level = unit(across(forward, maths.Y), maths.Z)
     yaw = maths.signed_angle(rotate(upright, level), foot.ahead, foot.up)
-    return maths.multiply(tilt, maths.multiply(turn(foot.up, yaw), upright))
+    return maths.multiply(tilt, maths.multiply(from_axis_angle(foot.up, yaw), upright))
 
 
 def limited(rot: Array, most: float) -> Array:
@@ -114,4 +115,4 @@ def limited(rot: Array, most: float) -> Array:
     angle = 2.0 * math.atan2(sine, float(rot[0]))
     if angle <= most:
         return rot
-    return turn(rot[1:] / sine, most)
+    return from_axis_angle(rot[1:] / sine, most)

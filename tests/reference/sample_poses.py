@@ -1,14 +1,14 @@
-"""Rigs, posed legs and grounds that the references and their rivals are tried on."""
+"""Rigs, poses, short clips and terrains on which the references and `jaxik` are compared."""
 
 import dataclasses
 import math
 
 import numpy as np
 
-from . import maths
-from .maths import Transform
-from .terrain import Terrain
-from .things import Frame, Rig
+from reference import maths
+from reference.characters import Frame, Rig
+from reference.maths import Transform
+from reference.terrain import Terrain
 
 THIGH, SHIN, ANKLE = 0.45, 0.43, 0.08  # m; ANKLE is the height over the sole
 STILL = Transform(np.zeros(3), maths.IDENTITY)
@@ -49,10 +49,10 @@ def make_frame(
         reach = ankle - hip
         distance = np.linalg.norm(reach)
         down = reach / distance
-        hinge = maths.rotate(maths.turn(maths.Y, hinge_yaw), -maths.X)
+        hinge = maths.rotate(maths.from_axis_angle(maths.Y, hinge_yaw), -maths.X)
         hinge = maths.unit(maths.across(hinge, down), hinge)
         bend = math.acos((THIGH**2 + distance**2 - SHIN**2) / (2 * THIGH * distance))
-        knee = hip + maths.rotate(maths.turn(hinge, bend), down * THIGH)
+        knee = hip + maths.rotate(maths.from_axis_angle(hinge, bend), down * THIGH)
         knee_rot = maths.shortest_arc(rig.knee_axis_ls[leg], hinge, maths.Y)
         ankle_rot = maths.inverse(rig.ankle_from_foot[leg])
         toe = ankle + np.array([0.0, 0.02 - ANKLE, 0.15])
@@ -118,7 +118,7 @@ def stepping(rig: Rig, count: int = 60) -> list[Frame]:
     While an ankle is below the raised height it does not move over the ground.
     """
     frames = []
-    turned = maths.turn(maths.Y, 0.7)
+    turned = maths.from_axis_angle(maths.Y, 0.7)
     for index in range(count):
         ankles = []
         for leg in range(2):
@@ -149,7 +149,7 @@ def rough(rng: np.random.Generator, cells: int = 23, size: float = 6.0) -> Terra
     return Terrain(maths.Y, triangles=triangles.reshape(-1, 3, 3))
 
 
-def turn_angle(a: np.ndarray, b: np.ndarray) -> float:
+def rotation_angle(a: np.ndarray, b: np.ndarray) -> float:
     """Largest angle between rotations of equal shape (..., 4)."""
     a, b = a.reshape(-1, 4), b.reshape(-1, 4)
     apart = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))

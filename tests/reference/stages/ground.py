@@ -1,16 +1,28 @@
-"""Contact, probe, lean, target, lock and pelvis of the `record` reference: senses and memory.
+"""Contact, probe, lean, target, lock and pelvis of the `record` reference.
 
-`up` is the terrain's, unit, world; everything is in world space unless it says _ms.
+`up` is that of the terrain, unit; everything is in world space unless it says _ms.
 """
 
 import math
 
 import numpy as np
 
-from . import maths
-from .maths import Array, Eased, across, apply, clip, cross, length, lerp, rotate, unapply, unit
-from .terrain import Hit
-from .things import Foot, Frame, Ground, Hold, Parameters, Rig, State, world_from_foot
+from reference import maths
+from reference.characters import Foot, Frame, Ground, Hold, Parameters, Rig, State, world_from_foot
+from reference.maths import (
+    Array,
+    Motion,
+    across,
+    apply,
+    clip,
+    cross,
+    length,
+    lerp,
+    rotate,
+    unapply,
+    unit,
+)
+from reference.terrain import Hit
 
 
 def forward(turned: Array, up: Array) -> Array:
@@ -81,11 +93,11 @@ def lean(
     up: Array,
     state: State | None,
     frame: Frame,
-) -> tuple[float, list[Eased], Array, Array]:
+) -> tuple[float, list[Motion], Array, Array]:
     """Slide weight, smoothed slope (2), the body's turn (4) and the smoothed normal (3), world."""
     right = cross(forward, up)
     shares = taking_part(parameters, frame)
-    weights = [foot.seen * share for foot, share in zip(feet, shares, strict=True)]
+    weights = [foot.grounded * share for foot, share in zip(feet, shares, strict=True)]
     normal = np.zeros(3)
     for foot, weight in zip(feet, weights, strict=True):
         normal = normal + weight * foot.hit.normal
@@ -95,7 +107,7 @@ def lean(
 
     hz = parameters["lean.tick_hz"]
     if state is None:
-        slide, slope = float(frame.slide), [Eased(goal, 0.0) for goal in goals]
+        slide, slope = float(frame.slide), [Motion(goal, 0.0) for goal in goals]
     else:
         rising = frame.slide > state.slide_weight
         slide_gain = parameters["lean.slide_on_gain" if rising else "lean.slide_off_gain"]
@@ -113,14 +125,14 @@ def lean(
         lerp(parameters[f"lean.{name}_rate"], parameters[f"lean.{name}_rate_slide"], slide) * angle
         for name, angle in zip(("forward", "side"), angles, strict=True)
     )
-    body_turn = maths.turn_by_vector(right * lean_forward - forward * lean_side)
+    body_turn = maths.from_rotvec(right * lean_forward - forward * lean_side)
     smooth_normal = unit(up - math.tan(angles[0]) * forward - math.tan(angles[1]) * right, up)
     return slide, slope, body_turn, smooth_normal
 
 
 def smooth_height(
-    parameters: Parameters, leg: int, foot: Foot, up: Array, before: Eased | None, dt: float
-) -> Eased:
+    parameters: Parameters, leg: int, foot: Foot, up: Array, before: Motion | None, dt: float
+) -> Motion:
     """Smoothed height of the foothold along up, m."""
     goal = float(up @ foot.foothold_ws)
     rises = before is None or goal > before.value
@@ -243,7 +255,7 @@ def pelvis_height(
 ) -> float:
     """Smoothed height of the body over its animated place, m along up or the normal."""
     shares = taking_part(parameters, frame)
-    weights = [foot.seen * share for foot, share in zip(feet, shares, strict=True)]
+    weights = [foot.grounded * share for foot, share in zip(feet, shares, strict=True)]
     gaps = [float(up @ (t - foot.ankle_ws)) for t, foot in zip(targets, feet, strict=True)]
     asking = [(w, g) for w, g, share in zip(weights, gaps, shares, strict=True) if share > 0.0]
     top = max((gap for _, gap in asking), default=0.0)

@@ -1,4 +1,4 @@
-"""What the references are given: parameters, rig, frames; and what `record`'s remembers."""
+"""Parameters, rigs, frames and memory of the characters that the references move."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -7,11 +7,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from . import maths
-from .maths import Array, Eased, Transform
-from .terrain import ALL_LAYERS, Hit, LegTerrains
+from reference import maths
+from reference.maths import Array, Motion, Transform
+from reference.terrain import ALL_LAYERS, Hit, LegTerrains
 
-# The record's defaults of a 1.8 m adult; gains per tick of 30 Hz; then the group it lacks.
+# Defaults of the `record` system for a 1.8 m adult; gains per tick of 30 Hz.
 DEFAULTS: dict[str, Any] = {
     "contact.ground_height": 0.0,
     "contact.planted_height": 0.10,
@@ -68,7 +68,7 @@ DEFAULTS: dict[str, Any] = {
 
 
 class Ground(Protocol):
-    """What a ray can be cast onto."""
+    """Something that rays can be cast onto."""
 
     @property
     def up(self) -> Array: ...
@@ -77,16 +77,16 @@ class Ground(Protocol):
 
 
 def under(terrain: Ground, leg: int) -> Ground:
-    """The ground as `leg` meets it."""
+    """The ground as the rays of `leg` hit it."""
     return terrain.legs[leg] if isinstance(terrain, LegTerrains) else terrain
 
 
 class Parameters:
-    """Values by dotted name; a value is shared, or has one row a leg.
+    """Values by dotted name; a value is shared by the legs, or has one row per leg.
 
     Args:
         changes: values other than the default.
-        defaults: those of one system; `record`'s unless given.
+        defaults: those of one system, `record` by default.
 
     Raises:
         ValueError: a name that the system does not have.
@@ -105,14 +105,14 @@ class Parameters:
         return self.values[name]
 
     def of_leg(self, name: str, leg: int) -> Any:
-        """The value that `leg` sees."""
+        """The value for `leg`."""
         value = np.asarray(self.values[name])
         return value[leg] if value.ndim > np.ndim(self.defaults[name]) else self.values[name]
 
 
 @dataclass
 class Rig:
-    """What stays the same: knee_axis_ls (legs 3), ankle_from_foot (legs 4), side (legs)."""
+    """Constants of a character: knee_axis_ls (legs 3), ankle_from_foot (legs 4), side (legs)."""
 
     knee_axis_ls: Array
     ankle_from_foot: Array
@@ -121,11 +121,12 @@ class Rig:
 
 @dataclass
 class Stride:
-    """Where each leg is in its stride: what an animation's own labels tell.
+    """Where each leg is in its stride, according to the labels of the animation.
 
-    `standing` (legs) is 0..1; `last_ws` and `next_ws` (legs 3), m, are where the ball stood and
-    will stand, while it stands where it does; `fraction` (legs) is the part of the swing's time that
-    has passed, 0 while standing; where `known` (legs) is 0 only `standing` is told.
+    `standing` (legs) is 0..1. `last_ws` and `next_ws` (legs 3), m, are where the ball of the foot
+    last stood and will stand next; while it stands, `last_ws` is its present position. `fraction`
+    (legs) is the part of the swing's time that has passed, 0 while standing. Where `known` (legs)
+    is 0, only `standing` is valid.
     """
 
     standing: Array
@@ -136,18 +137,18 @@ class Stride:
 
     @classmethod
     def unknown(cls, legs: int) -> "Stride":
-        """Of an animation without labels."""
-        place = np.zeros((legs, 3))
-        return cls(np.ones(legs), place, place, np.zeros(legs), np.zeros(legs))
+        """The stride of an animation without labels."""
+        origin = np.zeros((legs, 3))
+        return cls(np.ones(legs), origin, origin, np.zeros(legs), np.zeros(legs))
 
 
 @dataclass
 class Frame:
     """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space.
 
-    `speed` is the character's, `foot_speed` (legs) that of the animated ankles and `toe_speed` that
-    of the toes, m/s in the world; all are 0 unless given. Without `velocity_ws` (3), m/s, the
-    character moves forward.
+    `speed` is that of the character, `foot_speed` (legs) that of the animated ankles and
+    `toe_speed` (legs) that of the toes, m/s, world space; all default to 0. Without `velocity_ws`
+    (3), m/s, the character moves forward.
     """
 
     world_from_model: Transform
@@ -184,7 +185,7 @@ class Frame:
 
 @dataclass
 class Hold:
-    """What one foot's lock remembers, along the axes of the platform or in its space."""
+    """Memory of one foot's lock, in the space of the platform."""
 
     locked: bool
     factor: float
@@ -196,10 +197,10 @@ class Hold:
 
 @dataclass
 class State:
-    """What the next frame needs; of the lists one each for a leg."""
+    """Memory of the `record` system; lists have one entry per leg."""
 
-    ground: list[Eased]
-    slope: list[Eased]  # ahead and to the right
+    ground: list[Motion]
+    slope: list[Motion]  # ahead and to the right
     slide_weight: float
     pelvis_height: float
     pelvis_offset_ws: Array
@@ -208,9 +209,9 @@ class State:
 
 @dataclass
 class Foot:
-    """One leg's readings of this frame: animated joints, contact, hits and foothold, world.
+    """One leg in this frame: animated joints, contact, hits and foothold, world space.
 
-    `ball_ws` is the toe joint; `heading_ws` the foot's forward at right angles to up, unit.
+    `ball_ws` is the toe joint; `heading_ws` is the unit forward of the foot at right angles to up.
     """
 
     hip_ws: Array
@@ -226,19 +227,19 @@ class Foot:
     foothold_ws: Array
 
     @property
-    def seen(self) -> float:
-        """Contact weight of a foot that sees ground."""
+    def grounded(self) -> float:
+        """Contact weight of a foot with ground under it, else 0."""
         return self.contact if self.hit.found else 0.0
 
 
 def world_from_foot(rig: Rig, frame: Frame, leg: int) -> Array:
-    """Rotation from the animated foot's axes (x left, y up, z forward) to the world's."""
+    """Rotation from the axes of the animated foot (x left, y up, z forward) to the world's."""
     world_from_ankle = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
     return maths.multiply(world_from_ankle, rig.ankle_from_foot[leg])
 
 
 def joints(legs: Sequence[Sequence[Transform]]) -> dict[str, Array]:
-    """Outputs of the solved joints, from hip, knee, ankle and toe of each leg, model space."""
+    """Output of the solved joints: hip, knee, ankle and toe of each leg, model space."""
     output = {}
     for index, name in enumerate(("hip", "knee", "ankle", "toe")):
         output[f"{name}_pos"] = np.array([leg[index].pos for leg in legs])
@@ -253,7 +254,7 @@ def run(
     terrain: Ground,
     frames: Sequence[Frame],
 ) -> dict[str, Array]:
-    """A clip from its first frame: every output of `step`, stacked over the frames."""
+    """All outputs of `step` for a whole clip, stacked over the frames."""
     state, outputs = None, []
     for frame in frames:
         state, output = step(parameters, rig, terrain, state, frame)

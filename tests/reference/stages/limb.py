@@ -4,9 +4,20 @@ import math
 
 import numpy as np
 
-from . import maths
-from .maths import Array, Transform, across, apply, clip, cross, length, rotate, turn, unit
-from .things import Foot, Frame, Parameters, Rig
+from reference import maths
+from reference.characters import Foot, Frame, Parameters, Rig
+from reference.maths import (
+    Array,
+    Transform,
+    across,
+    apply,
+    clip,
+    cross,
+    from_axis_angle,
+    length,
+    rotate,
+    unit,
+)
 
 # Forward distance in m from ankle hit to toe hit below which their heights say no pitch.
 SHORT_FOOT = 0.01
@@ -48,7 +59,9 @@ def solve_leg(
     )
     reached = nearest <= distance <= soft_from and weight >= 1.0
 
-    knee_turn = turn(axis, _knee_angle(hip.pos - knee.pos, ankle.pos - knee.pos, axis, wanted))
+    knee_turn = from_axis_angle(
+        axis, _knee_angle(hip.pos - knee.pos, ankle.pos - knee.pos, axis, wanted)
+    )
     bent = knee.pos + rotate(knee_turn, ankle.pos - knee.pos)
     hip_turn = _hip_turn(
         bent - hip.pos, target - hip.pos, axis, parameters.of_leg("leg.twist", leg)
@@ -125,8 +138,8 @@ def _hip_turn(bent: Array, target: Array, axis: Array, twist: float) -> Array:
     along_leg = unit(bent, unit(target, -maths.Y))
     direction = unit(target, along_leg)
     arc = maths.shortest_arc(along_leg, direction, axis)
-    level = turn(direction, maths.signed_angle(rotate(arc, axis), axis, direction))
-    return maths.multiply(turn(direction, twist), maths.multiply(level, arc))
+    level = from_axis_angle(direction, maths.signed_angle(rotate(arc, axis), axis, direction))
+    return maths.multiply(from_axis_angle(direction, twist), maths.multiply(level, arc))
 
 
 def foot(
@@ -151,7 +164,7 @@ def foot(
     lateral = -side * right
 
     pitch, roll = _ground_angles(foot, heading, right, lateral, up)
-    pitch, roll = pitch * foot.seen, roll * foot.seen
+    pitch, roll = pitch * foot.grounded, roll * foot.grounded
 
     shin = unit(rotate(world_from_model, ankle.pos - knee.pos), -up)
     joint_pitch = _joint_angle(foot_forward, shin)
@@ -160,7 +173,7 @@ def foot(
         min(joint_pitch, parameters.of_leg("foot.min_pitch", leg)),
         max(joint_pitch, parameters.of_leg("foot.max_pitch", leg)),
     )
-    tilt = turn(right, pitch - joint_pitch)
+    tilt = from_axis_angle(right, pitch - joint_pitch)
     if side != 0.0:
         joint_roll = _joint_angle(side * rotate(foot_rot, maths.X), shin)
         roll = clip(
@@ -169,7 +182,7 @@ def foot(
             max(joint_roll, parameters.of_leg("foot.max_roll", leg)),
         )
         roll_axis = rotate(tilt, unit(cross(lateral, up), heading))
-        tilt = maths.multiply(turn(roll_axis, roll - joint_roll), tilt)
+        tilt = maths.multiply(from_axis_angle(roll_axis, roll - joint_roll), tilt)
 
     wanted = maths.multiply(maths.inverse(world_from_model), maths.multiply(tilt, rot_ws))
     weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
@@ -188,7 +201,7 @@ def _ground_angles(
         sole = foot.toe_hit.point - foot.hit.point
         if sole @ heading > SHORT_FOOT:
             pitch = math.atan2(float(sole @ up), float(sole @ heading))
-    pitched_up = rotate(turn(right, pitch), up)
+    pitched_up = rotate(from_axis_angle(right, pitch), up)
     return pitch, math.atan2(-float(normal @ lateral), float(normal @ pitched_up))
 
 

@@ -1,7 +1,8 @@
-"""The `unreal` pipeline in plain NumPy float64: feet that find the ground while one stands idle.
+"""The `unreal` system in plain NumPy float64: feet find the ground while the character is idle.
 
-One character, one leg, one frame at a time, written from the rules alone. Metres, radians, seconds;
-suffixes _ws world, _ms model. `up` is the body's, and of a leg's ray and effector the leg's own.
+One character, one leg, one frame at a time, written from the description of the rules and not from
+the code that is tested. Metres, radians, seconds; suffixes _ws world, _ms model.
+`up` is that of the body; the ray and effector of a leg use its own.
 """
 
 import math
@@ -11,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from . import ground, limb, maths, things
-from .maths import Array, Transform, apply
-from .things import Frame, Ground, Parameters, Rig
+from reference import characters, maths
+from reference.characters import Frame, Ground, Parameters, Rig
+from reference.maths import Array, Transform, apply
+from reference.stages import ground, limb
 
 DEFAULTS: dict[str, Any] = {
     "probe.ray_up": 0.9,
@@ -55,7 +57,7 @@ def step(
     idle = frame.speed <= parameters["contact.idle_speed"]
     found, offsets = [], []
     for leg in legs:
-        seen, offset = ground_offset(parameters, things.under(terrain, leg), frame, leg)
+        seen, offset = ground_offset(parameters, characters.under(terrain, leg), frame, leg)
         found.append(seen)
         offsets.append(offset if idle else 0.0)
 
@@ -72,7 +74,7 @@ def step(
     for leg in legs:
         raised = state.effector[leg] / parameters.of_leg("effector.mesh_scale", leg)
         target_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
-        target_ws = target_ws + terrain.up * state.hip + things.under(terrain, leg).up * raised
+        target_ws = target_ws + terrain.up * state.hip + characters.under(terrain, leg).up * raised
         target_ms = maths.unapply(frame.world_from_model, target_ws)
         hip, knee, ankle, arrived = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
         # The body only moves, so that the animated world rotation is the animated one in the model.
@@ -97,14 +99,14 @@ def step(
         "weight": np.array(shares),
         "reached": np.array(reached),
     }
-    return state, output | things.joints(solved)
+    return state, output | characters.joints(solved)
 
 
 def run(
     parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
 ) -> dict[str, Array]:
-    """A clip from its first frame: every output of `step`, stacked over the frames."""
-    return things.run(step, parameters, rig, terrain, frames)
+    """All outputs of `step` for a whole clip, stacked over the frames."""
+    return characters.run(step, parameters, rig, terrain, frames)
 
 
 def ground_offset(
@@ -139,10 +141,10 @@ def advance(
         return state
     else:
         speed = parameters["pelvis.speed"]
-        hip = maths.ease_by_speed(state.hip, hip_goal, speed, dt)
-        half_height = maths.ease_by_speed(state.half_height, half_height_goal, speed, dt)
+        hip = maths.move_by_speed(state.hip, hip_goal, speed, dt)
+        half_height = maths.move_by_speed(state.half_height, half_height_goal, speed, dt)
         effector = [
-            maths.ease_by_speed(before, goal, parameters.of_leg("effector.speed", leg), dt)
+            maths.move_by_speed(before, goal, parameters.of_leg("effector.speed", leg), dt)
             for leg, (before, goal) in enumerate(zip(state.effector, goals, strict=True))
         ]
     asleep = bool(idle and parameters["effector.latch"])

@@ -1,13 +1,14 @@
-"""The two-bone leg whose bend plane a pole gives, after ozz's job: `ozz` and `mec` share it.
+"""The two-bone leg in the plane of a pole, after ozz's job; `ozz` and `mec` share it.
 
-Points and directions in one space, whichever it is; model space for `solve_leg`.
+Positions and directions are in one space, whichever it is; model space for `solve_leg`.
 """
 
 import math
 
-from . import limb, maths
-from .maths import Array, Transform, cross, length, rotate, turn, unit
-from .things import Frame, Rig
+from reference import maths
+from reference.characters import Frame, Rig
+from reference.maths import Array, Transform, cross, from_axis_angle, length, rotate, unit
+from reference.stages import limb
 
 
 def solve_leg(
@@ -67,7 +68,7 @@ def turns(
     present = maths.interior_angle(thigh, shin, float(ankle @ ankle))
     if hinge @ cross(-knee, ankle - knee) < 0.0:
         present = -present
-    knee_turn = turn(hinge, maths.interior_angle(thigh, shin, wanted**2) - present)
+    knee_turn = from_axis_angle(hinge, maths.interior_angle(thigh, shin, wanted**2) - present)
 
     bent = knee + rotate(knee_turn, ankle - knee)
     if distance < maths.DIRECTIONLESS:
@@ -75,7 +76,11 @@ def turns(
     direction = target / distance
     arc = maths.shortest_arc(unit(bent, direction), direction, hinge)
     level = _to_pole(rotate(arc, hinge), direction, pole)
-    return maths.multiply(turn(direction, twist), maths.multiply(level, arc)), knee_turn, in_reach
+    return (
+        maths.multiply(from_axis_angle(direction, twist), maths.multiply(level, arc)),
+        knee_turn,
+        in_reach,
+    )
 
 
 def softened(distance: float, soft_from: float, chain: float) -> float:
@@ -93,4 +98,4 @@ def _to_pole(hinge: Array, direction: Array, pole: Array) -> Array:
     if length(wanted) < maths.DIRECTIONLESS:
         return maths.IDENTITY
     angle = math.acos(maths.clip(float(wanted @ hinge) / length(wanted), -1.0, 1.0))
-    return turn(direction, -angle if hinge @ pole < 0.0 else angle)
+    return from_axis_angle(direction, -angle if hinge @ pole < 0.0 else angle)

@@ -1,0 +1,1 @@
+"""Stages of the references: what several systems share."""

@@ -1,0 +1,1 @@
+"""The five systems, each composed of stages; `step` and `run` as in `jaxik`."""
