@@ -1,6 +1,7 @@
 from . import contact as contact
 from . import effector as effector
 from . import foot as foot
+from . import inputs as inputs
 from . import lean as lean
 from . import leg as leg
 from . import lock as lock

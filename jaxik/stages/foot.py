@@ -1,4 +1,4 @@
-"""Stage 10: ankles that lay the soles on the ground."""
+"""Stage 10: ankle rotations that align the feet with the ground."""
 
 from abc import abstractmethod
 
@@ -22,28 +22,28 @@ from .leg import SolvedLeg
 from .probe import foot_heading
 
 ANGLE_BAND = 0.035  # rad, 2 degrees
-SHARE_BAND = 0.05  # of a turn's angle
-LEAST_SHARE = 0.01  # a turn below this share of its limit counts as that
-SAME_ANGLE = 1e-6  # rad, within which a limit did nothing
-SHORTEST_SOLE = 0.01  # m, horizontal distance under which two hits give no pitch
+FRACTION_BAND = 0.05  # width of softened limits, as a fraction of the angle
+MIN_FRACTION = 0.01  # smaller angles count as this fraction of their limit
+SAME_ANGLE = 1e-6  # rad, below which a limit counts as inactive
+MIN_SOLE = 0.01  # m, horizontal distance of two hits that give a pitch
 LEFT = (1.0, 0.0, 0.0)  # foot axes
 
 
 @struct
 class SolvedFoot:
-    """A leg with its foot turned."""
+    """Legs with their feet turned."""
 
     pose: LegPose  # legs, model space
-    ankle: Float[Array, "legs 4"]  # correction, on the right of the ankle's rotation
-    reached: Float[Array, " legs"]  # 1 where the foot is turned as the ground asks, else 0
+    ankle: Float[Array, "legs 4"]  # local correction, right-multiplied
+    reached: Float[Array, " legs"]  # 1 where the foot has the rotation its rule wants, else 0
 
 
 class AbstractFoot(Rule):
-    """Turns feet."""
+    """Turns the feet to the ground."""
 
     @abstractmethod
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
-        """The ankles' rotation in the world that memory may keep, before the legs are solved."""
+        """Wanted ankle rotations, world space, before memory; locks may keep them."""
 
     @abstractmethod
     def pose(
@@ -53,20 +53,22 @@ class AbstractFoot(Rule):
 
 
 class AbstractAnimatedFoot(AbstractFoot):
-    """Turns feet from where the animation has them."""
+    """Turns feet from their animated rotation."""
 
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
         return animated_ankles(inputs.frame).rot
 
 
 class PitchRollFoot(AbstractAnimatedFoot):
-    """Pitches and rolls the animated foot onto the ground, its heading kept.
+    """Pitches and rolls the animated foot onto the ground and keeps its heading (the record).
 
-    The pitch comes from the two hits where there is a toe ray, else, like the roll, from the
-    normal; both count by the foot's contact. Pitch, then roll, lays the sole on the normal exactly.
-    Limits are joint angles against the shin: 0 is a foot at right angles to it, a positive pitch
-    lifts the toes, a positive roll lifts the outer edge (so one pair of roll limits serves both
-    sides, A16). They limit what the ground adds: an animation beyond its limits stays as it is.
+    The pitch comes from the hits of ankle and toe, or from the normal if there is no toe ray; the
+    roll comes from the normal. Both are scaled by contact. Pitch, then roll, aligns the sole with
+    the normal exactly.
+
+    Limits are joint angles against the shin: 0 is a foot perpendicular to it, a positive pitch
+    lifts the toes and a positive roll the outer edge, so that one pair of roll limits serves both
+    sides. They limit what the ground adds: an animation beyond its limits stays as it is.
     """
 
     max_pitch: Leaf = parameter(
@@ -113,26 +115,27 @@ class PitchRollFoot(AbstractAnimatedFoot):
             bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
         shin = quat.rotate(frame.world_from_model.rot, shin)
-        free_pitch, free_roll = pitch, roll
-        pitch = limited(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
-        roll = limited(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
+        wanted_pitch, wanted_roll = pitch, roll
+        pitch = limit_tilt(pitch, joint_angle(sole, shin), self.min_pitch, self.max_pitch, gate)
+        roll = limit_tilt(roll, joint_angle(outer, shin), self.min_roll, self.max_roll, gate)
 
         pitch, roll = vec.stacked_barrier(pitch, roll)
-        # Rolled about the level axis and then pitched: as pitched, then rolled about the pitched.
+        # A roll about the level axis before the pitch is a roll about the pitched axis after it.
         tilt = quat.multiply(
             quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, roll * rig.side)
         )
-        cut = jnp.abs(pitch - free_pitch) + jnp.abs(roll - free_roll)
-        kept = gate.below(cut, jnp.full_like(cut, SAME_ANGLE), band=ANGLE_BAND)
-        return turned(frame, effector, bend, quat.multiply(tilt, effector.rot_ws), kept)
+        lost = jnp.abs(pitch - wanted_pitch) + jnp.abs(roll - wanted_roll)
+        unlimited = gate.below(lost, jnp.full_like(lost, SAME_ANGLE), band=ANGLE_BAND)
+        return turn_feet(frame, effector, bend, quat.multiply(tilt, effector.rot_ws), unlimited)
 
 
 class AimFoot(AbstractAnimatedFoot):
-    """ozz's aim job: the ankle's up looks at a point one metre off the ground, along its normal.
+    """ozz's aim job: the foot's up axis aims at a point one metre above the ground on its normal.
 
-    From the pose after the leg's turn: the axis out of the sole, from `offset` (m, foot axes), aims
-    at the ankle's target plus the normal; the foot's forward axis is pulled to where it was, then
-    turned by `twist`. A leg without ground, or with `enabled` off, keeps its foot as carried.
+    It starts from the foot after the leg was solved. The axis out of the sole, from `offset` in
+    foot axes, aims at the ankle's target plus the normal. The foot's forward axis is kept as close
+    as possible, then turned by `twist`. A leg without ground, or with `enabled` off, keeps the
+    foot that the solved leg gives it.
     """
 
     enabled: Leaf = switch(True, doc="Whether feet are turned to the ground.")
@@ -155,9 +158,9 @@ class AimFoot(AbstractAnimatedFoot):
     ) -> SolvedFoot:
         rig, frame = inputs.rig, inputs.frame
         carried = bend.pose.ankle
-        into_model = frame.world_from_model.inverse()
+        model_from_world = frame.world_from_model.inverse()
         foot = quat.multiply(carried.rot, rig.ankle_from_foot)
-        aim = into_model.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
+        aim = model_from_world.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
         upward, ahead = (quat.rotate(foot, vec.constant(axis, aim)) for axis in (UP, FORWARD))
         start = quat.rotate(foot, self.offset)
         turn, reached = aim_rotation(
@@ -170,10 +173,10 @@ class AimFoot(AbstractAnimatedFoot):
 
 
 class FlatFoot(AbstractFoot):
-    """Lays the foot flat on three hits, its heading the animation's (Mec).
+    """Lays the foot flat on its three hits and keeps the animated heading (Mec).
 
-    The pitch is that from foot to toe, the roll that from foot to corner; where a ray missed it is
-    zero. Both tilt a foot that stands upright along its up, by `max_tilt` at most.
+    The pitch is that from foot to toe, the roll that from foot to corner; each is 0 where its ray
+    missed. Both tilt a level foot, together by at most `max_tilt`.
     """
 
     max_tilt: Leaf = parameter(
@@ -186,29 +189,31 @@ class FlatFoot(AbstractFoot):
         pitch = rise_angle(ground.ankle, ground.toe, ahead, up_ws)
         roll = rise_angle(ground.ankle, ground.corner, right, up_ws)
         tilt = quat.multiply(quat.from_axis_angle(right, pitch), quat.from_axis_angle(ahead, -roll))
-        level = quat.multiply(upright(ahead, up_ws), quat.conjugate(inputs.rig.ankle_from_foot))
-        flat = quat.multiply(at_most(tilt, self.max_tilt, inputs.gate), level)
+        level = quat.multiply(level_foot(ahead, up_ws), quat.conjugate(inputs.rig.ankle_from_foot))
+        flat = quat.multiply(limit_angle(tilt, self.max_tilt, inputs.gate), level)
         return quat.nlerp(animated_ankles(inputs.frame).rot, flat, ground.ankle.found)
 
     def pose(
         self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
     ) -> SolvedFoot:
-        return turned(inputs.frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
+        return turn_feet(inputs.frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
 
 
 class KeepFoot(AbstractAnimatedFoot):
-    """Feet keep their animated rotation in the world (Unreal, seed 001)."""
+    """Feet keep their animated rotation in the world (Unreal)."""
 
     def pose(
         self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
     ) -> SolvedFoot:
-        return turned(inputs.frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight))
+        return turn_feet(
+            inputs.frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight)
+        )
 
 
-def turned(
+def turn_feet(
     frame: Frame, effector: Effector, bend: SolvedLeg, rot_ws: Array, reached: Array
 ) -> SolvedFoot:
-    """The legs with their ankles turned to `rot_ws` in the world, each by its share of foot IK."""
+    """The legs with ankle rotations `rot_ws`, world space, each by its weight of foot IK."""
     wanted = quat.multiply(quat.conjugate(frame.world_from_model.rot), rot_ws)
     rot = quat.nlerp(bend.pose.ankle.rot, wanted, effector.weight)
     full = jnp.where(effector.weight >= 1, 1.0, 0.0)
@@ -216,7 +221,7 @@ def turned(
 
 
 def with_ankle(frame: Frame, bend: SolvedLeg, rot: Array, reached: Array) -> SolvedFoot:
-    """The legs with this rotation of their ankles, model space; the toe goes with it."""
+    """The legs with ankle rotations `rot`, model space; toes move with their ankles."""
     carried = bend.pose.ankle
     ankle, toe = frame.pose.ankle, frame.pose.toe
     turn = quat.multiply(rot, quat.conjugate(ankle.rot))
@@ -227,44 +232,46 @@ def with_ankle(frame: Frame, bend: SolvedLeg, rot: Array, reached: Array) -> Sol
 
 
 def rise_angle(low: Hit, high: Hit, along: Array, up_ws: Array) -> Array:
-    """Angle, rad, by which the ground rises from one hit to another along a level direction."""
+    """Angle at which the ground rises from one hit to another along a level direction, rad."""
     across = high.point - low.point
     return high.found * vec.safe_arctan2(vec.dot(across, up_ws), vec.dot(across, along))
 
 
-def upright(ahead: Array, up_ws: Array) -> Array:
-    """Rotation of a foot with its y along up and its z along `ahead`, unit and at right angles."""
+def level_foot(ahead: Array, up_ws: Array) -> Array:
+    """Rotation of a foot with y along `up_ws` and z along `ahead`, unit and perpendicular."""
     raised = quat.shortest_arc(vec.constant(UP, ahead), up_ws, vec.constant(LEFT, ahead))
     return quat.multiply(
         rotation_about(up_ws, quat.rotate(raised, vec.constant(FORWARD, ahead)), ahead), raised
     )
 
 
-def at_most(rot: Array, limit: Array, gate: AbstractGate) -> Array:
-    """The rotation with its angle limited, rad; its axis stays."""
+def limit_angle(rot: Array, limit: Array, gate: AbstractGate) -> Array:
+    """The rotation about the same axis, by an angle of at most `limit`, rad."""
     w, x, y, z = quat.components(jnp.where(rot[..., :1] < 0, -rot, rot))
     sin = vec.safe_sqrt(x * x + y * y + z * z)
     angle = 2.0 * vec.safe_arctan2(sin, w)
-    # As a share, so that a softened limit leaves small turns alone; a far limit stays a number.
-    wide = angle > LEAST_SHARE * limit
-    share = vec.safe_divide(limit, jnp.where(wide, angle, LEAST_SHARE * limit), otherwise=0.0)
-    share = gate.clip(share, jnp.zeros_like(share), jnp.ones_like(share), band=SHARE_BAND)
+    # As a fraction, so that a softened limit does not change small angles; stays finite for 0.
+    wide = angle > MIN_FRACTION * limit
+    fraction = vec.safe_divide(limit, jnp.where(wide, angle, MIN_FRACTION * limit), otherwise=0.0)
+    fraction = gate.clip(
+        fraction, jnp.zeros_like(fraction), jnp.ones_like(fraction), band=FRACTION_BAND
+    )
     turning = sin > jnp.finfo(sin.dtype).eps
     length = jnp.where(turning, angle / jnp.where(turning, sin, 1.0), 2.0)
-    return quat.from_rotvec(vec.scale(vec.stack(x, y, z), length * share))
+    return quat.from_rotvec(vec.scale(vec.stack(x, y, z), length * fraction))
 
 
 def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tuple[Array, Array]:
-    """Pitch and roll, rad, that lay a level sole on the ground, each times the foot's contact."""
+    """Pitch and roll that align a level sole with the ground, rad, scaled by contact."""
     up, ankle, toe = sensed.leg_up_ws, sensed.ground.ankle, sensed.ground.toe
     across = toe.point - ankle.point
     run = vec.dot(across, ahead)
     facing, rising = vec.dot(ankle.normal, up), -vec.dot(ankle.normal, ahead)
-    two = (toe.found * ankle.found > 0) & (run > SHORTEST_SOLE)
-    rise, run = jnp.where(two, vec.dot(across, up), rising), jnp.where(two, run, facing)
+    both_hit = (toe.found * ankle.found > 0) & (run > MIN_SOLE)
+    rise, run = jnp.where(both_hit, vec.dot(across, up), rising), jnp.where(both_hit, run, facing)
     rise, run, facing, rising = vec.stacked_barrier(rise, run, facing, rising)
     pitch = vec.safe_arctan2(rise, run)
-    # Of the normal, the part along the up of a foot so pitched.
+    # The part of the normal along the up axis of the pitched foot.
     upward = vec.safe_divide(run * facing + rise * rising, vec.safe_sqrt(run * run + rise * rise))
     roll = vec.safe_arctan2(side * vec.dot(ankle.normal, right), upward)
     standing = sensed.contact.weight * ankle.found
@@ -272,14 +279,14 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
 
 
 def joint_angle(axis: Array, shin: Array) -> Array:
-    """Angle, rad, by which `axis` of the foot rises from the plane at right angles to the shin."""
+    """Angle by which `axis` of the foot rises from the plane perpendicular to the shin, rad."""
     along = vec.dot(axis, shin)
     along, across = vec.stacked_barrier(along, vec.length(axis - vec.scale(shin, along)))
     return vec.safe_arctan2(-along, across)
 
 
-def limited(tilt: Array, joint: Array, low: Array, high: Array, gate: AbstractGate) -> Array:
-    """`tilt` shortened so that it takes the joint angle it adds to no further than a limit."""
-    least = jnp.where(joint < low, joint, low)
-    most = jnp.where(joint > high, joint, high)
-    return gate.clip(joint + tilt, least, most, band=ANGLE_BAND) - joint
+def limit_tilt(tilt: Array, joint: Array, low: Array, high: Array, gate: AbstractGate) -> Array:
+    """`tilt` shortened so that `joint + tilt` stays within its limits, or where `joint` is."""
+    low = jnp.where(joint < low, joint, low)
+    high = jnp.where(joint > high, joint, high)
+    return gate.clip(joint + tilt, low, high, band=ANGLE_BAND) - joint

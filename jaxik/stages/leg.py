@@ -23,27 +23,27 @@ from .inputs import Inputs
 
 @struct
 class SolvedLeg:
-    """A solved leg."""
+    """Legs after two-bone IK, their feet not yet turned."""
 
-    pose: LegPose  # legs, model space; ankle and toe carried along
-    hip: Float[Array, "legs 4"]  # correction, on the right of the hip's rotation
-    knee: Float[Array, "legs 4"]  # correction, on the right of the knee's rotation
+    pose: LegPose  # legs, model space
+    hip: Float[Array, "legs 4"]  # local correction, right-multiplied
+    knee: Float[Array, "legs 4"]  # local correction, right-multiplied
     reached: Float[Array, " legs"]  # 1 where the ankle is at its target, else 0
 
 
 @struct
 class LegGoal:
-    """What a leg is solved for."""
+    """What the legs are solved for."""
 
     pose: LegPose  # legs, animated, on the moved body, model space
-    target_ms: Float[Array, "legs 3"]  # m, of the ankle
-    weight: Float[Array, " legs"]  # 0..1
+    target_ms: Float[Array, "legs 3"]  # m, of the ankles
+    weight: Float[Array, " legs"]  # 0..1, how much foot IK each leg gets
 
 
 class AbstractLeg(Rule):
-    """Solves legs."""
+    """Solves the legs for their targets."""
 
-    weight: eqx.AbstractVar[Array]  # 0..1, share of foot IK
+    weight: eqx.AbstractVar[Array]  # 0..1, how much foot IK each leg gets
 
     @abstractmethod
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
@@ -53,14 +53,15 @@ class AbstractLeg(Rule):
 class TwoBone(AbstractLeg):
     """Turns the knee about its hinge until the ankle is as far as the target, then swings the hip.
 
-    Exact for a hinge that is not square to the leg: distances are split along and across the hinge
-    axis, and the triangle is closed across it. Half-angle algebra throughout (systems.md, 0, after
-    ozz's two-bone job). Knee limits and softening act on the distance from hip to ankle, never on
-    the angle: from `soften` times the longest reach the leg approaches that reach exponentially.
-    With `as_animated` on, a leg that the animation holds straighter or more bent may stay so.
+    This is exact for hinges that are not perpendicular to the leg: lengths are split into parts
+    along and across the hinge, and the triangle is closed across it. The half-angle algebra follows
+    ozz-animation's two-bone job. Knee limits and softening act on the distance from hip to ankle,
+    not on the angle: beyond `soften` times the longest reach, the leg approaches that reach
+    exponentially. With `as_animated` on, a leg that the animation holds straighter or more bent may
+    stay so.
 
-    Beyond reach the leg points at the target; with the target on the hip it keeps its direction; a
-    leg with a zero bone, or lying along its hinge, does not bend.
+    Beyond reach the leg points at the target. With the target on the hip it keeps its direction. A
+    leg with a bone of no length, or along its hinge, does not bend.
     """
 
     max_knee_angle: Leaf = parameter(
@@ -98,7 +99,7 @@ class TwoBone(AbstractLeg):
         return self.solve(inputs.rig, goal, inputs.gate)
 
     def solve(self, rig: Rig, goal: LegGoal, gate: AbstractGate) -> SolvedLeg:
-        """The leg by itself: with its ankle at the goal's target."""
+        """The legs by themselves, without the rest of the pipeline."""
         pose, target_ms = goal.pose, goal.target_ms
         limb = limb_of(rig, pose)
         to_target = vec.subtract(target_ms, pose.hip.pos)
@@ -110,13 +111,13 @@ class TwoBone(AbstractLeg):
         return bend_leg(rig, goal, LimbBend(swing, half_cos, half_sin, reached))
 
     def _reach(self, limb: Limb, to_target: Array, gate: AbstractGate) -> tuple[Array, Array]:
-        """Distance from hip to ankle that the limits allow, m, and 1 where that is the target's."""
+        """Distance from hip to ankle within the limits, m, and 1 where it is the target's."""
         to_hip, to_ankle = limb.to_hip, limb.to_ankle
         animated, distance = vec.length(to_ankle - to_hip), vec.length(to_target)
         thigh2, shin2 = vec.dot(to_hip, to_hip), vec.dot(to_ankle, to_ankle)
         thigh2, shin2, animated, distance = vec.stacked_barrier(thigh2, shin2, animated, distance)
         product = vec.safe_sqrt(thigh2 * shin2)
-        # Once, or each leg's loop would call the C library for them.
+        # Behind a barrier, or every leg's loop would call the C library for the cosines again.
         cos_max, cos_min = vec.stacked_barrier(
             jnp.cos(self.max_knee_angle), jnp.cos(self.min_knee_angle)
         )
@@ -134,10 +135,10 @@ class TwoBone(AbstractLeg):
 
 
 class PoleLeg(AbstractLeg):
-    """ozz's two-bone job: the plane of the leg contains the pole, here the animated knee's own.
+    """ozz's two-bone job: the leg's plane contains a pole, here that of the animated knee.
 
-    The pole is at right angles to hinge and shin: the knee's y axis of a rig whose x lies along the
-    bone and whose z is the hinge. With `enabled` off the leg stays as the body carries it.
+    The pole is perpendicular to hinge and shin. That is the knee's y axis in a rig whose x axis
+    points along the bone and whose z axis is the hinge. With `enabled` off legs move with the body.
     """
 
     enabled: Leaf = switch(True, doc="Whether legs are solved.")
@@ -167,10 +168,10 @@ class PoleLeg(AbstractLeg):
 
 
 class HintLeg(AbstractLeg):
-    """The same with the pole from the hip to a hint: the detected toe and the calf (Mec).
+    """Like `PoleLeg`, but the pole points from the hip to a hint in front of the shin (Mec).
 
-    The hint is the toe's place on the ground plus the animated vector from ankle to knee plus
-    `hint_offset`, in the character's axes (x left, y up, z forward).
+    The hint is the toe's hit on the ground, plus the animated vector from ankle to knee, plus
+    `hint_offset` in character axes (x left, y up, z forward).
     """
 
     hint_offset: Leaf = parameter(
@@ -216,14 +217,14 @@ def limb_of(rig: Rig, pose: LegPose) -> Limb:
 def solve_to_pole(
     inputs: Inputs, goal: LegGoal, pole_ms: Array, soften: Array, twist: Array
 ) -> SolvedLeg:
-    """The leg whose plane contains the direction `pole_ms`."""
+    """The legs, bent in the plane that contains the direction `pole_ms`."""
     limb = limb_of(inputs.rig, goal.pose)
     target = PoleTarget(goal.target_ms - goal.pose.hip.pos, pole_ms, twist)
     return bend_leg(inputs.rig, goal, bend_to_pole(limb, target, soften, inputs.gate))
 
 
 def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:
-    """The leg with its knee turned about its hinge, then its hip, each by the goal's weight."""
+    """The legs with knees and hips rotated as `bend` says, each by the goal's weight."""
     pose, weight = goal.pose, goal.weight
     limb = limb_of(rig, pose)
     half_cos, half_sin = quat.nlerp_half(bend.half_cos, bend.half_sin, weight)
@@ -231,16 +232,16 @@ def bend_leg(rig: Rig, goal: LegGoal, bend: LimbBend) -> SolvedLeg:
     swing = quat.nlerp_identity(bend.swing, weight)
 
     knee_pos = vec.add(pose.hip.pos, quat.rotate(swing, -limb.to_hip))
-    whole = quat.multiply(swing, knee_rot)
-    ankle_pos = vec.add(knee_pos, quat.rotate(whole, limb.to_ankle))
-    ankle = Transform(ankle_pos, quat.multiply(whole, pose.ankle.rot))
+    shin_rot = quat.multiply(swing, knee_rot)
+    ankle_pos = vec.add(knee_pos, quat.rotate(shin_rot, limb.to_ankle))
+    ankle = Transform(ankle_pos, quat.multiply(shin_rot, pose.ankle.rot))
     solved = LegPose(
         Transform(pose.hip.pos, quat.multiply(swing, pose.hip.rot)),
-        Transform(knee_pos, quat.multiply(whole, pose.knee.rot)),
+        Transform(knee_pos, quat.multiply(shin_rot, pose.knee.rot)),
         ankle,
         Transform(
-            vec.add(ankle_pos, quat.rotate(whole, pose.toe.pos - pose.ankle.pos)),
-            quat.multiply(whole, pose.toe.rot),
+            vec.add(ankle_pos, quat.rotate(shin_rot, pose.toe.pos - pose.ankle.pos)),
+            quat.multiply(shin_rot, pose.toe.rot),
         ),
     )
     return SolvedLeg(
