@@ -13,17 +13,13 @@ WINGS = {  # in import order: a wing may import those before it
     "jaxik": ["batching", "maths", "world", "solvers", "stages", "pipeline", "presets", "record"],
     "fitting": [
         "runtime", "datasets", "problem", "inference", "analysis", "experiments", "studies",
-        "report", "bench", "cli",
+        "report", "jobs", "bench", "cli",
     ],
 }  # fmt: skip
 STAGES = ["inputs", "contact", "root", "probe", "stride_probe", "target", "lean", "lock", "pelvis"]
 STAGES += ["effector", "leg", "foot"]
 LIBRARIES_OF_JAXIK = {"jax", "equinox", "jaxtyping", "numpy", "lazy_loader"}
 UPWARD_IMPORTS = {  # still to be removed
-    "fitting/analysis/accuracy.py": {"report"},
-    "fitting/analysis/difference.py": {"report"},
-    "fitting/analysis/worst_window.py": {"report"},
-    "fitting/studies/comparison.py": {"report"},
 }
 ONLY_IMPORTED_BY = {
     "trimesh": "fitting/datasets/terrain/mesh_files.py",

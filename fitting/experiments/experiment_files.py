@@ -29,7 +29,7 @@ import tomli_w
 
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
-from fitting.inference.settings import Settings, describe
+from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
 from fitting.runtime import validation
 from fitting.runtime.validation import Constraint, Table, check_table, flatten, nest
@@ -50,16 +50,22 @@ SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
 SIGMA_KEYS |= {"correlation": validation.FRACTION}
 
 
-def _tuple(value: Any) -> Any:
-    """TOML's lists as the tuples that settings hold."""
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _constraints(settings_class: type[Settings]) -> dict[str, Constraint]:
+def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
     return {
-        name: Constraint(declared.range, lambda value, one=declared: one.allows(_tuple(value)))
-        for name, declared in describe(settings_class).items()
+        name: Constraint(declared.range, lambda value, one=declared: one.allows(_value(value, one)))
+        for name, declared in describe(settings).items()
     }
+
+
+def _values(table: Table, settings: type[Settings]) -> dict[str, Any]:
+    return {name: _value(value, describe(settings)[name]) for name, value in table.items()}
+
+
+def _value(value: Any, declared: Setting) -> Any:
+    """A value as its setting holds it: a tuple for a list, and a float unless it is a count."""
+    if isinstance(value, list):
+        return tuple(_value(entry, declared) for entry in value)
+    return float(value) if type(value) is int and not declared.integer else value
 
 
 FIT_KEYS: dict[str, Constraint] = {
@@ -126,17 +132,16 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
 def _fit_options(value: object, where: str) -> FitOptions:
     table = check_table(value, FIT_KEYS, f"{where} [fit]")
     changed = check_table(table.get("search", {}), SEARCH_KEYS, f"{where} [fit.search]")
-    changed = {name: _tuple(entry) for name, entry in changed.items()}
-    changed |= {"max_steps": table["max_steps"]} if "max_steps" in table else {}
+    search = _values(changed, SearchSettings)
+    search |= {"max_steps": table["max_steps"]} if "max_steps" in table else {}
     with validation.error_context(f"{where} [fit.search]"):
-        search = SearchSettings(**changed)
-    return FitOptions(table.get("starts", 1), search)
+        return FitOptions(table.get("starts", 1), SearchSettings(**search))
 
 
 def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSettings:
     table = check_table(value, SAMPLE_KEYS, where)
     with validation.error_context(where):
-        sampler = SamplerSettings(**table)
+        sampler = SamplerSettings(**_values(table, SamplerSettings))
         sampler.walkers_for(free_count)
     return sampler
 

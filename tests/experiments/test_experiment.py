@@ -1,4 +1,4 @@
-"""Experiment files, and the problems they make."""
+"""Experiment files, and the problems that are made of them."""
 
 import dataclasses
 from pathlib import Path
@@ -8,7 +8,10 @@ import pytest
 
 import jaxik
 from fitting.datasets.clips import load_clip, save_clip
-from fitting.experiments import experiment, experiment_files, problems
+from fitting.experiments import experiment_files, problems
+from fitting.experiments.experiment import FitOptions
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.sampling.settings import SamplerSettings
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, ROOT, SECOND, UNEVEN_WALK, write
 
@@ -48,11 +51,17 @@ MISTAKES = [
     ({"rest": "[fit]\nstarts = 0"}, "starts is 0; wanted a whole number above 0"),
     ({"rest": "[fit]\nstarts = 1.5"}, "starts is 1.5; wanted a whole number above 0"),
     ({"rest": "[fit]\nmaxsteps = 1"}, "unknown key 'maxsteps'; nearest is 'max_steps'"),
+    ({"rest": "[fit.search]\nelit = 3"}, r"\[fit.search\]: unknown key 'elit'; nearest is 'elite'"),
+    ({"rest": "[fit.search]\nmax_steps = 3"}, r"\[fit.search\]: unknown key 'max_steps'"),
+    ({"rest": "[fit.search]\nelite = 0"}, "elite is 0; wanted a whole number from 1"),
+    ({"rest": "[fit.search]\nelite = 1.5"}, "elite is 1.5; wanted a whole number from 1"),
+    ({"rest": "[fit.search]\nensemble_spreads = 1"}, "is 1; wanted a list of numbers from 0"),
+    ({"rest": "[fit.search]\npopulation = 8"}, r"\[fit.search\]: gauss_newton_children is 16"),
     ({"rest": "[sample]\nwalkers = 5"}, "walkers is 5, wanted an even number from 4"),
     ({"rest": "[sample]\nwalkers = 2"}, "walkers is 2, wanted an even number from 4"),
     ({"rest": "[sample]\nstop_at = 'x'"}, "stop_at is 'x'; wanted a number above 0"),
 ]
-MISFITS = [  # found when the problem is made
+MISFITS = [  # noticed only when the problem is made
     ({"free": "pelvis.on_gian = {}"}, r"\[free\]: no parameter named 'pelvis.on_gian'; nearest is"),
     ({"free": "pelvis = {}"}, "no parameter named 'pelvis'; nearest is 'pelvis"),
     ({"free": "lock.enabled = {}"}, "no parameter named 'lock.enabled'"),
@@ -71,38 +80,43 @@ MISFITS = [  # found when the problem is made
 ]
 
 
-def test_the_embedded_experiment_is_read_as_it_stands():
-    read = experiment_files.load_experiment(UNEVEN_WALK)
-    assert (read.name, read.preset, read.loss, read.seed) == ("uneven walk", "record", "squares", 0)
-    (clip,) = read.clips
+def test_the_embedded_experiment_has_its_files_and_values():
+    loaded = experiment_files.load_experiment(UNEVEN_WALK)
+    assert (loaded.name, loaded.preset, loaded.loss, loaded.seed) == (
+        "uneven walk",
+        "record",
+        "squares",
+        0,
+    )
+    (clip,) = loaded.clips
     paths = (clip.reference, clip.base, clip.terrain, clip.truth)
     assert all(path is not None and path.is_absolute() and path.is_file() for path in paths)
-    assert len(read.free) >= 12 and read.free["pelvis.on_gain"] == {}
-    assert read.parameters["lean.gain_slide"] == 0.15
-    assert read.sigmas["ankle"] == 0.002
+    assert len(loaded.free) >= 12 and loaded.free["pelvis.on_gain"] == {}
+    assert loaded.parameters["lean.gain_slide"] == 0.15
+    assert loaded.sigmas["ankle"] == 0.002
 
 
-def test_what_a_file_leaves_out_has_defaults_and_its_name_is_the_file_s(tmp_path):
-    read = experiment_files.load_experiment(write(tmp_path, "hill.toml"))
-    assert read.name == "hill" and read.fps is None and read.parameters == {}
-    assert read.fit == experiment.FitOptions() and read.sample == experiment.SampleOptions()
-    assert read.free == {"pelvis.on_gain": {}, "foot.max_pitch": {"low": 0.1}}
+def test_missing_keys_have_defaults_and_the_name_is_that_of_the_file(tmp_path):
+    loaded = experiment_files.load_experiment(write(tmp_path, "hill.toml"))
+    assert loaded.name == "hill" and loaded.fps is None and loaded.parameters == {}
+    assert loaded.fit == FitOptions() and loaded.sample == SamplerSettings()
+    assert loaded.free == {"pelvis.on_gain": {}, "foot.max_pitch": {"low": 0.1}}
 
 
-@pytest.mark.parametrize(("parts", "said"), MISTAKES)
-def test_a_mistake_in_the_file_is_told_with_what_was_wanted(tmp_path, parts, said):
-    with pytest.raises(ValueError, match=f"experiment.toml.*{said}"):
+@pytest.mark.parametrize(("parts", "message"), MISTAKES)
+def test_a_mistake_in_the_file_is_reported_with_what_was_wanted(tmp_path, parts, message):
+    with pytest.raises(ValueError, match=f"experiment.toml.*{message}"):
         experiment_files.load_experiment(write(tmp_path, **parts))
 
 
-@pytest.mark.parametrize(("parts", "said"), MISFITS)
-def test_what_does_not_fit_the_preset_or_the_clips_is_told(tmp_path, parts, said):
-    read = experiment_files.load_experiment(write(tmp_path, **parts))
-    with pytest.raises(ValueError, match=said):
-        problems.make_problem(read)
+@pytest.mark.parametrize(("parts", "message"), MISFITS)
+def test_a_parameter_or_clip_that_does_not_fit_is_reported(tmp_path, parts, message):
+    loaded = experiment_files.load_experiment(write(tmp_path, **parts))
+    with pytest.raises(ValueError, match=message):
+        problems.make_problem(loaded)
 
 
-def test_a_file_that_is_not_there_or_no_toml_is_refused(tmp_path):
+def test_a_missing_file_or_one_that_is_not_toml_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="no.toml: no such file, wanted an experiment file"):
         experiment_files.load_experiment(tmp_path / "no.toml")
     with pytest.raises(ValueError, match="a folder, wanted an experiment file"):
@@ -112,7 +126,7 @@ def test_a_file_that_is_not_there_or_no_toml_is_refused(tmp_path):
         experiment_files.load_experiment(tmp_path / "bad.toml")
 
 
-def test_paths_are_meant_from_beside_the_file_wherever_it_is_called_from(tmp_path, monkeypatch):
+def test_paths_are_relative_to_the_file_and_not_to_the_working_folder(tmp_path, monkeypatch):
     for name in ("clips/uneven_walk.npz", "terrains/uneven_walk.ply"):
         (tmp_path / Path(name).name).symlink_to(ROOT / "data" / name)
     clips = '[[clips]]\nreference = "uneven_walk.npz"\nterrain = "uneven_walk.ply"\n'
@@ -122,7 +136,7 @@ def test_paths_are_meant_from_beside_the_file_wherever_it_is_called_from(tmp_pat
     assert clip.reference.is_absolute() and clip.base is None
 
 
-def test_the_fixed_parameters_are_in_the_system_and_the_free_ones_start_at_its_values(tmp_path):
+def test_free_parameters_start_at_the_values_of_the_system_with_its_fixed_ones(tmp_path):
     parts = {"rest": "[parameters]\nlock.enabled = false\nfoot.max_pitch = [0.3, 0.5]"}
     problem = problems.make_problem(experiment_files.load_experiment(write(tmp_path, **parts)))
     base = problem.space.system
@@ -136,9 +150,9 @@ def test_the_fixed_parameters_are_in_the_system_and_the_free_ones_start_at_its_v
     assert float(start["foot.max_pitch"]) == pytest.approx(0.4)
 
 
-def test_a_scene_holds_the_clips_cut_and_resampled_alike(tmp_path):
-    read = experiment_files.load_experiment(write(tmp_path, top="fps = 15.0"))
-    (scene,) = problems.make_problem(read).data
+def test_reference_and_animation_are_cut_and_resampled_alike(tmp_path):
+    loaded = experiment_files.load_experiment(write(tmp_path, top="fps = 15.0"))
+    (scene,) = problems.make_problem(loaded).data
     assert scene.frames.dt.shape == (16,) and float(scene.frames.dt[0]) == pytest.approx(1 / 15)
     reference = load_clip(ROOT / "data/clips/uneven_walk.npz")
     base = load_clip(ROOT / "data/clips/uneven_walk_base.npz")
@@ -153,23 +167,23 @@ def test_a_scene_holds_the_clips_cut_and_resampled_alike(tmp_path):
     assert scene.reference.observed.all()
 
 
-def test_a_marker_pop_is_not_seen(tmp_path):
+def test_a_frame_with_a_marker_pop_is_not_observed(tmp_path):
     clip = load_clip(ROOT / "data/clips/uneven_walk.npz")
     positions = clip.positions_ws.copy()
     positions[45, clip.rig.joints[0][2]] += 0.2
     save_clip(tmp_path / "popped.npz", dataclasses.replace(clip, positions_ws=positions))
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk.npz", "popped.npz") + SECOND
-    read = experiment_files.load_experiment(write(tmp_path, clips=clips))
-    (scene,) = problems.make_problem(read).data
+    loaded = experiment_files.load_experiment(write(tmp_path, clips=clips))
+    (scene,) = problems.make_problem(loaded).data
     assert (
         not scene.reference.observed[15]
         and np.asarray(scene.reference.observed)[[0, 12, 18, 30]].all()
     )
-    resampled = dataclasses.replace(read, fps=15.0)
+    resampled = dataclasses.replace(loaded, fps=15.0)
     assert not problems.make_problem(resampled).data[0].reference.observed[7]
 
 
-def test_contacts_are_held_against_labels_only(tmp_path):
+def test_contacts_count_only_where_the_clip_has_labels(tmp_path):
     clip = load_clip(ROOT / "data/clips/uneven_walk.npz")
     save_clip(tmp_path / "bare.npz", dataclasses.replace(clip, stance=None))
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk.npz", "bare.npz") + SECOND
@@ -177,15 +191,15 @@ def test_contacts_are_held_against_labels_only(tmp_path):
     with_labels = problems.make_problem(
         experiment_files.load_experiment(write(tmp_path, rest=rest))
     )
-    read = experiment_files.load_experiment(write(tmp_path, rest=rest, clips=clips))
+    loaded = experiment_files.load_experiment(write(tmp_path, rest=rest, clips=clips))
     assert float(with_labels.data[0].sigmas.contact) == 0.5
-    assert np.isinf(problems.make_problem(read).data[0].sigmas.contact)
+    assert np.isinf(problems.make_problem(loaded).data[0].sigmas.contact)
 
 
-def test_without_a_base_a_flat_one_is_made(tmp_path):
+def test_a_missing_flat_animation_is_made_from_the_reference(tmp_path):
     clips = "\n".join(line for line in CLIP.splitlines() if not line.startswith("base")) + "\n"
-    read = experiment_files.load_experiment(write(tmp_path, clips=clips + SECOND))
-    reference, base, _ = problems.load_clip_data(read.clips[0], None)
+    loaded = experiment_files.load_experiment(write(tmp_path, clips=clips + SECOND))
+    reference, base, _ = problems.load_clip_data(loaded.clips[0], None)
     stands = base.stance_labels() & reference.stance_labels()
     assert np.abs(base.joints_ws(3)[..., 1][stands]).max() < 0.2
     assert np.ptp(base.positions_ws[:, base.rig.pelvis, 1]) < 1e-9
@@ -193,13 +207,13 @@ def test_without_a_base_a_flat_one_is_made(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"frames": slice(0, 90)}, "has 90 frames at 30 Hz of the legs .*; the reference has 360"),
         ({"fps": 60.0}, "360 frames at 60 Hz .*; the reference has 360 frames at 30 Hz"),
     ],
 )
-def test_a_base_of_other_frames_is_refused(tmp_path, change, said):
+def test_a_flat_animation_with_other_frames_is_rejected(tmp_path, change, message):
     clip = load_clip(ROOT / "data/clips/uneven_walk_base.npz")
     if "frames" in change:
         clip = clip.select(change["frames"])
@@ -207,16 +221,16 @@ def test_a_base_of_other_frames_is_refused(tmp_path, change, said):
         clip = dataclasses.replace(clip, fps=change["fps"])
     save_clip(tmp_path / "base.npz", clip)
     clips = CLIP.replace(f"{ROOT}/data/clips/uneven_walk_base.npz", "base.npz")
-    read = experiment_files.load_experiment(write(tmp_path, clips=clips))
-    with pytest.raises(ValueError, match=said):
-        problems.make_problem(read)
+    loaded = experiment_files.load_experiment(write(tmp_path, clips=clips))
+    with pytest.raises(ValueError, match=message):
+        problems.make_problem(loaded)
 
 
-def test_more_steps_are_one_or_more(tmp_path):
-    read = experiment_files.load_experiment(write(tmp_path))
-    assert experiment.with_max_steps(read, 7).sample.max_steps == 7
+def test_a_limit_of_no_sampler_steps_is_rejected(tmp_path):
+    loaded = experiment_files.load_experiment(write(tmp_path))
+    assert loaded.with_max_sample_steps(7).sample.max_steps == 7
     with pytest.raises(ValueError, match="max-steps is 0; wanted 1 or more"):
-        experiment.with_max_steps(read, 0)
+        loaded.with_max_sample_steps(0)
 
 
 def test_the_blocks_experiment_makes_a_problem(mocap):
@@ -225,3 +239,24 @@ def test_the_blocks_experiment_makes_a_problem(mocap):
     (scene,) = problem.data
     assert scene.frames.dt.shape == (1141,)  # 38 s
     assert 0.9 < float(scene.reference.observed.mean()) < 1.0
+
+
+def test_settings_of_the_search_and_the_sampler_can_be_overridden(tmp_path):
+    rest = "[fit]\nstarts = 2\nmax_steps = 50\n[fit.search]\nelite = 4\nensemble_spreads = [1, 0.3]"
+    path = write(tmp_path, rest=f"{rest}\n[sample]\nmax_steps = 300\ncheck_every = 30")
+    loaded = experiment_files.load_experiment(path)
+    search = SearchSettings(max_steps=50, elite=4, ensemble_spreads=(1, 0.3))
+    assert loaded.fit == FitOptions(2, search)
+    assert loaded.sample == SamplerSettings(max_steps=300, check_every=30)
+    again = tmp_path / "again.toml"
+    again.write_text(experiment_files.experiment_to_toml(loaded))
+    reloaded = experiment_files.load_experiment(again)
+    assert (reloaded.fit, reloaded.sample) == (loaded.fit, loaded.sample)
+
+
+def test_only_settings_that_are_not_the_default_are_written(tmp_path):
+    loaded = experiment_files.load_experiment(write(tmp_path))
+    text = experiment_files.experiment_to_toml(loaded)
+    assert "[fit]\nstarts = 1\nmax_steps = 1000\n" in text and "[fit.search]" not in text
+    assert "[sample]\nmax_steps = 20000\nthin_by = 1\nstop_at = 50.0\n" in text
+    assert "check_every" not in text

@@ -1,4 +1,4 @@
-"""Parameters of a system as TOML."""
+"""Parameter files: a system as TOML."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,18 +11,18 @@ from jaxik.maths import parameter_tree
 from support.clips import ODD
 
 
-def written(folder, text):
+def write_file(folder, text):
     path = folder / "parameters.toml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_every_parameter_convention_and_switch_comes_back_exactly(tmp_path):
+def test_every_parameter_convention_and_switch_is_read_back_exactly(tmp_path):
     per_leg = {"foot.max_roll": jnp.array([0.1, 0.2]), "pelvis.tick_hz": jnp.array(60.0)}
     ik = parameter_tree.replace(parameter_tree.replace(jaxik.presets.record(), ODD), per_leg)
     ik = parameter_tree.replace(ik, {"leg.soften": jnp.nextafter(jnp.array(0.9), jnp.array(1.0))})
     back, preset = parameter_files.load_system(
-        written(tmp_path, parameter_files.system_to_toml(ik))
+        write_file(tmp_path, parameter_files.system_to_toml(ik))
     )
     assert preset == "record"
     for name in leaf_names(ik):
@@ -31,9 +31,9 @@ def test_every_parameter_convention_and_switch_comes_back_exactly(tmp_path):
         )
 
 
-def test_what_a_file_leaves_out_is_the_preset_s(tmp_path):
+def test_missing_values_are_those_of_the_preset(tmp_path):
     ik, preset = parameter_files.load_system(
-        written(tmp_path, "lock.enabled = false\nleg.soften = 1\n")
+        write_file(tmp_path, "lock.enabled = false\nleg.soften = 1\n")
     )
     assert preset == "record"
     changed = {"lock.enabled": False, "leg.soften": 1.0}
@@ -44,13 +44,13 @@ def test_what_a_file_leaves_out_is_the_preset_s(tmp_path):
         )
 
 
-def test_one_value_a_leg_is_taken(tmp_path):
-    ik, _ = parameter_files.load_system(written(tmp_path, "[foot]\nmax_pitch = [0.3, 0.4]\n"))
+def test_a_parameter_may_have_one_value_per_leg(tmp_path):
+    ik, _ = parameter_files.load_system(write_file(tmp_path, "[foot]\nmax_pitch = [0.3, 0.4]\n"))
     np.testing.assert_array_equal(parameter_tree.get(ik, "foot.max_pitch"), [0.3, 0.4])
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("lock = [[", "not TOML"),
         ("preset = 'recrod'", r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
@@ -70,12 +70,12 @@ def test_one_value_a_leg_is_taken(tmp_path):
         ("[probe]\ntoe_ls = [0.1, 0.2]", r"probe.toe_ls has shape \(2,\); wanted \(3,\)"),
     ],
 )
-def test_a_wrong_file_is_refused_with_what_came_and_what_was_wanted(tmp_path, text, said):
-    with pytest.raises(ValueError, match=said):
-        parameter_files.load_system(written(tmp_path, text))
+def test_a_mistake_is_reported_with_what_was_wanted(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        parameter_files.load_system(write_file(tmp_path, text))
 
 
-def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
+def test_a_missing_file_or_one_that_is_not_text_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="no.toml: no such file, wanted a parameter file"):
         parameter_files.load_system(tmp_path / "no.toml")
     with pytest.raises(ValueError, match="a folder, wanted a parameter file"):
