@@ -1,1 +1,10 @@
-"""Numbers about motion."""
+"""Numbers about motion: how a system's motion compares with the captured one or another system's.
+
+Everything here takes motions, scenes or results and returns numbers, in metres, radians and
+fractions. Sentences, tables and pictures of them are in `fitting.report`.
+
+Start with `playback`, which puts the animation, the solved and the captured motion of a clip side
+by side; `worst_window` reads it. `accuracy` holds the figures of the blocks benchmark, `measures`
+says how well a motion stands on its ground, `difference` compares two systems, and
+`limit_activity` says which limits and decisions a clip exercises.
+"""

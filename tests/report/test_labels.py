@@ -1,0 +1,30 @@
+"""Names, units and formats of the figures in tables."""
+
+import dataclasses
+
+import pytest
+
+from fitting.analysis.accuracy import Accuracy
+from fitting.analysis.difference import QUANTITIES
+from fitting.analysis.measures import Measures
+from fitting.analysis.playback import RESIDUAL_KINDS
+from fitting.report import labels
+
+
+@pytest.mark.parametrize(
+    ("figures", "columns"), [(Accuracy, labels.ACCURACY), (Measures, labels.MEASURES)]
+)
+def test_every_figure_has_a_column_in_the_same_order(figures, columns):
+    assert list(columns) == [field.name for field in dataclasses.fields(figures)]
+
+
+def test_every_residual_and_every_difference_has_a_label():
+    assert list(labels.RESIDUALS) == list(RESIDUAL_KINDS)
+    assert list(labels.DIFFERENCES) == list(QUANTITIES)
+
+
+def test_values_are_shown_in_the_unit_of_their_column():
+    assert labels.MEASURES["penetration_mean"].format(0.01234) == "1.23"
+    assert labels.MEASURES["reached"].format(0.875) == "87.5"
+    assert labels.MEASURES["pops"].format(12.0) == "12"
+    assert labels.MEASURES["slide"].format(float("nan")) == "–"
