@@ -1,4 +1,4 @@
-"""Vectors: their axioms, their limits and their slopes."""
+"""Vectors and safe scalar functions: agreement with NumPy, limits, gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,11 @@ RNG = np.random.default_rng(0)
 A, B = RNG.normal(size=(2, 4, 3))
 X, Y = RNG.normal(size=(2, 4))
 FUNCTIONS = {
-    "numbers": (vec.unstack, (A,)),
+    "unstack": (vec.unstack, (A,)),
     "components": (vec.components, (A,)),
     "stack": (vec.stack, (X, Y, X)),
-    "fence": (vec.barrier, (A,)),
-    "once": (vec.stacked_barrier, (X, Y)),
+    "barrier": (vec.barrier, (A,)),
+    "stacked_barrier": (vec.stacked_barrier, (X, Y)),
     "dot": (vec.dot, (A, B)),
     "cross": (vec.cross, (A, B)),
     "scale": (vec.scale, (A, X)),
@@ -31,7 +31,7 @@ FUNCTIONS = {
     "cos_sin": (vec.cos_sin, (X,)),
     "add": (vec.add, (A, B)),
     "length": (vec.length, (A,)),
-    "unit": (vec.normalize, (A, B)),
+    "normalize": (vec.normalize, (A, B)),
     "reject": (vec.reject, (A, B)),
 }
 
@@ -41,7 +41,7 @@ def everything(args):
 
 
 def products(a, b, weight):
-    """Several answers in one program: most of a test's time goes into compiling."""
+    """Several functions in one program: most of a test's time goes into compiling."""
     return (
         vec.dot(a, b),
         vec.cross(a, b),
@@ -52,32 +52,34 @@ def products(a, b, weight):
     )
 
 
-def test_precision_follows_the_inputs():
+def test_dtype_follows_the_inputs():
     for dtype in (jnp.float32, jnp.float64):
         args = {
             name: [jnp.asarray(x, dtype) for x in args] for name, (_, args) in FUNCTIONS.items()
         }
-        for name, answer in jax.eval_shape(everything, args).items():
-            assert {leaf.dtype for leaf in jax.tree.leaves(answer)} == {jnp.dtype(dtype)}, name
+        for name, output in jax.eval_shape(everything, args).items():
+            assert {leaf.dtype for leaf in jax.tree.leaves(output)} == {jnp.dtype(dtype)}, name
 
 
-def test_a_compiled_batch_is_many_singles():
+def test_a_compiled_batch_equals_the_vmap_of_single_calls():
     args = {name: [jnp.asarray(x) for x in args] for name, (_, args) in FUNCTIONS.items()}
     batch, singles = jax.jit(everything)(args), jax.jit(jax.vmap(everything))(args)
     for name in FUNCTIONS:
-        for one, other in zip(*map(jax.tree.leaves, (batch[name], singles[name])), strict=True):
-            assert_allclose(one, other, 1e-14, 1e-14, err_msg=name)
+        for actual, expected in zip(
+            *map(jax.tree.leaves, (batch[name], singles[name])), strict=True
+        ):
+            assert_allclose(actual, expected, 1e-14, 1e-14, err_msg=name)
 
 
-def test_one_vector_broadcasts_against_many():
-    one = jnp.asarray(B[0])
-    assert_allclose(vec.cross(jnp.asarray(A), one), np.cross(A, B[0]), atol=1e-15)
-    assert vec.dot(one, jnp.zeros((2, 5, 3))).shape == (2, 5)
-    assert vec.scale(one, jnp.asarray(X)).shape == (4, 3)
+def test_one_vector_broadcasts_against_a_batch():
+    single = jnp.asarray(B[0])
+    assert_allclose(vec.cross(jnp.asarray(A), single), np.cross(A, B[0]), atol=1e-15)
+    assert vec.dot(single, jnp.zeros((2, 5, 3))).shape == (2, 5)
+    assert vec.scale(single, jnp.asarray(X)).shape == (4, 3)
     assert vec.normalize(jnp.zeros((2, 4, 3)), jnp.asarray(A)).shape == (2, 4, 3)
 
 
-def test_a_constant_takes_the_precision_of_its_companion():
+def test_a_constant_takes_the_dtype_of_the_other_array():
     for dtype in (jnp.float32, jnp.float64):
         up = vec.constant((0.0, 1.0, 0.0), jnp.zeros(2, dtype))
         assert up.dtype == dtype and up.tolist() == [0.0, 1.0, 0.0]
@@ -85,7 +87,7 @@ def test_a_constant_takes_the_precision_of_its_companion():
 
 @few
 @given(vectors(ANY_SIZE), vectors(ANY_SIZE))
-def test_products_are_those_of_numpy(a, b):
+def test_products_agree_with_numpy(a, b):
     ja, jb = jnp.asarray(a), jnp.asarray(b)
     assert_allclose(vec.dot(ja, jb), np.dot(a, b), rtol=1e-12, atol=1e-15)
     assert_allclose(vec.cross(ja, jb), np.cross(a, b), rtol=1e-12, atol=1e-15)
@@ -96,7 +98,7 @@ def test_products_are_those_of_numpy(a, b):
     assert_allclose(vec.stacked_barrier(ja, jnp.asarray(2.0)), (a, np.full_like(a, 2.0)), atol=0)
 
 
-def test_the_vector_product_is_right_handed():
+def test_the_cross_product_is_right_handed():
     x, y, z = jnp.eye(3)
     assert_allclose(vec.cross(x, y), z, atol=0)
     assert_allclose(vec.cross(y, x), -z, atol=0)
@@ -104,20 +106,20 @@ def test_the_vector_product_is_right_handed():
 
 @few
 @given(vectors(ANY_SIZE), directions())
-def test_a_unit_has_length_one_and_the_same_direction_or_is_the_fallback(v, pair):
+def test_normalizing_keeps_the_direction_or_gives_the_fallback(v, pair):
     fallback = jnp.asarray(pair[0])
-    answer = vec.normalize(jnp.asarray(v), fallback)
-    assert_allclose(vec.length(answer), 1.0, atol=1e-14)
+    direction = vec.normalize(jnp.asarray(v), fallback)
+    assert_allclose(vec.length(direction), 1.0, atol=1e-14)
     if v.any():
-        assert_allclose(np.cross(answer, v), 0, atol=1e-14)
-        assert vec.dot(answer, jnp.asarray(v)) > 0
+        assert_allclose(np.cross(direction, v), 0, atol=1e-14)
+        assert vec.dot(direction, jnp.asarray(v)) > 0
     else:
-        assert_allclose(answer, fallback, atol=0)
+        assert_allclose(direction, fallback, atol=0)
 
 
 @few
 @given(vectors(ANY_SIZE), directions())
-def test_what_is_rejected_is_at_right_angles_and_the_rest_along(v, pair):
+def test_a_rejection_is_at_right_angles_and_the_rest_parallel(v, pair):
     direction = jnp.asarray(pair[0])
     across = vec.reject(jnp.asarray(v), direction)
     assert_allclose(vec.dot(across, direction), 0, atol=1e-14)
@@ -126,7 +128,7 @@ def test_what_is_rejected_is_at_right_angles_and_the_rest_along(v, pair):
 
 @few
 @given(numbers(), numbers())
-def test_safe_functions_are_the_plain_ones_away_from_their_limits(x, y):
+def test_safe_functions_equal_the_plain_ones_away_from_their_limits(x, y):
     jx, jy = jnp.asarray(x), jnp.asarray(y)
     assert_allclose(vec.safe_sqrt(jx), np.sqrt(max(x, 0.0)))
     assert_allclose(vec.safe_divide(jx, jy, otherwise=7.0), x / y if y else 7.0)
@@ -134,31 +136,31 @@ def test_safe_functions_are_the_plain_ones_away_from_their_limits(x, y):
         assert_allclose(vec.safe_arctan2(jy, jx), np.arctan2(y, x))
 
 
-def test_an_angle_is_told_to_the_last_digits_all_around_and_at_every_size():
+def test_arctan2_is_accurate_to_rounding_at_every_angle_and_size():
     angle = np.linspace(-np.pi, np.pi, 4001)[:, None]
     for dtype, sizes in ((np.float32, (1e-30, 1.0, 1e30)), (np.float64, (1e-200, 1.0, 1e200))):
         y = (np.sin(angle) * sizes).astype(dtype)
         x = (np.cos(angle) * sizes).astype(dtype)
         exact = np.arctan2(y.astype(np.float64), x.astype(np.float64))
-        answer = vec.safe_arctan2(jnp.asarray(y), jnp.asarray(x))
-        assert answer.dtype == dtype
-        assert_allclose(answer, exact, rtol=6 * float(np.finfo(dtype).eps))
+        angles = vec.safe_arctan2(jnp.asarray(y), jnp.asarray(x))
+        assert angles.dtype == dtype
+        assert_allclose(angles, exact, rtol=6 * float(np.finfo(dtype).eps))
 
 
-def test_cosines_and_sines_are_told_to_the_last_digits_all_around():
+def test_cosines_and_sines_are_accurate_to_rounding_at_every_angle():
     angle = np.linspace(-20.0, 20.0, 4001)
     for dtype in (np.float32, np.float64):
-        given = angle.astype(dtype)
-        cos, sin = vec.cos_sin(jnp.asarray(given))
+        rounded = angle.astype(dtype)
+        cos, sin = vec.cos_sin(jnp.asarray(rounded))
         assert cos.dtype == sin.dtype == dtype
-        exact = given.astype(np.float64)
-        # One rounding of the result, and that of an angle which holds several turns.
+        exact = rounded.astype(np.float64)
+        # One rounding of the result, plus that of an angle of several turns.
         allowed = np.finfo(dtype).eps * (2.0 + 0.5 * np.abs(exact))
         assert np.all(np.abs(np.asarray(cos, np.float64) - np.cos(exact)) <= allowed)
         assert np.all(np.abs(np.asarray(sin, np.float64) - np.sin(exact)) <= allowed)
 
 
-def test_safe_functions_are_flat_at_their_limits():
+def test_safe_functions_have_zero_gradient_at_their_limits():
     assert vec.safe_sqrt(jnp.asarray(0.0)) == vec.safe_sqrt(jnp.asarray(-1.0)) == 0
     assert vec.safe_arctan2(jnp.asarray(0.0), jnp.asarray(0.0)) == 0
     for x in (0.0, -1.0):
@@ -171,30 +173,30 @@ def test_safe_functions_are_flat_at_their_limits():
 
 @few
 @given(vectors((1.0, 1e-5, 0.0)), vectors(), numbers())
-def test_slopes_of_products_and_lengths_are_those_of_differences(a, b, weight):
+def test_gradients_of_products_and_lengths_match_finite_differences(a, b, weight):
     assert_gradients_match(products, a, b, weight)
 
 
 @few
 @given(vectors(), vectors())
-def test_slopes_of_directions_are_those_of_differences(v, fallback):
+def test_gradients_of_directions_match_finite_differences(v, fallback):
     assert_gradients_match(vec.normalize, v, fallback)
 
 
 @few
 @given(numbers(0.1, 2), numbers(0.1, 2), st.sampled_from([1.0, 1e-3]), st.sampled_from([1, -1]))
-def test_slopes_of_safe_functions_are_those_of_differences(x, y, size, sign):
+def test_gradients_of_safe_functions_match_finite_differences(x, y, size, sign):
     assert_gradients_match(vec.safe_sqrt, size * x)
     assert_gradients_match(vec.safe_divide, x, sign * size * y)
     assert_gradients_match(vec.safe_arctan2, size * x, sign * y)
     assert_gradients_match(vec.cos_sin, sign * x)
 
 
-def test_slopes_stay_finite_in_single_precision_however_short_the_vector():
+def test_gradients_stay_finite_in_single_precision_for_vectors_of_any_length():
     sizes = 10.0 ** -jnp.asarray([3, 6, 9, 15, 30], jnp.float32)
     v = sizes[:, None] * jnp.asarray([1.0, 0.0, 0.0], jnp.float32)
     fallback = jnp.asarray([0.0, 1.0, 0.0], jnp.float32)
-    of_unit = jax.jit(jax.vmap(jax.jacrev(vec.normalize), (0, None)))(v, fallback)
+    of_direction = jax.jit(jax.vmap(jax.jacrev(vec.normalize), (0, None)))(v, fallback)
     of_length = jax.jit(jax.vmap(jax.jacfwd(vec.length)))(v)
-    for slope in (of_unit, of_length):
-        assert slope.dtype == jnp.float32 and jnp.isfinite(slope).all()
+    for gradient in (of_direction, of_length):
+        assert gradient.dtype == jnp.float32 and jnp.isfinite(gradient).all()

@@ -125,9 +125,9 @@ def lean(
         lerp(parameters[f"lean.{name}_rate"], parameters[f"lean.{name}_rate_slide"], slide) * angle
         for name, angle in zip(("forward", "side"), angles, strict=True)
     )
-    body_turn = maths.from_rotvec(right * lean_forward - forward * lean_side)
+    body_rot = maths.from_rotvec(right * lean_forward - forward * lean_side)
     smooth_normal = unit(up - math.tan(angles[0]) * forward - math.tan(angles[1]) * right, up)
-    return slide, slope, body_turn, smooth_normal
+    return slide, slope, body_rot, smooth_normal
 
 
 def smooth_height(

@@ -23,10 +23,10 @@ from reference.maths import (
 SHORT_FOOT = 0.01
 
 
-def body(frame: Frame, offset_ws: Array, turn_ws: Array) -> Transform:
+def body(frame: Frame, offset_ws: Array, rot_ws: Array) -> Transform:
     """Model space before to model space after: a turn about the middle of the hips, and a shift."""
     model_from_world = maths.inverse(frame.world_from_model.rot)
-    rot = maths.conjugate(turn_ws, model_from_world)
+    rot = maths.conjugate(rot_ws, model_from_world)
     pivot = np.mean(frame.hip.pos, axis=0)
     return Transform(pivot + rotate(model_from_world, offset_ws) - rotate(rot, pivot), rot)
 
@@ -59,36 +59,36 @@ def solve_leg(
     )
     reached = nearest <= distance <= soft_from and weight >= 1.0
 
-    knee_turn = from_axis_angle(
+    knee_rot = from_axis_angle(
         axis, _knee_angle(hip.pos - knee.pos, ankle.pos - knee.pos, axis, wanted)
     )
-    bent = knee.pos + rotate(knee_turn, ankle.pos - knee.pos)
-    hip_turn = _hip_turn(
+    bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
+    hip_rot = _hip_rotation(
         bent - hip.pos, target - hip.pos, axis, parameters.of_leg("leg.twist", leg)
     )
 
-    return *turned(hip, knee, ankle, hip_turn, knee_turn, weight), reached
+    return *rotated(hip, knee, ankle, hip_rot, knee_rot, weight), reached
 
 
-def turned(
+def rotated(
     hip: Transform,
     knee: Transform,
     ankle: Transform,
-    hip_turn: Array,
-    knee_turn: Array,
+    hip_rot: Array,
+    knee_rot: Array,
     weight: float,
 ) -> tuple[Transform, Transform, Transform]:
     """Hip, knee and ankle after a share of both turns, that of the knee first."""
-    knee_turn = maths.nlerp(maths.IDENTITY, knee_turn, weight)
-    hip_turn = maths.nlerp(maths.IDENTITY, hip_turn, weight)
-    bent = knee.pos + rotate(knee_turn, ankle.pos - knee.pos)
-    shin_turn = maths.multiply(hip_turn, knee_turn)
+    knee_rot = maths.nlerp(maths.IDENTITY, knee_rot, weight)
+    hip_rot = maths.nlerp(maths.IDENTITY, hip_rot, weight)
+    bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
+    shin_rot = maths.multiply(hip_rot, knee_rot)
     return (
-        Transform(hip.pos, maths.multiply(hip_turn, hip.rot)),
+        Transform(hip.pos, maths.multiply(hip_rot, hip.rot)),
         Transform(
-            hip.pos + rotate(hip_turn, knee.pos - hip.pos), maths.multiply(shin_turn, knee.rot)
+            hip.pos + rotate(hip_rot, knee.pos - hip.pos), maths.multiply(shin_rot, knee.rot)
         ),
-        Transform(hip.pos + rotate(hip_turn, bent - hip.pos), maths.multiply(shin_turn, ankle.rot)),
+        Transform(hip.pos + rotate(hip_rot, bent - hip.pos), maths.multiply(shin_rot, ankle.rot)),
     )
 
 
@@ -133,7 +133,7 @@ def _knee_angle(to_hip: Array, to_ankle: Array, axis: Array, wanted: float) -> f
     return maths.interior_angle(a, b, in_plane) - present
 
 
-def _hip_turn(bent: Array, target: Array, axis: Array, twist: float) -> Array:
+def _hip_rotation(bent: Array, target: Array, axis: Array, twist: float) -> Array:
     """Turn about the hip that points `bent` at `target`, keeps the bend plane, and twists."""
     along_leg = unit(bent, unit(target, -maths.Y))
     direction = unit(target, along_leg)

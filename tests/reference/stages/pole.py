@@ -39,14 +39,14 @@ def solve_leg(
         limb.carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle)
     )
     hinge = rotate(knee.rot, rig.knee_axis_ls[leg])
-    hip_turn, knee_turn, in_reach = turns(
+    hip_rot, knee_rot, in_reach = joint_rotations(
         knee.pos - hip.pos, ankle.pos - hip.pos, hinge, target - hip.pos, pole, soften, twist
     )
     reached = in_reach and weight >= 1.0
-    return *limb.turned(hip, knee, ankle, hip_turn, knee_turn, weight), reached
+    return *limb.rotated(hip, knee, ankle, hip_rot, knee_rot, weight), reached
 
 
-def turns(
+def joint_rotations(
     knee: Array,
     ankle: Array,
     hinge: Array,
@@ -68,17 +68,17 @@ def turns(
     present = maths.interior_angle(thigh, shin, float(ankle @ ankle))
     if hinge @ cross(-knee, ankle - knee) < 0.0:
         present = -present
-    knee_turn = from_axis_angle(hinge, maths.interior_angle(thigh, shin, wanted**2) - present)
+    knee_rot = from_axis_angle(hinge, maths.interior_angle(thigh, shin, wanted**2) - present)
 
-    bent = knee + rotate(knee_turn, ankle - knee)
+    bent = knee + rotate(knee_rot, ankle - knee)
     if distance < maths.DIRECTIONLESS:
-        return maths.IDENTITY, knee_turn, in_reach
+        return maths.IDENTITY, knee_rot, in_reach
     direction = target / distance
     arc = maths.shortest_arc(unit(bent, direction), direction, hinge)
     level = _to_pole(rotate(arc, hinge), direction, pole)
     return (
         maths.multiply(from_axis_angle(direction, twist), maths.multiply(level, arc)),
-        knee_turn,
+        knee_rot,
         in_reach,
     )
 

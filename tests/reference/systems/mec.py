@@ -61,7 +61,7 @@ class Leg:
     kept_rot: Array  # of the foot, from its axes to the platform's space
     fade: float
     offset_ws: Array  # of the last goal from the animated ankle, m
-    turn_ws: Array  # of the last goal from the animated rotation
+    rot_ws: Array  # of the last goal from the animated rotation
 
 
 @dataclass
@@ -204,10 +204,10 @@ def fade(
         after.fade = maths.move_towards(before.fade, end, frame.dt / time)
     if foot.found:
         after.offset_ws = goal_ws - foot.ankle_ws
-        after.turn_ws = maths.multiply(goal_rot, maths.inverse(foot.animated_rot))
+        after.rot_ws = maths.multiply(goal_rot, maths.inverse(foot.animated_rot))
     elif before is not None:
-        after.offset_ws, after.turn_ws = before.offset_ws, before.turn_ws
-    return foot.ankle_ws + after.offset_ws, maths.multiply(after.turn_ws, foot.animated_rot)
+        after.offset_ws, after.rot_ws = before.offset_ws, before.rot_ws
+    return foot.ankle_ws + after.offset_ws, maths.multiply(after.rot_ws, foot.animated_rot)
 
 
 def pelvis_height(

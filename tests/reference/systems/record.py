@@ -28,7 +28,7 @@ def step(
     legs = range(len(frame.weight))
     feet = [ground.sense(parameters, rig, terrain, frame, leg) for leg in legs]
 
-    slide, slope, body_turn_ws, smooth_normal = ground.lean(
+    slide, slope, body_rot_ws, smooth_normal = ground.lean(
         parameters, feet, forward, up, state, frame
     )
 
@@ -56,7 +56,7 @@ def step(
 
     pelvis = ground.pelvis_height(parameters, feet, targets, up, state, frame)
     pelvis_offset_ws = pelvis * (up if parameters["pelvis.vertical_only"] else smooth_normal)
-    body = limb.body(frame, pelvis_offset_ws, body_turn_ws)
+    body = limb.body(frame, pelvis_offset_ws, body_rot_ws)
 
     solved = []
     for leg in legs:
