@@ -1,4 +1,8 @@
-"""Whole systems as choices of rules: those that exist elsewhere, and one for human strides."""
+"""Complete foot-IK systems: four that exist elsewhere, and `stride` for people on uneven ground.
+
+Each function returns a `FootIK` with default parameters; print it to see them. The four are
+re-implementations from descriptions and source code, tested against independent NumPy references.
+"""
 
 import math
 
@@ -23,7 +27,11 @@ from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarg
 
 
 def record() -> FootIK:
-    """The game's foot-IK parameter record (systems.md, 4), for a 1.8 m adult."""
+    """The foot IK behind a game engine's parameter record, for a 1.8 m adult.
+
+    Locks standing feet, leans the body on slopes and lowers the pelvis to the lowest standing foot.
+    `jaxik.record` reads and writes the record's bytes.
+    """
     return FootIK(
         root=KeepRoot(),
         probe=FootProbe(),
@@ -39,15 +47,15 @@ def record() -> FootIK:
 
 
 def ozz() -> FootIK:
-    """ozz-animation's foot-IK sample (systems.md, 1).
+    """ozz-animation's foot IK sample.
 
     Its four switches are `root.enabled` (character height), `pelvis.enabled`, `leg.enabled`
     (two-bone) and `foot.enabled` (aim). Nothing has memory. `probe.use_toe`, `probe.toe_ls` and
-    `pelvis.vertical_only`, which come with rules of the record, change nothing here.
+    `pelvis.vertical_only` belong to rules of the record and change nothing here.
 
-    Not taken over from ozz 0.16: an aim with a weight below 1 goes the longer way round in 10 to
-    14 % of cases, and directions within 1.4 mrad of opposed count as opposed, so that the aim
-    misses by as much. `tests/test_golden.py` shows both.
+    Two inaccuracies of ozz 0.16 are not reproduced: with a weight below 1 its aim goes the longer
+    way round in 10 to 14 % of cases, and it treats directions within 1.4 mrad of opposed as
+    opposed, so that its aim misses by as much. `tests/solvers/test_golden.py` shows both.
     """
     return FootIK(
         root=GroundRoot(),
@@ -64,13 +72,15 @@ def ozz() -> FootIK:
 
 
 def unreal() -> FootIK:
-    """An Unreal character's foot IK (systems.md, 2), faithful with its latch.
+    """Unreal's foot IK control rig, with its latch.
 
-    It works only while the character stands still (`contact.idle_speed`). The latch stops all
-    movement once the feet have arrived and may freeze the pelvis short of its goal: better switch
-    `effector.latch` off. The root is the bottom of the capsule, whose half-height stands twice:
-    `probe.ray_up` is where rays start, `pelvis.half_height` what shrinks. The game puts the capsule
-    on the ground; where an animation's root has stayed on its flat floor, `root.enabled` does.
+    It works only while the character stands still (`contact.idle_speed`). As in the original, the
+    latch stops all movement once the feet have arrived, which can freeze the pelvis short of its
+    goal; better switch `effector.latch` off.
+
+    The root is the bottom of the capsule. The capsule's half-height is needed twice: rays start at
+    `probe.ray_up`, and `pelvis.half_height` is what shrinks. The game keeps the capsule on the
+    ground; for an animation whose root stays on its flat floor, switch `root.enabled` on.
     """
     return FootIK(
         root=GroundRoot(enabled=False),
@@ -87,12 +97,11 @@ def unreal() -> FootIK:
 
 
 def mec() -> FootIK:
-    """Mec Foot Placer (systems.md, 3).
+    """Mec Foot Placer, a plug-in for Unity.
 
-    Give `LegTerrains` for feet and hands with an up of their own. `active`, the switches and all
-    numbers of the probe, the lock and the legs may hold one value a leg. The game puts the
-    character on the ground; where an animation's root has stayed on its flat floor,
-    `root.enabled` does.
+    Use `LegTerrains` for feet and hands that each have their own up. All switches and numbers of
+    the probe, the lock and the legs can be one value per leg. The game keeps the character on the
+    ground; for an animation whose root stays on its flat floor, switch `root.enabled` on.
     """
     return FootIK(
         root=GroundRoot(enabled=False),
@@ -109,13 +118,14 @@ def mec() -> FootIK:
 
 
 def stride() -> FootIK:
-    """Foot IK that knows its next foothold: people on uneven ground.
+    """Foot IK that looks ahead to the next foothold: people on uneven ground.
 
-    Each foot goes from the ground of its last stance to that of its next, the pelvis where the feet
-    want it as far as the legs reach, a trailing heel rises before its leg is too long, and a
-    standing foot keeps its ball in place if `lock.enabled` asks for it. Give `Frame.stride` where
-    the animation knows its footholds; else they follow from the character's velocity. On the flat
-    floor for which an animation was made nothing changes.
+    Each foot goes from the ground of its last foothold to that of its next. The pelvis goes where
+    the feet want it, as far as the legs reach, and a trailing heel rises before its leg gets too
+    long. A standing foot keeps its ball in place if `lock.enabled` is on.
+
+    Provide `Frame.stride` if the animation's footholds are known; else they are predicted from the
+    character's velocity. On the flat floor for which an animation was made nothing changes.
     """
     return FootIK(
         root=KeepRoot(),

@@ -1,9 +1,9 @@
-"""The game's foot-IK parameter record: bytes, CSV text, and the parameters it means.
+"""A game engine's binary foot-IK parameter record: its bytes, a CSV form, and its parameters.
 
-Little-endian: u8 knee axis at 0x0, flags in bits 0-2 at 0x1 (3-7 padding), two bytes of padding, 31
-consecutive f32 from 0x04 to 0x7c, and from 0x80 a tail of unknown length. Everything that is read
-is kept, so that writing gives the same bytes again. The record's spelling and units live here only.
-Numbers like A1 name the settled questions of systems.md, section 4.
+The layout is little-endian: u8 knee axis at 0x0, flags in bits 0-2 at 0x1 (bits 3-7 are padding),
+two bytes of padding, 31 consecutive f32 from 0x04 to 0x7c, and from 0x80 a tail of unknown length.
+Everything that is read is kept, so that writing gives the same bytes again. Only this module knows
+the record's spelling and units; `Reading` says how fields that are open to doubt are understood.
 """
 
 import csv
@@ -13,7 +13,7 @@ import re
 import struct
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,9 @@ from jaxik.maths import parameter_tree
 from jaxik.pipeline import FootIK
 from jaxik.world.skeleton import Rig
 
-SIZE = 0x80
+Value = TypeVar("Value")
+
+SIZE = 0x80  # bytes, without the tail
 FLAGS = (  # bit at 0x1, name in the record, our name
     (0, "useFootLocking", "lock.enabled"),
     (1, "useFootEndRay", "probe.use_toe"),
@@ -71,12 +73,22 @@ QUIET_NAN = b"\0\0\xc0\x7f"  # what "nan" reads as
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """How the record's doubtful fields are read."""
+    """How to understand the fields whose unit or sign the record does not state.
 
-    length_unit: str = "auto"  # A1: auto, m or cm
-    knee_convention: str = "interior"  # A3: interior or flexion
-    lean_sign: int = 1  # A6: 1 or -1
-    tick_hz: float = 30.0  # A5
+    Attributes:
+        length_unit: unit of planted and raised heights and of ray lengths: "m", "cm", or "auto",
+            which warns and takes centimetres if a planted height is over 1 or a ray over 5, more
+            than any body of 1.8 m has in metres.
+        knee_convention: "interior" (pi is a straight leg) or "flexion" (0 is a straight leg).
+        lean_sign: 1 if a positive rate aligns the body with the ground's normal, -1 if it leans
+            into the hill.
+        tick_hz: the game's rate, to which all gains refer.
+    """
+
+    length_unit: str = "auto"
+    knee_convention: str = "interior"
+    lean_sign: int = 1
+    tick_hz: float = 30.0  # Hz
 
     def __post_init__(self) -> None:
         for name, allowed in (
@@ -84,15 +96,15 @@ class Reading:
             ("knee_convention", ("interior", "flexion")),
             ("lean_sign", (1, -1)),
         ):
-            if (came := getattr(self, name)) not in allowed:
-                raise ValueError(f"{name} is {came!r}; it is one of {allowed}")
+            if (value := getattr(self, name)) not in allowed:
+                raise ValueError(f"{name} is {value!r}; it is one of {allowed}")
         if not self.tick_hz > 0:
             raise ValueError(f"tick_hz is {self.tick_hz}; it is the game's rate, above 0")
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """The record as it is stored."""
+    """A record as it is stored."""
 
     knee_axis_type: int = 2
     flags: int = 0b111  # bits 0-2, and the padding bits 3-7
@@ -102,11 +114,11 @@ class Record:
 
     def __post_init__(self) -> None:
         for name in ("knee_axis_type", "flags"):
-            if not 0 <= (came := getattr(self, name)) <= 0xFF:
-                raise ValueError(f"{name} is {came}; it is one byte, 0 to 255")
-        came, wanted = list(map(len, (self.padding, *self.floats))), [2] + [4] * len(FLOATS)
-        if came != wanted:
-            raise ValueError(f"padding and floats have {wanted} bytes; these have {came}")
+            if not 0 <= (value := getattr(self, name)) <= 0xFF:
+                raise ValueError(f"{name} is {value}; it is one byte, 0 to 255")
+        sizes, expected = list(map(len, (self.padding, *self.floats))), [2] + [4] * len(FLOATS)
+        if sizes != expected:
+            raise ValueError(f"padding and floats have {expected} bytes; these have {sizes}")
 
     def value(self, name: str) -> float:
         """A float by its name in the record."""
@@ -122,7 +134,7 @@ class Record:
 
 
 def from_bytes(data: bytes) -> Record:
-    """The record in these bytes; everything from 0x80 on is kept as its tail.
+    """The record in these bytes; everything from 0x80 on becomes its tail.
 
     Raises:
         ValueError: for fewer than 0x80 bytes.
@@ -134,16 +146,16 @@ def from_bytes(data: bytes) -> Record:
 
 
 def to_bytes(record: Record) -> bytes:
-    """The bytes of a record, as they were read."""
+    """The bytes of a record: those it was read from."""
     head = bytes([record.knee_axis_type, record.flags]) + record.padding
     return head + b"".join(record.floats) + record.tail
 
 
 def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
-    """The pipeline with the record's parameters; those that it lacks keep their defaults.
+    """The record preset with a record's parameters; those that it lacks keep their defaults.
 
     Raises:
-        ValueError: for a number that is not finite, or an unknown knee axis.
+        ValueError: if a number is not finite or the knee axis is unknown.
     """
     reading = reading or Reading()
     knee_axis(record)
@@ -151,7 +163,7 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
     for name, ours, unit in _fields(reading):
         if not np.isfinite(stored := record.value(name)):
             raise ValueError(f"{name} is {stored}; the record's floats are finite numbers")
-        values[ours] = _inside(name, stored, unit, record, reading)
+        values[ours] = _from_stored(name, stored, unit, record, reading)
     toe = [values.pop(f"probe.toe_ls[{axis}]") for axis in range(3)]
     switches = {ours: record.flag(name) for _, name, ours in FLAGS}
     ticks = {name: reading.tick_hz for name in ("lean.tick_hz", "pelvis.tick_hz")}
@@ -161,62 +173,66 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
 
 
 def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = None) -> Record:
-    """The record that holds the pipeline's parameters.
+    """The record with a system's parameters.
 
-    `base` gives the knee axis, the padding and the tail; a float that means in `base` what it means
-    in `ik` keeps its bytes. With `length_unit` "auto" the unit is that of `base`, else metres.
+    Args:
+        ik: a system with the rules of the record preset.
+        base: where knee axis, padding and tail come from. A float whose value is the same in `base`
+            and `ik` keeps its bytes.
+        reading: units and signs to write. With `length_unit` "auto" lengths get the unit of `base`,
+            or metres.
 
     Raises:
-        ValueError: for a parameter that differs between legs, is beyond a 32-bit float, or would be
+        ValueError: if a parameter differs between legs, does not fit a 32-bit float, or would be
             read back in another unit.
     """
     reading = reading or Reading()
-    kept = base or Record()
-    flags = kept.flags & ~0b111
+    template = base or Record()
+    flags = template.flags & ~0b111
     for bit, _, ours in FLAGS:
-        flags |= int(_leaf(ik, ours)) << bit
-    guessed = reading.length_unit == "auto"
-    if guessed:
+        flags |= int(_shared_value(ik, ours)) << bit
+    automatic_unit = reading.length_unit == "auto"
+    if automatic_unit:
         length_unit = "cm" if base is not None and _in_centimetres(base) else "m"
         reading = dataclasses.replace(reading, length_unit=length_unit)
     floats = []
     for index, (name, ours, unit) in enumerate(_fields(reading)):
-        value = _leaf(ik, ours)
-        stored = _packed(_outside(value, unit, reading))
+        value = _shared_value(ik, ours)
+        stored = _packed(_to_stored(value, unit, reading))
         if base is not None and np.isfinite(base.value(name)):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                before = _inside(name, base.value(name), unit, base, reading)
+                before = _from_stored(name, base.value(name), unit, base, reading)
             if np.isclose(before, value, rtol=1e-6, atol=1e-7):
                 stored = base.floats[index]
         floats.append(stored)
-    made = dataclasses.replace(kept, flags=flags, floats=tuple(floats))
-    if guessed and _in_centimetres(made) != (reading.length_unit == "cm"):
+    record = dataclasses.replace(template, flags=flags, floats=tuple(floats))
+    if automatic_unit and _in_centimetres(record) != (reading.length_unit == "cm"):
         raise ValueError(
-            f"lengths written in {reading.length_unit} would be read in the other unit: a planted "
-            'height over 1 or a ray over 5 counts as cm; give length_unit "m" or "cm"'
+            f"lengths written in {reading.length_unit} would be read in the other unit, because a "
+            'planted height over 1 or a ray over 5 counts as cm; set length_unit to "m" or "cm"'
         )
-    return made
+    return record
 
 
 def knee_axis(record: Record) -> np.ndarray:
-    """The knee's hinge in its joint's space, unit (3,)."""
+    """The hinge of the knee in knee space, unit (3,)."""
     if record.knee_axis_type >= len(KNEE_AXES):
         raise ValueError(f"kneeAxisType is {record.knee_axis_type}; 0 to 5 are +X +Y +Z -X -Y -Z")
     return KNEE_AXES[record.knee_axis_type]
 
 
 def with_knee_axis(rig: Rig, record: Record) -> Rig:
-    """The rig of a game skeleton, whose knees turn about the record's axis.
+    """The rig with the record's knee axis, for a game skeleton.
 
-    A rig measured from a captured clip has its own axes and does not need this.
+    Not for rigs that were measured from a captured clip: these have their own axes.
     """
     axis = jnp.asarray(knee_axis(record), rig.knee_axis_ls.dtype)
     return dataclasses.replace(rig, knee_axis_ls=jnp.broadcast_to(axis, rig.knee_axis_ls.shape))
 
 
 def to_csv(records: list[Record]) -> str:
-    """One row a record under the record's own names; padding in hexadecimal."""
+    """CSV text with a row per record, the record's own names, and padding in hexadecimal."""
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
     rows.writerow(COLUMNS)
@@ -228,10 +244,10 @@ def to_csv(records: list[Record]) -> str:
 
 
 def from_csv(text: str) -> list[Record]:
-    """The records of a CSV; a column that is missing is an error, padding excepted.
+    """The records in CSV text; columns may be in any order, and those of padding may be missing.
 
     Raises:
-        ValueError: naming row and column.
+        ValueError: naming the row and column at fault.
     """
     rows = csv.DictReader(io.StringIO(text))
     columns = list(rows.fieldnames or [])
@@ -243,39 +259,48 @@ def from_csv(text: str) -> list[Record]:
     if twice := [name for name in COLUMNS if columns.count(name) > 1]:
         raise ValueError(f"the CSV has column {twice} more than once")
     records = []
-    for cells in rows:
-        line = f"row {rows.line_num}"
-        if None in cells or None in cells.values():
-            raise ValueError(f"{line} has not the {len(columns)} cells of the header")
-        flags = _read(line, cells, "padflag", _whole(0x1F), "a whole number from 0 to 31", "0") << 3
+    for values in rows:
+        cells = _Cells(f"row {rows.line_num}", values)
+        if None in values or None in values.values():
+            raise ValueError(f"{cells.row} has not the {len(columns)} cells of the header")
+        flags = cells.read("padflag", _whole(0x1F), "a whole number from 0 to 31", "0") << 3
         for bit, name, _ in FLAGS:
-            flags |= _read(line, cells, name, _whole(1), "0 or 1") << bit
-        axis = _read(line, cells, "kneeAxisType", _whole(0xFF), "a whole number from 0 to 255")
-        floats = tuple(_read(line, cells, name, _packed, "a 32-bit number") for name in FLOAT_NAMES)
-        padding = _read(line, cells, "pad1", bytes.fromhex, "bytes in hexadecimal", "0000")
-        tail = _read(line, cells, "pad3", bytes.fromhex, "bytes in hexadecimal")
+            flags |= cells.read(name, _whole(1), "0 or 1") << bit
+        axis = cells.read("kneeAxisType", _whole(0xFF), "a whole number from 0 to 255")
+        floats = tuple(cells.read(name, _packed, "a 32-bit number") for name in FLOAT_NAMES)
+        padding = cells.read("pad1", bytes.fromhex, "bytes in hexadecimal", "0000")
+        tail = cells.read("pad3", bytes.fromhex, "bytes in hexadecimal")
         if len(padding) != 2:
-            raise ValueError(f"{line}, column pad1: {padding.hex()!r} is not two bytes")
+            raise ValueError(f"{cells.row}, column pad1: {padding.hex()!r} is not two bytes")
         records.append(Record(axis, flags, padding, floats, tail))
     return records
 
 
-def _read(
-    line: str, cells: dict, name: str, convert: Callable, wanted: str, missing: str = ""
-) -> Any:
-    cell = (cells.get(name) or missing).strip()
-    try:
-        return convert(cell)
-    except ValueError:
-        raise ValueError(f"{line}, column {name}: {cell!r} is not {wanted}") from None
+@dataclasses.dataclass(frozen=True)
+class _Cells:
+    """One row of a CSV."""
+
+    row: str  # such as "row 2"
+    values: dict[str, str]
+
+    def read(
+        self, name: str, convert: Callable[[str], Value], expected: str, default: str = ""
+    ) -> Value:
+        """A cell, converted; an empty or missing one is read as `default`."""
+        cell = (self.values.get(name) or default).strip()
+        try:
+            return convert(cell)
+        except ValueError:
+            raise ValueError(f"{self.row}, column {name}: {cell!r} is not {expected}") from None
 
 
-def _whole(most: int) -> Callable[[str], int]:
-    return lambda cell: range(most + 1).index(int(cell))
+def _whole(maximum: int) -> Callable[[str], int]:
+    """A reader of whole numbers from 0 to `maximum`."""
+    return lambda cell: range(maximum + 1).index(int(cell))
 
 
 def _shortest(stored: bytes) -> str:
-    """The shortest decimal that reads back as the same f32; all bits of a NaN that is not plain."""
+    """The shortest decimal that reads back as the same f32; for a NaN with a payload, its bits."""
     value = np.frombuffer(stored, "<f4")[0]
     if np.isnan(value) and stored != QUIET_NAN:
         return f"nan(0x{stored[::-1].hex()})"
@@ -283,7 +308,7 @@ def _shortest(stored: bytes) -> str:
 
 
 def _packed(value: float | str) -> bytes:
-    """The f32 nearest to a number or its text; a ValueError where there is none."""
+    """The bytes of the f32 nearest to a number or its text; a ValueError if there is none."""
     if isinstance(value, str) and (bits := re.fullmatch(r"nan\(0x([0-9a-fA-F]{8})\)", value)):
         return bytes.fromhex(bits[1])[::-1]
     number = float(value)
@@ -294,15 +319,15 @@ def _packed(value: float | str) -> bytes:
 
 
 def _fields(reading: Reading) -> list[tuple[str, str, str]]:
-    """`FLOATS`, for a reading: a knee's largest flexion is its smallest interior angle (A3)."""
+    """`FLOATS` for a reading: the largest flexion is the smallest interior angle."""
     if reading.knee_convention == "interior":
         return list(FLOATS)
     other = {"leg.max_knee_angle": "leg.min_knee_angle", "leg.min_knee_angle": "leg.max_knee_angle"}
     return [(name, other.get(ours, ours), unit) for name, ours, unit in FLOATS]
 
 
-def _leaf(ik: FootIK, name: str) -> float:
-    """A number that all legs share."""
+def _shared_value(ik: FootIK, name: str) -> float:
+    """The value of a parameter, which must be the same for all legs."""
     leaf, _, index = name.rstrip("]").partition("[")
     values = np.asarray(parameter_tree.get(ik, leaf))
     values = np.unique(values[..., int(index)] if index else values)
@@ -312,13 +337,13 @@ def _leaf(ik: FootIK, name: str) -> float:
 
 
 def _in_centimetres(record: Record) -> bool:
-    """A1: planted over 1 or a ray over 5 can only be centimetres for a body of 1.8 m."""
+    """Whether lengths can only be in centimetres, for a body of 1.8 m."""
     rays = max(record.value("raycastDistanceUp"), record.value("raycastDistanceDown"))
     return record.value("footPlantedAnkleHeightMS") > 1.0 or rays > 5.0
 
 
-def _inside(name: str, value: float, unit: str, record: Record, reading: Reading) -> float:
-    """A stored number in metres, radians and gains."""
+def _from_stored(name: str, value: float, unit: str, record: Record, reading: Reading) -> float:
+    """A stored number in our units: metres, radians, gains per tick."""
     if unit == "length":
         if reading.length_unit == "cm":
             return value / 100.0
@@ -339,8 +364,8 @@ def _inside(name: str, value: float, unit: str, record: Record, reading: Reading
     return value
 
 
-def _outside(value: float, unit: str, reading: Reading) -> float:
-    """Metres, radians and gains as the record stores them."""
+def _to_stored(value: float, unit: str, reading: Reading) -> float:
+    """A number in our units as the record stores it."""
     if unit == "length" and reading.length_unit == "cm":
         return value * 100.0
     if unit == "cosine":

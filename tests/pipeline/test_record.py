@@ -273,7 +273,7 @@ def test_a_record_in_centimetres_stays_in_centimetres():
 
 def test_lengths_that_would_be_read_in_another_unit_are_not_written():
     ik = parameter_tree.replace(jaxik.presets.record(), {"probe.ray_up": 6.0})
-    with pytest.raises(ValueError, match='written in m .* give length_unit "m" or "cm"'):
+    with pytest.raises(ValueError, match='written in m .* set length_unit to "m" or "cm"'):
         record.from_ik(ik)
     assert record.from_ik(ik, reading=Reading(length_unit="m")).value("raycastDistanceUp") == 6.0
 
