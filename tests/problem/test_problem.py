@@ -1,4 +1,4 @@
-"""How much residuals tell that repeat one another."""
+"""How much information correlated residuals carry."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
 from support import toy
 
-ROWS, CLIPS = 400, 400
+RESIDUALS, CLIPS = 400, 400
 CORRELATION = 0.9
 
 
@@ -20,32 +20,36 @@ def residuals(ik: toy.Toy, data: jax.Array) -> jax.Array:
 
 
 def noise(rng: np.random.Generator) -> np.ndarray:
-    """First-order autoregressions of unit variance, (clips, rows)."""
-    steps = rng.normal(size=(CLIPS, ROWS)) * np.sqrt(1.0 - CORRELATION**2)
+    """First-order autoregressions of unit variance, (clips, residuals)."""
+    steps = rng.normal(size=(CLIPS, RESIDUALS)) * np.sqrt(1.0 - CORRELATION**2)
     steps[:, 0] /= np.sqrt(1.0 - CORRELATION**2)
     return lfilter([1.0], [1.0, -CORRELATION], steps)
 
 
-def covered(independent: float) -> float:
-    """How often the 95 % interval of a level covers it, noise of neighbours being correlated.
+def coverage(independent_fraction: float) -> float:
+    """How often the 95 % interval of a level covers it although the noise is correlated.
 
-    The rows are linear in the parameter's value, so that estimate and width follow from the slope.
+    The residuals are linear in the parameter's value, so that estimate and width follow from the
+    Jacobian.
     """
     ik = toy.Toy()
     space = make_space(ik, [free_parameter(ik, "foot.share", prior_sd=50.0)])
     problem = Problem(
-        space, jnp.zeros(ROWS), residuals, independent_fraction=jnp.asarray(independent)
+        space,
+        jnp.zeros(RESIDUALS),
+        residuals,
+        independent_fraction=jnp.asarray(independent_fraction),
     )
     u = jnp.zeros(1)
-    of_u = jax.jacfwd(lambda u: space.values(u)[0])(u)[0]
-    slopes = np.asarray(problem.jacobian(u))[:-1, 0] / float(of_u)  # of the rows, by value
-    assert slopes == pytest.approx(np.sqrt(independent))
-    width = 1.96 / np.sqrt(np.sum(slopes**2))
-    means = noise(np.random.default_rng(0)).mean(axis=1)  # of which the truth is 0
+    value_by_u = jax.jacfwd(lambda u: space.values(u)[0])(u)[0]
+    by_value = np.asarray(problem.jacobian(u))[:-1, 0] / float(value_by_u)
+    assert by_value == pytest.approx(np.sqrt(independent_fraction))
+    width = 1.96 / np.sqrt(np.sum(by_value**2))
+    means = noise(np.random.default_rng(0)).mean(axis=1)  # the truth is 0
     return float(np.mean(np.abs(means) < width))
 
 
-def test_residuals_that_repeat_one_another_give_intervals_that_cover_their_share():
-    share = (1.0 - CORRELATION) / (1.0 + CORRELATION)  # one over their autocorrelation time
-    assert covered(1.0) < 0.5
-    assert 0.92 < covered(share) < 0.98
+def test_the_independent_fraction_restores_the_coverage_of_correlated_residuals():
+    fraction = (1.0 - CORRELATION) / (1.0 + CORRELATION)  # one over their autocorrelation time
+    assert coverage(1.0) < 0.5
+    assert 0.92 < coverage(fraction) < 0.98

@@ -1,4 +1,4 @@
-"""The vector that a fit moves: transforms, order, priors, losses, and what a user may misspell."""
+"""Free parameters as a vector: transforms, order, priors, losses and mistakes of users."""
 
 import dataclasses
 
@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fitting.problem import free_parameters, loss, space
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.loss import CAUCHY, HUBER, apply_loss
 from fitting.problem.problem import Problem
+from fitting.problem.space import CENTRE_LIMIT, Space, make_space
 from jaxik.maths import smoothing
 from support import toy
 
@@ -20,17 +22,15 @@ TOLERANCE = 1e-9
 
 
 @eqx.filter_jit
-def unpack_and_pack(made: space.Space, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def unpack_and_pack(space: Space, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Values, and `u` again from the system and from the values."""
-    values = made.values(u)
-    named = dict(zip(made.names, values, strict=True))
-    return values, made.pack(made.unpack(u)), made.pack(named)
+    values = space.values(u)
+    named = dict(zip(space.names, values, strict=True))
+    return values, space.pack(space.unpack(u)), space.pack(named)
 
 
-def make(*names: str, **overrides) -> space.Space:
-    return space.make_space(
-        toy.Toy(), [free_parameters.free_parameter(toy.Toy(), n, **overrides) for n in names]
-    )
+def make(*names: str, **overrides) -> Space:
+    return make_space(toy.Toy(), [free_parameter(toy.Toy(), n, **overrides) for n in names])
 
 
 SPACE = make(*NAMES)
@@ -47,15 +47,15 @@ def test_values_stay_in_their_bounds_and_in_their_order_for_every_u(u):
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(-6, 6), min_size=len(NAMES), max_size=len(NAMES)))
-def test_packing_what_was_unpacked_gives_u_again(u):
+def test_packing_an_unpacked_system_gives_u_again(u):
     _, from_system, from_values = unpack_and_pack(SPACE, jnp.asarray(u))
     np.testing.assert_allclose(from_system, u, atol=1e-6)
     np.testing.assert_allclose(from_values, u, atol=1e-6)
 
 
 def test_the_middle_of_a_gain_is_the_geometric_middle_of_its_half_lives():
-    one = make("body.gain")
-    gain = one.values(jnp.zeros(1))[0]
+    space = make("body.gain")
+    gain = space.values(jnp.zeros(1))[0]
     ends = smoothing.half_life_of_gain(jnp.asarray([0.02, 0.9]), jnp.asarray(30.0))
     middle = smoothing.half_life_of_gain(gain, jnp.asarray(30.0))
     np.testing.assert_allclose(middle, jnp.sqrt(ends[0] * ends[1]), rtol=TOLERANCE)
@@ -66,46 +66,46 @@ def test_the_middle_of_a_logarithmic_range_is_its_geometric_middle():
     np.testing.assert_allclose(value, np.sqrt(0.01 * 0.5), rtol=TOLERANCE)
 
 
-def test_one_leg_can_be_free_and_the_other_keeps_its_value():
-    made = make("foot.limit[1]")
-    np.testing.assert_allclose(made.unpack(jnp.zeros(1)).foot.limit, [0.4, 0.45], rtol=TOLERANCE)
+def test_one_leg_can_be_free_while_the_other_keeps_its_value():
+    space = make("foot.limit[1]")
+    np.testing.assert_allclose(space.unpack(jnp.zeros(1)).foot.limit, [0.4, 0.45], rtol=TOLERANCE)
 
 
 def test_a_bare_name_frees_one_value_for_all_legs():
-    made = make("foot.limit")
-    assert made.size == 1
-    np.testing.assert_allclose(made.unpack(jnp.zeros(1)).foot.limit, [0.45, 0.45], rtol=TOLERANCE)
+    space = make("foot.limit")
+    assert space.size == 1
+    np.testing.assert_allclose(space.unpack(jnp.zeros(1)).foot.limit, [0.45, 0.45], rtol=TOLERANCE)
 
 
-def test_a_value_stays_above_a_fixed_partner_too():
-    made = make("lock.height_off")
-    assert made.values(jnp.full(1, -30.0))[0] == pytest.approx(0.06)
+def test_a_value_stays_above_one_that_is_fixed():
+    space = make("lock.height_off")
+    assert space.values(jnp.full(1, -30.0))[0] == pytest.approx(0.06)
 
 
 def test_the_prior_is_centred_at_the_present_values():
-    made = make(*NAMES)
-    np.testing.assert_allclose(made.pack({}), made.u0, rtol=TOLERANCE)
-    np.testing.assert_array_equal(made.prior_residuals(made.u0), 0)
-    np.testing.assert_allclose(made.prior_residuals(made.u0 + 1.6), 1, rtol=TOLERANCE)
+    space = make(*NAMES)
+    np.testing.assert_allclose(space.pack({}), space.u0, rtol=TOLERANCE)
+    np.testing.assert_array_equal(space.prior_residuals(space.u0), 0)
+    np.testing.assert_allclose(space.prior_residuals(space.u0 + 1.6), 1, rtol=TOLERANCE)
 
 
 def test_a_prior_at_a_bound_is_moved_inside_where_u_is_finite():
-    made = make("body.rise", prior_mean=0.0)
-    assert made.u0[0] == -space.CENTRE_LIMIT
+    space = make("body.rise", prior_mean=0.0)
+    assert space.u0[0] == -CENTRE_LIMIT
 
 
-def test_a_default_outside_the_given_bounds_is_taken_to_the_nearest_one():
-    assert free_parameters.free_parameter(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
+def test_a_default_outside_the_bounds_is_clipped():
+    assert free_parameter(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
 
 
-def test_smooth_and_thresholds_share_the_parameters_out():
-    made = make("lock.height_on", "body.rise")
-    assert made.smooth == (False, True)
-    assert made.thresholds == (True, False)
+def test_a_parameter_is_either_smooth_or_a_threshold():
+    space = make("lock.height_on", "body.rise")
+    assert space.smooth == (False, True)
+    assert space.thresholds == (True, False)
 
 
 @pytest.mark.parametrize(
-    ("name", "overrides", "said"),
+    ("name", "overrides", "message"),
     [
         ("lock.hight_on", {}, "nearest is 'lock.height_on'.*there are"),
         ("foot.limit[2]", {}, r"there are \['foot.limit\[0\]', 'foot.limit\[1\]'\]"),
@@ -122,43 +122,43 @@ def test_smooth_and_thresholds_share_the_parameters_out():
         ("foot.share", {"kind": "soft"}, "kind is 'soft'"),
     ],
 )
-def test_what_cannot_be_free_is_answered_with_what_can(name, overrides, said):
-    with pytest.raises(ValueError, match=said):
-        free_parameters.free_parameter(toy.Toy(), name, **overrides)
+def test_a_mistake_in_a_free_parameter_is_answered_with_what_is_allowed(name, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        free_parameter(toy.Toy(), name, **overrides)
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "message"),
     [
         ((), "nothing is free"),
         (("foot.share", "foot.share"), "free twice"),
         (("foot.limit", "foot.limit[0]"), "free twice"),
     ],
 )
-def test_a_space_of_nothing_or_of_doubles_is_refused(names, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_space_without_parameters_or_with_duplicates_is_refused(names, message):
+    with pytest.raises(ValueError, match=message):
         make(*names)
 
 
-def test_a_partner_that_leaves_no_room_is_refused():
-    frees = [
-        free_parameters.free_parameter(toy.Toy(), "lock.height_on"),
-        free_parameters.free_parameter(toy.Toy(), "lock.height_off"),
+def test_a_parameter_without_room_above_another_is_refused():
+    parameters = [
+        free_parameter(toy.Toy(), "lock.height_on"),
+        free_parameter(toy.Toy(), "lock.height_off"),
     ]
-    frees[1] = dataclasses.replace(frees[1], high=0.11)
+    parameters[1] = dataclasses.replace(parameters[1], high=0.11)
     with pytest.raises(ValueError, match="stays above lock.height_on, which reaches 0.12"):
-        space.make_space(toy.Toy(), frees)
+        make_space(toy.Toy(), parameters)
 
 
-def test_two_that_stay_above_each_other_are_refused():
-    frees = [
-        free_parameters.free_parameter(toy.Toy(), "lock.height_on"),
-        free_parameters.free_parameter(toy.Toy(), "lock.height_off"),
+def test_two_parameters_above_each_other_are_refused():
+    parameters = [
+        free_parameter(toy.Toy(), "lock.height_on"),
+        free_parameter(toy.Toy(), "lock.height_off"),
     ]
-    frees[0] = dataclasses.replace(frees[0], above="lock.height_off", high=0.3)
-    frees[1] = dataclasses.replace(frees[1], high=0.4)
+    parameters[0] = dataclasses.replace(parameters[0], above="lock.height_off", high=0.3)
+    parameters[1] = dataclasses.replace(parameters[1], high=0.4)
     with pytest.raises(ValueError, match="above"):
-        space.make_space(toy.Toy(), frees)
+        make_space(toy.Toy(), parameters)
 
 
 def test_packing_a_name_that_is_not_free_is_refused():
@@ -168,32 +168,35 @@ def test_packing_a_name_that_is_not_free_is_refused():
 
 LOSSES = {
     "squares": lambda z: z,
-    "huber": lambda z: np.where(z > loss.HUBER**2, 2 * loss.HUBER * np.sqrt(z) - loss.HUBER**2, z),
-    "cauchy": lambda z: loss.CAUCHY**2 * np.log1p(z / loss.CAUCHY**2),
+    "huber": lambda z: np.where(z > HUBER**2, 2 * HUBER * np.sqrt(z) - HUBER**2, z),
+    "cauchy": lambda z: CAUCHY**2 * np.log1p(z / CAUCHY**2),
 }
-ROWS = jnp.asarray([0.0, 1e-200, 1e-30, 1e-9, 1e-3, 0.5, 1.0, 1.345, 3.0, 1e3, 1e9, -1e-9, -2.0])
+RESIDUALS = jnp.asarray(
+    [0.0, 1e-200, 1e-30, 1e-9, 1e-3, 0.5, 1.0, 1.345, 3.0, 1e3, 1e9, -1e-9, -2.0]
+)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_the_square_of_a_robust_row_is_the_loss(loss):
-    rows = loss.apply_loss(ROWS, loss)
-    np.testing.assert_allclose(rows**2, LOSSES[loss](np.asarray(ROWS) ** 2), rtol=1e-9)
-    np.testing.assert_array_equal(jnp.sign(rows), jnp.sign(ROWS))
+def test_the_square_of_a_robust_residual_is_the_loss(loss):
+    robust = apply_loss(RESIDUALS, loss)
+    np.testing.assert_allclose(robust**2, LOSSES[loss](np.asarray(RESIDUALS) ** 2), rtol=1e-9)
+    np.testing.assert_array_equal(jnp.sign(robust), jnp.sign(RESIDUALS))
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_the_slope_of_a_robust_row_is_one_at_zero_and_finite_everywhere(loss, dtype):
-    rows = ROWS.astype(dtype)
-    slopes = jax.vmap(jax.grad(lambda row: loss.apply_loss(row[None], loss)[0]))(rows)
-    assert slopes.dtype == dtype
-    assert jnp.isfinite(slopes).all()
-    np.testing.assert_allclose(slopes[:4], 1, rtol=1e-6)
+def test_the_derivative_of_a_robust_residual_is_one_at_zero_and_finite_everywhere(loss, dtype):
+    residuals = RESIDUALS.astype(dtype)
+    derivative = jax.grad(lambda residual: apply_loss(residual[None], loss)[0])
+    derivatives = jax.vmap(derivative)(residuals)
+    assert derivatives.dtype == dtype
+    assert jnp.isfinite(derivatives).all()
+    np.testing.assert_allclose(derivatives[:4], 1, rtol=1e-6)
 
 
 def test_an_unknown_loss_is_refused():
     with pytest.raises(ValueError, match="loss is 'absolute', wanted one of"):
-        loss.apply_loss.__wrapped__(ROWS, "absolute")  # the tests' type check would come first
+        apply_loss.__wrapped__(RESIDUALS, "absolute")  # the tests' type check would come first
 
 
 def residuals(ik: toy.Toy, data: jax.Array) -> jax.Array:
@@ -225,7 +228,7 @@ def test_other_data_bounds_and_centres_do_not_compile_again():
         return problem.cost(u)
 
     for value in (0.1, 0.2):
-        made = make("foot.share")
-        made = eqx.tree_at(lambda s: (s.low, s.u0), made, (made.low - value, made.u0 + value))
-        cost(Problem(made, jnp.asarray([value]), residuals), jnp.asarray([value]))
+        space = make("foot.share")
+        space = eqx.tree_at(lambda s: (s.low, s.u0), space, (space.low - value, space.u0 + value))
+        cost(Problem(space, jnp.asarray([value]), residuals), jnp.asarray([value]))
     assert len(traces) == 1

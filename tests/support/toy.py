@@ -1,11 +1,10 @@
-"""A small system of the shape of a foot-IK fit: a scan over frames and two legs, with hysteresis.
+"""A small system with the structure of foot IK: a scan over frames and two legs, with hysteresis.
 
-A foot is locked while it is near the ground and slow; its anchor follows it while free and freezes
-when locked; offsets, pelvis and pitch are smoothed and clamped. Metres, seconds, radians.
+A foot is locked while it is near the ground and slow. Its anchor follows it while it is free and
+freezes when it locks. Offsets, pelvis and pitch are smoothed and clamped. Metres, seconds, radians.
 """
 
 import functools
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,7 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.inference.optimisation import search
-from fitting.problem import free_parameters, loss, space
+from fitting.problem import space
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.loss import Loss
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree, smoothing
 from jaxik.maths.gate import HARD
@@ -91,7 +92,7 @@ class Toy(eqx.Module):
 
 
 class Inputs(eqx.Module):
-    """What the animation and the ground give, per frame and leg."""
+    """Animation and ground, per frame and leg."""
 
     pos: Float[Array, "frames legs"]  # m, along the way
     height: Float[Array, "frames legs"]  # m, above the ground
@@ -102,7 +103,7 @@ class Inputs(eqx.Module):
 
 class Data(eqx.Module):
     inputs: Inputs
-    seen: tuple[Array, Array, Array]  # pos, pelvis, pitch
+    observed: tuple[Array, Array, Array]  # pos, pelvis, pitch
 
 
 THRESHOLDS = ("lock.height_on", "lock.height_off", "lock.speed_on", "lock.speed_off")
@@ -138,7 +139,7 @@ def run(ik: Toy, inputs: Inputs) -> tuple[Array, Array, Array]:
     """Foot positions, pelvis height and foot pitches over the frames."""
     lock, body, foot, dt = ik.lock, ik.body, ik.foot, inputs.dt
 
-    def step(state: Any, frame: Any) -> Any:
+    def step(state: tuple[Array, ...], frame: tuple[Array, ...]):
         before, anchor, offset, locked, pelvis, pitch = state
         pos, height, ground, slope = frame
         speed = jnp.abs(pos - before) / dt
@@ -165,13 +166,15 @@ def run(ik: Toy, inputs: Inputs) -> tuple[Array, Array, Array]:
 
 
 def residuals(ik: Toy, data: Data) -> Array:
-    """Rows in sigmas."""
+    """Residuals in sigmas."""
     sigmas = (SIGMA_POS, SIGMA_POS, SIGMA_PITCH)
-    rows = [
-        ((one - seen) / sigma).ravel()
-        for one, seen, sigma in zip(run(ik, data.inputs), data.seen, sigmas, strict=True)
+    parts = [
+        ((modelled - observed) / sigma).ravel()
+        for modelled, observed, sigma in zip(
+            run(ik, data.inputs), data.observed, sigmas, strict=True
+        )
     ]
-    return jnp.concatenate(rows)
+    return jnp.concatenate(parts)
 
 
 def make_inputs(seed: int = 0, frames: int = 400, fps: float = 60.0) -> Inputs:
@@ -202,15 +205,15 @@ def make_inputs(seed: int = 0, frames: int = 400, fps: float = 60.0) -> Inputs:
 
 
 def make_data(truth: Toy, seed: int = 0, frames: int = 400, outliers: float = 0.0) -> Data:
-    """What the true system shows, with noise of one sigma and a share of gross outliers."""
+    """Motion of the true system, with noise of one sigma and a fraction of gross outliers."""
     inputs = make_inputs(seed, frames)
     random = np.random.default_rng(seed + 1000)
-    seen = []
+    observed = []
     for clean, sigma in zip(run(truth, inputs), (SIGMA_POS, SIGMA_POS, SIGMA_PITCH), strict=True):
         noise = random.normal(0, sigma, clean.shape)
         gross = random.random(clean.shape) < outliers
-        seen.append(clean + noise + gross * 30 * sigma * random.random(clean.shape))
-    return Data(inputs, tuple(seen))  # type: ignore[arg-type]
+        observed.append(clean + noise + gross * 30 * sigma * random.random(clean.shape))
+    return Data(inputs, tuple(observed))  # type: ignore[arg-type]
 
 
 NAMES = (*THRESHOLDS, *SMOOTH, "foot.idle")
@@ -218,7 +221,7 @@ NAMES = (*THRESHOLDS, *SMOOTH, "foot.idle")
 
 @functools.cache
 def solved(seed: int) -> tuple[Problem, search.Solution]:
-    """A problem and its solution, made once for all tests."""
+    """A problem and its solution, computed once for all tests."""
     problem = make_problem(seed)
     return problem, search.find_best_fit(problem)
 
@@ -229,10 +232,10 @@ def make_problem(
     names: tuple[str, ...] = NAMES,
     truth: dict[str, float] = TRUTH,
     outliers: float = 0.0,
-    loss: loss.Loss = "squares",
+    loss: Loss = "squares",
 ) -> Problem:
-    """The defaults as a start, the truth in the data."""
-    made = space.make_space(Toy(), [free_parameters.free_parameter(Toy(), name) for name in names])
-    held = space.make_space(Toy(), [free_parameters.free_parameter(Toy(), name) for name in TRUTH])
-    clean = held.unpack(held.pack(truth))
-    return Problem(made, make_data(clean, seed, frames, outliers), residuals, loss)
+    """A problem that starts at the defaults, with data made from the truth."""
+    free = [free_parameter(Toy(), name) for name in names]
+    known = space.make_space(Toy(), [free_parameter(Toy(), name) for name in TRUTH])
+    data = make_data(known.unpack(known.pack(truth)), seed, frames, outliers)
+    return Problem(space.make_space(Toy(), free), data, residuals, loss)

@@ -1,20 +1,20 @@
-"""A chain on disk that a kill cannot spoil.
+"""A chain on disk that survives a kill of the process.
 
 emcee's HDF5 backend (3.1.6, `HDFBackend.save_step`) opens the file at every step, which costs 5 ms,
-and changes it in place: of 24 kills between two of its writes to the disk 4 left a file from which
-nothing could be read. Here a finished step is one record appended to a journal beside the HDF5
-file, in one write and with a checksum, so that a kill can only tear the last one, which is then
-dropped.
-From time to time `save` writes the whole chain to a new HDF5 file, exchanges it for the old one
-(an exchange that either happens or does not) and empties the journal. Steps that stand in both are
-recognised by their number. The HDF5 file has the layout of emcee's backend, which can read it.
+and changes it in place: 4 of 24 kills between two of its writes left a file that could not be read.
+Here a finished step is one record appended to a journal beside the HDF5 file, in one write and with
+a checksum. A kill can only tear the last record, which is then dropped.
+
+From time to time `save` writes the whole chain to a new HDF5 file, replaces the old one atomically
+and empties the journal. Steps that are in both are recognised by their number. The HDF5 file has
+the layout of emcee's backend, which can read it.
 """
 
 import dataclasses
 import os
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import h5py
 import numpy as np
@@ -23,46 +23,49 @@ from jaxtyping import Bool, Float
 GROUP = "mcmc"  # emcee's name for it
 FORMAT = 1
 
+# numpy's `RandomState.get_state()`: generator, keys, position, whether a normal is left, and which.
+RandomState: TypeAlias = tuple[str, np.ndarray, int, int, float]
+
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """What a chain must share with a run that continues it."""
+    """What a run must have in common with a chain to continue it."""
 
     parameters: tuple[str, ...]
     walkers: int
     seed: int
     thin_by: int  # sampler steps per stored step
-    problem: str  # digest of the data and the space
+    problem: str  # digest of the data and the parameter space
 
     @property
     def token(self) -> bytes:
-        """32 characters that stand for it in the journal."""
+        """32 characters that identify it in the journal."""
         return f"{zlib.crc32(repr(self).encode()):08x}{self.problem:.24}".encode()
 
 
 class LastStep(NamedTuple):
-    """All that the next step depends on."""
+    """The last step of a chain: all that the next one depends on."""
 
     u: Float[np.ndarray, "walkers free"]
     log_probability: Float[np.ndarray, " walkers"]
-    random_state: tuple[Any, ...]  # of numpy's RandomState
+    random_state: RandomState
 
 
 class Chain:
-    """The steps so far, in memory, and on disk if it has a path."""
+    """The steps so far, in memory and, with a path, on disk."""
 
     def __init__(self, identity: Identity, path: Path | None = None):
         """Opens the chain at `path`, or starts one there.
 
         Raises:
-            ValueError: where the file is not a chain, or is one of another run.
+            ValueError: if the file is not a chain, or is that of another run.
         """
         self.identity = identity
         self.path = path
         self.accepted = np.zeros(identity.walkers)  # accepted proposals, of one per stored step
         self._u: list[np.ndarray] = []
         self._log_probability: list[np.ndarray] = []
-        self._random_state: tuple[Any, ...] | None = None
+        self._random_state: RandomState | None = None
         self._journal = None
         self._saved = -1  # steps in the HDF5 file
         if path is None:
@@ -72,9 +75,9 @@ class Chain:
             self._saved = len(self)
             self._read_journal(journal_path(path))
         else:
-            journal_path(path).unlink(missing_ok=True)  # of a chain that someone deleted
+            journal_path(path).unlink(missing_ok=True)  # of a chain that was deleted
         self.save()
-        # Unbuffered: a record is one write, and waits in no buffer of this process.
+        # Unbuffered, so that each record is one write.
         self._journal = open(journal_path(path), "wb", buffering=0)
 
     def __len__(self) -> int:
@@ -82,19 +85,19 @@ class Chain:
 
     @property
     def u(self) -> Float[np.ndarray, "steps walkers free"]:
-        """Where the walkers were, without bounds."""
+        """Positions of the walkers in `u`."""
         shape = (0, self.identity.walkers, len(self.identity.parameters))
         return np.stack(self._u) if self._u else np.empty(shape)
 
     @property
     def log_probability(self) -> Float[np.ndarray, "steps walkers"]:
-        """Of the posterior, up to a constant."""
+        """Log-density of the posterior there, up to a constant."""
         empty = np.empty((0, self.identity.walkers))
         return np.stack(self._log_probability) if self._u else empty
 
     @property
     def last(self) -> LastStep | None:
-        """Where to go on; None before the first step."""
+        """The step to continue from; None before the first."""
         if self._random_state is None:
             return None
         return LastStep(self._u[-1].copy(), self._log_probability[-1].copy(), self._random_state)
@@ -104,9 +107,9 @@ class Chain:
         u: Float[np.ndarray, "walkers free"],
         log_probability: Float[np.ndarray, " walkers"],
         accepted: Bool[np.ndarray, " walkers"],
-        random_state: tuple[Any, ...],
+        random_state: RandomState,
     ) -> None:
-        """Keeps one step; when it returns, no kill of this process loses it."""
+        """Stores one step; once it returns, a kill of this process cannot lose it."""
         if self._journal is not None:
             record = np.zeros((), _record(self.identity))
             record["token"] = self.identity.token
@@ -114,23 +117,22 @@ class Chain:
             record["u"] = u
             record["log_probability"] = log_probability
             record["accepted"] = accepted
-            _, record["keys"], record["position"], record["has_gauss"], record["gauss"] = (
-                random_state
-            )
+            for name, part in zip(RANDOM_STATE_FIELDS, random_state[1:], strict=True):
+                record[name] = part
             record["checksum"] = _checksum(record)
             self._journal.write(record.tobytes())
-        self._take(u, log_probability, accepted, random_state)
+        self._remember(u, log_probability, accepted, random_state)
 
     def save(self) -> None:
-        """Writes the HDF5 file anew and empties the journal; nothing without a path."""
+        """Writes the HDF5 file anew and empties the journal; does nothing without a path."""
         if self.path is None or self._saved == len(self):
             return
-        fresh = self.path.with_name(f"{self.path.name}.new")
-        with h5py.File(fresh, "w") as file:
+        temporary = self.path.with_name(f"{self.path.name}.new")
+        with h5py.File(temporary, "w") as file:
             self._write(file.create_group(GROUP))
-        with open(fresh, "rb") as raw:
-            os.fsync(raw.fileno())  # on the disk before its name is: the power may fail too
-        os.replace(fresh, self.path)
+        with open(temporary, "rb") as raw:
+            os.fsync(raw.fileno())  # the content before the name, in case the power fails
+        os.replace(temporary, self.path)
         self._saved = len(self)
         if self._journal is not None:
             self._journal.seek(0)
@@ -140,20 +142,24 @@ class Chain:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Saves and leaves only the HDF5 file."""
+        """Saves the chain and removes the journal."""
         self.save()
         if self.path is not None and self._journal is not None:
             self._journal.close()
             self._journal = None
             journal_path(self.path).unlink(missing_ok=True)
 
-    def _take(
-        self, u: np.ndarray, log_probability: np.ndarray, accepted: np.ndarray, state: tuple
+    def _remember(
+        self,
+        u: np.ndarray,
+        log_probability: np.ndarray,
+        accepted: np.ndarray,
+        random_state: RandomState,
     ) -> None:
         self._u.append(np.array(u, float))  # copies: emcee moves its walkers in place
         self._log_probability.append(np.array(log_probability, float))
         self.accepted = self.accepted + accepted
-        self._random_state = tuple(state)
+        self._random_state = random_state
 
     def _write(self, group: h5py.Group) -> None:
         """The layout of emcee 3.1.6, and the identity."""
@@ -183,7 +189,7 @@ class Chain:
                 )
             if attributes["format"] != FORMAT:
                 raise ValueError(f"its format is {attributes['format']}, wanted {FORMAT}")
-            found = Identity(
+            identity = Identity(
                 parameters=tuple(attributes["parameters"].tolist()),
                 walkers=int(attributes["walkers"]),
                 seed=int(attributes["seed"]),
@@ -192,37 +198,47 @@ class Chain:
             )
         except (OSError, KeyError, ValueError) as error:
             raise ValueError(f"{path} is not a chain of this sampler: {error}") from error
-        _compare(path, found, self.identity)
+        _check_same_run(path, identity, self.identity)
         self.accepted = accepted
         self._u = list(chain)
         self._log_probability = list(log_probability)
         if len(self):
-            self._random_state = tuple(attributes[f"random_state_{i}"] for i in range(5))
+            self._random_state = _random_state(
+                *(attributes[f"random_state_{i}"] for i in range(1, 5))
+            )
 
     def _read_journal(self, path: Path) -> None:
-        """Takes the records that continue the chain, up to the first that is torn."""
+        """Adds the records that continue the chain, up to the first that is torn."""
         if not path.exists():
             return
         for record in np.fromfile(path, _record(self.identity)):
             if record["token"] != self.identity.token or record["checksum"] != _checksum(record):
                 break
             if record["step"] < len(self):
-                continue  # saved already; the kill came before the journal was emptied
+                continue  # saved already: killed before the journal was emptied
             if record["step"] > len(self):
                 break
-            names = ("keys", "position", "has_gauss", "gauss")
-            keys, position, has_gauss, gauss = (record[name] for name in names)
-            state = ("MT19937", keys.copy(), int(position), int(has_gauss), float(gauss))
-            self._take(record["u"], record["log_probability"], record["accepted"], state)
+            state = _random_state(*(record[name] for name in RANDOM_STATE_FIELDS))
+            self._remember(record["u"], record["log_probability"], record["accepted"], state)
 
 
 def journal_path(path: Path) -> Path:
-    """Where the steps since the last `save` stand."""
+    """The file of the steps since the last `save`."""
     return path.with_name(f"{path.name}.journal")
 
 
+RANDOM_STATE_FIELDS = ("keys", "position", "has_gauss", "gauss")
+
+
+def _random_state(
+    keys: np.ndarray, position: np.integer, has_gauss: np.integer, gauss: np.floating
+) -> RandomState:
+    """The generator's state from what a file holds of it."""
+    return "MT19937", keys.copy(), int(position), int(has_gauss), float(gauss)
+
+
 def _record(identity: Identity) -> np.dtype:
-    """One step in the journal."""
+    """The layout of one step in the journal."""
     walkers = identity.walkers
     return np.dtype(
         [
@@ -240,15 +256,15 @@ def _record(identity: Identity) -> np.dtype:
     )
 
 
-def _checksum(record: Any) -> int:
+def _checksum(record: np.ndarray | np.void) -> int:
     """Of everything before the record's last field."""
     return zlib.crc32(record.tobytes()[:-4])
 
 
-def _compare(path: Path, found: Identity, wanted: Identity) -> None:
+def _check_same_run(path: Path, stored: Identity, current: Identity) -> None:
     """Raises ValueError for the first thing in which the two differ."""
     for field in dataclasses.fields(Identity):
-        there, here = getattr(found, field.name), getattr(wanted, field.name)
+        there, here = getattr(stored, field.name), getattr(current, field.name)
         if there != here:
             raise ValueError(
                 f"{path} holds the chain of another run: its {field.name} is {there},"

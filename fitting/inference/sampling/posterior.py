@@ -40,8 +40,8 @@ class WalkerStart:
     that far away get stuck.
     """
 
-    u: Float[Array | np.ndarray, " free"]
-    sd: Float[Array | np.ndarray, " free"]  # of u
+    u: Float[Array | np.ndarray, " _"]  # as many as there are free parameters
+    sd: Float[Array | np.ndarray, " _"]  # of u
 
 
 @dataclasses.dataclass(frozen=True)

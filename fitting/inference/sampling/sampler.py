@@ -6,7 +6,7 @@ acceptance is wrong, and in 20 dimensions it shrinks a unit variance to 0.81.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import emcee
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from fitting.problem.problem import Problem
 from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
-from .chain import Chain, Identity, LastStep
+from .chain import Chain, Identity, LastStep, RandomState
 
 DRAWS = 100  # attempts to start every walker where its log-probability is finite
 
@@ -98,7 +98,7 @@ def _start(
         u[missing] = drawn[missing]
         log_probability[missing] = evaluate(drawn)[missing]
         if np.isfinite(log_probability).all():
-            return LastStep(u, log_probability, tuple(random.get_state()))
+            return LastStep(u, log_probability, cast(RandomState, random.get_state()))
     finite = int(np.isfinite(log_probability).sum())
     raise ValueError(
         f"only {finite} of {identity.walkers} walkers have a finite log-probability after {DRAWS}"
