@@ -1,1 +1,9 @@
-"""The best fit, its posterior, and what the data determine."""
+"""The best fit of a problem, its posterior, and what the data determine of it.
+
+Everything here takes a `Problem` (`fitting.problem`) and returns numbers. Files, experiments and
+reports are elsewhere: `fitting.experiments`, `fitting.studies`, `fitting.report`.
+
+Start with `optimisation/search.py`, the way to the best fit, and `sampling/posterior.py`.
+`identifiability.py` judges a solution, `threshold_profile.py` its thresholds, and `sensitivity.py`
+finds the parameters that matter before anything is fitted.
+"""

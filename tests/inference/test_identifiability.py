@@ -1,4 +1,4 @@
-"""What a fit says of itself: determined, undetermined, at a bound, correlated, not at a minimum."""
+"""How well the data determine parameters: intervals, bounds, correlations, missed minima."""
 
 import dataclasses
 
@@ -14,12 +14,12 @@ from fitting.problem.problem import Problem
 from support import toy
 
 SEED = 5  # a toy clip that determines every threshold
-BLUNT = 2  # one in which the foot is always lifted before it is fast
+UNINFORMATIVE = 2  # one in which the foot is always lifted before it is fast
 TRUTH = np.asarray([toy.TRUTH.get(name, np.nan) for name in toy.NAMES])
 
 
 def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, search.Solution]:
-    """A solution found in a few steps, as it starts where it should end."""
+    """A problem and its solution, found in a few steps since it starts at the truth."""
     problem = toy.make_problem(seed, truth=truth)
     start = np.clip(np.asarray(problem.space.pack(truth)), -5, 5)
     return problem, search.find_best_fit(problem, SearchSettings(max_steps=24), starts=start[None])
@@ -30,7 +30,7 @@ def report() -> identifiability.Identifiability:
     return identifiability.assess_identifiability(*toy.solved(SEED))
 
 
-def test_a_parameter_that_does_nothing_is_named_undetermined(report):
+def test_a_parameter_without_effect_is_undetermined(report):
     assert report.undetermined == ("foot.idle",)
     idle = report.names.index("foot.idle")
     assert report.contraction[idle] == pytest.approx(0, abs=1e-9)
@@ -39,14 +39,14 @@ def test_a_parameter_that_does_nothing_is_named_undetermined(report):
     assert report.weakest == ("foot.idle",)
 
 
-def test_intervals_hold_the_truth_of_nearly_all_parameters(report):
+def test_intervals_contain_the_truth_of_nearly_all_parameters(report):
     known = np.isfinite(TRUTH)
     covered = (report.interval[:, 0] <= TRUTH) & (TRUTH <= report.interval[:, 1])
     assert covered[known].sum() >= known.sum() - 1
     assert (report.interval[:, 0] <= report.interval[:, 1]).all()
 
 
-def test_a_threshold_has_an_interval_of_its_profile_and_no_standard_deviation(report):
+def test_a_threshold_has_the_interval_of_its_profile_and_no_standard_deviation(report):
     problem, solution = toy.solved(SEED)
     thresholds = np.asarray(problem.space.thresholds)
     np.testing.assert_array_equal(np.isnan(report.sd), thresholds)
@@ -65,14 +65,14 @@ def test_a_threshold_has_an_interval_of_its_profile_and_no_standard_deviation(re
 def test_the_laplace_sd_of_a_linear_parameter_is_the_least_squares_one(report):
     problem, solution = toy.solved(SEED)
     smooth = np.asarray(problem.space.smooth)
-    slopes = solution.jacobian[:, smooth]
-    expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    jacobian = solution.jacobian[:, smooth]
+    expected = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     np.testing.assert_allclose(report.sd[smooth], expected, rtol=1e-6)
 
 
 def test_a_threshold_that_the_clip_never_reaches_has_a_wide_interval():
     i = toy.NAMES.index("lock.speed_off")
-    profile = threshold_profile.profile(*from_the_truth(BLUNT, toy.TRUTH), "lock.speed_off")
+    profile = threshold_profile.profile(*from_the_truth(UNINFORMATIVE, toy.TRUTH), "lock.speed_off")
     low, high = profile.interval
     assert high - low > 0.5 * 2.3
     assert low <= TRUTH[i] <= high
@@ -82,7 +82,7 @@ def test_a_fit_at_its_minimum_is_not_improved_by_its_profiles(report):
     assert report.improvement < 0.5
 
 
-def test_a_fit_off_its_minimum_is_told_by_how_much():
+def test_a_fit_off_its_minimum_knows_by_how_much():
     problem, solution = toy.solved(SEED)
     values = dict(zip(toy.NAMES, solution.values, strict=True)) | {"lock.height_on": 0.06}
     u = np.asarray(problem.space.pack(values))
@@ -103,22 +103,22 @@ def test_a_value_at_its_bound_is_flagged():
     assert named == {"body.rise": "low", "foot.limit[1]": "low"}
 
 
-def test_parameters_that_do_the_same_are_named_as_a_pair(report):
+def test_parameters_with_the_same_effect_are_named_as_a_pair(report):
     assert report.correlated == ()
     problem, solution = toy.solved(SEED)
-    one, other = (toy.NAMES.index(name) for name in ("foot.idle", "body.drop"))
-    slopes = solution.jacobian.copy()
+    idle, drop = (toy.NAMES.index(name) for name in ("foot.idle", "body.drop"))
+    jacobian = solution.jacobian.copy()
     data = slice(0, -problem.space.size)
-    slopes[data, one] = slopes[data, other]
+    jacobian[data, idle] = jacobian[data, drop]
     twin = identifiability.assess_identifiability(
-        problem, dataclasses.replace(solution, jacobian=slopes)
+        problem, dataclasses.replace(solution, jacobian=jacobian)
     )
     ((first, second, correlation),) = twin.correlated
     assert {first, second} == {"foot.idle", "body.drop"}
     assert correlation == pytest.approx(-1, abs=1e-3)
 
 
-def test_slopes_that_are_not_finite_are_refused():
+def test_a_jacobian_that_is_not_finite_is_refused():
     problem, solution = toy.solved(SEED)
     broken = dataclasses.replace(solution, jacobian=solution.jacobian * np.nan)
     with pytest.raises(ValueError, match="the Jacobian at the solution is not finite"):

@@ -37,12 +37,12 @@ def _descend(
     if lm is None or not np.array_equal(u, lm.u):
         lm = levenberg_marquardt.evaluate(model, u)
     state = dataclasses.replace(state, point=_point(lm))
-    pace = Pace()
+    streaks = Streaks()
     for _ in range(max_steps):
         state = search.spend_step(state)
         before, lm = lm, levenberg_marquardt.step(model, lm)
-        pace = pace.after(before, lm, search.settings)
-        finished = pace.finished(search.settings, max_rejected)
+        streaks = streaks.after(before, lm, search.settings)
+        finished = streaks.finished(search.settings, max_rejected)
         converged = stage == "polish" and finished
         state = search.move(state, stage, _point(lm), converged=converged)
         if finished:
@@ -59,13 +59,13 @@ def descend_ensemble(
     """
     model = EnsembleModel(search.problem, shifts)
     lm = levenberg_marquardt.evaluate(model, search.array(state.point.u))
-    pace = Pace()
+    streaks = Streaks()
     for _ in range(search.settings.descent_steps):
         state = search.spend_step(state)
         before, lm = lm, levenberg_marquardt.step(model, lm)
-        pace = pace.after(before, lm, search.settings)
+        streaks = streaks.after(before, lm, search.settings)
         state = search.report(state, "ensemble", float(lm.cost))
-        if pace.finished(search.settings, search.settings.max_rejected_steps):
+        if streaks.finished(search.settings, search.settings.max_rejected_steps):
             break
     return dataclasses.replace(state, point=Point(np.asarray(lm.u)))
 
@@ -79,19 +79,19 @@ def _point(lm: LMState) -> Point:
 
 
 @dataclasses.dataclass(frozen=True)
-class Pace:
-    """How well a descent is doing."""
+class Streaks:
+    """Steps in a row without progress."""
 
-    small: int = 0  # accepted steps in a row that gained next to nothing
-    rejected: int = 0  # rejected steps in a row
+    small: int = 0  # accepted, but with next to no gain
+    rejected: int = 0
 
-    def after(self, before: LMState, after: LMState, settings: SearchSettings) -> "Pace":
-        """The pace after one more step."""
+    def after(self, before: LMState, after: LMState, settings: SearchSettings) -> "Streaks":
+        """The streaks after one more step."""
         if not after.accepted:
-            return Pace(self.small, self.rejected + 1)
+            return Streaks(self.small, self.rejected + 1)
         cost = np.asarray(before.cost)
         small = cost - np.asarray(after.cost) <= settings.min_step_gain * cost
-        return Pace(self.small + 1 if small else 0)
+        return Streaks(self.small + 1 if small else 0)
 
     def finished(self, settings: SearchSettings, max_rejected: int) -> bool:
         """Whether further steps are not worth it."""

@@ -1,1 +1,7 @@
-"""The posterior by ensemble sampling."""
+"""The posterior by emcee's ensemble sampler, with chains that survive a kill.
+
+It samples the hard program, which is not differentiable: no gradients are used.
+
+Start with `posterior.py`. `sampler.py` runs emcee, `chain.py` keeps the steps on disk,
+`diagnostics.py` decides when a chain is long enough.
+"""
