@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from fitting.inference.sampling.diagnostics import ParameterSummary
 from fitting.inference.sampling.posterior import Posterior
 
 from .fit_tables import Truth
@@ -40,6 +41,6 @@ def covered(posterior: Posterior, truth: Mapping[str, float], names: Sequence[st
     return f"{inside} of {len(known)}"
 
 
-def covers(row: Mapping[str, float], true: float) -> bool:
+def covers(row: ParameterSummary, true: float) -> bool:
     """Whether the 95 % interval of a posterior's row contains this value."""
     return row["low95"] <= true <= row["high95"]

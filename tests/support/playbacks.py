@@ -59,19 +59,13 @@ def playback(
     }
     per_foot = np.ones((FRAMES, 2))
     ground = np.zeros((FRAMES, 2, 3)) + [0.0, LEVEL, 0.0]
-    return Playback(
-        **{
-            "before": standing(0.0), "after": after, "captured": captured,
-            "up_ws": np.array([0.0, 1.0, 0.0]),
-            "forward_ws": np.zeros((FRAMES, 3)) + [0.0, 0.0, 1.0],
-            "ground_ws": ground, "grounded": per_foot,
-            "ball_ground_ws": ground, "ball_grounded": per_foot,
-            "floor": np.zeros(FRAMES), "dt": np.full(FRAMES, 1 / FPS),
-            "contact": per_foot, "locked": 0 * per_foot, "reached": per_foot, "stance": per_foot,
-            "slide": np.zeros(FRAMES), "seen": seen,
-            "errors": all_errors, "residuals": residuals,
-            "sigmas": {kind: np.asarray(sigma) for kind, sigma in all_sigmas.items()},
-            "label": "captured",
-        }
-        | fields
+    play = Playback(
+        before=standing(0.0), after=after, captured=captured,
+        up_ws=np.array([0.0, 1.0, 0.0]), forward_ws=np.zeros((FRAMES, 3)) + [0.0, 0.0, 1.0],
+        ground_ws=ground, grounded=per_foot, ball_ground_ws=ground, ball_grounded=per_foot,
+        floor=np.zeros(FRAMES), dt=np.full(FRAMES, 1 / FPS),
+        contact=per_foot, locked=0 * per_foot, reached=per_foot, stance=per_foot,
+        slide=np.zeros(FRAMES), seen=seen, errors=all_errors, residuals=residuals,
+        sigmas={kind: np.asarray(sigma) for kind, sigma in all_sigmas.items()}, label="captured",
     )  # fmt: skip
+    return dataclasses.replace(play, **fields)

@@ -37,49 +37,51 @@ SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
 
 
 @styled
-def motion(play: Playback, legs: Sequence[str], title: str) -> Figure:
+def motion(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """Heights of ankles and pelvis over time above the ground; whole clip and a part of it."""
-    figure, columns = _whole_and_part(play, len(legs) + 1, title)
-    ground = 100 * play.ground_height()
+    figure, columns = _whole_and_part(playback, len(legs) + 1, title)
+    ground = 100 * playback.ground_height()
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=False)):
             _plot_motions(
-                axes, play, lambda motion, leg=leg: 100 * play.height(motion.ankle[:, leg])
+                axes, playback, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg])
             )
-            earth(axes, play.time, ground[:, leg])
-            axes.set_title(f"{name.capitalize()} ankle, with the ground under it ({play.label})")
-        _plot_motions(shown[-1], play, lambda motion: 100 * play.height(motion.pelvis))
-        earth(shown[-1], play.time, ground.mean(axis=1))
+            earth(axes, playback.time, ground[:, leg])
+            axes.set_title(
+                f"{name.capitalize()} ankle, with the ground under it ({playback.label})"
+            )
+        _plot_motions(shown[-1], playback, lambda motion: 100 * playback.height(motion.pelvis))
+        earth(shown[-1], playback.time, ground.mean(axis=1))
         shown[-1].set_title("Pelvis, with the mean ground under the feet")
     for axes in columns[0]:
         axes.set_ylabel("height, cm")
-    legend(figure, *_lines(play), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
+    legend(figure, *_lines(playback), Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"))
     return figure
 
 
 @styled
-def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
+def side_view(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """Legs seen from the side, in the part of the clip that climbs most."""
-    start, end = steepest_part(play.time, play.height(play.captured.pelvis))
+    start, end = steepest_part(playback.time, playback.height(playback.captured.pelvis))
     inside = slice(start, end + 1)
-    travelled = play.travelled[inside]
+    travelled = playback.travelled[inside]
     spacing = max(LEG_SPACING, (np.max(travelled) - np.min(travelled)) / 20)
     chosen = start + np.unique(np.floor((travelled - travelled[0]) / spacing), return_index=True)[1]
     tall = np.clip(16.0 * 1.35 / (np.ptp(travelled) + 1.6), 2.2, 6.5)
     figure = Figure(figsize=(17, (tall + 0.7) * len(legs) + 1.4), layout="constrained")
-    figure.suptitle(f"{title}, seen from the right, {_seconds(play, start, end)}")
+    figure.suptitle(f"{title}, seen from the right, {_seconds(playback, start, end)}")
     rows = figure.subplots(len(legs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for leg, (axes, name) in enumerate(zip(rows, legs, strict=True)):
-        for colour, motion in _motions(play):
+        for colour, motion in _motions(playback):
             joints = np.stack([motion.hip, motion.knee, motion.ankle, motion.toe], axis=-2)[:, leg]
-            across, height = play.along(joints)[chosen], play.height(joints)[chosen]
+            across, height = playback.along(joints)[chosen], playback.height(joints)[chosen]
             axes.plot(across.T, height.T, color=colour, linewidth=2.0, solid_capstyle="round")
             axes.plot(across[:, 1:3].T, height[:, 1:3].T, "o", color=colour, markersize=4)
-            pelvis = play.along(motion.pelvis)[inside], play.height(motion.pelvis)[inside]
+            pelvis = playback.along(motion.pelvis)[inside], playback.height(motion.pelvis)[inside]
             axes.plot(*pelvis, color=colour, linewidth=2.6)
-        along = play.along(play.ground_ws)[inside, leg]
+        along = playback.along(playback.ground_ws)[inside, leg]
         order = np.argsort(along, kind="stable")
-        earth(axes, along[order], play.ground_height()[inside, leg][order])
+        earth(axes, along[order], playback.ground_height()[inside, leg][order])
         axes.set_aspect("equal")
         axes.set_title(
             f"{name.capitalize()} leg every {100 * spacing:.0f} cm, and the path of the pelvis"
@@ -87,18 +89,20 @@ def side_view(play: Playback, legs: Sequence[str], title: str) -> Figure:
         axes.set_ylabel("height, m")
     rows[-1].set_xlabel("distance travelled, m")
     ground = Patch(facecolor=EARTH, edgecolor=GROUND, label="ground under this foot's track")
-    legend(figure, *_lines(play), ground)
+    legend(figure, *_lines(playback), ground)
     return figure
 
 
 @styled
-def knees(play: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
+def knees(playback: Playback, legs: Sequence[str], limits: Sequence[float], title: str) -> Figure:
     """Knee angles over time with the fitted limits; whole clip and a part of it."""
-    figure, columns = _whole_and_part(play, len(legs), title)
-    lines = _lines(play)
+    figure, columns = _whole_and_part(playback, len(legs), title)
+    lines = _lines(playback)
     for shown in columns:
         for leg, (axes, name) in enumerate(zip(shown, legs, strict=True)):
-            _plot_motions(axes, play, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg]))
+            _plot_motions(
+                axes, playback, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg])
+            )
             axes.set_title(f"{name.capitalize()} knee (180° is straight)")
             low, high = axes.get_ylim()
             for limit in limits:
@@ -121,9 +125,9 @@ def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
     grid = figure.subplots(len(kinds), 2, squeeze=False, width_ratios=[2.4, 1])
     for (axes, side), kind in zip(grid, kinds, strict=True):
         name, unit, factor = RESIDUALS[kind]
-        for play, colour in ((first, BEFORE), (fitted, AFTER)):
-            size = factor * _size(play, kind)
-            axes.plot(_times(play, size), size, color=colour, linewidth=1.2)
+        for playback, colour in ((first, BEFORE), (fitted, AFTER)):
+            size = factor * _size(playback, kind)
+            axes.plot(_times(playback, size), size, color=colour, linewidth=1.2)
         axes.axhline(factor * float(fitted.sigmas[kind]), **SIGMA)
         of_legs = "" if kind in ("pelvis", "body") else " (the larger of the legs)"
         axes.set_title(f"{name}: size of the error{of_legs}")
@@ -144,38 +148,38 @@ def residuals(first: Playback, fitted: Playback, title: str) -> Figure:
 
 
 @styled
-def locks(play: Playback, legs: Sequence[str], title: str) -> Figure:
+def locks(playback: Playback, legs: Sequence[str], title: str) -> Figure:
     """When each foot stands and locks, as lanes; the whole clip and a part of it."""
-    labelled, locking = bool(np.any(play.stance)), bool(np.any(play.locked))
+    labelled, locking = bool(np.any(playback.stance)), bool(np.any(playback.locked))
     lanes: list[tuple[str, str, np.ndarray]] = []
     for leg, name in enumerate(legs):
-        lanes.append((f"{name} contact weight", STANDING, np.asarray(play.contact)[:, leg]))
+        lanes.append((f"{name} contact weight", STANDING, np.asarray(playback.contact)[:, leg]))
         if locking:
-            lanes.append((f"{name} foot locked", LOCKED, np.asarray(play.locked)[:, leg]))
+            lanes.append((f"{name} foot locked", LOCKED, np.asarray(playback.locked)[:, leg]))
         if labelled:
             lanes.append(
-                (f"{name} stance, {play.label}", CAPTURED, np.asarray(play.stance)[:, leg])
+                (f"{name} stance, {playback.label}", CAPTURED, np.asarray(playback.stance)[:, leg])
             )
-    if np.any(play.slide):
-        lanes.append(("sliding", SLIDING, np.asarray(play.slide)))
-    parts = sections(play.time, play.height(play.captured.pelvis))
+    if np.any(playback.slide):
+        lanes.append(("sliding", SLIDING, np.asarray(playback.slide)))
+    parts = sections(playback.time, playback.height(playback.captured.pelvis))
     tall = (0.55 * len(lanes) + 1.3) * len(parts) + 1.3
     figure = Figure(figsize=(17, tall), layout="constrained")
     figure.suptitle(title if locking else f"{title} (no foot ever locks)")
     rows = figure.subplots(len(parts), 1, squeeze=False)[:, 0]
     for axes, (start, end) in zip(rows, parts, strict=True):
-        _draw_lanes(axes, play.time, lanes)
-        axes.set_xlim(play.time[start], play.time[end])
+        _draw_lanes(axes, playback.time, lanes)
+        axes.set_xlim(playback.time[start], playback.time[end])
         whole = (start, end) == parts[0]
-        axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(play, start, end)}")
+        axes.set_title("Whole clip" if whole else f"Enlarged: {_seconds(playback, start, end)}")
         axes.set_xlabel("time, s")
     released = Line2D([], [], color="black", marker="v", linestyle="", label="released")
     shown = [
         (True, Patch(color=STANDING, label="contact weight, 0 to 1")),
         (locking, Patch(color=LOCKED, label="foot locked")),
         (locking, released),
-        (labelled, Patch(color=CAPTURED, label=f"stance, {play.label}")),
-        (bool(np.any(play.slide)), Patch(color=SLIDING, label="sliding")),
+        (labelled, Patch(color=CAPTURED, label=f"stance, {playback.label}")),
+        (bool(np.any(playback.slide)), Patch(color=SLIDING, label="sliding")),
     ]
     legend(figure, *(entry for visible, entry in shown if visible))
     return figure
@@ -210,48 +214,50 @@ def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
     return figure
 
 
-def _lines(play: Playback) -> list[Line2D]:
+def _lines(playback: Playback) -> list[Line2D]:
     """Legend entries of the three motions."""
     shown = (
         (BEFORE, "flat animation, before foot IK"),
         (AFTER, "after fitted foot IK"),
-        (CAPTURED, play.label),
+        (CAPTURED, playback.label),
     )
     return [Line2D([], [], color=colour, linewidth=3, label=label) for colour, label in shown]
 
 
-def _whole_and_part(play: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
+def _whole_and_part(playback: Playback, rows: int, title: str) -> tuple[Figure, list[list[Axes]]]:
     figure = Figure(figsize=(17, 3.4 * rows + 1.6), layout="constrained")
     figure.suptitle(title)
-    return figure, whole_and_part(figure, play.time, play.height(play.captured.pelvis), rows)
+    return figure, whole_and_part(
+        figure, playback.time, playback.height(playback.captured.pelvis), rows
+    )
 
 
-def _motions(play: Playback) -> list[tuple[str, Motion]]:
+def _motions(playback: Playback) -> list[tuple[str, Motion]]:
     """The three motions with their colours, in drawing order."""
-    return [(BEFORE, play.before), (CAPTURED, play.captured), (AFTER, play.after)]
+    return [(BEFORE, playback.before), (CAPTURED, playback.captured), (AFTER, playback.after)]
 
 
-def _plot_motions(axes: Axes, play: Playback, series: Callable[[Motion], np.ndarray]) -> None:
+def _plot_motions(axes: Axes, playback: Playback, series: Callable[[Motion], np.ndarray]) -> None:
     """Plots one series of the animation, the captured and the solved motion over time."""
-    for colour, motion in _motions(play):
+    for colour, motion in _motions(playback):
         axes.plot(
-            play.time, series(motion), color=colour, linewidth=1.2 if colour == BEFORE else 1.7
+            playback.time, series(motion), color=colour, linewidth=1.2 if colour == BEFORE else 1.7
         )
 
 
-def _size(play: Playback, kind: str) -> np.ndarray:
+def _size(playback: Playback, kind: str) -> np.ndarray:
     """Length of the error of a kind in every frame, the larger of the legs; NaN if not seen."""
-    error = np.abs(np.asarray(play.errors[kind]))
+    error = np.abs(np.asarray(playback.errors[kind]))
     if kind != "contact":
         error = np.linalg.norm(error, axis=-1)
     if error.ndim > 1:
         error = error.max(axis=1)
-    seen = play.seen if len(error) == len(play.seen) else play.seen[1:-1]
+    seen = playback.seen if len(error) == len(playback.seen) else playback.seen[1:-1]
     return np.where(seen, error, np.nan)
 
 
-def _times(play: Playback, series: np.ndarray) -> np.ndarray:
-    return play.time if len(series) == len(play.time) else play.time[1:-1]
+def _times(playback: Playback, series: np.ndarray) -> np.ndarray:
+    return playback.time if len(series) == len(playback.time) else playback.time[1:-1]
 
 
 def _distribution(axes: Axes, first: np.ndarray, fitted: np.ndarray) -> None:
@@ -285,5 +291,5 @@ def _draw_lanes(axes: Axes, time: np.ndarray, lanes: Sequence[tuple[str, str, np
     axes.grid(False, axis="y")
 
 
-def _seconds(play: Playback, start: int, end: int) -> str:
-    return f"{play.time[start]:.1f} s to {play.time[end]:.1f} s"
+def _seconds(playback: Playback, start: int, end: int) -> str:
+    return f"{playback.time[start]:.1f} s to {playback.time[end]:.1f} s"

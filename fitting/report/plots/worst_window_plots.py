@@ -18,49 +18,51 @@ UNSEEN = "#dddddd"
 
 
 @styled
-def worst_window(play: Playback, legs: Sequence[str], window: WorstWindow, title: str) -> Figure:
+def worst_window(
+    playback: Playback, legs: Sequence[str], window: WorstWindow, title: str
+) -> Figure:
     """Heights of feet and pelvis, and knee angles, captured and fitted, in the worst window."""
     inside = slice(window.start, window.end + 1)
-    time = play.time[inside]
+    time = playback.time[inside]
     rows = 2 * len(legs) + 1
     figure = Figure(figsize=(17, 3.1 * rows + 1.6), layout="constrained")
     figure.suptitle(title)
     panels = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
-    ground = 100 * play.ground_height()[inside]
+    ground = 100 * playback.ground_height()[inside]
 
     def draw(axes: Axes, series: Callable[[Motion], np.ndarray]) -> None:
-        for colour, motion in ((CAPTURED, play.captured), (AFTER, play.after)):
+        for colour, motion in ((CAPTURED, playback.captured), (AFTER, playback.after)):
             axes.plot(time, series(motion)[inside], color=colour, linewidth=2.2)
 
     for leg, name in enumerate(legs):
         foot, knee = panels[leg], panels[len(legs) + 1 + leg]
-        draw(foot, lambda motion, leg=leg: 100 * play.height(motion.ankle[:, leg]))
+        draw(foot, lambda motion, leg=leg: 100 * playback.height(motion.ankle[:, leg]))
         earth(foot, time, ground[:, leg])
-        foot.set_title(f"{name.capitalize()} ankle, with the ground under it ({play.label})")
+        foot.set_title(f"{name.capitalize()} ankle, with the ground under it ({playback.label})")
         draw(knee, lambda motion, leg=leg: np.degrees(motion.knee_angle[:, leg]))
         knee.set_title(f"{name.capitalize()} knee (180° is straight)")
         knee.set_ylabel("knee angle, degrees")
         for axes in (foot, knee):
-            stance = np.asarray(play.stance)[inside, leg] > 0.5
+            stance = np.asarray(playback.stance)[inside, leg] > 0.5
             _shade(axes, time, stance, color=STANDING, alpha=STANCE_ALPHA)
     pelvis = panels[len(legs)]
-    draw(pelvis, lambda motion: 100 * play.height(motion.pelvis))
+    draw(pelvis, lambda motion: 100 * playback.height(motion.pelvis))
     pelvis.set_title("Pelvis")
     for axes in panels[: len(legs) + 1]:
         axes.set_ylabel("height, cm")
     for axes in panels:
-        _shade(axes, time, ~np.asarray(play.seen)[inside], color=UNSEEN)
-        axes.axvline(play.time[window.frame], color="black", linestyle=":", linewidth=1.6)
+        _shade(axes, time, ~np.asarray(playback.seen)[inside], color=UNSEEN)
+        axes.axvline(playback.time[window.frame], color="black", linestyle=":", linewidth=1.6)
     panels[-1].set_xlabel("time, s")
     panels[-1].set_xlim(time[0], time[-1])
     entries = [
-        Line2D([], [], color=CAPTURED, linewidth=3, label=play.label),
+        Line2D([], [], color=CAPTURED, linewidth=3, label=playback.label),
         Line2D([], [], color=AFTER, linewidth=3, label="after fitted foot IK"),
         Patch(facecolor=EARTH, edgecolor=GROUND, label="ground"),
         Patch(color=STANDING, alpha=STANCE_ALPHA, label="captured stance"),
         Line2D([], [], color="black", linestyle=":", label="largest error"),
     ]
-    if not np.all(np.asarray(play.seen)[inside]):
+    if not np.all(np.asarray(playback.seen)[inside]):
         entries.append(Patch(color=UNSEEN, label="left out of the fit"))
     legend(figure, *entries, columns=6)
     return figure
