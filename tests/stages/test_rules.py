@@ -18,9 +18,9 @@ from fitting.experiments import (
 )
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Solution
-from fitting.report import fit_report
 from fitting.studies import run_folder, translation
-from fitting.studies.study import Fit
+from fitting.studies.animations import Animation, AnimationFiles
+from fitting.studies.fit import Fit
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, leg, pelvis
@@ -176,10 +176,11 @@ def test_rules_are_kept_through_a_run(tmp_path):
         {}, 0.0,
     )  # fmt: skip
     run = tmp_path / "run"
+    run_folder.save_solution(run, read, problem, solution)
     run_folder.save_fit(run, Fit(read, problem, solution, found))
-    again, told = run_folder.load_fit(run)
-    assert again.rules == read.rules
-    assert json.loads((run / run_folder.FIT).read_text())["parameters"] == told["parameters"]
+    reloaded, summary = run_folder.load_fit(run)
+    assert reloaded.rules == read.rules
+    assert json.loads((run / run_folder.FIT).read_text())["parameters"] == summary["parameters"]
     ik, _ = parameter_files.load_system(run / run_folder.PARAMETERS)
     assert systems.rule_names(ik) == systems.rule_names(read.starting_system())
     fitted = [float(parameter_tree.get(ik, name)) for name in names]
@@ -187,25 +188,26 @@ def test_rules_are_kept_through_a_run(tmp_path):
 
 
 def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):
-    def lifted(source, base, ground):
-        return base.with_motion(base.positions_ws + [0.0, 0.1, 0.0], base.rotations_ws)
+    def lift(animation, ik):
+        base = animation.clip
+        return None, base.with_motion(base.positions_ws + [0.0, 0.1, 0.0], base.rotations_ws)
 
-    monkeypatch.setattr(translation, "_solved", lifted)
+    monkeypatch.setattr(Animation, "solve", lift)
     path = tmp_path / "mine.toml"
     path.write_text("leg.soften = 0.9\n[rules]\npelvis = 'CapsulePelvis'\n[pelvis]\nspeed = 4.0\n")
-    source = translation.read_system("ozz", "--from")
-    target = translation.read_system(str(path), "--to")
+    source = translation.load_named_system("ozz", "--from")
+    target = translation.load_named_system(str(path), "--to")
     clip = ROOT / "data" / "clips" / "uneven_walk_base.npz"
     ground = ROOT / "data" / "terrains" / "uneven_walk.ply"
-    made = translation.plan(
-        source, target, [clip], [ground], tmp_path / "run", named={"pelvis.speed": {}}, fps=5.0
-    )
-    assert made.experiment.rules == {"pelvis": "CapsulePelvis"}
-    assert made.experiment.parameters == {"pelvis.speed": 4.0, "leg.soften": 0.9}
-    assert made.experiment.clips[0].truth is None, "its parameters are others"
-    again = made.experiment.starting_system()
+    files = AnimationFiles(clip, ground)
+    request = translation.TranslationRequest(source, target, (files,), {"pelvis.speed": {}}, 5.0)
+    prepared = translation.prepare(request, tmp_path / "run")
+    assert prepared.experiment.rules == {"pelvis": "CapsulePelvis"}
+    assert prepared.experiment.parameters == {"pelvis.speed": 4.0, "leg.soften": 0.9}
+    assert prepared.experiment.clips[0].truth is None, "its parameters are others"
+    again = prepared.experiment.starting_system()
     assert systems.rule_names(again) == systems.rule_names(target.ik)
-    fitted = made.problem.space.unpack(made.problem.space.u0)
+    fitted = prepared.problem.space.unpack(prepared.problem.space.u0)
     assert systems.rule_names(fitted) == systems.rule_names(target.ik)
 
 

@@ -1,4 +1,4 @@
-"""Runs on disk."""
+"""Run folders: what they hold, and what is rejected."""
 
 import json
 import math
@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.experiments import experiment, parameter_files
+from fitting.experiments import experiment_files, parameter_files, problems
 from fitting.inference.identifiability import Identifiability
-from fitting.inference.optimisation.search import Progress, Solution
-from fitting.studies import run_folder, study
+from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.studies import run_folder
+from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, write
 
@@ -19,13 +20,13 @@ NAMES = ("pelvis.on_gain", "foot.max_pitch")
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory) -> study.Fit:
-    """A fit that nothing has solved: its numbers are made up."""
-    folder = tmp_path_factory.mktemp("store")
+def fitted(tmp_path_factory) -> Fit:
+    """A fit with invented numbers; no search has run."""
+    folder = tmp_path_factory.mktemp("experiment")
     rest = "[sigmas]\nbody = inf\ncorrelation = 0.4\n[parameters]\nlock.enabled = false"
     path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.2")
-    asked = experiment_files.load_experiment(path)
-    problem = problems.make_problem(asked)
+    experiment = experiment_files.load_experiment(path)
+    problem = problems.make_problem(experiment)
     u = np.array([0.3, -0.2])
     solution = Solution(
         names=NAMES,
@@ -40,7 +41,7 @@ def fitted(tmp_path_factory) -> study.Fit:
         steps=8,
         seconds=9.0,
     )
-    identification = Identifiability(
+    identifiability = Identifiability(
         names=NAMES,
         contraction=np.array([0.9, 0.2]),
         interval=np.array([[0.1, 0.5], [0.2, 0.9]]),
@@ -52,27 +53,33 @@ def fitted(tmp_path_factory) -> study.Fit:
         profiles={},
         improvement=0.0,
     )
-    return study.Fit(asked, problem, solution, identification)
+    return Fit(experiment, problem, solution, identifiability)
+
+
+def save(run, fitted):
+    """Writes a fit as a job does."""
+    run_folder.save_solution(run, fitted.experiment, fitted.problem, fitted.solution)
+    run_folder.save_fit(run, fitted)
 
 
 def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path):
     run = tmp_path / "deep" / "run"
-    run_folder.save_fit(run, fitted)
-    asked, told = run_folder.load_fit(run)
-    assert [row["name"] for row in told["parameters"]] == list(NAMES)
-    assert [row["u"] for row in told["parameters"]] == [0.3, -0.2]
-    assert [row["start_sd"] for row in told["parameters"]] == [0.01, study.THRESHOLD_SD]
-    assert [row["determined"] for row in told["parameters"]] == [True, False]
-    assert [row["at_bound"] for row in told["parameters"]] == ["", "high"]
-    assert told["correlated"] == [[*NAMES, 0.95]] and told["history"][0]["stage"] == "start"
+    save(run, fitted)
+    experiment, summary = run_folder.load_fit(run)
+    assert [row["name"] for row in summary["parameters"]] == list(NAMES)
+    assert [row["u"] for row in summary["parameters"]] == [0.3, -0.2]
+    assert [row["start_sd"] for row in summary["parameters"]] == [0.01, THRESHOLD_SD]
+    assert [row["determined"] for row in summary["parameters"]] == [True, False]
+    assert [row["at_bound"] for row in summary["parameters"]] == ["", "high"]
+    assert summary["correlated"] == [[*NAMES, 0.95]] and summary["history"][0]["stage"] == "start"
     ik, preset = parameter_files.load_system(run / run_folder.PARAMETERS)
     assert preset == "record" and not parameter_tree.get(ik, "lock.enabled")
     values = [float(parameter_tree.get(ik, name)) for name in NAMES]
     np.testing.assert_allclose(values, fitted.solution.values, rtol=1e-12)
-    assert (asked.free, asked.clips) == (fitted.experiment.free, fitted.experiment.clips)
+    assert (experiment.free, experiment.clips) == (fitted.experiment.free, fitted.experiment.clips)
 
 
-def test_the_experiment_of_a_run_is_whole_even_if_its_file_is_gone(fitted, tmp_path):
+def test_the_experiment_in_a_run_does_not_need_its_original_file(fitted, tmp_path):
     text = experiment_files.experiment_to_toml(fitted.experiment)
     (tmp_path / "again.toml").write_text(text)
     again = experiment_files.load_experiment(tmp_path / "again.toml")
@@ -83,30 +90,30 @@ def test_the_experiment_of_a_run_is_whole_even_if_its_file_is_gone(fitted, tmp_p
 
 
 def test_a_run_is_unfinished_until_its_numbers_are_written(fitted, tmp_path):
-    run_folder.save_fit(tmp_path, fitted)
+    save(tmp_path, fitted)
     run_folder.save_solution(tmp_path, fitted.experiment, fitted.problem, fitted.solution)
     with pytest.raises(ValueError, match="no fit.json; there is .*parameters.toml"):
         run_folder.load_fit(tmp_path)
 
 
-def test_the_ball_of_a_threshold_is_small_and_no_ball_is_flat(fitted):
+def test_walkers_start_near_thresholds_and_neither_too_near_nor_too_far(fitted):
     sd = np.array([np.nan, 9.0])
-    wide = study.Fit(
+    wide = Fit(
         fitted.experiment, fitted.problem, fitted.solution,
         Identifiability(**(vars(fitted.identifiability) | {"sd": sd})),
     )  # fmt: skip
-    np.testing.assert_array_equal(wide.start_sd, [study.THRESHOLD_SD, study.MOST_SD])
+    np.testing.assert_array_equal(wide.start_sd, [THRESHOLD_SD, MAX_START_SD])
 
 
-def test_a_gain_reads_as_its_half_life_and_as_gains_at_other_rates():
-    read = run_folder.gain_readings(0.3)
-    assert read["gain_at_30_hz"] == pytest.approx(0.3)
-    assert (1 - read["gain_at_60_hz"]) ** 2 == pytest.approx(0.7)
-    assert 0.7 ** (30 * read["half_life"]) == pytest.approx(0.5)
+def test_a_gain_has_a_half_life_and_gains_at_other_rates():
+    readings = gain_readings(0.3)
+    assert readings["gain_at_30_hz"] == pytest.approx(0.3)
+    assert (1 - readings["gain_at_60_hz"]) ** 2 == pytest.approx(0.7)
+    assert 0.7 ** (30 * readings["half_life"]) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("fit.json", None, "no fit.json; there is"),
         ("experiment.toml", None, "no experiment.toml"),
@@ -120,17 +127,17 @@ def test_a_gain_reads_as_its_half_life_and_as_gains_at_other_rates():
         ("experiment.toml", "free = [", "experiment.toml: not TOML"),
     ],
 )
-def test_a_folder_that_is_no_finished_run_is_refused(fitted, tmp_path, name, text, said):
-    run_folder.save_fit(tmp_path, fitted)
+def test_an_unfinished_run_is_rejected(fitted, tmp_path, name, text, message):
+    save(tmp_path, fitted)
     if text is None:
         (tmp_path / name).unlink()
     else:
         (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         run_folder.load_fit(tmp_path)
 
 
-def test_what_is_no_folder_is_refused(tmp_path):
+def test_a_missing_or_empty_folder_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="no such folder; `jaxik fit` makes a run"):
         run_folder.load_fit(tmp_path / "no")
     (tmp_path / "file").write_text("x")
@@ -141,19 +148,19 @@ def test_what_is_no_folder_is_refused(tmp_path):
         run_folder.load_fit(tmp_path / "empty")
 
 
-def test_a_place_for_a_run_is_checked_and_nothing_made(tmp_path, monkeypatch):
-    run_folder.check_place(tmp_path / "runs" / "walk")
-    run_folder.check_place(tmp_path)
+def test_checking_an_output_folder_makes_nothing(tmp_path, monkeypatch):
+    run_folder.check_output_folder(tmp_path / "runs" / "walk")
+    run_folder.check_output_folder(tmp_path)
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("x")
-    for place in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(ValueError, match="no folder for the run can be made, as .* is a file"):
-            run_folder.check_place(place)
+    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(ValueError, match="no folder can be made here, as .* is a file"):
+            run_folder.check_output_folder(folder)
     monkeypatch.setattr(os, "access", lambda *_: False)  # the tests may run as root
     with pytest.raises(ValueError, match="is read-only"):
-        run_folder.check_place(tmp_path / "run")
+        run_folder.check_output_folder(tmp_path / "run")
 
 
 def test_the_numbers_are_plain_json(fitted):
-    told = json.loads(json.dumps(run_folder.describe_fit(fitted), allow_nan=False))
-    assert told["cost_before"] == 90.0 and told["converged"] is True
+    summary = json.loads(json.dumps(fitted.summary, allow_nan=False))
+    assert summary["cost_before"] == 90.0 and summary["converged"] is True

@@ -1,4 +1,4 @@
-"""Translation: one system's parameters from another's motion, and what is said of the rest."""
+"""Translation: the parameters of one system from the motion of another, and what remains."""
 
 import json
 import math
@@ -31,14 +31,14 @@ pytestmark = pytest.mark.slow
 
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
 TRUTH = {"pelvis.on_gain": 0.45, "pelvis.limit": 0.17}
-SOFT = {"leg.soften": 0.96}  # in the source, and not free: something remains
+SOFT = {"leg.soften": 0.96}  # of the source, but not free, so that a difference remains
 FREE = ",".join(TRUTH)
-WORDS = ("ankle", "knee", "pelvis", "foot", "body")
+QUANTITIES = ("ankle", "knee", "pelvis", "foot", "body")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def hurried(tmp_path_factory):
-    """Programs compiled in a hurry, as each runs a few times on a short clip."""
+def unoptimised(tmp_path_factory):
+    """Compiles without optimisations, as each program runs a few times on a short clip."""
     jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
     jax.config.update("jax_disable_most_optimizations", True)
     yield
@@ -48,7 +48,7 @@ def hurried(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Path:
-    """One and a half seconds of the embedded walk, up the first steps."""
+    """One and a half seconds of the uneven walk, up the first steps."""
     whole = load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz")
     path = tmp_path_factory.mktemp("clips") / "short.npz"
     save_clip(path, whole.select(slice(90, 135)))
@@ -57,7 +57,7 @@ def clip(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory) -> Path:
-    """A `record` with other values."""
+    """A parameter file of `record` with other values."""
     path = tmp_path_factory.mktemp("source") / "mine.toml"
     path.write_text(
         parameter_files.system_to_toml(parameter_tree.replace(presets.record(), TRUTH | SOFT))
@@ -67,7 +67,7 @@ def source(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(source, clip, tmp_path_factory) -> Path:
-    """A finished translation; not to be written to."""
+    """A finished translation; tests must not change it."""
     folder = tmp_path_factory.mktemp("runs") / "mine"
     words = ["translate", "--from", source, "--to", "record", "--free", FREE]
     words += ["--clip", clip, "--terrain", GROUND, "-o", folder]
@@ -76,30 +76,31 @@ def run(source, clip, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def quickly(monkeypatch):
-    """Fits of residuals that compile at once."""
+def quick_residuals(monkeypatch):
+    """Fits residuals that compile at once."""
     monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
 
 
-def refused(capsys, *words: object) -> str:
+def error_of(capsys, *words: object) -> str:
+    """The one line that a command prints when it fails."""
     assert main.main(["translate", *(str(word) for word in words)]) == main.MISTAKE
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.count("\n") == 1
-    return told.err
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.count("\n") == 1
+    return output.err
 
 
-def test_the_parameters_behind_a_motion_are_found_again(run):
+def test_the_parameters_of_the_source_are_recovered(run):
     fitted, preset = parameter_files.load_system(run / "record.toml")
     assert preset == "record"
     for name, value in TRUTH.items():
-        one = parameter_tree.declarations(fitted)[name]
-        near = 0.05 * (one.high - one.low)
-        assert float(parameter_tree.get(fitted, name)) == pytest.approx(value, abs=near)
+        declared = parameter_tree.declarations(fitted)[name]
+        tolerance = 0.05 * (declared.high - declared.low)
+        assert float(parameter_tree.get(fitted, name)) == pytest.approx(value, abs=tolerance)
     text = (run / "summary.md").read_text()
     assert "2 of 2 determined parameters within 5 % of their range" in text
 
 
-def test_what_is_said_to_be_reproduced_is_so_by_another_count(run, clip):
+def test_the_reported_differences_agree_with_an_independent_calculation(run, clip):
     base, reference = load_flat_animation(clip), load_clip(run / "source.npz")
     ik, _ = parameter_files.load_system(run / "record.toml")
     ground = mesh_files.load_terrain(GROUND)
@@ -107,120 +108,126 @@ def test_what_is_said_to_be_reproduced_is_so_by_another_count(run, clip):
         base, jaxik.run(ik, base.rig, ground, clip_frames.frames_from_clip(base))
     )
 
-    def places(one, joints):
-        apart = one.positions_ws[:, joints] - reference.positions_ws[:, joints]
-        return np.sqrt(np.sum(apart**2, axis=-1))
+    def distance(clip_, joints):
+        offsets = clip_.positions_ws[:, joints] - reference.positions_ws[:, joints]
+        return np.sqrt(np.sum(offsets**2, axis=-1))
 
-    def angles(one, joints):
-        a, b = (each.rotations_ws[:, joints] for each in (one, reference))
-        turn = rotation(a).inv() * rotation(b)
-        return turn.magnitude().reshape(a.shape[:2])
+    def angle(clip_, joints):
+        a, b = (each.rotations_ws[:, joints] for each in (clip_, reference))
+        between = rotation(a).inv() * rotation(b)
+        return between.magnitude().reshape(a.shape[:2])
 
     def rotation(wxyz):
         return Rotation.from_quat(wxyz.reshape(-1, 4), scalar_first=True)
 
-    def distances(one):
-        _, knee, ankle, _ = np.transpose(one.rig.joints)
-        found = {"ankle": places(one, ankle), "knee": places(one, knee)}
-        found |= {"pelvis": places(one, [one.rig.pelvis]), "foot": angles(one, ankle)}
-        return found | {"body": angles(one, [one.rig.pelvis])}
+    def differences(clip_):
+        _, knee, ankle, _ = np.transpose(clip_.rig.joints)
+        pelvis = [clip_.rig.pelvis]
+        return {
+            "ankle": distance(clip_, ankle), "knee": distance(clip_, knee),
+            "pelvis": distance(clip_, pelvis), "foot": angle(clip_, ankle),
+            "body": angle(clip_, pelvis),
+        }  # fmt: skip
 
-    told = json.loads((run / "translation.json").read_text())["reproduced"]["all frames"]
+    numbers = json.loads((run / "translation.json").read_text())["reproduced"]["all frames"]
     summary = (run / "summary.md").read_text()
-    left, had = distances(solved), distances(base)
-    for kind in WORDS:
-        rms, correction = (np.sqrt(np.mean(one[kind] ** 2)) for one in (left, had))
-        factor = 1000 if kind in WORDS[:3] else np.degrees(1)
-        assert told[kind]["rms"] == pytest.approx(factor * rms, abs=1e-6)
-        assert told[kind]["correction"] == pytest.approx(factor * correction, abs=1e-6)
-        assert told[kind]["max"] == pytest.approx(factor * left[kind].max(), abs=1e-6)
-        if kind == "body":  # the clip turns it by nothing
-            assert told[kind]["reproduced"] is None
+    after, before = differences(solved), differences(base)
+    for name in QUANTITIES:
+        rms, correction = (np.sqrt(np.mean(each[name] ** 2)) for each in (after, before))
+        factor = 1000 if name in QUANTITIES[:3] else np.degrees(1)
+        assert numbers[name]["rms"] == pytest.approx(factor * rms, abs=1e-6)
+        assert numbers[name]["correction"] == pytest.approx(factor * correction, abs=1e-6)
+        assert numbers[name]["max"] == pytest.approx(factor * after[name].max(), abs=1e-6)
+        if name == "body":  # the source does not rotate it in this clip
+            assert numbers[name]["reproduced"] is None
             continue
-        assert told[kind]["reproduced"] == pytest.approx(1 - rms / correction, abs=1e-6)
-        share = f"{100 * (1 - rms / correction):.1f} %"
-        assert f"{share} of that of the {DIFFERENCES[kind].name}" in summary
-    assert 0.9 < told["ankle"]["reproduced"] < 0.999
+        assert numbers[name]["reproduced"] == pytest.approx(1 - rms / correction, abs=1e-6)
+        percentage = f"{100 * (1 - rms / correction):.1f} %"
+        assert f"{percentage} of that of the {DIFFERENCES[name].name}" in summary
+    assert 0.9 < numbers["ankle"]["reproduced"] < 0.999
 
 
 def test_the_folder_is_a_run_with_the_same_problem(run, clip):
-    asked, told = run_folder.load_fit(run)
-    assert set(asked.free) == set(TRUTH) and told["converged"]
+    experiment, summary = run_folder.load_fit(run)
+    assert set(experiment.free) == set(TRUTH) and summary["converged"]
     text = (run / "experiment.toml").read_text()
     assert 'reference = "source.npz"' in text and f'base = "{clip}"' in text
     ik, _ = parameter_files.load_system(run / "parameters.toml")
-    problem = problems.make_problem(asked)
+    problem = problems.make_problem(experiment)
     u = problem.space.pack(ik)
-    assert float(problem.cost(u)) == pytest.approx(told["cost"], rel=1e-6)
+    assert float(problem.cost(u)) == pytest.approx(summary["cost"], rel=1e-6)
 
 
-def test_the_summary_puts_both_systems_side_by_side(run):
+def test_the_summary_shows_both_systems_side_by_side(run):
     text = (run / "summary.md").read_text()
     assert text.startswith("# mine to record\n")
     assert "## How much of `mine` `record` reproduces" in text and "difference.png" in text
     table = text.partition("## Parameters of both systems")[2]
     (line,) = (line for line in table.splitlines() if line.startswith("| `pelvis.limit`"))
     assert line.startswith("| `pelvis.limit` | m | 0.17 | 0.") and line.endswith("| fitted |")
-    assert "`lean.gain_slide`" in text.partition("kept their values, as asked:")[2].splitlines()[0]
+    assert (
+        "`lean.gain_slide`" in text.partition("kept their values, as requested:")[2].splitlines()[0]
+    )
     assert (run / "source.toml").is_file() and (run / "difference.png").stat().st_size > 10_000
 
 
-def test_a_source_that_another_system_cannot_follow_is_told_honestly(run):
+def test_a_target_that_does_not_follow_is_reported_with_its_worst_place(run):
     (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
     still = parameter_tree.replace(presets.record(), {"leg.weight": 0.0, "lock.enabled": False})
-    found = difference.measure(scene, playback.run(still, scene))
-    told = difference_report.numbers([found])["all frames"]
-    assert told["ankle"]["reproduced"] < 0.3
-    said = difference_report.shortcomings([found], "a", "b")
-    assert said[0].startswith("Ankles: ") and "(rms) remain of" in said[0]
-    worst = 1000 * found.remaining["ankle"].max()
-    assert f"at most {worst:.4g} mm" in said[0]
+    measured = difference.measure(scene, playback.run(still, scene))
+    numbers = difference_report.numbers([measured])["all frames"]
+    assert numbers["ankle"]["reproduced"] < 0.3
+    sentence, *_ = difference_report.shortcomings([measured], "a", "b")
+    assert sentence.startswith("Ankles: ") and "(rms) remain of" in sentence
+    worst = 1000 * measured.remaining["ankle"].max()
+    assert f"at most {worst:.4g} mm" in sentence
 
 
-def test_frames_in_which_the_character_stands_are_counted_apart():
+def test_standing_and_moving_frames_are_counted_separately():
     frames = np.arange(4)
-    zero, one = np.zeros((4, 2)), np.ones((4, 2))
-    left = np.stack([np.array([0.0, 0.0, 1.0, 1.0])] * 2, axis=1)
-    kinds = dict.fromkeys(difference.QUANTITIES, one)
-    made = difference.Difference(
-        ("left", "right"), frames * 0.1, frames < 2, kinds, kinds | {"ankle": left, "knee": zero}
-    )
-    told = difference_report.numbers([made])
-    assert told["standing"]["ankle"]["reproduced"] == 1.0
-    assert told["moving"]["ankle"]["reproduced"] == 0.0
-    assert told["all frames"]["ankle"]["rms"] == pytest.approx(1000 * math.sqrt(0.5))
-    assert told["all frames"]["knee"]["reproduced"] == 1.0
-    never = difference.Difference(made.legs, made.time, frames < 0, kinds, kinds)
+    zeros, ones = np.zeros((4, 2)), np.ones((4, 2))
+    late = np.stack([np.array([0.0, 0.0, 1.0, 1.0])] * 2, axis=1)
+    correction = dict.fromkeys(difference.QUANTITIES, ones)
+    remaining = correction | {"ankle": late, "knee": zeros}
+    half = difference.Difference(("left", "right"), frames * 0.1, frames < 2, correction, remaining)
+    numbers = difference_report.numbers([half])
+    assert numbers["standing"]["ankle"]["reproduced"] == 1.0
+    assert numbers["moving"]["ankle"]["reproduced"] == 0.0
+    assert numbers["all frames"]["ankle"]["rms"] == pytest.approx(1000 * math.sqrt(0.5))
+    assert numbers["all frames"]["knee"]["reproduced"] == 1.0
+    never = difference.Difference(half.legs, half.time, frames < 0, correction, correction)
     assert set(difference_report.numbers([never])) == {"all frames"}
 
 
-def test_what_the_source_leaves_alone_has_no_share():
-    zero, some = np.zeros((3, 1)), np.full((3, 1), 0.02)
-    kinds = dict.fromkeys(difference.QUANTITIES, zero)
-    made = difference.Difference(
-        ("left",), np.arange(3.0), np.zeros(3, bool), kinds, kinds | {"foot": some}
+def test_a_quantity_that_the_source_does_not_correct_has_no_fraction():
+    correction = dict.fromkeys(difference.QUANTITIES, np.zeros((3, 1)))
+    remaining = correction | {"foot": np.full((3, 1), 0.02)}
+    rotated = difference.Difference(
+        ("left",), np.arange(3.0), np.zeros(3, bool), correction, remaining
     )
-    told = difference_report.numbers([made])["all frames"]
-    assert told["foot"]["reproduced"] is None
-    assert told["foot"]["rms"] == pytest.approx(np.degrees(0.02))
-    (said,) = difference_report.shortcomings([made], "a", "b")
-    assert said.startswith("a leaves the orientation of the feet as animated; b is 1.146 ° (rms)")
-    assert difference_report.table(difference.summarise([made])["all frames"], "a")[4][-1] == "–"
+    numbers = difference_report.numbers([rotated])["all frames"]
+    assert numbers["foot"]["reproduced"] is None
+    assert numbers["foot"]["rms"] == pytest.approx(np.degrees(0.02))
+    (text,) = difference_report.shortcomings([rotated], "a", "b")
+    assert text.startswith("a leaves the orientation of the feet as animated; b is 1.146 ° (rms)")
+    table = difference_report.table(difference.summarise([rotated])["all frames"], "a")
+    assert table[4][-1] == "–"
 
 
-def test_only_what_moves_the_clip_is_free_unless_it_is_named(run):
+def test_only_parameters_that_move_the_clip_are_free_by_default(run):
     (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
     named = sensitivity.all_parameters(presets.record())
     assert {"probe.toe_ls[0]", "probe.toe_ls[2]", "pelvis.limit"} <= set(named)
     assert named["lock.max_speed"] == {"high": 12.0}  # it is infinite: that must be within reach
-    some = {one: named[one] for one in ("pelvis.limit", "lean.gain_slide", "leg.max_knee_angle")}
-    moving = sensitivity.measure_sensitivity(presets.record(), some, (scene,))
+    tried = ("pelvis.limit", "lean.gain_slide", "leg.max_knee_angle")
+    few = {name: named[name] for name in tried}
+    moving = sensitivity.measure_sensitivity(presets.record(), few, (scene,))
     assert set(moving) == {"pelvis.limit", "leg.max_knee_angle"}  # nothing slides in this clip
     assert moving["pelvis.limit"] > 5.0
 
 
-def test_an_interrupted_translation_is_written_with_its_best_point(
-    quickly, source, clip, tmp_path, monkeypatch, capsys
+def test_an_interrupted_translation_writes_its_best_point(
+    quick_residuals, source, clip, tmp_path, monkeypatch, capsys
 ):
     def interrupt(_) -> str:
         signal.raise_signal(signal.SIGINT)
@@ -230,14 +237,14 @@ def test_an_interrupted_translation_is_written_with_its_best_point(
     words = ["--from", source, "--to", "record", "--free", ",".join(quick.TARGETS)]
     words += ["--clip", clip, "--terrain", GROUND, "-o", tmp_path / "run"]
     assert main.main(["translate", *map(str, words)]) == main.INTERRUPTED
-    told = json.loads((tmp_path / "run" / run_folder.FIT).read_text())
-    assert told["message"].startswith("Interrupted after 0 steps")
+    numbers = json.loads((tmp_path / "run" / run_folder.FIT).read_text())
+    assert numbers["message"].startswith("Interrupted after 0 steps")
     assert "Interrupted after 0 steps" in (tmp_path / "run" / run_folder.SUMMARY).read_text()
     assert (tmp_path / "run" / "source.npz").is_file()
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"--from": "recrod"}, "--from takes a preset or a parameter .toml: no preset named"),
         ({"--to": "recrod"}, "--to takes a preset or a parameter .toml: no preset named 'recrod'"),
@@ -254,8 +261,8 @@ def test_an_interrupted_translation_is_written_with_its_best_point(
         ({"--fps": "0"}, "fps is 0.0; wanted a number above 0"),
     ],
 )
-def test_what_cannot_be_translated_is_told_and_nothing_written(
-    change, said, clip, tmp_path, capsys, monkeypatch
+def test_wrong_input_is_reported_and_nothing_written(
+    change, message, clip, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     Path("full").mkdir()
@@ -268,16 +275,22 @@ def test_what_cannot_be_translated_is_told_and_nothing_written(
     )
     for name, text in texts.items():
         Path(name).write_text(text)
-    given = {"--from": "record", "--to": "record", "--clip": clip, "--terrain": GROUND, "-o": "run"}
+    options = {
+        "--from": "record",
+        "--to": "record",
+        "--clip": clip,
+        "--terrain": GROUND,
+        "-o": "run",
+    }
     again = ["--terrain", GROUND] if change == {"--terrain": None} else []
-    given |= {key: value for key, value in change.items() if value is not None}
+    options |= {key: value for key, value in change.items() if value is not None}
     before = sorted(tmp_path.rglob("*"))
-    words = [word for pair in given.items() for word in pair]
-    assert said in refused(capsys, *words, *again)
+    words = [word for pair in options.items() for word in pair]
+    assert message in error_of(capsys, *words, *again)
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_free_parameters_may_come_with_ranges(tmp_path):
+def test_a_file_of_free_parameters_may_have_ranges(tmp_path):
     path = tmp_path / "free.toml"
     path.write_text("[free]\npelvis.limit = { high = 0.4 }\n")
     assert translation.read_free(str(path), presets.record()) == {"pelvis.limit": {"high": 0.4}}

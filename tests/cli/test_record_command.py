@@ -1,0 +1,115 @@
+"""The command `jaxik record`: shows the game's record, and converts it without losing a byte."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fitting.cli import main
+from jaxik import record
+from support.records import ADULT, packed
+
+
+@pytest.fixture
+def binary(tmp_path) -> Path:
+    content = dataclasses.replace(
+        packed(cosineMaxKneeAngle=-0.987654), knee_axis_type=4, flags=0b10101_101,
+        padding=b"\x12\x34", tail=b"tail",
+    )  # fmt: skip
+    path = tmp_path / "footik.bin"
+    path.write_bytes(record.to_bytes(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    "more", [[], ["--knee", "flexion", "--lean-sign", "-1", "--tick-hz", "60"]]
+)
+def test_a_record_converted_to_toml_and_back_is_the_same_to_the_byte(binary, more, capsys):
+    toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
+    assert main.main(["record", "to-toml", str(binary), "-o", str(toml), *more]) == 0
+    words = ["record", "to-bytes", str(toml), "--base", str(binary), "-o", str(back), *more]
+    assert main.main(words) == 0
+    assert back.read_bytes() == binary.read_bytes()
+
+
+def test_show_prints_both_names_and_both_units(binary, capsys):
+    assert main.main(["record", "show", str(binary)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"kneeAxisType +4 \(-Y\)", text)
+    assert re.search(r"useFootEndRay +off +probe.use_toe", text)
+    assert re.search(r"lockedDisableMaxAngle +172 +lock.release_max_angle = 3.00197 rad", text)
+    assert all(name in text for name in ADULT)
+
+
+def test_a_record_converted_to_csv_and_back_is_the_same_to_the_byte(binary, capsys):
+    assert main.main(["record", "show", str(binary), "--csv"]) == 0
+    path, back = binary.with_suffix(".csv"), binary.with_name("back.bin")
+    path.write_text(capsys.readouterr().out)
+    assert main.main(["record", "to-bytes", str(path), "-o", str(back)]) == 0
+    assert back.read_bytes() == binary.read_bytes()
+
+
+@pytest.mark.filterwarnings("default")
+def test_lengths_in_centimetres_are_mentioned_in_one_line(tmp_path, capsys):
+    path = tmp_path / "cm.bin"
+    content = packed(raycastDistanceUp=50.0, raycastDistanceDown=80.0)
+    path.write_bytes(record.to_bytes(content))
+    assert main.main(["record", "show", str(path)]) == 0
+    output = capsys.readouterr()
+    assert "jaxik: raycastDistanceUp = 50.0 is read as centimetres\n" in output.err
+    assert re.search(r"raycastDistanceUp +50 +probe.ray_up = 0.5 m", output.out)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["show", "no.bin"], "no.bin: no such file, wanted a record"),
+        (["show", "."], "a folder, wanted a record"),
+        (["show", "short.bin"], "short.bin: a foot-IK record has at least 128 bytes; these are 3"),
+        (["show", "bad.csv"], "bad.csv: the CSV has no column"),
+        (["show", "binary.csv"], "binary.csv: 'utf-8' codec can't decode"),
+        (["show", "none.csv"], "none.csv: the CSV has no row"),
+        (["show", "no.toml"], "no.toml: no such file, wanted a parameter file"),
+        (["show", "bad.toml"], "bad.toml: unknown key 'lok'; nearest is 'lock'"),
+        (["show", "nan.bin"], "nan.bin: originalGroundHeightMS is nan"),
+        (["show", "axis.bin"], "axis.bin: kneeAxisType is 9"),
+        (["show", "footik.bin", "--tick-hz", "0"], "tick_hz is 0.0"),
+        (["to-toml", "nan.bin", "-o", "a.toml"], "nan.bin: originalGroundHeightMS is nan"),
+        (["to-toml", "two.csv", "-o", "a.toml"], "two.csv has 2 rows"),
+        (["to-toml", "footik.bin", "-o", "no/a.toml"], "there is no folder no"),
+        (["to-bytes", "one.toml", "-o", "."], "cannot be written: it is a folder"),
+        (["to-bytes", "one.toml", "--base", "no.bin", "-o", "a.bin"], "no.bin: no such file"),
+        (["to-bytes", "two.csv", "--base", "footik.bin", "-o", "a.bin"], "a base completes"),
+    ],
+)
+def test_a_wrong_record_is_reported_and_writes_nothing(words, message, binary, capsys, monkeypatch):
+    monkeypatch.chdir(binary.parent)
+    rows = record.to_csv([packed(), packed()])
+    texts = {"bad.csv": "a,b\n1,2\n", "none.csv": rows.splitlines()[0] + "\n", "two.csv": rows}
+    texts |= {"bad.toml": "[lok]\nx = 1", "one.toml": "lock.enabled = false"}
+    for name, text in texts.items():
+        Path(name).write_text(text)
+    binaries = {"nan.bin": packed(originalGroundHeightMS=np.nan)}
+    binaries["axis.bin"] = dataclasses.replace(packed(), knee_axis_type=9)
+    for name, content in binaries.items():
+        Path(name).write_bytes(record.to_bytes(content))
+    Path("short.bin").write_bytes(b"abc")
+    Path("binary.csv").write_bytes(b"\xff\xfe")
+    before = set(binary.parent.iterdir())
+    assert main.main(["record", *words]) == main.MISTAKE
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.count("\n") == 1 and message in output.err
+    assert set(binary.parent.iterdir()) == before
+
+
+def test_parameters_of_another_preset_cannot_become_a_record(tmp_path, capsys):
+    path = tmp_path / "ozz.toml"
+    path.write_text('preset = "ozz"\n')
+    words = ["record", "to-bytes", str(path), "-o", str(tmp_path / "footik.bin")]
+    assert main.main(words) == main.MISTAKE
+    assert capsys.readouterr().err.endswith(
+        "parameters of 'ozz'; only those of 'record' make one\n"
+    )
+    assert not (tmp_path / "footik.bin").exists()
