@@ -108,27 +108,27 @@ def carousel(time: float) -> characters.Transform:
 
 
 def clip(
-    legs: int = 2, told: bool = True, rides: bool = False, leaps: bool = False
+    legs: int = 2, known: bool = True, rides: bool = False, leaps: bool = False
 ) -> list[characters.Frame]:
-    """A walk across all the blocks and beyond, with slipping and turning feet and odd weights.
+    """A walk across all blocks and beyond, with slipping, turning and partly weighted feet.
 
     Told, the stride is unknown for a while; the labels are doubtful for another. It may ride on a
     platform, and leap at first and once again: then its feet are too fast to stand.
     """
     rig, rng = rig_of(legs), np.random.default_rng(5)
-    frames = walk(rig, FRAMES, told=told, heading=0.12, start=(-0.5, 0.03, -3.7), speed=0.8)
+    frames = walk(rig, FRAMES, known=known, heading=0.12, start=(-0.5, 0.03, -3.7), speed=0.8)
     changed = []
     for index, frame in enumerate(frames):
-        share, time = index / FRAMES, index / 60
+        fraction, time = index / FRAMES, index / 60
         weight, known = np.ones(legs), frame.stride.known
         standing = frame.stride.standing
-        if 0.5 < share < 0.55:
+        if 0.5 < fraction < 0.55:
             weight[0] = 0.5
-        if 0.6 < share < 0.62:
+        if 0.6 < fraction < 0.62:
             weight[-1] = 0.0
-        if 0.7 < share < 0.8:
+        if 0.7 < fraction < 0.8:
             known = 0.0 * known
-        if 0.3 < share < 0.4:
+        if 0.3 < fraction < 0.4:
             standing = 0.2 + 0.6 * standing
         wobble = maths.from_axis_angle(
             maths.unit(rng.normal(size=3), maths.Y), rng.uniform(0.0, 0.1)
@@ -160,10 +160,10 @@ def clip(
 @pytest.mark.parametrize("name", RULES)
 def test_the_defaults_are_those_of_the_reference(name):
     ik = to_ik({}, name)
-    for key, wanted in stride.defaults(*RULES[name]).items():
+    for key, expected in stride.defaults(*RULES[name]).items():
         rule, _, leaf = key.partition(".")
-        came = np.asarray(getattr(getattr(ik, rule), leaf))
-        np.testing.assert_allclose(came, wanted, rtol=1e-6, err_msg=key)
+        actual = np.asarray(getattr(getattr(ik, rule), leaf))
+        np.testing.assert_allclose(actual, expected, rtol=1e-6, err_msg=key)
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_600_frames_agree_with_the_reference(preset, values, how):
 
 
 @pytest.mark.slow
-def test_feet_with_an_up_of_their_own_agree_with_the_reference():
+def test_feet_with_different_ups_agree_with_the_reference():
     tilts = [maths.from_axis_angle(axis, 0.2) for axis in (maths.X, -maths.Z, maths.Z)]
     ups = [maths.Y, *(maths.rotate(tilt, maths.Y) for tilt in tilts)]
     body, *each = [PlainTerrain(up, triangles=uneven().triangles) for up in ups]
@@ -188,7 +188,7 @@ def test_feet_with_an_up_of_their_own_agree_with_the_reference():
 def compare(
     preset: str, values: dict[str, Any], frames: Sequence[characters.Frame], plain: Any, ours: Any
 ) -> None:
-    """Every output of 600 frames."""
+    """Asserts that all outputs of 600 frames agree with the reference."""
     rules = RULES[preset]
     rig = rig_of(len(frames[0].weight))
     parameters = characters.Parameters(values, defaults=stride.defaults(*rules))
@@ -203,20 +203,20 @@ def compare(
         "locked": after.lock.locked,
         "reached": result.reached,
     }
-    # Of a leg that is exactly as long as animated rounding says whether it is as long.
+    # For a leg exactly as long as animated, rounding decides whether it reaches.
     sure = {"reached": np.abs(expected["stretch"]) > 1e-9}
-    for key, came in flags.items():
-        wanted = np.where(sure.get(key, True), expected[key], came) > 0.5
-        np.testing.assert_array_equal(np.asarray(came) > 0.5, wanted, err_msg=key)
+    for key, actual in flags.items():
+        certain = np.where(sure.get(key, True), expected[key], actual) > 0.5
+        np.testing.assert_array_equal(np.asarray(actual) > 0.5, certain, err_msg=key)
         if key != "locked" or values.get("lock.enabled", False):
             assert 0.02 < expected[key].mean() < 0.99, key
     assert 0.02 < (expected["heel_lift"] > 0).mean() < 0.9
     hit = sensed.ground.ankle
-    seen = expected["found"][..., None]
+    reported = expected["found"][..., None]
     pairs = {
         "contact": sensed.contact.weight,
-        "hit_ws": np.where(seen, hit.point, expected["hit_ws"]),
-        "normal": np.where(seen, hit.normal, expected["normal"]),
+        "hit_ws": np.where(reported, hit.point, expected["hit_ws"]),
+        "normal": np.where(reported, hit.normal, expected["normal"]),
         "ground_height": after.target.height,
         "ground_velocity": after.target.velocity,
         "foothold_ws": advanced.foothold_ws,
@@ -228,9 +228,9 @@ def compare(
         "body_pos": result.body.pos,
         **{f"{joint}_pos": getattr(result.pose, joint).pos for joint in JOINTS},
     }
-    for key, came in pairs.items():
+    for key, actual in pairs.items():
         np.testing.assert_allclose(
-            np.asarray(came), expected[key], rtol=0, atol=POSITION, err_msg=key
+            np.asarray(actual), expected[key], rtol=0, atol=POSITION, err_msg=key
         )
     for joint in JOINTS:
         rot = np.asarray(getattr(result.pose, joint).rot)

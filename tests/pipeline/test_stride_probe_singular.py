@@ -1,4 +1,4 @@
-"""Frames on which a stride's formulas have no answer: values and slopes stay finite."""
+"""Frames where the formulas of a stride are singular: values and gradients stay finite."""
 
 import dataclasses
 import functools
@@ -29,7 +29,7 @@ from support.clips import to_terrain as to_ground
 pytestmark = pytest.mark.slow
 
 UPHILL, STEEP = planes((0.4, 0, 0)), planes((0, 0.9, 0))
-AT_WORK = {  # everything that the defaults leave off
+AT_WORK = {  # everything that is off by default
     "lock.enabled": True,
     "target.rise_half_life": 0.1,
     "target.fall_half_life": 0.05,
@@ -40,39 +40,39 @@ AT_WORK = {  # everything that the defaults leave off
 }
 
 
-def told(share: float, **changes: Any) -> jaxik.Frame:
-    """Feet half way of their stride in plan, when this share of its time has passed."""
-    frames = to_frames(swinging(share))
+def known(fraction: float, **changes: Any) -> jaxik.Frame:
+    """Feet half way of their stride in plan, after this fraction of its time."""
+    frames = to_frames(swinging(fraction))
     return dataclasses.replace(frames, stride=dataclasses.replace(frames.stride, **changes))
 
 
-def untold(velocity: float) -> jaxik.Frame:
-    """Feet half way of a stride that follows from the character's speed forward, m/s."""
-    frames = to_frames(swinging(0.5, told=False))
+def unknown(velocity: float) -> jaxik.Frame:
+    """Feet half way of a stride predicted from the character's forward speed, m/s."""
+    frames = to_frames(swinging(0.5, known=False))
     return dataclasses.replace(frames, velocity_ws=frames.velocity_ws * (velocity / 0.8))
 
 
 def nowhere() -> jaxik.Frame:
-    """A stride that ends where it began."""
-    frames = told(0.5)
+    """A stride that ends where it starts."""
+    frames = known(0.5)
     return dataclasses.replace(
         frames, stride=dataclasses.replace(frames.stride, next_ws=frames.stride.last_ws)
     )
 
 
 SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any]]] = {
-    "share 0": (told(0.0), UPHILL, {}),
-    "share 1": (told(1.0), UPHILL, {}),
-    "share at the end of the rise": (told(0.75), UPHILL, {"probe.rise_end": 0.75}),
-    "no time to rise": (told(0.5), UPHILL, {"probe.rise_start": 0.5, "probe.rise_end": 0.5}),
+    "fraction 0": (known(0.0), UPHILL, {}),
+    "fraction 1": (known(1.0), UPHILL, {}),
+    "fraction at the end of the rise": (known(0.75), UPHILL, {"probe.rise_end": 0.75}),
+    "no time to rise": (known(0.5), UPHILL, {"probe.rise_start": 0.5, "probe.rise_end": 0.5}),
     "last is next": (nowhere(), UPHILL, {}),
-    "no velocity": (untold(0.0), UPHILL, {}),
-    "hardly any velocity": (untold(1e-12), UPHILL, {}),
-    "no ground": (told(0.5), FLAT, {"probe.layers": 0}),
-    "no ground, untold": (untold(0.8), FLAT, {"probe.layers": 0}),
-    "ground out of reach": (told(0.5), planes((0, 0, -0.9)), {}),
+    "no velocity": (unknown(0.0), UPHILL, {}),
+    "hardly any velocity": (unknown(1e-12), UPHILL, {}),
+    "no ground": (known(0.5), FLAT, {"probe.layers": 0}),
+    "no ground, unknown": (unknown(0.8), FLAT, {"probe.layers": 0}),
+    "ground out of reach": (known(0.5), planes((0, 0, -0.9)), {}),
     "one leg out of reach": (standing(), planes((0, 4.0, 0)), {}),
-    "a wall": (told(0.5), planes((1e6, 0, 0)), {}),
+    "a wall": (known(0.5), planes((1e6, 0, 0)), {}),
     "no weight": (standing(weight=0.0), UPHILL, {}),
     "half weight": (standing(weight=0.5), UPHILL, {}),
     "no time": (dataclasses.replace(standing(), dt=0.0 * standing().dt), UPHILL, {}),
@@ -102,16 +102,16 @@ def inputs_of(preset: str, name: str) -> Inputs:
 
 @pytest.mark.parametrize(("preset", "name"), BOTH)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
-def test_values_and_slopes_are_finite(preset: str, name: str, gate: Any):
+def test_values_and_derivatives_are_finite(preset: str, name: str, gate: Any):
     inputs = inputs_of(preset, name)
-    values, slopes, after = measured(inputs, tangents_of(inputs), gate)
-    for numbers in (values, slopes):
+    values, gradients, after = measured(inputs, tangents_of(inputs), gate)
+    for numbers in (values, gradients):
         assert np.isfinite(list(numbers.values())).all(), numbers
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
 
 
 @pytest.mark.parametrize(("preset", "name"), BOTH)
-def test_slopes_are_finite_and_the_same_both_ways(preset: str, name: str):
+def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(preset: str, name: str):
     inputs = inputs_of(preset, name)
     tangents = tangents_of(inputs)
     forward = measured(inputs, tangents, HARD)[1]["everything"]
@@ -124,22 +124,22 @@ def test_slopes_are_finite_and_the_same_both_ways(preset: str, name: str):
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
-def slopes_of(inputs: tuple[Any, ...]) -> Any:
+def gradients_of(inputs: tuple[Any, ...]) -> Any:
     floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
 
-    def summed(floats: Any) -> jax.Array:
+    def weighted_sum(floats: Any) -> jax.Array:
         ik, rig, ground, frames = eqx.combine(floats, rest)
         result = jaxik.run(ik, rig, ground, frames)
         return total((result.pose, result.body))
 
-    return jax.grad(summed)(floats)
+    return jax.grad(weighted_sum)(floats)
 
 
 @pytest.mark.parametrize("present", [[True, False], [False, False]], ids=["one", "both"])
-def test_slopes_are_finite_with_a_foot_absent(present: list[bool]):
-    """Its leg is nothing at all: no place, no bones, no stride."""
+def test_gradients_are_finite_with_an_absent_leg(present: list[bool]):
+    """The leg has no position, no bones and no stride."""
     here = np.asarray(present)[:, None]
-    frames = told(0.5)
+    frames = known(0.5)
     kept = jax.tree.map(
         lambda leaf: leaf * here if leaf.ndim == 3 else leaf * here[:, 0],
         (frames.pose, frames.stride, frames.foot_speed, frames.toe_speed),
@@ -148,6 +148,6 @@ def test_slopes_are_finite_with_a_foot_absent(present: list[bool]):
     frames = dataclasses.replace(frames, **dict(zip(names, kept, strict=True)))
     rig = dataclasses.replace(to_rig(RIG), present=jnp.asarray(present))
     for preset in ("stride", "by speed"):
-        slopes = slopes_of((to_ik(AT_WORK, preset), rig, to_ground(UPHILL), frames))
-        for path, slope in jax.tree_util.tree_leaves_with_path(slopes):
+        gradients = gradients_of((to_ik(AT_WORK, preset), rig, to_ground(UPHILL), frames))
+        for path, slope in jax.tree_util.tree_leaves_with_path(gradients):
             assert np.isfinite(slope).all(), jax.tree_util.keystr(path)

@@ -1,4 +1,4 @@
-"""Systems that nobody listed: the stages compose, whichever rules are chosen."""
+"""Systems with randomly chosen rules: any rules of different stages work together."""
 
 import dataclasses
 import functools
@@ -39,7 +39,7 @@ TWISTS = jnp.array([0.0, 0.2])
 
 
 def rules_of(stage: type) -> list[type]:
-    """The stage's rules: the classes under it that nothing is left to be said of."""
+    """The rules of a stage: its subclasses that have no subclasses themselves."""
     children = [child for child in stage.__subclasses__() if child.__module__.startswith("jaxik.")]
     return [rule for child in children for rule in rules_of(child)] or [stage]
 
@@ -51,7 +51,7 @@ STAGES: dict[str, list[type]] = {
 
 
 def draw() -> dict[str, jaxik.FootIK]:
-    """Systems of rules in an order drawn for each stage, so that each rule comes up."""
+    """Systems with the rules of each stage in random order, so that each rule occurs."""
     rng = np.random.default_rng(3)
     orders = {stage: rng.permutation(len(rules)) for stage, rules in STAGES.items()}
     return {
@@ -84,24 +84,24 @@ BLENDS = {
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
-def both_ways(
+def run_and_step(
     iks: jaxik.FootIK, ground: Any, frames: jaxik.Frame
 ) -> tuple[jaxik.Result, jaxik.Result]:
-    """For each system of a batch the clip as a whole, and step by step."""
+    """The clip as a whole and step by step, for each system of a batch."""
     rig = to_rig(RIG)
 
-    def one(ik: jaxik.FootIK) -> tuple[jaxik.Result, jaxik.Result]:
+    def run_system(ik: jaxik.FootIK) -> tuple[jaxik.Result, jaxik.Result]:
         def stepped(state: jaxik.State, frame: jaxik.Frame) -> tuple[jaxik.State, jaxik.Result]:
             return jaxik.step(ik, rig, ground, state, frame, trace=True)
 
         steps = jax.lax.scan(stepped, jaxik.init(ik, rig), frames)[1]
         return jaxik.run(ik, rig, ground, frames), steps
 
-    return jax.vmap(one)(iks)
+    return jax.vmap(run_system)(iks)
 
 
 def batch(name: str) -> jaxik.FootIK:
-    """The blend as it is, and with twisted legs of which only a part is taken."""
+    """The blend itself, and one with twisted legs that get only a part of foot IK."""
     iks = [
         parameter_tree.replace(BLENDS[name], {"leg.weight": weight, "leg.twist": twist})
         for weight, twist in zip(WEIGHTS, TWISTS, strict=True)
@@ -110,16 +110,16 @@ def batch(name: str) -> jaxik.FootIK:
 
 
 @functools.cache
-def wander() -> jaxik.Frame:
+def clip() -> jaxik.Frame:
     return to_frames(wandering(RIG, np.random.default_rng(1), COUNT))
 
 
 @functools.cache
-def wandered(name: str) -> tuple[jaxik.Result, jaxik.Result]:
-    return both_ways(batch(name), to_terrain(BROKEN), wander())
+def results(name: str) -> tuple[jaxik.Result, jaxik.Result]:
+    return run_and_step(batch(name), to_terrain(BROKEN), clip())
 
 
-def test_every_rule_of_every_stage_is_in_some_blend():
+def test_all_rules_of_all_stages_occur_in_the_random_systems():
     for stage, rules in STAGES.items():
         assert len(rules) > 1
         used = {type(getattr(blend, stage)) for blend in draw().values()}
@@ -128,12 +128,14 @@ def test_every_rule_of_every_stage_is_in_some_blend():
 
 @pytest.mark.parametrize("name", BLENDS)
 def test_a_blend_is_finite_and_its_bones_keep_their_lengths(name: str):
-    result = wandered(name)[0]
+    result = results(name)[0]
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
-        endless = ".rays." in jax.tree_util.keystr(path)
-        assert (np.isfinite(leaf) | (endless & ~np.isnan(leaf))).all(), jax.tree_util.keystr(path)
-    for came, wanted in zip(bone_lengths(result.pose), bone_lengths(wander().pose), strict=True):
-        np.testing.assert_allclose(came, np.broadcast_to(wanted, came.shape), atol=1e-9)
+        may_be_infinite = ".rays." in jax.tree_util.keystr(path)
+        assert (np.isfinite(leaf) | (may_be_infinite & ~np.isnan(leaf))).all(), (
+            jax.tree_util.keystr(path)
+        )
+    for actual, expected in zip(bone_lengths(result.pose), bone_lengths(clip().pose), strict=True):
+        np.testing.assert_allclose(actual, np.broadcast_to(expected, actual.shape), atol=1e-9)
     for joint in JOINTS:
         size = np.linalg.norm(getattr(result.pose, joint).rot, axis=-1)
         np.testing.assert_allclose(size, 1.0, atol=1e-12)
@@ -141,30 +143,30 @@ def test_a_blend_is_finite_and_its_bones_keep_their_lengths(name: str):
 
 @pytest.mark.parametrize("name", BLENDS)
 def test_steps_of_a_blend_equal_the_clip_as_a_whole(name: str):
-    whole, steps = wandered(name)
+    whole, steps = results(name)
     assert_close(steps, whole, 1e-9)
 
 
 @pytest.mark.parametrize("name", BLENDS)
-def test_members_of_a_batch_of_blends_have_their_own_numbers(name: str):
-    one, other = (at(wandered(name)[0].pose.knee.pos, member) for member in range(2))
-    assert np.abs(one - other).max() > 1e-3
+def test_members_of_a_batch_keep_their_own_parameters(name: str):
+    first, second = (at(results(name)[0].pose.knee.pos, member) for member in range(2))
+    assert np.abs(first - second).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", BLENDS)
-def test_standing_on_flat_ground_moves_hips_and_ankles_by_the_sole_at_most(name: str):
-    """A foot's height over its sole is 0.08 m in the clip, and what the target says in the rule.
+def test_standing_on_flat_ground_moves_hips_and_ankles_no_more_than_sole_heights_differ(name: str):
+    """Ankles are 0.08 m above their soles in the clip, which the target rule may see otherwise.
 
-    The knees of nearly straight legs move further than that.
+    Knees of nearly straight legs move further than that.
     """
     frames = to_frames(animate(RIG, count=COUNT))
-    result = at(both_ways(batch(name), to_terrain(FLAT), frames)[0], 0)
-    where = BLENDS[name].target
+    result = at(run_and_step(batch(name), to_terrain(FLAT), frames)[0], 0)
+    rule = BLENDS[name].target
     sole = 0.0
-    if isinstance(where, target.SoleTarget | target.ContactTarget):
-        sole = abs(float(where.foot_height) - sample_poses.ANKLE)
+    if isinstance(rule, target.SoleTarget | target.ContactTarget):
+        sole = abs(float(rule.foot_height) - sample_poses.ANKLE)
     for joint in ("hip", "ankle"):
         moved = getattr(result.pose, joint).pos - getattr(frames.pose, joint).pos
         assert np.linalg.norm(moved, axis=-1).max() < sole + 1e-9, joint
-    turn = np.abs(np.sum(result.pose.ankle.rot * frames.pose.ankle.rot, axis=-1))
-    np.testing.assert_allclose(turn, 1.0, atol=1e-9)
+    cosine = np.abs(np.sum(result.pose.ankle.rot * frames.pose.ankle.rot, axis=-1))
+    np.testing.assert_allclose(cosine, 1.0, atol=1e-9)

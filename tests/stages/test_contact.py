@@ -1,4 +1,4 @@
-"""Feet that stand by their speed: what they remember, and how far it counts."""
+"""Contact by speed and height: hysteresis, smoothing and memory."""
 
 import dataclasses
 
@@ -22,20 +22,20 @@ from support.clips import (
 )
 
 HALF = FRAMES // 2
-PACES = (1.0, 0.4, 0.2, 0.4, 0.6, 0.4)  # m/s, of the toes, one after the other
+SPEEDS = (1.0, 0.4, 0.2, 0.4, 0.6, 0.4)  # m/s, of the toes, one after the other
 HEIGHTS = (0.12, 0.09, 0.07, 0.09, 0.11, 0.09)  # m, likewise
 STANDS = (0, 0, 1, 1, 0, 0)  # between 0.25 and 0.5 m/s, 0.075 and 0.1 m: as before
-EACH = FRAMES // len(PACES)  # frames
+EACH = FRAMES // len(SPEEDS)  # frames
 resume = jax.jit(jaxik.resume, compiler_options=QUICK)
 
 
 def clip(speed: np.ndarray, height: np.ndarray) -> jaxik.Frame:
-    """Standing legs whose toes have this speed, m/s, and height, m (frames)."""
+    """Standing legs whose toes have these speeds, m/s, and heights, m (frames)."""
     frames = to_frames(animate(RIG))
     toe = frames.pose.toe.pos.at[..., 1].set(jnp.asarray(height)[:, None])
     pose = dataclasses.replace(frames.pose, toe=jaxik.Transform(toe, frames.pose.toe.rot))
-    both = jnp.asarray(np.stack([speed, speed], axis=-1))
-    return dataclasses.replace(frames, pose=pose, toe_speed=both)
+    toe_speed = jnp.asarray(np.stack([speed, speed], axis=-1))
+    return dataclasses.replace(frames, pose=pose, toe_speed=toe_speed)
 
 
 def result_of(frames: jaxik.Frame, **values: float) -> jaxik.Result:
@@ -45,17 +45,17 @@ def result_of(frames: jaxik.Frame, **values: float) -> jaxik.Result:
 
 @pytest.mark.parametrize("by", ["speed", "height"])
 def test_a_foot_between_the_thresholds_stays_as_it_was(by: str):
-    calm, low = np.zeros(FRAMES), np.full(FRAMES, 0.02)
-    speed = np.repeat(PACES, EACH) if by == "speed" else calm
+    still, low = np.zeros(FRAMES), np.full(FRAMES, 0.02)
+    speed = np.repeat(SPEEDS, EACH) if by == "speed" else still
     height = np.repeat(HEIGHTS, EACH) if by == "height" else low
     contact = result_of(clip(speed, height)).trace.sensed.contact
-    wanted = np.repeat(STANDS, EACH)[:, None].repeat(2, axis=-1)
-    np.testing.assert_array_equal(contact.planted, wanted)
-    np.testing.assert_array_equal(contact.lifted, 1 - wanted)
-    np.testing.assert_array_equal(contact.weight, wanted)
+    expected = np.repeat(STANDS, EACH)[:, None].repeat(2, axis=-1)
+    np.testing.assert_array_equal(contact.planted, expected)
+    np.testing.assert_array_equal(contact.lifted, 1 - expected)
+    np.testing.assert_array_equal(contact.weight, expected)
 
 
-def test_the_first_frame_decides_between_the_thresholds_as_for_a_foot_that_swings():
+def test_a_foot_between_the_thresholds_in_the_first_frame_swings():
     between = clip(np.full(FRAMES, 0.4), np.full(FRAMES, 0.02))
     assert not np.asarray(result_of(between).trace.sensed.contact.planted).any()
 
@@ -75,7 +75,7 @@ def test_a_clip_cut_in_two_and_resumed_equals_the_whole():
     values = {"contact.half_life": 0.1, "target.rise_half_life": 0.1, "target.spring": True}
     ik = to_ik(values, "by speed")
     rng = np.random.default_rng(0)
-    frames = clip(rng.choice(PACES, FRAMES), np.full(FRAMES, 0.02))
+    frames = clip(rng.choice(SPEEDS, FRAMES), np.full(FRAMES, 0.02))
     rig, ground = to_rig(RIG), to_terrain(FLAT)
     whole = resume(ik, rig, ground, jaxik.init(ik, rig), frames)
     memory, first = resume(ik, rig, ground, jaxik.init(ik, rig), at(frames, slice(HALF)))
@@ -86,9 +86,9 @@ def test_a_clip_cut_in_two_and_resumed_equals_the_whole():
     assert_close(halves, whole[1], 1e-12)
 
 
-def test_the_memory_told_of_each_frame_is_the_one_after_it():
-    """From the trace a clip can be taken up anywhere."""
-    speed = np.repeat(PACES, EACH)
+def test_the_trace_holds_the_memory_after_each_frame():
+    """So a clip can be resumed from the trace at any frame."""
+    speed = np.repeat(SPEEDS, EACH)
     result = result_of(clip(speed, np.full(FRAMES, 0.02)))
     standing = result.trace.advanced.state.contact.standing
     np.testing.assert_array_equal(standing[:, 0], np.repeat(STANDS, EACH))

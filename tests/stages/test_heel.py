@@ -1,4 +1,4 @@
-"""Heels that rise about the ball: against a search for the turn, and along whole walks."""
+"""Heels that rise about the ball, compared with a numerical search and along whole walks."""
 
 import functools
 
@@ -22,10 +22,10 @@ VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.2}
 angle_of = jax.jit(effector.heel_angle)
 
 
-def searched(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: float) -> float:
-    """The smallest turn, rad, that brings the ankle within `length` m, or else as near as it gets.
+def search_angle(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: float) -> float:
+    """The smallest angle, rad, that brings the ankle within `length`, m, or as near as possible.
 
-    0 for a leg that is short enough, or that a small turn would only make longer.
+    It is 0 for a leg that is short enough, or that a small rise of the heel would lengthen.
     """
 
     def distance(angle: float) -> float:
@@ -39,26 +39,26 @@ def searched(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: flo
     return brentq(lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12)
 
 
-def draws(count: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
-    """Balls under hips, ankles behind and over them, and lengths that are short of it or not."""
+def random_legs(count: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+    """Random balls, ankles behind and above them, and expected lengths, some of them too short."""
     rng = np.random.default_rng(2)
-    drawn = []
+    legs = []
     for _ in range(count):
         axis = maths.unit(np.array([-1.0, *rng.normal(0.0, 0.3, 2)]), maths.X)
         to_ball = np.array([rng.normal(0.0, 0.1), -0.9, rng.uniform(-0.6, 0.6)])
         arm = np.array([rng.normal(0.0, 0.02), rng.uniform(0.0, 0.1), rng.uniform(-0.18, -0.1)])
-        short = rng.choice([-0.02, 0.01, 0.05, 0.3])
-        drawn.append((to_ball, arm, axis, maths.length(to_ball + arm) - short))
-    return drawn
+        excess = rng.choice([-0.02, 0.01, 0.05, 0.3])
+        legs.append((to_ball, arm, axis, maths.length(to_ball + arm) - excess))
+    return legs
 
 
-def test_the_turn_of_the_heel_is_the_one_that_a_search_finds():
-    drawn = draws(60)
-    wanted = np.array([searched(*each) for each in drawn])
-    came = angle_of(*(jnp.asarray(np.stack(column)) for column in zip(*drawn, strict=True)))
-    assert 0.2 < (wanted > 0).mean() < 0.9
-    # The turn that comes nearest is only as sharp as a minimum.
-    np.testing.assert_allclose(np.maximum(came, 0.0), wanted, rtol=0, atol=1e-6)
+def test_the_angle_of_the_heel_is_the_one_that_a_search_finds():
+    legs = random_legs(60)
+    expected = np.array([search_angle(*each) for each in legs])
+    actual = angle_of(*(jnp.asarray(np.stack(column)) for column in zip(*legs, strict=True)))
+    assert 0.2 < (expected > 0).mean() < 0.9
+    # Where the length cannot be reached, the search is only as precise as a minimum.
+    np.testing.assert_allclose(np.maximum(actual, 0.0), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -66,31 +66,29 @@ def test_the_turn_of_the_heel_is_the_one_that_a_search_finds():
     [
         ([0.0, -0.9, 0.0], [0.0, 0.0, 0.0], 0.8),  # ankle on the ball
         ([0.0, 0.0, 0.0], [0.0, 0.1, -0.1], 0.8),  # ball on the hip
-        ([0.0, -0.9, -0.9], [0.0, 0.1, 0.1], 0.8),  # as near as it gets
-        ([0.0, -0.9, 0.2], [0.0, 0.0, -0.1], 0.0),  # no leg
+        ([0.0, -0.9, -0.9], [0.0, 0.1, 0.1], 0.8),  # cannot become so short
+        ([0.0, -0.9, 0.2], [0.0, 0.0, -0.1], 0.0),  # a leg of no length
         ([0.0, -0.9, 0.0], [0.1, 0.0, 0.0], 0.8),  # along the axis
     ],
     ids=["no foot", "folded", "nearest", "no leg", "along the axis"],
 )
-def test_the_turn_has_finite_slopes_where_it_has_no_answer(to_ball, arm, length):
+def test_the_angle_has_finite_gradients_where_there_is_no_solution(to_ball, arm, length):
     one_leg = (np.array(row)[None] for row in (to_ball, arm, -maths.X, length))
     finite_jacobian(effector.heel_angle, *one_leg)
 
 
 @functools.cache
 def walked() -> tuple[jaxik.Frame, jaxik.Result]:
-    """Across uneven blocks."""
+    """A walk across uneven blocks."""
     frames = to_frames(walk(RIG, COUNT, start=(0.0, 0.0, -2.5), heading=0.1))
-    ground = to_terrain(blocks(np.random.default_rng(5), most=0.2, odd=False))
+    ground = to_terrain(blocks(np.random.default_rng(5), max_height=0.2, irregular=False))
     run = jax.jit(jaxik.run, compiler_options=QUICK)
     return frames, run(to_ik(VALUES, "stride"), to_rig(RIG), ground, frames)
 
 
 @functools.cache
 def heels() -> dict[str, np.ndarray]:
-    """Of every foot of the walk: by how much its heel rose and should have, rad; hip to ankle
-    before and after and how far they may be apart, m.
-    """
+    """Each heel's lift and expected lift, rad; its leg's length before, after and at most, m."""
     frames, result = walked()
     sensed, advanced = result.trace.sensed, result.trace.advanced
     hip = sensed.hip_ws + advanced.state.pelvis.offset_ws[:, None]
@@ -104,53 +102,55 @@ def heels() -> dict[str, np.ndarray]:
 
     arm = sensed.ankle_ws - sensed.ball_ws
     axis = -np.asarray(quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X)))
-    wanted = [
-        searched(ball, arm, axis[index], length)
-        for index, rows in enumerate(
+    expected = [
+        search_angle(ball, arm, axis[index], length)
+        for index, legs in enumerate(
             zip(*map(np.asarray, (before - arm, arm, longest)), strict=True)
         )
-        for ball, arm, length in zip(*rows, strict=True)
+        for ball, arm, length in zip(*legs, strict=True)
     ]
     cosine = np.abs(np.sum(advanced.effector.rot_ws * sensed.ankle_rot_ws, axis=-1))
     return {
         "lift": 2.0 * np.arccos(np.minimum(cosine, 1.0)),
-        "wanted": np.reshape(wanted, longest.shape),
+        "expected": np.reshape(expected, longest.shape),
         "before": np.linalg.norm(before, axis=-1),
         "after": np.linalg.norm(after, axis=-1),
         "longest": longest,
     }
 
 
-def test_a_heel_rises_on_a_walk_as_a_search_finds_and_no_further_than_it_may():
-    spans, most = heels(), VALUES["effector.max_lift"]
-    assert 0.02 < (spans["wanted"] > 0.0).mean() < 0.9 and (spans["wanted"] > most).any()
-    np.testing.assert_allclose(spans["lift"], np.minimum(spans["wanted"], most), rtol=0, atol=1e-6)
+def test_on_a_walk_a_heel_rises_as_far_as_a_search_finds_within_its_limit():
+    walk, max_lift = heels(), VALUES["effector.max_lift"]
+    assert 0.02 < (walk["expected"] > 0.0).mean() < 0.9 and (walk["expected"] > max_lift).any()
+    np.testing.assert_allclose(
+        walk["lift"], np.minimum(walk["expected"], max_lift), rtol=0, atol=1e-6
+    )
 
 
-def test_a_leg_is_kept_within_its_length_where_a_heel_that_rises_can_do_so():
-    spans, most = heels(), VALUES["effector.max_lift"]
-    rises = (spans["lift"] > 1e-6) & (spans["wanted"] < most)
+def test_a_rising_heel_keeps_the_leg_at_its_longest():
+    walk, max_lift = heels(), VALUES["effector.max_lift"]
+    rises = (walk["lift"] > 1e-6) & (walk["expected"] < max_lift)
     assert rises.mean() > 0.02
-    np.testing.assert_allclose(spans["after"][rises], spans["longest"][rises], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(walk["after"][rises], walk["longest"][rises], rtol=0, atol=1e-9)
 
 
 def test_a_heel_stays_down_where_the_leg_is_short_enough():
-    spans = heels()
-    short = spans["before"] < spans["longest"] - 1e-9
+    walk = heels()
+    short = walk["before"] < walk["longest"] - 1e-9
     assert short.mean() > 0.1
-    assert spans["lift"][short].max() < 1e-7
-    np.testing.assert_allclose(spans["after"][short], spans["before"][short], rtol=0, atol=1e-12)
+    assert walk["lift"][short].max() < 1e-7
+    np.testing.assert_allclose(walk["after"][short], walk["before"][short], rtol=0, atol=1e-12)
 
 
-def test_the_ball_stays_where_the_target_has_it_while_the_heel_rises():
+def test_the_ball_stays_in_place_while_the_heel_rises():
     frames, result = walked()
     sensed, advanced = result.trace.sensed, result.trace.advanced
-    place = jax.vmap(lambda root, ball: root.apply(ball))
-    ball = place(frames.world_from_model, result.pose.toe.pos)
+    to_world = jax.vmap(lambda root, ball: root.apply(ball))
+    ball = to_world(frames.world_from_model, result.pose.toe.pos)
     lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
-    asked = advanced.foothold_ws + lift + (sensed.ball_ws - sensed.ankle_ws)
-    # The sole is laid on the slope about the ankle afterwards: only level ground keeps the ball.
+    requested = advanced.foothold_ws + lift + (sensed.ball_ws - sensed.ankle_ws)
+    # The foot is then rotated onto the slope about its ankle: the ball stays on level ground only.
     level = np.asarray(sensed.ground.ankle.normal)[..., 1] * np.asarray(sensed.contact.weight)
     arrived = (np.asarray(result.reached) > 0) & ((level == 0) | (level > 1 - 1e-12))
     assert (heels()["lift"][arrived] > 0.02).any()
-    np.testing.assert_allclose(ball[arrived], asked[arrived], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(ball[arrived], requested[arrived], rtol=0, atol=1e-8)

@@ -1,4 +1,4 @@
-"""What every parameter and switch does, stage by stage, and the slopes through the stages."""
+"""Effects of all parameters and switches of the record, and gradients through its stages."""
 
 import dataclasses
 import functools
@@ -37,7 +37,7 @@ from support.clips import to_terrain as to_ground
 
 NO_LOCK = {"lock.enabled": False}
 STIFF = {"pelvis.limit": 0.0}
-LOOSE = {  # nothing releases a lock but what a case sets
+LOOSE = {  # nothing releases a lock except what a case sets
     "lock.release_distance": 9.0,
     "lock.release_cone": 1.5,
     "lock.release_max_angle": 3.1415926536,
@@ -204,7 +204,7 @@ EXTRA = (
     ),
 )
 LATE = planes((0, 0, 0), (0.5, 0, -1.2))  # begins to rise where "goes forward" ends
-RULES = (  # switches of the rules that the record does not have, which change nothing when off
+RULES = (  # switches of our rules that the record lacks; off by default
     Case(
         "target.spring",
         "goes forward",
@@ -224,7 +224,7 @@ RULES = (  # switches of the rules that the record does not have, which change n
         {"lean.forward_rate": 0.8},
     ),
     Case(
-        "lock.hold_ball",  # of feet that count as standing until their heels are well up
+        "lock.hold_ball",  # feet that count as standing until their heels are well up
         "walks",
         FLAT,
         (False, True),
@@ -247,7 +247,7 @@ def named(cases: Any) -> Any:
     return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
 
 
-def test_every_field_of_the_record_and_every_parameter_has_a_case():
+def test_all_fields_of_the_record_and_all_parameters_have_a_case():
     assert [case.name for case in RECORD if case not in SLOPED] == [
         "lock.enabled",
         "probe.use_toe",
@@ -266,36 +266,36 @@ def test_every_field_of_the_record_and_every_parameter_has_a_case():
 
 @pytest.mark.slow
 @named(CASES)
-def test_a_parameter_moves_the_result_the_way_it_should(case: Case):
+def test_a_parameter_has_the_expected_effect(case: Case):
     assert_effect(case, "record")
 
 
 @pytest.mark.slow
 @named(SLOPED)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
-def test_a_parameters_slope_is_its_difference_quotient(case: Case, gate: Any):
+def test_the_derivative_of_a_parameter_is_its_difference_quotient(case: Case, gate: Any):
     assert_slope(case, "record", gate)
 
 
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
 @pytest.mark.parametrize("name", ["limps", "limps on its toes"])
-def test_slopes_with_respect_to_the_animation_and_the_ground_are_difference_quotients(name, gate):
+def test_gradients_of_animation_and_terrain_are_difference_quotients(name, gate):
     uneven = planes((0.05, 0.11, 0.0), (0.21, -0.1, -0.1))
     ik = to_ik({"pelvis.vertical_only": False})
     inputs = (ik, clip(name), to_ground(uneven), jaxik.init(ik, to_rig(RIG)))
     rng = np.random.default_rng(0)
-    flat = still(inputs)
+    zero = still(inputs)
     pose, root = inputs[1].pose, inputs[1].world_from_model
     jitter = lambda x: jnp.asarray(0.1 * rng.normal(size=x.shape))  # noqa: E731
     shifted = eqx.tree_at(
         lambda f: (f.pose.hip.pos, f.pose.ankle.pos, f.pose.toe.pos, f.world_from_model.pos),
-        flat[1],
+        zero[1],
         tuple(map(jitter, (pose.hip.pos, pose.ankle.pos, pose.toe.pos, root.pos))),
     )
     raised = eqx.tree_at(
-        lambda g: [plane.point_ws for plane in g.surfaces], flat[2], [jnp.full(3, 0.1, float)] * 3
+        lambda g: [plane.point_ws for plane in g.surfaces], zero[2], [jnp.full(3, 0.1, float)] * 3
     )
-    tangents = (flat[0], shifted, raised, flat[3])
+    tangents = (zero[0], shifted, raised, zero[3])
 
     def numbers(measures: dict[str, jax.Array]) -> np.ndarray:
         return np.array(list(measures.values()))
@@ -303,15 +303,15 @@ def test_slopes_with_respect_to_the_animation_and_the_ground_are_difference_quot
     def along(step: float) -> np.ndarray:
         floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
         floats = jax.tree.map(lambda x, t: x + step * t, floats, tangents)
-        return numbers(measured(eqx.combine(floats, rest), flat, gate)[0])
+        return numbers(measured(eqx.combine(floats, rest), zero, gate)[0])
 
-    slopes = numbers(measured(inputs, tangents, gate)[1])
+    derivatives = numbers(measured(inputs, tangents, gate)[1])
     quotients = (along(1e-6) - along(-1e-6)) / 2e-6
-    assert np.abs(slopes).max() > 1e-2
-    np.testing.assert_allclose(slopes, quotients, rtol=1e-4, atol=1e-6)
+    assert np.abs(derivatives).max() > 1e-2
+    np.testing.assert_allclose(derivatives, quotients, rtol=1e-4, atol=1e-6)
 
 
-# Where slopes go wrong. One frame each, so that the whole is also a clip of one frame.
+# Inputs where gradients could become NaN or infinite. Clips of one frame each.
 
 THIGH, SHIN = sample_poses.THIGH, sample_poses.SHIN
 ON_HIP = {"probe.ray_up": 2.0, "target.max_ankle_height": 2.0, "pelvis.limit": 0.0}
@@ -369,8 +369,8 @@ SINGULAR: dict[str, tuple[dict[str, Any], jaxik.Frame, Any]] = {
 }
 
 
-def summed(floats: Any, rest: Any) -> jax.Array:
-    """An uneven sum of places, turns, offsets and slopes."""
+def weighted_sum(floats: Any, rest: Any) -> jax.Array:
+    """A weighted sum of positions, rotations, offsets and slopes."""
     ik, frames, ground, gate = eqx.combine(floats, rest)
     result = jaxik.run(ik, to_rig(RIG), ground, frames, gate)
     state = result.trace.advanced.state
@@ -379,49 +379,49 @@ def summed(floats: Any, rest: Any) -> jax.Array:
 
 @functools.partial(jax.jit, compiler_options=QUICK)
 @jax.vmap
-def forward_slope(floats: Any, rest: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    return jax.jvp(lambda floats: summed(floats, rest), (floats,), (tangents,))
+def forward_derivative(floats: Any, rest: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    return jax.jvp(lambda floats: weighted_sum(floats, rest), (floats,), (tangents,))
 
 
-backward_slopes = jax.jit(jax.vmap(jax.grad(summed)), compiler_options=QUICK)
+reverse_gradients = jax.jit(jax.vmap(jax.grad(weighted_sum)), compiler_options=QUICK)
 
 
 def singular_inputs(gate: Any) -> tuple[Any, Any, Any]:
-    """Floats, everything else, and a tangent of the floats, of all `SINGULAR`."""
-    each = [
+    """Floats, other leaves, and a random tangent of the floats, for all of `SINGULAR`."""
+    members = [
         (to_ik(values), frames, to_ground(ground), gate)
         for values, frames, ground in SINGULAR.values()
     ]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
     floats, rest = eqx.partition(batch, eqx.is_inexact_array)
     rng = np.random.default_rng(0)
     return floats, rest, jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), floats)
 
 
 @functools.cache
-def hard_slopes() -> tuple[Any, ...]:
+def hard_gradients() -> tuple[Any, ...]:
     floats, rest, tangents = singular_inputs(HARD)
-    return *forward_slope(floats, rest, tangents), backward_slopes(floats, rest), tangents
+    return *forward_derivative(floats, rest, tangents), reverse_gradients(floats, rest), tangents
 
 
 @functools.cache
-def smooth_slopes() -> tuple[jax.Array, jax.Array]:
-    return forward_slope(*singular_inputs(Smooth(1.0)))
+def smooth_derivatives() -> tuple[jax.Array, jax.Array]:
+    return forward_derivative(*singular_inputs(Smooth(1.0)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SINGULAR)
-def test_slopes_are_finite_and_the_same_both_ways(name):
-    value, forward, slopes, tangents = at(hard_slopes(), list(SINGULAR).index(name))
-    for path, slope in jax.tree_util.tree_leaves_with_path(slopes):
-        assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
+def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(name):
+    value, forward, gradients, tangents = at(hard_gradients(), list(SINGULAR).index(name))
+    for path, gradient in jax.tree_util.tree_leaves_with_path(gradients):
+        assert np.isfinite(gradient).all(), jax.tree_util.keystr(path)
     assert np.isfinite(value) and np.isfinite(forward)
-    pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(tangents), strict=True)
-    reverse = [np.sum(np.asarray(slope) * np.asarray(tangent)) for slope, tangent in pairs]
+    pairs = zip(jax.tree.leaves(gradients), jax.tree.leaves(tangents), strict=True)
+    reverse = [np.sum(np.asarray(gradient) * np.asarray(tangent)) for gradient, tangent in pairs]
     np.testing.assert_allclose(sum(reverse), forward, rtol=1e-9, atol=1e-9 * np.abs(reverse).max())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SINGULAR)
-def test_slopes_through_softened_decisions_are_finite(name):
-    assert np.isfinite(at(smooth_slopes(), list(SINGULAR).index(name))).all()
+def test_derivatives_through_softened_decisions_are_finite(name):
+    assert np.isfinite(at(smooth_derivatives(), list(SINGULAR).index(name))).all()

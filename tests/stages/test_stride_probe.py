@@ -1,4 +1,4 @@
-"""Feet that know their next foothold: nothing moves on a flat floor, and nothing ever jumps."""
+"""The stride probe: nothing moves on a flat floor, and the ground never jumps."""
 
 import dataclasses
 import functools
@@ -30,10 +30,10 @@ JOINTS = ("hip", "knee", "ankle", "toe")
 run = jax.jit(jaxik.run, compiler_options=QUICK)
 
 
-def stepped(*tops: tuple[float, float, float]) -> PlainTerrain:
-    """Three level blocks, each from one place forward to another and at a height, m.
+def level_blocks(*tops: tuple[float, float, float]) -> PlainTerrain:
+    """Three level blocks, each given by where it starts and ends forward, and its height, m.
 
-    The last stands for those that are missing: equal shapes share a program.
+    Missing blocks repeat the last one: equal shapes share a program.
     """
     triangles = []
     for near, far, height in (*tops, *(tops[-1:] * 3))[:3]:
@@ -45,12 +45,12 @@ def stepped(*tops: tuple[float, float, float]) -> PlainTerrain:
 # Flat floor.
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["told", "untold"])
-def test_nothing_at_all_changes_on_a_flat_floor(told: bool):
-    frames = to_frames(walk(RIG, FRAMES, told=told, heading=0.4, start=(0.3, 0.0, -0.2)))
+@pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
+def test_nothing_changes_on_a_flat_floor(known: bool):
+    frames = to_frames(walk(RIG, FRAMES, known=known, heading=0.4, start=(0.3, 0.0, -0.2)))
     legs = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
     assert legs.max() > 0.99 * (sample_poses.THIGH + sample_poses.SHIN), (
-        "knees are straight, heels rise"
+        "knees are straight and heels rise"
     )
     ik = to_ik({"lock.enabled": True}, "stride")
     result = run(ik, to_rig(RIG), to_terrain(FLAT), frames)
@@ -60,30 +60,30 @@ def test_nothing_at_all_changes_on_a_flat_floor(told: bool):
     assert_close(effector.rot_ws, sensed.ankle_rot_ws, 1e-9)
     assert np.abs(result.body.pos).max() < 1e-9
     for joint in JOINTS:
-        came, wanted = (getattr(pose, joint) for pose in (result.pose, frames.pose))
-        np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-9, err_msg=joint)
-        assert sample_poses.rotation_angle(np.asarray(came.rot), np.asarray(wanted.rot)) < 1e-7, (
-            joint
-        )
+        actual, expected = (getattr(pose, joint) for pose in (result.pose, frames.pose))
+        np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=1e-9, err_msg=joint)
+        assert (
+            sample_poses.rotation_angle(np.asarray(actual.rot), np.asarray(expected.rot)) < 1e-7
+        ), joint
 
 
 # The ground under a swinging foot.
 
 
-def swing(shares: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jaxik.Frame:
-    """Feet on their way from one place forward to the next, m; both may be one for each frame."""
+def swing(fractions: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jaxik.Frame:
+    """Feet that swing from `last` to `following`, m forward, each one value or one per frame."""
     frame = animate(RIG, count=1)[0]
     frames = []
-    for share, start, end in np.broadcast(shares, last, following):
+    for fraction, start, end in np.broadcast(fractions, last, following):
         sideways = frame.toe.pos * [1.0, 0.0, 0.0]
         stride = characters.Stride(
             standing=np.zeros(2),
             last_ws=sideways + start * maths.Z,
             next_ws=sideways + end * maths.Z,
-            fraction=np.full(2, share),
+            fraction=np.full(2, fraction),
             known=np.ones(2),
         )
-        ahead = maths.lerp(start, end, maths.smooth01(share)) - frame.toe.pos[0, 2]
+        ahead = maths.lerp(start, end, maths.smooth01(fraction)) - frame.toe.pos[0, 2]
         root = frame.world_from_model._replace(pos=ahead * maths.Z)
         frames.append(dataclasses.replace(frame, stride=stride, world_from_model=root))
     return to_frames(frames)
@@ -91,22 +91,22 @@ def swing(shares: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jaxik.
 
 @functools.partial(jax.jit, compiler_options=QUICK)
 def heights(ground: Any, frames: jaxik.Frame) -> jax.Array:
-    """Ground under the left ankle as the probe of `stride` tells it, m (frames)."""
+    """Ground height under the left ankle by the probe of `stride`, m (frames)."""
     ik, rig = to_ik({}, "stride"), to_rig(RIG)
 
-    def look(frame: jaxik.Frame) -> jax.Array:
+    def height(frame: jaxik.Frame) -> jax.Array:
         inputs = Inputs(rig, ground, frame, HARD)
         contact = ik.contact.sense(inputs)
-        seen = ik.probe.sense(inputs, contact, ik.target.foot_height)
-        return seen.ankle.point[0, 1]
+        ground_hits = ik.probe.sense(inputs, contact, ik.target.foot_height)
+        return ground_hits.ankle.point[0, 1]
 
-    return jax.vmap(look)(frames)
+    return jax.vmap(height)(frames)
 
 
-STEP_UP = stepped((-3.0, 0.3, 0.0), (0.3, 3.0, 0.25))
-STEP_DOWN = stepped((-3.0, 0.5, 0.25), (0.5, 3.0, 0.0))
-HURDLE = stepped((-3.0, 0.35, 0.0), (0.35, 0.45, 0.2), (0.45, 3.0, 0.0))
-CLIFF = stepped((-3.0, 0.5, 0.0), (0.5, 3.0, -0.8))
+STEP_UP = level_blocks((-3.0, 0.3, 0.0), (0.3, 3.0, 0.25))
+STEP_DOWN = level_blocks((-3.0, 0.5, 0.25), (0.5, 3.0, 0.0))
+HURDLE = level_blocks((-3.0, 0.35, 0.0), (0.35, 0.45, 0.2), (0.45, 3.0, 0.0))
+CLIFF = level_blocks((-3.0, 0.5, 0.0), (0.5, 3.0, -0.8))
 FINE = np.linspace(0.0, 1.0, 801)
 
 
@@ -120,24 +120,26 @@ def test_the_ground_of_a_swing_does_not_jump_and_leads_to_the_next_foothold(grou
     assert height[-1] == pytest.approx(end, abs=1e-12)
     assert 0.1 < height.max() <= highest + 1e-12
     coarse, fine = (np.abs(np.diff(height[::step])).max() for step in (8, 1))
-    assert coarse < 0.02 and fine < coarse / 6, "where it jumped, both would be as large"
+    assert coarse < 0.02 and fine < coarse / 6, "at a jump both would be equally large"
 
 
-def test_a_cliff_is_not_followed_and_its_edge_is_not_felt():
+def test_a_cliff_and_its_edge_do_not_change_the_ground():
     assert np.abs(heights(to_terrain(CLIFF), swing(FINE))).max() == 0.0
     along_edge = swing(np.full(801, 0.6), following=np.linspace(0.4, 0.6, 801))
     assert np.abs(heights(to_terrain(CLIFF), along_edge)).max() == 0.0
 
 
-def test_a_step_loses_its_say_by_and_by_as_it_grows_too_high():
-    """Between 0.6 and 0.7 m down, the foot comes back to the height of its last ground."""
+def test_a_step_fades_out_gradually_as_it_becomes_too_high():
+    """Between 0.6 and 0.7 m down, the foot returns to the height of its last foothold."""
     drops, arrived = np.linspace(0.5, 0.8, 61), swing(np.full(801, 1.0))
-    grounds = [to_terrain(stepped((-3.0, 0.5, 0.0), (0.5, 3.0, -drop))) for drop in drops]
+    grounds = [to_terrain(level_blocks((-3.0, 0.5, 0.0), (0.5, 3.0, -drop))) for drop in drops]
     height = np.array([heights(ground, arrived)[0] for ground in grounds])
-    followed, lost = drops < 0.6, drops > 0.7 + 1e-9
+    followed, ignored = drops < 0.6, drops > 0.7 + 1e-9
     np.testing.assert_allclose(height[followed], -drops[followed], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(height[lost], 0.0, rtol=0, atol=1e-12)
-    assert np.abs(np.diff(height)).max() < 0.06, "0.6 m within 0.1 m, at most half as fast again"
+    np.testing.assert_allclose(height[ignored], 0.0, rtol=0, atol=1e-12)
+    assert np.abs(np.diff(height)).max() < 0.06, (
+        "0.6 m within 0.1 m, at no more than 1.5 times the mean slope"
+    )
 
 
 # Feet that stand.
@@ -148,13 +150,13 @@ def drifting_walk() -> jaxik.Frame:
     frames = []
     for index, frame in enumerate(walk(RIG, FRAMES)):
         root = frame.world_from_model
-        slipped = root._replace(pos=root.pos + 0.08 * index / 60 * maths.X)
-        frames.append(dataclasses.replace(frame, world_from_model=slipped))
+        moved = root._replace(pos=root.pos + 0.08 * index / 60 * maths.X)
+        frames.append(dataclasses.replace(frame, world_from_model=moved))
     return to_frames(sample_poses.with_speeds(frames))
 
 
 def ball_slip(hold_ball: bool) -> np.ndarray:
-    """How far a locked foot's solved ball moves along the ground in a frame, m."""
+    """How far the solved ball of a locked foot moves along the ground in each frame, m."""
     values = {"lock.enabled": True, "lock.hold_ball": hold_ball, "lock.lock_half_life": 0.0}
     frames = drifting_walk()
     result = run(to_ik(values, "stride"), to_rig(RIG), to_terrain(FLAT), frames)
@@ -162,11 +164,11 @@ def ball_slip(hold_ball: bool) -> np.ndarray:
         frames.world_from_model, result.pose.toe.pos
     )
     locked = np.asarray(result.trace.advanced.state.lock.locked) > 0
-    held = locked[1:] & locked[:-1] & (np.asarray(result.reached) > 0)[1:]
-    assert held.mean() > 0.3
-    return np.linalg.norm(np.diff(ball, axis=0)[..., [0, 2]], axis=-1)[held]
+    locked_twice = locked[1:] & locked[:-1] & (np.asarray(result.reached) > 0)[1:]
+    assert locked_twice.mean() > 0.3
+    return np.linalg.norm(np.diff(ball, axis=0)[..., [0, 2]], axis=-1)[locked_twice]
 
 
 def test_a_locked_ball_does_not_slide_while_the_heel_rises():
     assert ball_slip(hold_ball=True).max() < 1e-9
-    assert ball_slip(hold_ball=False).max() > 1e-3, "as a locked ankle lets it"
+    assert ball_slip(hold_ball=False).max() > 1e-3, "a locked ankle lets the ball slide"

@@ -1,4 +1,4 @@
-"""What every number, switch and mask of the other systems does, and its slope."""
+"""Effects of all numbers, switches and masks of the other systems, and their derivatives."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ RIGHT_KINK = planes((0, 0, 0), (0, -0.5, -0.065))  # rises 0.03 m to the right o
 
 
 def roots(**base: Any) -> tuple[Case, ...]:
-    """A character that looks for its own ground; whether a ray finds it has no slope."""
+    """A character put on its ground; whether a ray hits has no derivative."""
     return (
         Case("root.enabled", "standing", RAISED, (False, True), "root height", 1),
         Case(
@@ -51,7 +51,7 @@ def roots(**base: Any) -> tuple[Case, ...]:
 
 
 def legs(low: Any, **base: Any) -> tuple[Case, ...]:
-    """What every two-bone leg has; `low` is ground out of its reach."""
+    """Cases of all two-bone legs; `low` is ground out of their reach."""
     base = STIFF | base
     return (
         Case("leg.soften", "standing", low, (0.85, 0.95), "knee angle", 1, base),
@@ -60,7 +60,7 @@ def legs(low: Any, **base: Any) -> tuple[Case, ...]:
     )
 
 
-# The knee of a leg whose aim leans forward: the hint's height counts once it stands aside.
+# The leg's aim leans forward: the height of the hint counts once the hint is aside.
 ASIDE = (0.1, 0.0, 0.0)
 
 CASES: dict[str, tuple[Case, ...]] = {
@@ -77,7 +77,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("pelvis.limit", "standing", LOWER, (0.1, 0.2), "pelvis height", -1, KEPT),
         Case("pelvis.on_gain", "goes forward", RAMP_UP, (0.1, 0.3), "pelvis height", 1, KEPT),
         Case(
-            "pelvis.off_gain",  # counts by how much no foot stands
+            "pelvis.off_gain",  # counts as far as no foot stands
             "goes forward",
             RAMP_UP,
             (0.05, 0.2),
@@ -97,7 +97,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         *legs(LOWERED, **KEPT),
         Case("leg.enabled", "standing", RAISED, (False, True), "miss", -1, KEPT | STIFF),
         Case("foot.enabled", "standing", planes((0.3, 0, 0)), (False, True), "pitch", 1),
-        # The turned foot brings the ray's start to the side that the offset has left.
+        # The rotated foot moves the start of the axis back to the side that the offset left.
         Case("foot.offset[0]", "standing", FLAT, ((0, 0, 0), (0.1, 0, 0)), "left roll", 1),
         Case("foot.offset[2]", "standing", FLAT, ((0, 0, 0), (0, 0, 0.1)), "pitch", 1),
         Case("foot.twist", "standing", FLAT, (0.0, 0.2), "yaw", 1),
@@ -124,7 +124,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("effector.speed", "goes forward", RAMP_UP, (2.0, 6.0), "target height", 1, FOLLOWS),
         Case("effector.latch", "goes forward", RAMP_UP, (False, True), "target height", -1, IDLE),
         Case(
-            "effector.latch_distance",  # stops that far short of a ground it rises to
+            "effector.latch_distance",  # stops this far short of rising ground
             "stops",
             planes((0, 0, 0.3)),
             (0.005, 0.05),
@@ -180,7 +180,7 @@ CASES: dict[str, tuple[Case, ...]] = {
             FIXED | {"probe.by_speed": True},
         ),
         Case(
-            "probe.by_height",  # an unstable foot looks less far, and loses the ground
+            "probe.by_height",  # the rays of an unstable foot are shorter and lose the ground
             "standing",
             LOW,
             (False, True),
@@ -204,7 +204,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("lock.plant", "drifts slowly", FLAT, (False, True), "slip", -1),
         Case("lock.plant_weight", "drifts slowly", FLAT, (0.2, 0.8), "slip", -1),
         Case(
-            "lock.plant_speed",  # planting that was off holds the feet back the sooner
+            "lock.plant_speed",  # planting that was off takes hold sooner
             "drifts slowly",
             FLAT,
             (0.5, 2.0),
@@ -225,7 +225,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("foot.max_tilt", "standing", planes((0.8, 0, 0)), (0.3, 0.5), "pitch", 1),
     ),
 }
-# What the other rules of a system do not ask for: its cases are those of the record.
+# Parameters that no other rule of the system reads; their cases are those of the record.
 INERT: dict[str, tuple[Case, ...]] = {
     "ozz": (
         Case("probe.use_toe", "standing", KINK, (False, True), "everything", 0),
@@ -260,7 +260,7 @@ SLOPED = {
 
 
 @pytest.mark.parametrize("preset", CASES)
-def test_every_number_switch_and_mask_of_a_system_has_a_case(preset: str):
+def test_all_numbers_switches_and_masks_of_a_system_have_a_case(preset: str):
     paths = jax.tree_util.tree_leaves_with_path(to_ik({}, preset))
     leaves = {jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths}
     assert {case.leaf for case in CASES[preset] + INERT[preset]} == leaves
@@ -268,12 +268,12 @@ def test_every_number_switch_and_mask_of_a_system_has_a_case(preset: str):
 
 @pytest.mark.slow
 @listed(CASES)
-def test_a_leaf_moves_the_result_the_way_it_should(preset: str, case: Case):
+def test_a_leaf_has_the_expected_effect(preset: str, case: Case):
     assert_effect(case, preset)
 
 
 @listed(INERT)
-def test_a_leaf_that_no_rule_of_the_system_asks_for_changes_nothing(preset: str, case: Case):
+def test_a_leaf_that_no_rule_reads_changes_nothing(preset: str, case: Case):
     before, after = (run_case(case, value, preset)[0] for value in case.values)
     assert after == pytest.approx(before, abs=1e-9)
 
@@ -281,5 +281,5 @@ def test_a_leaf_that_no_rule_of_the_system_asks_for_changes_nothing(preset: str,
 @pytest.mark.slow
 @listed(SLOPED)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
-def test_a_numbers_slope_is_its_difference_quotient(preset: str, case: Case, gate: Any):
+def test_the_derivative_of_a_number_is_its_difference_quotient(preset: str, case: Case, gate: Any):
     assert_slope(case, preset, gate)

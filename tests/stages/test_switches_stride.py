@@ -1,4 +1,4 @@
-"""What every number, switch and mask of `stride` does, and of the rules that may stand in it."""
+"""Effects of all numbers, switches and masks of `stride` and of rules that can replace its own."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 NONE, ALL = 0xFFFFFFFE, 0xFFFFFFFF  # masks without and with the layer of the planes
 LOCKS = {"lock.enabled": True}
-LOOSE = LOCKS | {  # nothing releases a lock but what a case sets
+LOOSE = LOCKS | {  # nothing releases a lock except what a case sets
     "lock.release_distance": 9.0,
     "lock.release_cone": 1.5,
     "lock.release_max_angle": 3.1415926536,
@@ -29,8 +29,11 @@ LOOSE = LOCKS | {  # nothing releases a lock but what a case sets
 }
 BENDS = {"leg.as_animated": False}
 RIGID = {"effector.max_lift": 0.0}
-WIDE = {"probe.way_slope": 0.5}  # what is beside an edge counts
-EAGER = {"contact.planted_speed": 1.0, "contact.raised_speed": 1.5}  # a walking root stands
+WIDE = {"probe.way_slope": 0.5}  # ground beside an edge counts
+EAGER = {
+    "contact.planted_speed": 1.0,
+    "contact.raised_speed": 1.5,
+}  # a root that stands while the feet walk
 UPHILL, DOWNHILL = planes((0.4, 0, 0)), planes((-0.4, 0, 0))
 GENTLE = planes((0.15, 0, 0))
 TILTED, STEEP, WALL = (planes((0, left, 0)) for left in (0.4, 0.9, 4.0))  # the left foot higher
@@ -38,7 +41,7 @@ LOWERED, RAISED = planes((0, 0, -0.5)), planes((0, 0, 0.1))
 
 
 def followed(**base: Any) -> tuple[Case, ...]:
-    """How the pelvis follows its goal."""
+    """Cases of how the pelvis follows its goal."""
     up, down = ("goes forward", RAMP_UP), ("goes forward", RAMP_DOWN)
     eased = base | {"pelvis.rise_half_life": 0.2}
     return (
@@ -71,8 +74,10 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.way_slope", "lifts off", UPHILL, (0.5, 1.0), "target height", -1),
         Case("probe.heel_length", "comes down", DOWNHILL, (0.05, 0.09), "target height", 1),
         Case("probe.ball_height", "lifts off", UPHILL, (0.03, 0.06), "target height", 1, WIDE),
-        Case("probe.stance_time", "swings untold", KINK, (0.5, 0.7), "target height", 1),
-        Case("probe.swing_time", "swings untold", KINK, (0.3, 0.5), "target height", 1),
+        Case(
+            "probe.stance_time", "swings, footholds unknown", KINK, (0.5, 0.7), "target height", 1
+        ),
+        Case("probe.swing_time", "swings, footholds unknown", KINK, (0.3, 0.5), "target height", 1),
         Case("target.min_ankle_height", "standing", LOWERED, (-0.3, -0.2), "target height", 1),
         Case(
             "target.max_ankle_height",
@@ -194,19 +199,19 @@ SLOPED = {
     [("stride", ("",)), ("by speed", ("contact.", "pelvis."))],
     ids=["stride", "the other contact and pelvis"],
 )
-def test_every_number_switch_and_mask_has_a_case(preset: str, stages: tuple[str, ...]):
+def test_all_numbers_switches_and_masks_have_a_case(preset: str, stages: tuple[str, ...]):
     paths = jax.tree_util.tree_leaves_with_path(to_ik({}, preset))
     leaves = {jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths}
-    wanted = {leaf for leaf in leaves if leaf.startswith(stages)}
-    assert {case.leaf for case in CASES[preset]} == wanted
+    expected = {leaf for leaf in leaves if leaf.startswith(stages)}
+    assert {case.leaf for case in CASES[preset]} == expected
 
 
 @listed(CASES)
-def test_a_leaf_moves_the_result_the_way_it_should(preset: str, case: Case):
+def test_a_leaf_has_the_expected_effect(preset: str, case: Case):
     assert_effect(case, preset)
 
 
 @listed(SLOPED)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
-def test_a_numbers_slope_is_its_difference_quotient(preset: str, case: Case, gate: Any):
+def test_the_derivative_of_a_number_is_its_difference_quotient(preset: str, case: Case, gate: Any):
     assert_slope(case, preset, gate)

@@ -1,4 +1,4 @@
-"""Cases of what a leaf of a system does: from one value to another, a measure goes one way."""
+"""Cases of what a parameter does: from one value to another, a measure rises or falls."""
 
 import dataclasses
 import functools
@@ -24,22 +24,22 @@ QUICK: dict[str, Any] = {
 }  # compiling takes far longer than running
 FORWARD, UP, LEFT = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 
-# What is read off a result: one number each, over all frames.
+# Measures: numbers that summarise a result, each over all frames.
 
 
 def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
-    """Means, m and rad (a lean or a foot's turn as the sine of its angle)."""
+    """Means in m and rad; leans and foot rotations as the sine of their angle."""
     after = result.trace.advanced.state
     effector = result.trace.advanced.effector
     hip, knee, ankle = (getattr(result.pose, name).pos for name in ("hip", "knee", "ankle"))
     up = frames.pose.hip.pos * 0 + jnp.asarray(UP)
-    turned = quat.multiply(result.pose.ankle.rot, quat.conjugate(frames.pose.ankle.rot))
-    toes = quat.rotate(turned, up * 0 + jnp.asarray(FORWARD))
-    edge = quat.rotate(turned, up * 0 + jnp.asarray(LEFT))[..., 1]
+    foot_rot = quat.multiply(result.pose.ankle.rot, quat.conjugate(frames.pose.ankle.rot))
+    toes = quat.rotate(foot_rot, up * 0 + jnp.asarray(FORWARD))
+    edge = quat.rotate(foot_rot, up * 0 + jnp.asarray(LEFT))[..., 1]
     body = quat.rotate(result.body.rot, up[:, 0])
     thigh, shin = hip - knee, ankle - knee
     bend = vec.safe_arctan2(vec.length(vec.cross(thigh, shin)), vec.dot(thigh, shin))
-    place = jax.vmap(lambda w, a: w.apply(a))(frames.world_from_model, ankle)
+    ankle_ws = jax.vmap(lambda w, a: w.apply(a))(frames.world_from_model, ankle)
     numbers = {
         "root height": result.trace.sensed.root_ws[..., 1],
         "target height": effector.target_ws[..., 1],
@@ -57,12 +57,12 @@ def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
         "lean forward": body[..., 2],
         "lean right": -body[..., 0],
         "weight": effector.weight,
-        "slip": vec.length(place[1:] - place[:-1]),
-        "miss": vec.length(place - effector.target_ws),
+        "slip": vec.length(ankle_ws[1:] - ankle_ws[:-1]),
+        "miss": vec.length(ankle_ws - effector.target_ws),
     }
     ball = jax.vmap(lambda w, a: w.apply(a))(frames.world_from_model, result.pose.toe.pos)
-    stood = result.trace.sensed.contact.planted[1:]
-    numbers["ball slip"] = stood * vec.length(ball[1:] - ball[:-1])
+    standing = result.trace.sensed.contact.planted[1:]
+    numbers["ball slip"] = standing * vec.length(ball[1:] - ball[:-1])
     if isinstance(after.lock, jaxik.stages.lock.LockState):
         numbers |= {"locked": after.lock.locked, "offset": vec.length(after.lock.offset)}
     means = {name: jnp.mean(number) for name, number in numbers.items()}
@@ -70,14 +70,14 @@ def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
 
 
 def total(tree: Any) -> jax.Array:
-    """An uneven sum of all floats of a tree."""
+    """A sum of all floats of a tree with different weights."""
     leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array))
     return sum(
         (jnp.sum(jnp.cos(jnp.arange(x.size) + 1.0) * x.ravel()) for x in leaves), jnp.zeros(())
     )
 
 
-Inputs = tuple[jaxik.FootIK, jaxik.Frame, Any, jaxik.State]  # the system, clip, ground, memory
+Inputs = tuple[jaxik.FootIK, jaxik.Frame, Any, jaxik.State]  # system, clip, terrain, memory
 
 
 def read(floats: Any, rest: Any, gate: Any) -> tuple[dict[str, jax.Array], jaxik.State]:
@@ -89,17 +89,17 @@ def read(floats: Any, rest: Any, gate: Any) -> tuple[dict[str, jax.Array], jaxik
 
 @functools.partial(jax.jit, compiler_options=QUICK)
 def measured(inputs: Inputs, tangents: Any, gate: Any) -> tuple[dict, dict, jaxik.State]:
-    """The measures, their change along `tangents` (one for each float), and the memory after."""
+    """The measures, their derivatives along `tangents` (one per float), and the memory after."""
     floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
     return jax.jvp(lambda x: read(x, rest, gate), (floats,), (tangents,), has_aux=True)
 
 
 def still(inputs: Any) -> Any:
-    """The tangent along which nothing changes."""
+    """A tangent of zeros."""
     return jax.tree.map(jnp.zeros_like, eqx.filter(inputs, eqx.is_inexact_array))
 
 
-# Situations. Four seconds each; a ground that rises forward, left, and its height.
+# Situations of four seconds each.
 
 
 def drifting(speed: float) -> Callable[[float], list[float]]:
@@ -115,7 +115,7 @@ def stepping_up(time: float) -> np.ndarray:
 
 
 def limping(time: float) -> np.ndarray:
-    """Feet of which one always asks for more than the other."""
+    """Feet of which one always requests more than the other."""
     lift = 0.02 * np.sin(2.9 * time)
     return np.array([[0.11, 0.123 + lift, 0.071], [-0.1, 0.141 - lift, -0.03]])
 
@@ -151,10 +151,10 @@ def rising(time: float) -> np.ndarray:
     return sample_poses.standing((0.08 + 0.03 * time, 0.08 + 0.03 * time))
 
 
-def swinging(share: float, told: bool = True) -> list[characters.Frame]:
-    """Feet half way from the last place to the next, in plan, when `share` of the time is over.
+def swinging(fraction: float, known: bool = True) -> list[characters.Frame]:
+    """Feet half way between two footholds, in plan, when `fraction` of the swing is over.
 
-    Untold, they are where they are by the speed of the character.
+    With unknown footholds these are predicted from the speed of the character.
     """
     frame = animate(RIG, sample_poses.standing((0.15, 0.15)), count=1)[0]
     half_way = 0.4 * np.asarray(FORWARD)
@@ -162,8 +162,8 @@ def swinging(share: float, told: bool = True) -> list[characters.Frame]:
         standing=np.zeros(2),
         last_ws=frame.toe.pos - half_way,
         next_ws=frame.toe.pos + half_way,
-        fraction=np.full(2, share),
-        known=np.full(2, float(told)),
+        fraction=np.full(2, fraction),
+        known=np.full(2, float(known)),
     )
     velocity = 0.8 * np.asarray(FORWARD)
     return padded([dataclasses.replace(frame, stride=stride, velocity_ws=velocity)])
@@ -178,7 +178,7 @@ STRIDES: dict[str, Callable[[], list[characters.Frame]]] = {
     "walks": lambda: walk(RIG, FRAMES),
     "lifts off": lambda: swinging(0.25),
     "comes down": lambda: swinging(0.75),
-    "swings untold": lambda: swinging(0.5, told=False),
+    "swings, footholds unknown": lambda: swinging(0.5, known=False),
 }
 ANKLE_DEEP = planes((0.2, 0.0, 0.3))
 RAMP_UP, RAMP_DOWN = planes((0, 0, 0), (0.2, 0, -0.1)), planes((0, 0, 0), (-0.2, 0, 0.2))
@@ -192,21 +192,21 @@ def clip(name: str) -> jaxik.Frame:
 
 
 def posed(hip: Any, knee: Any, ankle: Any, count: int = 1) -> jaxik.Frame:
-    """Both legs with their joints in these places, m, model space, their spaces unturned."""
+    """Two equal legs with joints at these positions, m, model space, and identity rotations."""
     frame = animate(RIG, count=1)[0]
-    both = lambda place: np.tile(np.asarray(place, float), (2, 1))  # noqa: E731
+    per_leg = lambda point: np.tile(np.asarray(point, float), (2, 1))  # noqa: E731
     frame = dataclasses.replace(
         frame,
-        hip=frame.hip._replace(pos=both(hip)),
-        knee=frame.knee._replace(pos=both(knee)),
-        ankle=frame.ankle._replace(pos=both(ankle)),
-        toe=frame.toe._replace(pos=both(ankle)),
+        hip=frame.hip._replace(pos=per_leg(hip)),
+        knee=frame.knee._replace(pos=per_leg(knee)),
+        ankle=frame.ankle._replace(pos=per_leg(ankle)),
+        toe=frame.toe._replace(pos=per_leg(ankle)),
     )
     return to_frames(padded([frame], count))
 
 
 class Case(NamedTuple):
-    """From the first value to the second, the measure goes the way of `sign`."""
+    """From the first value to the second, the measure changes in the direction of `sign`."""
 
     name: str
     clip: str
@@ -215,8 +215,10 @@ class Case(NamedTuple):
     measure: str
     sign: int
     base: dict[str, Any] = {}
-    slope: bool = True  # False: a hit is there or not, and a miss has no slope
-    before: dict[str, Any] | None = None  # values of an earlier pass of the clip, remembered
+    slope: bool = True  # False where a ray hits or misses: that has no derivative
+    before: dict[str, Any] | None = (
+        None  # values in an earlier pass of the clip, whose memory is kept
+    )
 
     @property
     def leaf(self) -> str:
@@ -235,30 +237,30 @@ def inputs_of(case: Case, value: Any, preset: str) -> Inputs:
 def run_case(
     case: Case, value: Any, preset: str, gate: Any = HARD, tangent: Any = None
 ) -> tuple[float, float]:
-    """The case's measure at a value, and its slope along a tangent of the leaf."""
+    """The case's measure at a value, and its derivative along a tangent of the leaf."""
     inputs = inputs_of(case, value, preset)
     tangents = still(inputs)
     if tangent is not None:
         tangents = (parameter_tree.replace(tangents[0], {case.leaf: tangent}), *tangents[1:])
-    values, slopes, _ = measured(inputs, tangents, gate)
-    return float(values[case.measure]), float(slopes[case.measure])
+    values, derivatives, _ = measured(inputs, tangents, gate)
+    return float(values[case.measure]), float(derivatives[case.measure])
 
 
 def assert_effect(case: Case, preset: str) -> None:
-    """The measure moves as the case says."""
+    """Asserts that the measure changes as the case says."""
     low, high = (run_case(case, value, preset)[0] for value in case.values)
     assert case.sign * (high - low) > 1e-4, (low, high)
 
 
 def has_slope(case: Case, preset: str) -> bool:
-    """Whether the case is one of a number."""
+    """Whether the case is about a number, not a switch."""
     return jnp.issubdtype(parameter_tree.get(to_ik({}, preset), case.leaf).dtype, jnp.inexact)
 
 
 def assert_slope(case: Case, preset: str, gate: Any) -> None:
-    """The slope at the middle is the difference quotient, and goes the way of the case.
+    """Asserts that the derivative at the middle is the difference quotient, with the case's sign.
 
-    A hard decision has no slope: there, a threshold's is not compared.
+    Hard decisions have no derivative, so those of thresholds are not compared there.
     """
     low, high = (np.asarray(value, float) for value in case.values)
     middle, tangent = (low + high) / 2 + 1e-3 * (high - low), (high - low)

@@ -1,7 +1,7 @@
-"""Clips, grounds and rigs for the tests of the pipeline, and the way from the reference's to ours.
+"""Clips, terrain and rigs for pipeline tests, and conversions from the reference's types to ours.
 
-Clips have `FRAMES` frames, two legs and grounds of three planes unless a test asks for another:
-equal shapes share one compiled program.
+Clips have `FRAMES` frames and two legs, and terrain has three planes, unless a test needs others:
+equal shapes fraction one compiled program.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from reference.terrain import Terrain as PlainTerrain
 
 FRAMES = 240
 HZ = 60.0
-ODD: dict[str, Any] = {  # every parameter away from its default
+ODD: dict[str, Any] = {  # all parameters away from their defaults
     "contact.ground_height": 0.01,
     "contact.planted_height": 0.095,
     "contact.raised_height": 0.15,
@@ -98,8 +98,8 @@ def to_rig(rig: reference.Rig) -> jaxik.Rig:
 def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
     """The frames stacked on a leading axis."""
 
-    def stacked(rows: Iterable[np.ndarray]) -> jax.Array:
-        return jnp.asarray(np.stack(list(rows)))
+    def stacked(arrays: Iterable[np.ndarray]) -> jax.Array:
+        return jnp.asarray(np.stack(list(arrays)))
 
     def transform(name: str) -> jaxik.Transform:
         each = [getattr(frame, name) for frame in frames]
@@ -127,7 +127,7 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
 
 
 def by_speed() -> jaxik.FootIK:
-    """`stride` with the rules for animations without labels, and the other pelvis."""
+    """`stride` with the rules for animations without contact labels, and another pelvis."""
     rules = {"contact": contact.SpeedContact(), "pelvis": pelvis.SupportPelvis()}
     return dataclasses.replace(jaxik.presets.stride(), **rules)
 
@@ -136,7 +136,7 @@ BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
 
 
 def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
-    """The preset or the blend of that name with other values."""
+    """The preset or blend with this name, with some values replaced."""
     return parameter_tree.replace((BLENDS.get(preset) or getattr(jaxik.presets, preset))(), values)
 
 
@@ -158,28 +158,30 @@ def to_leg_terrains(ground: LegTerrains) -> terrain.LegTerrains:
 
 
 def make_rig(seed: int = 0, legs: int = 2) -> reference.Rig:
-    """Joint spaces drawn at random."""
+    """A rig with random joint spaces."""
     return sample_poses.make_rig(np.random.default_rng(seed), legs)
 
 
 def planes(*tilts: tuple[float, float, float]) -> PlainTerrain:
-    """Three planes, each given by how steeply it rises forward and left, and its height, m.
+    """Three planes, each with its slope forward and to the left, and its height, m.
 
-    Those that are missing are the last, each 100 m further down: of two planes that are one, which
-    has the slope is a matter of rounding. Rays meet the highest below their start.
+    Rays hit the highest plane below their start. Missing planes repeat the last one, each 100 m
+    lower: with two equal planes, rounding would decide which of them gets the gradient.
     """
-    listed = (*tilts, *((*tilts[-1][:2], tilts[-1][2] - deep) for deep in (100.0, 200.0)))[:3]
+    all_tilts = (*tilts, *((*tilts[-1][:2], tilts[-1][2] - depth) for depth in (100.0, 200.0)))[:3]
     return PlainTerrain(
         maths.Y,
         planes=[
             (np.array([0.0, height, 0.0]), np.array([-left, 1.0, -forward]))
-            for forward, left, height in listed
+            for forward, left, height in all_tilts
         ],
     )
 
 
 FLAT = planes((0.0, 0.0, 0.0))
-BROKEN = planes((0.2, 0.0, 0.0), (-0.25, 0.3, -0.3), (0.0, -0.35, -0.95))  # `wandering` meets two
+BROKEN = planes(
+    (0.2, 0.0, 0.0), (-0.25, 0.3, -0.3), (0.0, -0.35, -0.95)
+)  # `wandering` hits two of them
 
 
 def animate(
@@ -196,19 +198,19 @@ def animate(
     weight: Any = 1.0,
     platform: Any = sample_poses.STILL,
 ) -> list[reference.Frame]:
-    """Frames of two legs from what may each be a number, or a function of time, s.
+    """Frames of two legs. Each argument is a value or a function of time, s.
 
     Args:
         rig: joint spaces.
-        ankles: (legs, 3), m, model space; standing unless given.
+        ankles: (legs, 3), m, model space; standing by default.
         count: frames.
-        hz: frames a second.
+        hz: frames per second.
         hip_height: m.
-        place: root in the world, m.
+        place: position of the root, m, world space.
         heading: of the root about up, rad.
         foot: pitch of the feet, rad, toes up.
         slide: 0..1.
-        weight: 0..1, one for both legs or one each.
+        weight: 0..1, one for all legs or one per leg.
         platform: world_from_platform.
     """
 
@@ -238,10 +240,10 @@ def animate(
 
 
 def stepping(rig: reference.Rig, drift: float = 0.0, **changes: Any) -> list[reference.Frame]:
-    """A walk of 0.6 m/s: a foot rises straight, swings, and comes down straight.
+    """A walk of 0.6 m/s whose feet rise vertically, swing, and come down vertically.
 
-    While an ankle is below the raised height it does not move over the ground, but for `drift`,
-    m/s, by which the whole walk slides sideways.
+    An ankle below the raised height does not move over the ground, except for `drift`, m/s, by
+    which the whole walk slides sideways.
     """
 
     def ankles(time: float) -> np.ndarray:
@@ -263,7 +265,7 @@ def _step(cycles: float, leg: int) -> list[float]:
 
 
 def padded(frames: list, count: int = FRAMES) -> list:
-    """The clip made longer by its last frame."""
+    """The clip, extended by repeating its last frame."""
     return frames + [frames[-1]] * (count - len(frames))
 
 
@@ -273,11 +275,13 @@ def wandering(
     count: int = FRAMES,
     stand: tuple[float, ...] = (),
 ) -> list:
-    """A clip that meets everything: steps, drifting feet, slides, half-weighted legs, odd frame
-    times, a turning root, swinging hips, tilted feet. Its stride is told in the first half.
+    """A clip with a bit of everything.
 
-    Between the shares `stand` of the clip (from, to, and again from, to) the root stands where it
-    is, at a speed of exactly 0, and the feet, held in their step, only sway and bob a little.
+    It has steps, drifting feet, slides, half-weighted legs, uneven frame times, a turning root,
+    swinging hips and tilted feet. Its footholds are known in the first half only.
+
+    Between the fractions `stand` of the clip (start, end, start, end, ...) the root stands still,
+    at a speed of exactly 0, and the feet, paused in their step, only sway and bob a little.
     """
     stands = list(zip(stand[::2], stand[1::2], strict=True))
     legs = len(rig.side)
@@ -302,11 +306,11 @@ def wandering(
             x = 0.1 * rig.side[leg] + 0.01 * np.sin(3.1 * phase)
             ankle = [x, 0.08 + 0.12 * swing, 0.18 * np.cos(2 * np.pi * cycle)]
             ankles.append(ankle + sway * (-1.0) ** leg)
-        share = index / count
+        fraction = index / count
         weight = np.ones(legs)
-        if 0.67 < share < 0.73:
+        if 0.67 < fraction < 0.73:
             weight[0] = 0.5
-        if 0.77 < share < 0.78:
+        if 0.77 < fraction < 0.78:
             weight[-1] = 0.0
         frame = sample_poses.make_frame(
             rig,
@@ -315,39 +319,39 @@ def wandering(
             hinge_yaw=0.2 * np.sin(phase),
             world_from_model=reference.Transform(place.copy(), turned),
             weight=weight,
-            slide=float(0.3 < share < 0.5),
+            slide=float(0.3 < fraction < 0.5),
             dt=dt,
         )
         axis = rng.normal(size=3)
         tilt = maths.from_axis_angle(axis / np.linalg.norm(axis), rng.uniform(0.0, 0.2))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
-        stride = _strides(frame, np.array(swung), known=share < 0.5)
+        stride = _strides(frame, np.array(swung), known=fraction < 0.5)
         ankle = frame.ankle._replace(rot=rot)
         frames.append(dataclasses.replace(frame, ankle=ankle, stride=stride))
     return sample_poses.with_speeds(frames)
 
 
-def _strides(frame: reference.Frame, share: np.ndarray, known: bool) -> characters.Stride:
-    """Strides of half a metre forward, of which each foot has come the share (legs)."""
+def _strides(frame: reference.Frame, fraction: np.ndarray, known: bool) -> characters.Stride:
+    """Strides of half a metre forward, of which each foot has covered `fraction` (legs)."""
     balls = np.array([maths.apply(frame.world_from_model, pos) for pos in frame.toe.pos])
     forward = 0.5 * maths.rotate(frame.world_from_model.rot, maths.Z)
     return characters.Stride(
-        standing=(share == 0.0).astype(float),
-        last_ws=balls - share[:, None] * forward,
-        next_ws=balls + (1.0 - share[:, None]) * forward,
-        fraction=share,
-        known=np.full(len(share), float(known)),
+        standing=(fraction == 0.0).astype(float),
+        last_ws=balls - fraction[:, None] * forward,
+        next_ws=balls + (1.0 - fraction[:, None]) * forward,
+        fraction=fraction,
+        known=np.full(len(fraction), float(known)),
     )
 
 
 def at(tree: Any, index: Any) -> Any:
-    """The rows of every leaf."""
+    """Each leaf, indexed along its first axis."""
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def assert_close(came: Any, wanted: Any, tolerance: float) -> None:
-    """Every leaf of two equal trees within `tolerance`; NaN is never close."""
-    paths = jax.tree_util.tree_leaves_with_path(wanted)
-    for (path, b), a in zip(paths, jax.tree.leaves(came), strict=True):
+def assert_close(actual: Any, expected: Any, tolerance: float) -> None:
+    """Asserts that all leaves of two trees agree within `tolerance`; NaN never agrees."""
+    paths = jax.tree_util.tree_leaves_with_path(expected)
+    for (path, b), a in zip(paths, jax.tree.leaves(actual), strict=True):
         name = jax.tree_util.keystr(path)
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, equal_nan=False, err_msg=name)

@@ -1,10 +1,10 @@
-"""The game's record of an adult, to be changed field by field."""
+"""The parameter record of an adult, to be changed field by field."""
 
 import struct
 
 from jaxik.record import FLOAT_NAMES, Record
 
-ADULT = {  # systems.md, section 4, at 30 Hz
+ADULT = {  # gains per tick at 30 Hz
     "originalGroundHeightMS": 0.0,
     "minAnkleHeightMS": -0.30,
     "maxAnkleHeightMS": 0.55,

@@ -1,4 +1,4 @@
-"""Walks that know their footholds, and ground of blocks for them to meet."""
+"""Synthetic walks with known footholds, and terrain made of blocks."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,45 +14,45 @@ from reference.terrain import Terrain
 HZ = 60.0
 SPEED = 0.9  # m/s
 CYCLE = 1.0  # s
-STANCE = 0.6  # share of the cycle
-HEEL_OFF = 0.6  # share of the stance after which the heel rises
-HEEL_RISE = 0.7  # rad, by which it has risen at its end
-LANDED = 0.04  # of the cycle for which the ball already rests before the foot counts as standing
+STANCE = 0.6  # fraction of the cycle
+HEEL_OFF = 0.6  # fraction of the stance after which the heel rises
+HEEL_RISE = 0.7  # rad, pitch of the foot at the end of its stance
+LANDED = 0.04  # fraction of the cycle that the ball rests before the foot counts as standing
 SWING_HEIGHT = 0.12  # m
 BALL_HEIGHT = 0.055  # m, of a standing foot's toe joint
-BALL_AHEAD = 0.10  # m, of the root in the middle of a stance
+BALL_AHEAD = 0.10  # m, ahead of the root in mid-stance
 BALL_REACH = np.array(
     [0.0, BALL_HEIGHT - sample_poses.ANKLE, 0.15]
 )  # m, from the ankle of a flat foot
 
 
 class Step(NamedTuple):
-    """One foot at one time: its ball ahead of where the walk began, m, and the foot's pitch."""
+    """One foot at one time; distances are those of its ball from where the walk began, m."""
 
     standing: float
     last: float
     next: float
-    share: float
+    fraction: float
     height: float
     pitch: float  # rad, toes down
 
     @property
     def ahead(self) -> float:
-        return maths.lerp(self.last, self.next, maths.smooth01(self.share))
+        return maths.lerp(self.last, self.next, maths.smooth01(self.fraction))
 
 
-def step_at(time: float, turn: float, speed: float) -> Step:
-    """Of the foot that comes down `turn` of a cycle after the walk began."""
-    cycle, phase = divmod(time / CYCLE - turn, 1.0)
-    last = speed * CYCLE * (cycle + turn + STANCE / 2) + BALL_AHEAD
+def step_at(time: float, offset: float, speed: float) -> Step:
+    """The foot that lands `offset` cycles after the walk began."""
+    cycle, phase = divmod(time / CYCLE - offset, 1.0)
+    last = speed * CYCLE * (cycle + offset + STANCE / 2) + BALL_AHEAD
     following = last + speed * CYCLE
     if phase < STANCE:
-        risen = maths.smooth01((phase / STANCE - HEEL_OFF) / (1.0 - HEEL_OFF))
-        return Step(1.0, last, following, 0.0, BALL_HEIGHT, HEEL_RISE * risen)
-    share = min((phase - STANCE) / (1.0 - STANCE - LANDED), 1.0)
-    height = BALL_HEIGHT + SWING_HEIGHT * np.sin(np.pi * share) ** 2
-    left = 1.0 - maths.smooth01(share / 0.6)
-    return Step(0.0, last, following, share, height, HEEL_RISE * left)
+        heel_rise = maths.smooth01((phase / STANCE - HEEL_OFF) / (1.0 - HEEL_OFF))
+        return Step(1.0, last, following, 0.0, BALL_HEIGHT, HEEL_RISE * heel_rise)
+    fraction = min((phase - STANCE) / (1.0 - STANCE - LANDED), 1.0)
+    height = BALL_HEIGHT + SWING_HEIGHT * np.sin(np.pi * fraction) ** 2
+    heel_rise = 1.0 - maths.smooth01(fraction / 0.6)
+    return Step(0.0, last, following, fraction, height, HEEL_RISE * heel_rise)
 
 
 def walk(
@@ -60,53 +60,58 @@ def walk(
     count: int,
     *,
     hz: float = HZ,
-    told: bool = True,
+    known: bool = True,
     speed: float = SPEED,
     heading: float = 0.0,
     start: Any = (0.0, 0.0, 0.0),
     hip_height: float = 0.915,
     **changes: Any,
 ) -> list[Frame]:
-    """A walk on a flat floor: balls that stand still, heels that rise about them, straight knees.
+    """A walk on a flat floor with still balls of standing feet, rising heels and straight knees.
 
     Args:
-        rig: joint spaces of legs that take turns.
+        rig: joint spaces of the legs, which step in turn.
         count: frames.
-        hz: frames a second.
-        told: whether the stride is, and not just which feet stand.
-        speed: m/s.
+        hz: frames per second.
+        known: whether footholds are known; if not, only which feet stand.
+        speed: of the walk, m/s.
         heading: of the walk about up, rad.
         start: of the root, m.
         hip_height: m.
-        changes: of every frame.
+        changes: fields that are the same in all frames.
     """
-    turned = maths.from_axis_angle(maths.Y, heading)
+    heading_rot = maths.from_axis_angle(maths.Y, heading)
     legs = len(rig.side)
     frames = []
     for index in range(count):
         time = index / hz
         steps = [step_at(time, leg / legs, speed) for leg in range(legs)]
-        root = Transform(np.asarray(start) + maths.rotate(turned, speed * time * maths.Z), turned)
+        root = Transform(
+            np.asarray(start) + maths.rotate(heading_rot, speed * time * maths.Z), heading_rot
+        )
         stride = Stride(
             standing=np.array([step.standing for step in steps]),
-            last_ws=_places([step.last for step in steps], rig, turned, start),
-            next_ws=_places([step.next for step in steps], rig, turned, start),
-            fraction=np.array([step.share for step in steps]),
-            known=np.full(legs, float(told)),
+            last_ws=_balls_ws([step.last for step in steps], rig, heading_rot, start),
+            next_ws=_balls_ws([step.next for step in steps], rig, heading_rot, start),
+            fraction=np.array([step.fraction for step in steps]),
+            known=np.full(legs, float(known)),
         )
-        frames.append(_posed(rig, steps, speed * time, root, stride, hip_height, 1.0 / hz))
+        frames.append(_frame_of(rig, steps, speed * time, root, stride, hip_height, 1.0 / hz))
     return [dataclasses.replace(frame, **changes) for frame in sample_poses.with_speeds(frames)]
 
 
-def _places(aheads: Sequence[float], rig: Rig, turned: np.ndarray, start: Any) -> np.ndarray:
-    """Balls (legs, 3) of feet that stand, world, m."""
-    places = [
-        [0.1 * side, BALL_HEIGHT, ahead] for side, ahead in zip(rig.side, aheads, strict=True)
+def _balls_ws(
+    distances: Sequence[float], rig: Rig, heading_rot: np.ndarray, start: Any
+) -> np.ndarray:
+    """Balls of standing feet, (legs, 3), m, world space."""
+    points = [
+        [0.1 * side, BALL_HEIGHT, distance]
+        for side, distance in zip(rig.side, distances, strict=True)
     ]
-    return np.array([start + maths.rotate(turned, np.array(place)) for place in places])
+    return np.array([start + maths.rotate(heading_rot, np.array(point)) for point in points])
 
 
-def _posed(
+def _frame_of(
     rig: Rig,
     steps: list[Step],
     travelled: float,
@@ -115,7 +120,7 @@ def _posed(
     hip_height: float,
     dt: float,
 ) -> Frame:
-    """The frame of these steps."""
+    """The frame with feet as in `steps`."""
     balls = np.array(
         [
             [0.1 * side, step.height, step.ahead - travelled]
@@ -140,27 +145,27 @@ def blocks(
     columns: int = 4,
     rows: int = 15,
     size: float = 0.45,
-    most: float = 0.14,
+    max_height: float = 0.14,
     tilt: float = 0.15,
-    odd: bool = True,
+    irregular: bool = True,
 ) -> Terrain:
-    """Square tops of blocks around the origin, each at a height and tilt of its own.
+    """Tops of square blocks around the origin, each with its own height and tilt.
 
     Args:
-        rng: draws them.
-        columns: of blocks, sideways.
-        rows: likewise, forward.
-        size: of a block, m.
-        most: height over or under the floor, m.
+        rng: random numbers for heights and tilts.
+        columns: number of blocks sideways.
+        rows: number of blocks forward.
+        size: side of a block, m.
+        max_height: largest height above or below the floor, m.
         tilt: largest tangent of a top's slope.
-        odd: some blocks are missing, some far too high, some far too steep.
+        irregular: make some blocks missing, far too high, or far too steep.
     """
     triangles = []
     for column in range(columns):
         for row in range(rows):
-            height = rng.uniform(-most, most)
+            height = rng.uniform(-max_height, max_height)
             slopes = rng.uniform(-tilt, tilt, size=2)
-            kind = rng.uniform() if odd else 1.0
+            kind = rng.uniform() if irregular else 1.0
             if kind < 0.05:
                 continue
             if kind < 0.10:
