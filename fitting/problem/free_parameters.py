@@ -12,6 +12,7 @@ from jaxtyping import Array
 from jaxik.maths import parameter_tree
 
 PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
+OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +38,6 @@ class FreeParameter:
         """Index of the leg whose element is free, or None for the whole leaf."""
         index = self.name.partition("[")[2]
         return int(index[:-1]) if index else None
-
-
-OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
 
 
 def free_parameter(ik: eqx.Module, name: str, **overrides: float | int | str) -> FreeParameter:

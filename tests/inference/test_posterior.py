@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import emcee
 import equinox as eqx
@@ -18,7 +18,7 @@ import pytest
 from jaxtyping import Array, Float
 
 from fitting.inference.sampling import diagnostics, posterior, sampler
-from fitting.inference.sampling.chain import Chain, Identity, journal_path
+from fitting.inference.sampling.chain import Chain, Identity, RandomState, journal_path
 from fitting.inference.sampling.posterior import Posterior, WalkerStart
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.free_parameters import PRIOR_SD, free_parameter
@@ -488,7 +488,7 @@ def test_the_journal_of_a_deleted_or_replaced_chain_is_ignored(tmp_path):
     path = tmp_path / "chain.h5"
     problem = normal(2)[0]
     with Chain(Identity(problem.space.names, 8, 5, 1, posterior.digest(problem)), path) as other:
-        state = tuple(np.random.RandomState(0).get_state())
+        state = cast(RandomState, np.random.RandomState(0).get_state())
         other.append(np.zeros((8, 2)), np.zeros(8), np.ones(8, bool), state)
         stale = journal_path(path).read_bytes()
     assert len(stale) > 0
@@ -504,7 +504,7 @@ def test_the_journal_of_a_deleted_or_replaced_chain_is_ignored(tmp_path):
 def test_steps_in_both_files_count_once_and_steps_after_a_gap_do_not_count(tmp_path):
     path = tmp_path / "chain.h5"
     identity = Identity(("a",), 4, 0, 1, "0" * 64)
-    state = tuple(np.random.RandomState(0).get_state())
+    state = cast(RandomState, np.random.RandomState(0).get_state())
     with Chain(identity, path) as chain:
         empty = path.read_bytes()
         journals = []

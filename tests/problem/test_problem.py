@@ -23,7 +23,7 @@ def noise(rng: np.random.Generator) -> np.ndarray:
     """First-order autoregressions of unit variance, (clips, residuals)."""
     steps = rng.normal(size=(CLIPS, RESIDUALS)) * np.sqrt(1.0 - CORRELATION**2)
     steps[:, 0] /= np.sqrt(1.0 - CORRELATION**2)
-    return lfilter([1.0], [1.0, -CORRELATION], steps)
+    return np.asarray(lfilter([1.0], [1.0, -CORRELATION], steps))
 
 
 def coverage(independent_fraction: float) -> float:

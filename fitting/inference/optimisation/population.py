@@ -171,7 +171,7 @@ def _children(
     """
     thresholds, settings = search.thresholds, search.settings
     parents = elite[random.integers(len(elite), size=count)]
-    rate = max(settings.shifted_fraction, 1 / max(1, thresholds.sum()))
+    rate = max(settings.shift_probability, 1 / max(1, thresholds.sum()))
     shifted = (random.random(parents.shape) < rate) & thresholds
     shifts = random.normal(0, spread, parents.shape) * shifted
     redrawn = np.zeros(parents.shape, bool)

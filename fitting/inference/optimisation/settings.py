@@ -9,9 +9,7 @@ from fitting.inference.settings import Settings, setting
 class SearchSettings(Settings):
     """Settings of `search.find_best_fit`.
 
-    The defaults were tuned on walks over uneven ground: more of anything takes longer and rarely
-    finds a lower cost. Spreads are standard deviations of `u`, gains are relative falls of the
-    cost.
+    Spreads are standard deviations of `u`, gains are relative falls of the cost.
 
     Raises:
         ValueError: for a setting out of its range.
@@ -49,8 +47,10 @@ class SearchSettings(Settings):
     gauss_newton_children: int = setting(
         16, "Candidates of a generation that come again after a Gauss-Newton step."
     )
-    shifted_fraction: float = setting(
-        0.3, "Fraction of the thresholds that a child changes, on average.", high=1
+    shift_probability: float = setting(
+        0.3,
+        "Probability that a child shifts a threshold; on average it shifts at least one.",
+        high=1,
     )
     generation_decay: float = setting(
         0.6, "Factor on the spread of the shifts from one generation to the next.", high=1
