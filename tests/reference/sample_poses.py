@@ -15,13 +15,13 @@ STILL = Transform(np.zeros(3), maths.IDENTITY)
 
 
 def random_rot(rng: np.random.Generator) -> np.ndarray:
-    """A unit quaternion, evenly drawn."""
+    """A uniformly distributed unit quaternion."""
     q = rng.normal(size=4)
     return q / np.linalg.norm(q)
 
 
 def make_rig(rng: np.random.Generator, legs: int = 2) -> Rig:
-    """Random joint spaces; sides alternate, and an odd leg out is in the middle."""
+    """Random joint spaces; left and right legs, and a third one in the middle."""
     axis = rng.normal(size=(legs, 3))
     side = np.array([1.0, -1.0, 0.0][:legs])
     return Rig(
@@ -38,10 +38,10 @@ def make_frame(
     hinge_yaw: float = 0.0,
     **changes,
 ) -> Frame:
-    """Legs bent to the ankles (legs, 3, model space) about a sideways hinge, their feet flat.
+    """Legs bent about a sideways hinge to the given ankles (legs, 3, model space), with flat feet.
 
-    Knee spaces are such that the rig's knee axis is the hinge; ankle spaces such that the foot
-    is flat and looks along model forward.
+    In knee space the rig's knee axis is the hinge; in ankle space the foot is flat and points
+    along model forward.
     """
     columns = {name: ([], []) for name in ("hip", "knee", "ankle", "toe")}
     for leg, ankle in enumerate(np.asarray(ankles, dtype=float)):
@@ -77,9 +77,9 @@ def make_frame(
 
 
 def with_speeds(frames: list[Frame]) -> list[Frame]:
-    """The clip, its frames' speeds made of the differences from the frame before.
+    """The clip with speeds from the differences to the previous frame.
 
-    The first frame, which has none, is as fast as the second.
+    The first frame gets the speeds of the second.
     """
     roots = [frame.world_from_model.pos for frame in frames]
     ankles, toes = (
@@ -113,12 +113,12 @@ def standing(heights: tuple[float, ...] = (ANKLE, ANKLE), forward: float = 0.05)
 
 
 def stepping(rig: Rig, count: int = 60) -> list[Frame]:
-    """Walking forward and turned in the world: a foot rises straight, swings, and comes down.
+    """A walk, rotated in the world: each foot rises vertically, swings, and comes down.
 
-    While an ankle is below the raised height it does not move over the ground.
+    While an ankle is below the raised height it does not move horizontally.
     """
     frames = []
-    turned = maths.from_axis_angle(maths.Y, 0.7)
+    heading = maths.from_axis_angle(maths.Y, 0.7)
     for index in range(count):
         ankles = []
         for leg in range(2):
@@ -127,13 +127,13 @@ def stepping(rig: Rig, count: int = 60) -> list[Frame]:
             height = ANKLE + 0.12 * min(max((phase - 0.5) / 0.15, 0.0), 1.0, (1.0 - phase) / 0.15)
             stride = 0.3 * (cycle + swing - 0.5 * leg)
             ankles.append([0.1 - 0.2 * leg, height, stride - 0.3 * index / 30 + 0.05])
-        root = maths.rotate(turned, np.array([0.3, 0.0, 0.3 * index / 30]))
-        frames.append(make_frame(rig, np.array(ankles), world_from_model=Transform(root, turned)))
+        root = maths.rotate(heading, np.array([0.3, 0.0, 0.3 * index / 30]))
+        frames.append(make_frame(rig, np.array(ankles), world_from_model=Transform(root, heading)))
     return with_speeds(frames)
 
 
 def plane(slope_forward: float, slope_left: float, height: float = 0.0) -> Terrain:
-    """A plane that rises forward and to the left by the given tangents."""
+    """A plane that rises forward and to the left with the given tangents."""
     normal = np.array([-slope_left, 1.0, -slope_forward])
     return Terrain(maths.Y, planes=[(np.array([0.0, height, 0.0]), normal)])
 

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from reference.maths import Array
 
-# Cosine between a surface's normal and up below which a vertical ray runs along the surface.
+# Cosine between a surface's normal and up below which the ray runs along the surface.
 EDGE_ON = 1e-9
 ALL_LAYERS = 0xFFFFFFFF
-# Barycentric slack, so that a ray through a shared edge meets at least one of its triangles.
+# Barycentric tolerance: a ray through a shared edge hits at least one of its triangles.
 SLACK = 1e-12
 
 
 class Hit(NamedTuple):
-    """Where a ray ended. Without a find: the ray's end, or start if endless, and up as normal."""
+    """What a ray hit. For a miss: the end of the ray (its start if infinite) and up as normal."""
 
     found: bool
     point: Array
@@ -31,9 +31,9 @@ class Terrain:
 
     Args:
         up: unit (3); rays run against it.
-        planes: pairs of a point (3) and a normal (3, any length), seen from both sides.
-        triangles: (count, 3 corners, 3), m, seen from both sides, in any winding.
-        plane_layers: layer of each plane, 0 to 31; all on layer 0 unless given.
+        planes: pairs of a point (3) and a normal (3, any length), two-sided.
+        triangles: (count, 3 corners, 3), m, two-sided, in any winding.
+        plane_layers: layer of each plane, 0 to 31; all 0 by default.
         triangle_layers: (count), layer of each triangle, likewise.
     """
 
@@ -65,7 +65,7 @@ class Terrain:
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:
         """The first surface at most `reach` m below `origin`, its normal towards up.
 
-        Surfaces whose layer's bit `mask` lacks are passed through. Among surfaces at the same
+        Rays pass through surfaces whose layer is not in `mask`. Among surfaces at the same
         distance the first in the list wins, planes before triangles.
         """
         nearest, normal, found = reach, self.up, False
@@ -80,8 +80,8 @@ class Terrain:
             if 0.0 <= distance <= reach and (not found or distance < nearest):
                 nearest, normal, found = distance, facing, True
         if len(self.triangles):
-            seen = (mask >> np.asarray(self.triangle_layers)) & 1 == 1
-            distances = np.where(seen, self._distances(origin), np.inf)
+            visible = (mask >> np.asarray(self.triangle_layers)) & 1 == 1
+            distances = np.where(visible, self._distances(origin), np.inf)
             best = int(np.argmin(distances))
             distance = float(distances[best])
             if math.isfinite(distance) and distance <= reach and (not found or distance < nearest):
@@ -91,28 +91,28 @@ class Terrain:
         return Hit(found, origin - self.up * nearest, normal)
 
     def _distances(self, origin: Array) -> Array:
-        """Distance down to every triangle (count), infinite where the ray passes it by."""
+        """Distance down to every triangle (count), infinite where the ray misses it."""
         away = origin - self._corner
         first = np.sum(away * self._side, axis=-1) * self._scale
-        turned = np.cross(away, self._first)
-        second = (turned @ -self.up) * self._scale
-        distance = np.sum(turned * self._second, axis=-1) * self._scale
+        cross = np.cross(away, self._first)
+        second = (cross @ -self.up) * self._scale
+        distance = np.sum(cross * self._second, axis=-1) * self._scale
         inside = (first >= -SLACK) & (second >= -SLACK) & (first + second <= 1.0 + SLACK)
         return np.where(self._usable & inside & (distance >= 0.0), distance, np.inf)
 
 
 @dataclass
 class LegTerrains:
-    """The world as each leg meets it, under the leg's own up; the body has a terrain too."""
+    """The world with an up direction per leg; the body has a terrain too."""
 
     body: Terrain
     legs: Sequence[Terrain]
 
     @property
     def up(self) -> Array:
-        """The body's up."""
+        """Up of the body."""
         return self.body.up
 
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:
-        """The body's ray."""
+        """The first hit of a ray of the body."""
         return self.body.cast(origin, reach, mask)

@@ -25,19 +25,19 @@ from reference.maths import (
 from reference.terrain import Hit
 
 
-def forward(turned: Array, up: Array) -> Array:
-    """The model's forward in the plane at right angles to up; of its up where it looks along up."""
-    return unit(across(rotate(turned, maths.Z), up), unit(across(rotate(turned, maths.Y), up), up))
+def forward(rot: Array, up: Array) -> Array:
+    """The model's forward at right angles to up; made of its own up where it looks along up."""
+    return unit(across(rotate(rot, maths.Z), up), unit(across(rotate(rot, maths.Y), up), up))
 
 
 def heading(rig: Rig, frame: Frame, leg: int, up: Array) -> Array:
-    """The animated foot's forward at right angles to up; the model's where it points along up."""
+    """The animated foot's forward at right angles to up; the model's where the foot is along up."""
     sole = rotate(world_from_foot(rig, frame, leg), maths.Z)
     return unit(across(sole, up), forward(frame.world_from_model.rot, up))
 
 
 def sense(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int) -> Foot:
-    """Contact, rays and foothold of one leg (steps 1 to 3)."""
+    """Contact, rays and foothold of one leg."""
     up = terrain.up
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
     lift = frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg)
@@ -77,7 +77,7 @@ def sense(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: 
 def foothold(
     parameters: Parameters, leg: int, hit: Hit, ankle_ws: Array, lift: float, up: Array
 ) -> Array:
-    """Where the foot would stand: the hit, raised as a flat sole on its slope raises the ankle."""
+    """Where the foot would stand: the hit, raised by as much as a flat sole on a slope needs."""
     if not hit.found:
         return ankle_ws - up * lift
     steepest = math.cos(parameters.of_leg("target.max_slope", leg))
@@ -94,16 +94,16 @@ def lean(
     state: State | None,
     frame: Frame,
 ) -> tuple[float, list[Motion], Array, Array]:
-    """Slide weight, smoothed slope (2), the body's turn (4) and the smoothed normal (3), world."""
+    """Slide weight, smoothed slope (2), body rotation (4) and smoothed normal (3), world."""
     right = cross(forward, up)
-    shares = taking_part(parameters, frame)
-    weights = [foot.grounded * share for foot, share in zip(feet, shares, strict=True)]
+    leg_weights = weights_of_legs(parameters, frame)
+    weights = [foot.grounded * w for foot, w in zip(feet, leg_weights, strict=True)]
     normal = np.zeros(3)
     for foot, weight in zip(feet, weights, strict=True):
         normal = normal + weight * foot.hit.normal
     if sum(weights) == 0.0:
         normal = up
-    goals = [math.atan2(-float(normal @ way), float(normal @ up)) for way in (forward, right)]
+    goals = [math.atan2(-float(normal @ axis), float(normal @ up)) for axis in (forward, right)]
 
     hz = parameters["lean.tick_hz"]
     if state is None:
@@ -111,8 +111,8 @@ def lean(
     else:
         rising = frame.slide > state.slide_weight
         slide_gain = parameters["lean.slide_on_gain" if rising else "lean.slide_off_gain"]
-        share = maths.fraction_of_gain(slide_gain, hz, frame.dt)
-        slide = lerp(state.slide_weight, float(frame.slide), share)
+        fraction = maths.fraction_of_gain(slide_gain, hz, frame.dt)
+        slide = lerp(state.slide_weight, float(frame.slide), fraction)
         gain = lerp(parameters["lean.gain"], parameters["lean.gain_slide"], slide)
         half_life, spring = maths.half_life_of_gain(gain, hz), parameters["lean.spring"]
         slope = [
@@ -143,7 +143,7 @@ def smooth_height(
 def clamped_target(
     parameters: Parameters, leg: int, foot: Foot, up: Array, height: float, frame: Frame
 ) -> tuple[Array, Array]:
-    """Foothold at the smoothed height and ankle target above it, both moved into the limits."""
+    """Foothold at the smoothed height and the ankle target above it, both within the limits."""
     foothold = foot.foothold_ws + up * (height - up @ foot.foothold_ws)
     target = foothold + up * foot.lift
     lowest = parameters.of_leg("target.min_ankle_height", leg)
@@ -163,9 +163,9 @@ def lock(
     pelvis_offset: Array,
     frame: Frame,
 ) -> tuple[Hold, Array]:
-    """What the foot's lock remembers, and the target's offset in world space (3).
+    """Memory of the foot's lock after this frame, and the offset of the target (3), world.
 
-    `pelvis_offset` is that of the frame before, world (3).
+    `pelvis_offset` (3) is that of the previous frame, world.
     """
     if before is None:
         was_locked, factor = False, 0.0
@@ -178,19 +178,19 @@ def lock(
             rolled = foot.ball_ws - apply(frame.platform, before.ball)
             moved = across(rolled, up) + up * float(up @ moved)
 
-    # It points where it did when it was last free.
+    # A locked foot keeps the heading it had when it was last free.
     pointed = foot.heading_ws
     if before is not None and was_locked:
         pointed = rotate(frame.platform.rot, before.heading)
 
-    # Where the ankle would be if the foot stayed, seen from where the hip probably is.
+    # Where the ankle would be if the foot stayed, relative to where the hip probably is.
     hip = foot.hip_ws + pelvis_offset
     kept = foothold - moved + offset + up * foot.lift
     thigh = length(frame.hip.pos[leg] - frame.knee.pos[leg])
     shin = length(frame.knee.pos[leg] - frame.ankle.pos[leg])
     knee_angle = maths.interior_angle(thigh, shin, float((kept - hip) @ (kept - hip)))
     deviation = maths.angle_between(kept - hip, foot.ankle_ws - foot.hip_ws)
-    takes_part = taking_part(parameters, frame)[leg] > 0.0
+    takes_part = weights_of_legs(parameters, frame)[leg] > 0.0
     must_release = (
         foot.lifted
         or knee_angle < parameters.of_leg("lock.release_min_angle", leg)
@@ -215,10 +215,10 @@ def lock(
         factor += maths.fraction_of_half_life(half_life, frame.dt) * (1.0 - factor)
         offset = offset - factor * moved
     else:
-        kept_share = 1.0 - maths.fraction_of_half_life(
+        remaining = 1.0 - maths.fraction_of_half_life(
             parameters.of_leg("lock.unlock_half_life", leg), frame.dt
         )
-        factor, offset, pointed = factor * kept_share, offset * kept_share, foot.heading_ws
+        factor, offset, pointed = factor * remaining, offset * remaining, foot.heading_ws
     into_platform = maths.inverse(frame.platform.rot)
     after = Hold(
         locked,
@@ -232,13 +232,13 @@ def lock(
 
 
 def is_slow(parameters: Parameters, name: str, leg: int, moved: Array, dt: float) -> bool:
-    """Whether a move, m, in `dt` s keeps to the speed limit of that name; an endless one does."""
+    """Whether a move, m, in `dt` s respects the speed limit of that name, which may be infinite."""
     limit = parameters.of_leg(name, leg)
     return math.isinf(limit) or length(moved) <= limit * dt
 
 
-def taking_part(parameters: Parameters, frame: Frame) -> list[float]:
-    """Each leg's share of foot IK, 0..1."""
+def weights_of_legs(parameters: Parameters, frame: Frame) -> list[float]:
+    """How much foot IK each leg gets, 0..1."""
     return [
         float(weight * parameters.of_leg("leg.weight", leg))
         for leg, weight in enumerate(frame.weight)
@@ -253,13 +253,15 @@ def pelvis_height(
     state: State | None,
     frame: Frame,
 ) -> float:
-    """Smoothed height of the body over its animated place, m along up or the normal."""
-    shares = taking_part(parameters, frame)
-    weights = [foot.grounded * share for foot, share in zip(feet, shares, strict=True)]
+    """Smoothed height of the body above its animated position, m along up or the normal."""
+    leg_weights = weights_of_legs(parameters, frame)
+    weights = [foot.grounded * w for foot, w in zip(feet, leg_weights, strict=True)]
     gaps = [float(up @ (t - foot.ankle_ws)) for t, foot in zip(targets, feet, strict=True)]
-    asking = [(w, g) for w, g, share in zip(weights, gaps, shares, strict=True) if share > 0.0]
-    top = max((gap for _, gap in asking), default=0.0)
-    low = min((top + weight * (gap - top) for weight, gap in asking), default=0.0)
+    taking_part = [
+        (w, gap) for w, gap, total in zip(weights, gaps, leg_weights, strict=True) if total > 0.0
+    ]
+    top = max((gap for _, gap in taking_part), default=0.0)
+    low = min((top + w * (gap - top) for w, gap in taking_part), default=0.0)
     contact = max(weights)
     limit = parameters["pelvis.limit"]
     goal = contact * clip(low, -limit, limit)

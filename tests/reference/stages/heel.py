@@ -22,7 +22,7 @@ def raised(
     offset_ws: Array,
     up: Array,
 ) -> tuple[Array, Array, float]:
-    """Ankle target, ankle rotation and by how much the heel rose about the ball, rad."""
+    """Ankle target, ankle rotation, and the angle by which the heel rises about the ball, rad."""
     rot_ws = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
     from_ball = foot.ankle_ws - foot.ball_ws
     ball = target - from_ball
@@ -44,5 +44,5 @@ def raised(
         angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
         angle += math.atan2(by_sine, by_cosine)
         lift = clip(angle, 0.0, parameters.of_leg("effector.max_lift", leg))
-    turn = maths.from_axis_angle(axis, -lift)
-    return ball + rotate(turn, from_ball), maths.multiply(turn, rot_ws), lift
+    rise = maths.from_axis_angle(axis, -lift)
+    return ball + rotate(rise, from_ball), maths.multiply(rise, rot_ws), lift

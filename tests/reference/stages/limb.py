@@ -19,12 +19,12 @@ from reference.maths import (
     unit,
 )
 
-# Forward distance in m from ankle hit to toe hit below which their heights say no pitch.
+# Forward distance from ankle hit to toe hit, m, below which their heights give no pitch.
 SHORT_FOOT = 0.01
 
 
 def body(frame: Frame, offset_ws: Array, rot_ws: Array) -> Transform:
-    """Model space before to model space after: a turn about the middle of the hips, and a shift."""
+    """Motion of the body in model space: a rotation about the middle of the hips, and an offset."""
     model_from_world = maths.inverse(frame.world_from_model.rot)
     rot = maths.conjugate(rot_ws, model_from_world)
     pivot = np.mean(frame.hip.pos, axis=0)
@@ -32,7 +32,7 @@ def body(frame: Frame, offset_ws: Array, rot_ws: Array) -> Transform:
 
 
 def carry(transform: Transform, joint: Transform, leg: int) -> Transform:
-    """One leg's joint, carried rigidly."""
+    """One leg's joint, moved rigidly with the body."""
     return Transform(
         apply(transform, joint.pos[leg]), maths.multiply(transform.rot, joint.rot[leg])
     )
@@ -78,7 +78,7 @@ def rotated(
     knee_rot: Array,
     weight: float,
 ) -> tuple[Transform, Transform, Transform]:
-    """Hip, knee and ankle after a share of both turns, that of the knee first."""
+    """Hip, knee and ankle after both rotations by a weight, the knee's first."""
     knee_rot = maths.nlerp(maths.IDENTITY, knee_rot, weight)
     hip_rot = maths.nlerp(maths.IDENTITY, hip_rot, weight)
     bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
@@ -103,7 +103,7 @@ def _wanted_distance(
 ) -> tuple[float, float, float]:
     """Nearest hip-ankle distance, where softening starts, and the softened distance, all m.
 
-    Nothing limits or softens the distance `animated`, if it is given.
+    The animated distance, if not None, is neither limited nor softened.
     """
     nearest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(min_angle), 0.0))
     farthest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(max_angle), 0.0))
@@ -121,7 +121,7 @@ def _wanted_distance(
 
 
 def _knee_angle(to_hip: Array, to_ankle: Array, axis: Array, wanted: float) -> float:
-    """Turn about the hinge `axis` after which hip and ankle are `wanted` m apart."""
+    """Angle about the hinge `axis` that puts hip and ankle `wanted` m apart."""
     a, b = length(across(to_hip, axis)), length(across(to_ankle, axis))
     if min(a, b) < maths.DIRECTIONLESS:
         return 0.0
@@ -134,7 +134,7 @@ def _knee_angle(to_hip: Array, to_ankle: Array, axis: Array, wanted: float) -> f
 
 
 def _hip_rotation(bent: Array, target: Array, axis: Array, twist: float) -> Array:
-    """Turn about the hip that points `bent` at `target`, keeps the bend plane, and twists."""
+    """Rotation of the hip that points `bent` at `target`, keeps the bend plane, and twists."""
     along_leg = unit(bent, unit(target, -maths.Y))
     direction = unit(target, along_leg)
     arc = maths.shortest_arc(along_leg, direction, axis)

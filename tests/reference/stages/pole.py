@@ -25,15 +25,15 @@ def solve_leg(
     """Hip, knee and ankle that bring the ankle to `target`, and whether they do; model space.
 
     Args:
-        rig: whose hinge the knee turns about.
-        leg: which.
-        frame: the animated pose, which `body` carries first.
-        body: model space before to model space after.
-        target: of the ankle (3), m.
-        pole: direction (3, any length) that the bend plane shall contain.
-        soften: share of the leg's length from which on the target is softened, 0..1.
-        twist: further turn about the direction of the target, rad.
-        weight: share of both turns, 0..1.
+        rig: with the hinge of the knee.
+        leg: index of the leg.
+        frame: the animated pose, which moves with the body first.
+        body: motion of the body in model space.
+        target: position of the ankle (3), m.
+        pole: direction (3, any length) that the bend plane is to contain.
+        soften: fraction of the leg's length beyond which the target is softened, 0..1.
+        twist: about the direction of the target, rad.
+        weight: of both rotations, 0..1.
     """
     hip, knee, ankle = (
         limb.carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle)
@@ -55,16 +55,16 @@ def joint_rotations(
     soften: float,
     twist: float,
 ) -> tuple[Array, Array, bool]:
-    """Turns of the hip and, before it, of the knee; whether the target is within reach.
+    """Rotations of the hip and, before it, of the knee; whether the target is within reach.
 
-    Places (3) are seen from the hip, m; `hinge` (3) is unit, and a turn about it opens the knee.
+    Positions (3) are relative to the hip, m; a rotation about the unit `hinge` (3) opens the knee.
     """
     thigh, shin, distance = length(knee), length(ankle - knee), length(target)
     soft_from = maths.clip(soften, 0.0, 1.0) * (thigh + shin)
     wanted = softened(distance, soft_from, thigh + shin)
     in_reach = abs(thigh - shin) < distance <= soft_from
 
-    # The hinge is not asked whether it is at right angles to the bones: full lengths count.
+    # Full lengths count, whether or not the hinge is at right angles to the bones.
     present = maths.interior_angle(thigh, shin, float(ankle @ ankle))
     if hinge @ cross(-knee, ankle - knee) < 0.0:
         present = -present
@@ -84,7 +84,7 @@ def joint_rotations(
 
 
 def softened(distance: float, soft_from: float, chain: float) -> float:
-    """Distance that is aimed at, m: past `soft_from` it nears the chain's length."""
+    """Softened distance, m: beyond `soft_from` it tends to the length of the chain."""
     room = chain - soft_from
     if distance <= soft_from or room <= 0.0:
         return distance
@@ -93,7 +93,7 @@ def softened(distance: float, soft_from: float, chain: float) -> float:
 
 
 def _to_pole(hinge: Array, direction: Array, pole: Array) -> Array:
-    """Turn about the unit `direction` that brings `pole` into the plane across `hinge`."""
+    """Rotation about the unit `direction` that brings `pole` into the plane across `hinge`."""
     wanted = cross(direction, unit(pole, direction))
     if length(wanted) < maths.DIRECTIONLESS:
         return maths.IDENTITY

@@ -12,13 +12,13 @@ from reference.characters import Frame, Ground, Parameters, Rig, world_from_foot
 from reference.maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
 from reference.terrain import Hit
 
-WAY_POINTS = 8
-FADE = 0.10  # m or rad over which what goes beyond a limit ceases to count
-EDGE_FRACTION = 0.15  # share of the swing's time in which the way ceases to count at either end
+PATH_POINTS = 8
+FADE = 0.10  # m or rad beyond a limit over which a reading fades out
+EDGE_FRACTION = 0.15  # of the swing's time at either end, over which the path fades out
 
 
 class Swing(NamedTuple):
-    """Where a leg is in its stride, the places at the root's level."""
+    """Where a leg is in its stride; positions at the height of the root."""
 
     last: Array
     next: Array
@@ -26,17 +26,17 @@ class Swing(NamedTuple):
 
 
 def level(frame: Frame, up: Array, point: Array) -> Array:
-    """The point at the root's level."""
+    """The point moved to the height of the root."""
     return point - up * height(frame, up, point)
 
 
 def height(frame: Frame, up: Array, point: Array) -> float:
-    """Of the point."""
+    """Height of a point above the root, m."""
     return float((point - frame.world_from_model.pos) @ up)
 
 
 def look(parameters: Parameters, terrain: Ground, leg: int, level_point: Array) -> Hit:
-    """The ground at that place, from `ray_up` over the root's level to `ray_down` under it."""
+    """The ground at that position, from `ray_up` above the root's height to `ray_down` below it."""
     above = parameters.of_leg("probe.ray_up", leg)
     reach = above + parameters.of_leg("probe.ray_down", leg)
     mask = int(parameters.of_leg("probe.layers", leg))
@@ -44,11 +44,11 @@ def look(parameters: Parameters, terrain: Ground, leg: int, level_point: Array) 
 
 
 def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bool) -> Swing:
-    """As the animation tells it; where it does not, from the character's velocity."""
+    """The swing from the labels of the animation; without them, from the character's velocity."""
     stride = frame.stride
     if stride.known[leg] > 0.5:
-        places = (level(frame, up, place[leg]) for place in (stride.last_ws, stride.next_ws))
-        return Swing(*places, float(stride.fraction[leg]))
+        ends = (level(frame, up, pos[leg]) for pos in (stride.last_ws, stride.next_ws))
+        return Swing(*ends, float(stride.fraction[leg]))
     stance_time = parameters.of_leg("probe.stance_time", leg)
     swing_time = parameters.of_leg("probe.swing_time", leg)
     velocity = across(frame.travel_ws, up)
@@ -72,13 +72,11 @@ def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bo
 def ground_of_stride(
     parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, planted: bool
 ) -> tuple[Hit, Swing]:
-    """What the leg is told of the ground under its ankle, and the swing that this comes from."""
+    """The ground under the ankle of a leg, and the swing that it was predicted from."""
     up = terrain.up
     stride = swing(parameters, frame, leg, up, planted)
     here = level(frame, up, apply(frame.world_from_model, frame.ankle.pos[leg]))
-    last, following = (
-        look(parameters, terrain, leg, place) for place in (stride.last, stride.next)
-    )
+    last, following = (look(parameters, terrain, leg, pos) for pos in (stride.last, stride.next))
     if not last.found and not following.found:
         return Hit(False, here, up), stride
     last = last if last.found else following
@@ -117,7 +115,7 @@ def lift_over_edges(
     ground: float,
     top: float,
 ) -> float:
-    """How far the ground must be raised for the animated sole to clear what is on its way, m."""
+    """How far the ground must be raised for the animated sole to clear obstacles on its path, m."""
     up = terrain.up
     axes = world_from_foot(rig, frame, leg)
     behind = np.array(
@@ -132,18 +130,18 @@ def lift_over_edges(
     ball = toe - up * parameters.of_leg("probe.ball_height", leg)
 
     need = 0.0
-    for index in range(WAY_POINTS):
-        place = stride.last + (stride.next - stride.last) * (index + 0.5) / WAY_POINTS
-        hit = look(parameters, terrain, leg, place)
+    for index in range(PATH_POINTS):
+        pos = stride.last + (stride.next - stride.last) * (index + 0.5) / PATH_POINTS
+        hit = look(parameters, terrain, leg, pos)
         if not hit.found:
             continue
         edge = height(frame, up, hit.point)
         beyond = edge - top - parameters.of_leg("probe.max_step", leg)
         counts = 1.0 - smooth01(beyond / FADE)
         for point in (heel, ball):
-            away = length(across(point - place, up))
+            away = length(across(point - pos, up))
             over = edge - parameters.of_leg("probe.way_slope", leg) * away - ground
-            # What the animation itself does over its floor is not to be mended.
+            # The clearance that the animation has over its own floor is subtracted.
             lift = height(frame, up, point) - parameters.of_leg("probe.clearance", leg)
             need = max(need, counts * over - max(lift, 0.0))
     return need

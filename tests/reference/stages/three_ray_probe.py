@@ -13,12 +13,12 @@ from reference.stages import ground
 
 @dataclass
 class Foot:
-    """One leg's readings of this frame, world. Without a hit the point is not to be used."""
+    """One leg in this frame, world space. Where `found` is false, `point` is meaningless."""
 
     up: Array
-    share: float
+    weight: float
     ankle_ws: Array
-    animated_rot: Array  # of the foot, from its axes to the world
+    animated_rot: Array  # from the axes of the foot to the world
     extra: float
     found: bool
     point: Array
@@ -31,7 +31,7 @@ class Foot:
 def extra_length(
     parameters: Parameters, frame: Frame, leg: int, up: Array, ankle_ws: Array
 ) -> float:
-    """How far in m rays look below the sole."""
+    """How far the rays reach below the sole, m."""
     by_height = parameters.of_leg("probe.by_height", leg)
     by_speed = parameters.of_leg("probe.by_speed", leg)
     if not by_height and not by_speed:
@@ -46,14 +46,14 @@ def extra_length(
 
 
 def sense(
-    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, share: float
+    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, weight: float
 ) -> Foot:
-    """The foot's three rays, and what they say of its tilt."""
+    """The foot's three rays and the tilt of the ground that follows from them."""
     up = terrain.up
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
     animated_rot = characters.world_from_foot(rig, frame, leg)
-    looking = rotate(animated_rot, np.asarray(parameters.of_leg("probe.forward", leg)))
-    ahead = unit(across(looking, up), ground.forward(frame.world_from_model.rot, up))
+    foot_forward = rotate(animated_rot, np.asarray(parameters.of_leg("probe.forward", leg)))
+    ahead = unit(across(foot_forward, up), ground.forward(frame.world_from_model.rot, up))
     right = cross(ahead, up)
 
     extra = extra_length(parameters, frame, leg, up, ankle_ws)
@@ -82,7 +82,7 @@ def sense(
             roll = math.atan2(float(up @ (corner.point - hit.point)), half_width)
     return Foot(
         up=up,
-        share=share,
+        weight=weight,
         ankle_ws=ankle_ws,
         animated_rot=animated_rot,
         extra=float(extra),
@@ -96,7 +96,7 @@ def sense(
 
 
 def flat_foot(parameters: Parameters, leg: int, foot: Foot) -> Array:
-    """Rotation from the foot's axes to the world that lays it on the ground, its yaw kept."""
+    """Rotation from the foot's axes to the world that lays it flat with its animated yaw."""
     pitch = from_axis_angle(cross(foot.ahead, foot.up), foot.pitch)
     tilt = limited(
         maths.multiply(pitch, from_axis_angle(foot.ahead, -foot.roll)),
@@ -109,10 +109,10 @@ def flat_foot(parameters: Parameters, leg: int, foot: Foot) -> Array:
     return maths.multiply(tilt, maths.multiply(from_axis_angle(foot.up, yaw), upright))
 
 
-def limited(rot: Array, most: float) -> Array:
-    """The turn `rot`, of less than half a circle, by at most `most` rad about its axis."""
+def limited(rot: Array, limit: float) -> Array:
+    """The rotation `rot`, by less than pi, with its angle limited to `limit` rad."""
     sine = maths.length(rot[1:])
     angle = 2.0 * math.atan2(sine, float(rot[0]))
-    if angle <= most:
+    if angle <= limit:
         return rot
-    return from_axis_angle(rot[1:] / sine, most)
+    return from_axis_angle(rot[1:] / sine, limit)

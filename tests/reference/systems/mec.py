@@ -53,20 +53,20 @@ DEFAULTS: dict[str, Any] = {
 
 @dataclass
 class Leg:
-    """What one leg remembers."""
+    """Memory of one leg."""
 
     plant_weight: float
     planted: bool
     kept_point: Array  # in the platform's space, m
-    kept_rot: Array  # of the foot, from its axes to the platform's space
+    kept_rot: Array  # from the axes of the foot to the platform's space
     fade: float
-    offset_ws: Array  # of the last goal from the animated ankle, m
-    rot_ws: Array  # of the last goal from the animated rotation
+    offset_ws: Array  # m, from the animated ankle to the last goal
+    rot_ws: Array  # from the animated rotation to the last goal's
 
 
 @dataclass
 class State:
-    """What the next frame needs."""
+    """Memory between frames."""
 
     pelvis_height: float
     legs: list[Leg]
@@ -78,11 +78,11 @@ def step(
     """One frame. Without a state it is the first: smoothed values start on their goals."""
     up = terrain.up
     legs = range(len(frame.weight))
-    shares = ground.taking_part(parameters, frame)
+    leg_weights = ground.weights_of_legs(parameters, frame)
     feet, memory, goals = [], [], []
     for leg in legs:
         below = characters.under(terrain, leg)
-        foot = three_ray_probe.sense(parameters, rig, below, frame, leg, shares[leg])
+        foot = three_ray_probe.sense(parameters, rig, below, frame, leg, leg_weights[leg])
         before = None if state is None else state.legs[leg]
         after, point, rot = plant(parameters, below, frame, leg, foot, before)
         height = parameters.of_leg("target.foot_height", leg)
@@ -99,7 +99,7 @@ def step(
     solved, reached, weights, hints = [], [], [], []
     for leg in legs:
         target_ws, rot_ws = goals[leg]
-        weight = shares[leg] * memory[leg].fade
+        weight = leg_weights[leg] * memory[leg].fade
         hint_ws = knee_hint(parameters, frame, leg, feet[leg])
         hip, knee, ankle, arrived = solve_leg(
             parameters, rig, leg, frame, body, target_ws, hint_ws, weight
@@ -149,7 +149,7 @@ def plant(
     foot: Foot,
     before: Leg | None,
 ) -> tuple[Leg, Array, Array]:
-    """What the leg remembers, its fade apart; its foothold and the foot's rotation there, world."""
+    """Memory of the leg without its fade; foothold and rotation of the foot there, world."""
     goal_weight = parameters.of_leg("lock.plant_weight", leg)
     speed = parameters.of_leg("lock.plant_speed", leg)
     if before is None or math.isinf(speed):
@@ -168,15 +168,15 @@ def plant(
         else:
             kept_point = maths.unapply(frame.platform, point)
             kept_rot = maths.multiply(maths.inverse(frame.platform.rot), rot)
-        stood = followed(parameters, terrain, leg, foot, apply(frame.platform, kept_point))
-        point = point + weight * (stood - point)
+        standing = followed(parameters, terrain, leg, foot, apply(frame.platform, kept_point))
+        point = point + weight * (standing - point)
         rot = maths.nlerp(rot, maths.multiply(frame.platform.rot, kept_rot), weight)
     after = Leg(weight, planted, kept_point, kept_rot, 0.0, np.zeros(3), maths.IDENTITY)
     return after, point, rot
 
 
 def followed(parameters: Parameters, terrain: Ground, leg: int, foot: Foot, kept: Array) -> Array:
-    """The kept point at the height that the ground has there now."""
+    """The kept point at the present height of the ground."""
     above = parameters.of_leg("target.foot_height", leg) + parameters.of_leg("probe.ray_up", leg)
     mask = int(parameters.of_leg("probe.layers", leg))
     hit = terrain.cast(kept + foot.up * above, above + foot.extra, mask)
@@ -195,7 +195,7 @@ def fade(
     goal_ws: Array,
     goal_rot: Array,
 ) -> tuple[Array, Array]:
-    """Ankle target and foot rotation, world; fills in what `after` remembers of them."""
+    """Ankle target and foot rotation, world; completes the memory `after`."""
     end = 1.0 if foot.found else 0.0
     time = parameters.of_leg("effector.transition_time", leg)
     if before is None or time <= 0.0:
@@ -218,10 +218,10 @@ def pelvis_height(
     state: State | None,
     frame: Frame,
 ) -> float:
-    """Height in m of the body over its animated place, so that every leg is long enough."""
+    """Height of the body above its animated position, m, at which every leg is long enough."""
     goal, lows, highs = 0.0, [], []
     for leg, (foot, target) in enumerate(zip(feet, targets, strict=True)):
-        if not foot.found or foot.share <= 0.0:
+        if not foot.found or foot.weight <= 0.0:
             continue
         gap = target - apply(frame.world_from_model, frame.hip.pos[leg])
         along = float(gap @ up)
@@ -238,7 +238,7 @@ def pelvis_height(
 
 
 def knee_hint(parameters: Parameters, frame: Frame, leg: int, foot: Foot) -> Array:
-    """Where the knee shall look at from the hip, world, m."""
+    """The point that the knee is to look at from the hip, m, world."""
     calf = frame.knee.pos[leg] - frame.ankle.pos[leg]
     moved = calf + np.asarray(parameters.of_leg("leg.hint_offset", leg))
     return foot.toe_point + rotate(frame.world_from_model.rot, moved)

@@ -44,19 +44,19 @@ DEFAULTS: dict[str, Any] = {
 
 @dataclass
 class State:
-    """What the next frame needs."""
+    """Memory between frames."""
 
     pelvis_height: float
 
 
 @dataclass
 class Foot:
-    """One leg's readings, world, the character standing on the ground already."""
+    """One leg in this frame, world space, with the character already put on the ground."""
 
     ankle_ws: Array
     hit: Hit
     target_ws: Array
-    share: float
+    weight: float
 
 
 def step(
@@ -66,9 +66,9 @@ def step(
     up = terrain.up
     legs = range(len(frame.weight))
     lift = root_lift(parameters, terrain, frame)
-    shares = ground.taking_part(parameters, frame)
+    leg_weights = ground.weights_of_legs(parameters, frame)
     feet = [
-        sense(parameters, characters.under(terrain, leg), frame, leg, up * lift, shares[leg])
+        sense(parameters, characters.under(terrain, leg), frame, leg, up * lift, leg_weights[leg])
         for leg in legs
     ]
     pelvis = pelvis_height(parameters, feet, up, state, frame)
@@ -77,7 +77,7 @@ def step(
 
     solved, reached, foot_reached, weights = [], [], [], []
     for leg, foot in zip(legs, feet, strict=True):
-        weight = foot.share if foot.hit.found else 0.0
+        weight = foot.weight if foot.hit.found else 0.0
         leg_weight = weight if parameters.of_leg("leg.enabled", leg) else 0.0
         hip, knee, ankle, arrived = solve_leg(parameters, rig, leg, frame, body, foot, leg_weight)
         rot, aimed = aim_foot(parameters, rig, leg, frame, foot, ankle, weight)
@@ -111,7 +111,7 @@ def run(
 
 
 def root_lift(parameters: Parameters, terrain: Ground, frame: Frame) -> float:
-    """Height in m of the ground at the character's origin over that origin."""
+    """Height of the ground above the character's origin, m."""
     if not parameters["root.enabled"]:
         return 0.0
     origin = frame.world_from_model.pos
@@ -121,7 +121,7 @@ def root_lift(parameters: Parameters, terrain: Ground, frame: Frame) -> float:
 
 
 def sense(
-    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, lift_ws: Array, share: float
+    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, lift_ws: Array, weight: float
 ) -> Foot:
     """Ray and ankle target of one leg."""
     up = terrain.up
@@ -134,22 +134,21 @@ def sense(
         steepest = math.cos(parameters.of_leg("target.max_slope", leg))
         cosine = max(float(hit.normal @ up), steepest)
         target = hit.point + up * (parameters.of_leg("target.foot_height", leg) / cosine)
-    return Foot(ankle_ws=ankle_ws, hit=hit, target_ws=target, share=share)
+    return Foot(ankle_ws=ankle_ws, hit=hit, target_ws=target, weight=weight)
 
 
 def pelvis_height(
     parameters: Parameters, feet: list[Foot], up: Array, state: State | None, frame: Frame
 ) -> float:
-    """Height in m of the body over its animated place, along up.
+    """Height of the body above its animated position along up, m.
 
-    A foot that sees ground with part of its share only counts as far between the highest foot and
-    itself.
+    A foot with a partial weight counts as partly between the highest foot and itself.
     """
     gaps, weights = [], []
     for foot in feet:
-        if foot.share > 0.0:
+        if foot.weight > 0.0:
             gaps.append(float(up @ (foot.target_ws - foot.ankle_ws)))
-            weights.append(foot.share if foot.hit.found else 0.0)
+            weights.append(foot.weight if foot.hit.found else 0.0)
     contact = max(weights, default=0.0)
     if not parameters["pelvis.enabled"]:
         contact = 0.0
@@ -201,35 +200,36 @@ def aim_foot(
     ankle: Transform,
     weight: float,
 ) -> tuple[Array, bool]:
-    """Model-space rotation of the ankle, its sole along the ground, and whether that was met."""
+    """Model-space rotation of the ankle with its sole on the ground, and whether it gets there."""
     weight = weight * parameters.of_leg("foot.weight", leg)
     if not parameters.of_leg("foot.enabled", leg):
         weight = 0.0
     carried_ws = maths.multiply(frame.world_from_model.rot, ankle.rot)
     world_from_foot = maths.multiply(carried_ws, rig.ankle_from_foot[leg])
     toes = rotate(world_from_foot, maths.Z)
-    looked_at = foot.target_ws + foot.hit.normal
-    correction, met = aim(
+    look_at = foot.target_ws + foot.hit.normal
+    correction, reached = aim(
         forward=rotate(world_from_foot, maths.Y),
         offset=rotate(world_from_foot, np.asarray(parameters.of_leg("foot.offset", leg))),
         up=toes,
-        target=looked_at - apply(frame.world_from_model, ankle.pos),
+        target=look_at - apply(frame.world_from_model, ankle.pos),
         pole=toes,
         twist=parameters.of_leg("foot.twist", leg),
     )
     correction = maths.nlerp(maths.IDENTITY, correction, weight)
     model_from_world = maths.inverse(frame.world_from_model.rot)
     rot = maths.multiply(model_from_world, maths.multiply(correction, carried_ws))
-    return rot, met and weight >= 1.0
+    return rot, reached and weight >= 1.0
 
 
 def aim(
     forward: Array, offset: Array, up: Array, target: Array, pole: Array, twist: float
 ) -> tuple[Array, bool]:
-    """The turn after which the ray from `offset` along `forward` meets `target`; whether it does.
+    """Rotation after which the ray from `offset` along `forward` passes through `target`.
 
-    `up` then faces `pole`. All (3) in one space, from the joint. The identity where the offset is
-    farther than the target, or the target on the joint.
+    `up` then faces `pole`. All (3) in one space, from the joint. The identity where the ray passes
+    the joint farther away than the target is, or where the target is on the joint. Also whether
+    the target is reached.
     """
     along = float(offset @ forward)
     root = float(target @ target) - float(offset @ offset) + along**2

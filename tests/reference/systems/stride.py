@@ -20,7 +20,7 @@ from reference.stages import ground, heel, limb, stride_probe
 from reference.systems import record
 from reference.terrain import ALL_LAYERS
 
-# The rules that may stand in the stages which have two.
+# The alternatives in the stages that have two rules.
 CONTACTS: dict[str, dict[str, Any]] = {
     "label": {"contact.ground_height": 0.0},
     "speed": {
@@ -51,7 +51,7 @@ PELVISES: dict[str, dict[str, Any]] = {
 
 
 def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
-    """Every parameter of the system with these rules."""
+    """All parameters of the system with these rules."""
     kept = ("target.", "lock.", "leg.", "foot.")
     return {
         **{name: value for name, value in record.DEFAULTS.items() if name.startswith(kept)},
@@ -84,7 +84,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
 
 @dataclass
 class Standing:
-    """Contact of one foot: whether it stands, and how far that counts by now."""
+    """Contact of one foot: whether it stands, and the smoothed weight of that."""
 
     standing: bool
     weight: float
@@ -92,7 +92,7 @@ class Standing:
 
 @dataclass
 class State:
-    """What the next frame needs; of the lists one each for a leg."""
+    """Memory between frames; lists have one entry per leg."""
 
     standing: list[Standing]
     ground: list[Motion]
@@ -120,12 +120,12 @@ def step(
     for leg, up in zip(legs, ups, strict=True):
         before = None if state is None else state.standing[leg]
         if contact == "speed":
-            stands = stand_by_speed(parameters, frame, leg, before)
+            contact_of_leg = contact_by_speed(parameters, frame, leg, before)
         else:
             label = float(frame.stride.standing[leg])
-            stands = Standing(label > 0.5, label)
+            contact_of_leg = Standing(label > 0.5, label)
         below = characters.under(terrain, leg)
-        foot, swing = sense(parameters, rig, below, frame, leg, stands)
+        foot, swing = sense(parameters, rig, below, frame, leg, contact_of_leg)
 
         eased = ground.smooth_height(
             parameters, leg, foot, up, None if state is None else state.ground[leg], frame.dt
@@ -133,7 +133,7 @@ def step(
         foothold, target = ground.clamped_target(parameters, leg, foot, up, eased.value, frame)
         hold = None if state is None else state.holds[leg]
         hold, offset = ground.lock(parameters, leg, foot, foothold, up, hold, offset_before, frame)
-        standing.append(stands)
+        standing.append(contact_of_leg)
         feet.append(foot)
         swings.append(swing)
         heights.append(eased)
@@ -166,8 +166,8 @@ def step(
     output = {
         "body_pos": body.pos,
         "body_rot": body.rot,
-        "contact": np.array([stands.weight for stands in standing]),
-        "standing": np.array([stands.standing for stands in standing]),
+        "contact": np.array([foot.weight for foot in standing]),
+        "standing": np.array([foot.standing for foot in standing]),
         "found": np.array([foot.hit.found for foot in feet]),
         "fraction": np.array([swing.fraction for swing in swings]),
         "hit_ws": np.array([foot.hit.point for foot in feet]),
@@ -184,7 +184,7 @@ def step(
         "heel_lift": np.array(lifts),
         "target_ws": np.array(aims),
         "reached": np.array(reached),
-        "stretch": np.array(stretches),  # by which the target is farther than animated
+        "stretch": np.array(stretches),  # by how much the target is farther than animated
     }
     after = State(standing, heights, holds, eased, goal, offset_ws)
     return after, output | characters.joints(solved)
@@ -199,11 +199,11 @@ def run(
     pelvis: str = "reach",
 ) -> dict[str, Array]:
     """All outputs of `step` for a whole clip, stacked over the frames."""
-    exchanged = functools.partial(step, contact=contact, pelvis=pelvis)
-    return characters.run(exchanged, parameters, rig, terrain, frames)
+    step_with_rules = functools.partial(step, contact=contact, pelvis=pelvis)
+    return characters.run(step_with_rules, parameters, rig, terrain, frames)
 
 
-def stand_by_speed(
+def contact_by_speed(
     parameters: Parameters, frame: Frame, leg: int, before: Standing | None
 ) -> Standing:
     """A foot stands once its toe is low and slow, until it is high or fast."""
@@ -223,18 +223,18 @@ def stand_by_speed(
         stands = before.standing
     if before is None:
         return Standing(stands, float(stands))
-    share = maths.fraction_of_half_life(parameters.of_leg("contact.half_life", leg), frame.dt)
-    return Standing(stands, lerp(before.weight, float(stands), share))
+    fraction = maths.fraction_of_half_life(parameters.of_leg("contact.half_life", leg), frame.dt)
+    return Standing(stands, lerp(before.weight, float(stands), fraction))
 
 
 def sense(
-    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, stands: Standing
+    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, contact: Standing
 ) -> tuple[Foot, stride_probe.Swing]:
-    """One leg's readings of this frame, and where it is in its stride."""
+    """One leg in this frame, and where it is in its stride."""
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
     lift = float(frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg))
     hit, swing = stride_probe.ground_of_stride(
-        parameters, rig, terrain, frame, leg, stands.standing
+        parameters, rig, terrain, frame, leg, contact.standing
     )
     foot = Foot(
         hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
@@ -242,9 +242,9 @@ def sense(
         ball_ws=apply(frame.world_from_model, frame.toe.pos[leg]),
         heading_ws=ground.heading(rig, frame, leg, terrain.up),
         lift=lift,
-        contact=stands.weight,
-        planted=stands.standing,
-        lifted=not stands.standing,
+        contact=contact.weight,
+        planted=contact.standing,
+        lifted=not contact.standing,
         hit=hit,
         toe_hit=hit._replace(found=False),
         foothold_ws=ground.foothold(parameters, leg, hit, ankle_ws, lift, terrain.up),
@@ -262,59 +262,59 @@ def pelvis_goal(
     state: State | None,
     frame: Frame,
 ) -> float:
-    """Height for the body, m, by the rule of that name."""
-    shares = ground.taking_part(parameters, frame)
-    asked = [
+    """Height that the body is to have, m, by the rule of that name."""
+    leg_weights = ground.weights_of_legs(parameters, frame)
+    requested = [
         float((target - foot.ankle_ws) @ leg_up)
         for foot, target, leg_up in zip(feet, targets, ups, strict=True)
     ]
     if pelvis == "reach":
-        return reach_goal(parameters, feet, targets, shares, asked, up, frame)
-    return support_goal(parameters, feet, shares, asked, state)
+        return reach_goal(parameters, feet, targets, leg_weights, requested, up, frame)
+    return support_goal(parameters, feet, leg_weights, requested, state)
 
 
 def support_goal(
     parameters: Parameters,
     feet: list[Foot],
-    shares: list[float],
-    asked: list[float],
+    leg_weights: list[float],
+    requested: list[float],
     state: State | None,
 ) -> float:
-    """What the standing feet ask for, and a share of what the lowest foot does."""
-    asking = [gap for gap, share in zip(asked, shares, strict=True) if share > 0.0]
-    weights = [foot.grounded * share for foot, share in zip(feet, shares, strict=True)]
+    """Between the heights that the standing feet and the lowest foot request."""
+    taking_part = [gap for gap, w in zip(requested, leg_weights, strict=True) if w > 0.0]
+    weights = [foot.grounded * w for foot, w in zip(feet, leg_weights, strict=True)]
     if sum(weights) == 0.0:
         if state is not None:
             return state.pelvis_goal
-        total = sum(share * gap for share, gap in zip(shares, asked, strict=True))
-        return total / sum(shares) if asking else 0.0
-    support = sum(w * gap for w, gap in zip(weights, asked, strict=True)) / sum(weights)
-    return support + parameters["pelvis.lowest_share"] * (min(asking) - support)
+        total = sum(w * gap for w, gap in zip(leg_weights, requested, strict=True))
+        return total / sum(leg_weights) if taking_part else 0.0
+    support = sum(w * gap for w, gap in zip(weights, requested, strict=True)) / sum(weights)
+    return support + parameters["pelvis.lowest_share"] * (min(taking_part) - support)
 
 
 def reach_goal(
     parameters: Parameters,
     feet: list[Foot],
     targets: list[Array],
-    shares: list[float],
-    asked: list[float],
+    leg_weights: list[float],
+    requested: list[float],
     up: Array,
     frame: Frame,
 ) -> float:
-    """Between what all feet ask for on average and what the highest does, within reach."""
-    if sum(shares) == 0.0:
+    """Between the mean and the highest of the requested heights, within reach of all legs."""
+    if sum(leg_weights) == 0.0:
         return 0.0
-    mean = sum(w * gap for w, gap in zip(shares, asked, strict=True)) / sum(shares)
-    highest = max(gap for gap, share in zip(asked, shares, strict=True) if share > 0.0)
+    mean = sum(w * gap for w, gap in zip(leg_weights, requested, strict=True)) / sum(leg_weights)
+    highest = max(gap for gap, w in zip(requested, leg_weights, strict=True) if w > 0.0)
     wanted, untouched = [lerp(mean, highest, parameters["pelvis.highest_share"])], [0.0]
-    for leg, share in enumerate(shares):
-        if share > 0.0:
+    for leg, weight in enumerate(leg_weights):
+        if weight > 0.0:
             hip = feet[leg].hip_ws
             longest = parameters["pelvis.extension"] * heel.leg_length(frame, leg)
             wanted.append(highest_hip(targets[leg] - hip, longest, up))
             untouched.append(highest_hip(feet[leg].ankle_ws - hip, longest, up))
     softness = parameters["pelvis.softness"]
-    return soft_least(wanted, softness) - soft_least(untouched, softness)
+    return soft_minimum(wanted, softness) - soft_minimum(untouched, softness)
 
 
 def highest_hip(to_foot: Array, longest: float, up: Array) -> float:
@@ -323,16 +323,16 @@ def highest_hip(to_foot: Array, longest: float, up: Array) -> float:
     return float(to_foot @ up) + math.sqrt(max(0.0, longest**2 - float(aside @ aside)))
 
 
-def soft_least(values: list[float], softness: float) -> float:
+def soft_minimum(values: list[float], softness: float) -> float:
     """A smooth lower bound of the values, m."""
-    least = min(values)
-    return least - softness * math.log(sum(math.exp((least - x) / softness) for x in values))
+    lowest = min(values)
+    return lowest - softness * math.log(sum(math.exp((lowest - x) / softness) for x in values))
 
 
 def follow_goal(parameters: Parameters, state: State | None, goal: float, dt: float) -> Motion:
-    """The body's height on its way to the goal, m."""
+    """The smoothed height of the body, m."""
     if state is None:
         return Motion(goal, 0.0)
-    way = "rise" if goal > state.pelvis.value else "fall"
-    half_life = parameters[f"pelvis.{way}_half_life"]
+    direction = "rise" if goal > state.pelvis.value else "fall"
+    half_life = parameters[f"pelvis.{direction}_half_life"]
     return maths.follow(state.pelvis, goal, half_life, dt, parameters["pelvis.spring"])

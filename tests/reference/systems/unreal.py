@@ -40,7 +40,7 @@ DEFAULTS: dict[str, Any] = {
 
 @dataclass
 class State:
-    """What the next frame needs; rows are legs. Heights in m along up."""
+    """Memory between frames; lists have one entry per leg. Heights in m along up."""
 
     hip: float
     half_height: float
@@ -53,21 +53,21 @@ def step(
 ) -> tuple[State, dict[str, Array]]:
     """One frame. Without a state it is the first: smoothed values start on their goals."""
     legs = range(len(frame.weight))
-    shares = ground.taking_part(parameters, frame)
+    leg_weights = ground.weights_of_legs(parameters, frame)
     idle = frame.speed <= parameters["contact.idle_speed"]
     found, offsets = [], []
     for leg in legs:
-        seen, offset = ground_offset(parameters, characters.under(terrain, leg), frame, leg)
-        found.append(seen)
+        hit, offset = ground_offset(parameters, characters.under(terrain, leg), frame, leg)
+        found.append(hit)
         offsets.append(offset if idle else 0.0)
 
     hip_goal = 0.0
     if parameters["pelvis.enabled"]:
-        for offset, share in zip(offsets, shares, strict=True):
-            if share > 0.0:
+        for offset, weight in zip(offsets, leg_weights, strict=True):
+            if weight > 0.0:
                 hip_goal = min(hip_goal, offset)
     goals = [offset - hip_goal for offset in offsets]
-    state = advance(parameters, state, idle, hip_goal, goals, shares, frame.dt)
+    state = advance(parameters, state, idle, hip_goal, goals, leg_weights, frame.dt)
 
     body = limb.body(frame, terrain.up * state.hip, maths.IDENTITY)
     solved, reached, targets = [], [], []
@@ -77,8 +77,8 @@ def step(
         target_ws = target_ws + terrain.up * state.hip + characters.under(terrain, leg).up * raised
         target_ms = maths.unapply(frame.world_from_model, target_ws)
         hip, knee, ankle, arrived = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
-        # The body only moves, so that the animated world rotation is the animated one in the model.
-        ankle = Transform(ankle.pos, maths.nlerp(ankle.rot, frame.ankle.rot[leg], shares[leg]))
+        # The body does not rotate, so the animated model-space rotation is the world's as well.
+        ankle = Transform(ankle.pos, maths.nlerp(ankle.rot, frame.ankle.rot[leg], leg_weights[leg]))
         solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle)))
         reached.append(arrived)
         targets.append(target_ws)
@@ -96,7 +96,7 @@ def step(
         "idle": np.array(idle),
         "found": np.array(found),
         "target_ws": np.array(targets),
-        "weight": np.array(shares),
+        "weight": np.array(leg_weights),
         "reached": np.array(reached),
     }
     return state, output | characters.joints(solved)
@@ -112,7 +112,7 @@ def run(
 def ground_offset(
     parameters: Parameters, terrain: Ground, frame: Frame, leg: int
 ) -> tuple[bool, float]:
-    """Whether the ray from the foot's place on the plan meets ground, and that foot's offset, m."""
+    """Whether the ray at the foot's horizontal position hits ground; the foot's offset, m."""
     up = terrain.up
     origin_height = float(up @ frame.world_from_model.pos)
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
@@ -130,7 +130,7 @@ def advance(
     idle: bool,
     hip_goal: float,
     goals: list[float],
-    shares: list[float],
+    leg_weights: list[float],
     dt: float,
 ) -> State:
     """Hip, capsule and effectors after one frame, and whether the feet have come to rest."""
@@ -148,8 +148,8 @@ def advance(
             for leg, (before, goal) in enumerate(zip(state.effector, goals, strict=True))
         ]
     asleep = bool(idle and parameters["effector.latch"])
-    for leg, share in enumerate(shares):
+    for leg, weight in enumerate(leg_weights):
         near = abs(goals[leg] - effector[leg]) <= parameters.of_leg("effector.latch_distance", leg)
-        if share > 0.0 and not near:
+        if weight > 0.0 and not near:
             asleep = False
     return State(hip, half_height, effector, asleep)
