@@ -99,13 +99,12 @@ def solve_two_bone(rows: Table, dtype: DTypeLike = jnp.float64) -> Solution:
     hinge = directions(to_start, directions(rows.mid, rows.mid_axis))
     hinge = hinge / np.maximum(np.linalg.norm(hinge, axis=-1, keepdims=True), TINY)
     target, direction = points(to_start, rows.target), directions(to_start, rows.pole_vector)
-    task = (
-        Limb(-knee, ankle - knee, hinge),
-        pole.PoleTarget(target, direction, rows.twist_angle),
-        rows.soften,
+    limb = Limb(*(jnp.asarray(x, dtype) for x in (-knee, ankle - knee, hinge)))
+    pole_target = pole.PoleTarget(
+        *(jnp.asarray(x, dtype) for x in (target, direction, rows.twist_angle))
     )
-    limb, target, soften = jax.tree.map(lambda x: jnp.asarray(x, dtype), task)
-    bend = jax.jit(pole.bend_to_pole)(limb, target, soften, HARD)
+    soften = jnp.asarray(rows.soften, dtype)
+    bend = jax.jit(pole.bend_to_pole)(limb, pole_target, soften, HARD)
 
     half = bend.half_cos, bend.half_sin
     start = weighted(bend.swing, rows)
@@ -126,10 +125,11 @@ def to_aim(rows: Table) -> tuple[np.ndarray, np.ndarray]:
 def solve_aim(rows: Table, dtype: DTypeLike = jnp.float64) -> tuple[np.ndarray, np.ndarray]:
     """Our corrections (rows, 4), and whether the target is reached."""
     target, direction = to_aim(rows)
-    target = pole.PoleTarget(target, direction, rows.twist_angle)
-    task = (target, rows.forward, rows.offset, rows.up)
-    task = jax.tree.map(lambda x: jnp.asarray(x, dtype), task)
-    rot, reached = jax.jit(aim.aim_rotation)(*task, HARD)
+    pole_target = pole.PoleTarget(
+        *(jnp.asarray(x, dtype) for x in (target, direction, rows.twist_angle))
+    )
+    axes = (jnp.asarray(x, dtype) for x in (rows.forward, rows.offset, rows.up))
+    rot, reached = jax.jit(aim.aim_rotation)(pole_target, *axes, HARD)
     return np.asarray(weighted(rot, rows)), np.asarray(reached) == 1
 
 
