@@ -301,8 +301,8 @@ def solve(
     )
     if is_blocks_file(animation.clip):
         captured = load_clip(animation.clip)
-        found = accuracy.summarise([accuracy.clip_errors(solved, captured, loaded.clip)])
-        log(f"\n{aligned(fit_tables.accuracy_table(found))}")
+        errors = accuracy.clip_errors(solved, captured, loaded.clip)
+        log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")
     return solved
 
 
@@ -323,8 +323,8 @@ def _assess_and_save(
     """The fit; its solution is on disk before the assessment, which may fail."""
     if run is not None:
         run_folder.save_solution(run, experiment, problem, solution)
-    found = assess_identifiability(problem, solution)
-    fitted = Fit(experiment, problem, solution, found, known_values, run)
+    identifiability = assess_identifiability(problem, solution)
+    fitted = Fit(experiment, problem, solution, identifiability, known_values, run)
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

@@ -9,9 +9,9 @@ free = { pelvis.limit = {} }            # fitted in addition
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import jaxik
+from fitting.inference.sensitivity import FreeTable
 from fitting.runtime import validation
 
 from .systems import leaf_names, read_free_table, rule_names, with_parameters, with_rules
@@ -25,8 +25,8 @@ class Ablation:
 
     name: str
     rules: Mapping[str, str] = field(default_factory=dict)  # by stage
-    parameters: Mapping[str, Any] = field(default_factory=dict)  # by dotted name
-    free: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by dotted name
+    parameters: Mapping[str, object] = field(default_factory=dict)  # by dotted name
+    free: FreeTable = field(default_factory=dict)  # by dotted name
 
 
 KEYS = {"name": validation.TEXT} | dict.fromkeys(("rules", "parameters", "free"), validation.TABLE)

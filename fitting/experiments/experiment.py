@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import jaxik
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
+from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import FreeParameter, free_parameter
 from fitting.problem.loss import Loss
 from fitting.runtime import validation
@@ -56,7 +56,7 @@ class Experiment:
 
     path: Path  # of the file; relative paths in it start from there
     clips: tuple[ClipEntry, ...]
-    free: Mapping[str, Mapping[str, Any]]  # by dotted name, with overrides of the declaration
+    free: FreeTable  # by dotted name, with overrides of the declaration
     preset: str = "record"
     name: str = ""
     fps: float | None = None  # clips are resampled to this rate
@@ -64,7 +64,7 @@ class Experiment:
     independent_every: float = 0.0  # s, spacing at which residuals are independent; 0: all are
     seed: int = 0
     rules: Mapping[str, str] = field(default_factory=dict)  # by stage, where not the preset's
-    parameters: Mapping[str, Any] = field(default_factory=dict)  # fixed values by dotted name
+    parameters: Mapping[str, object] = field(default_factory=dict)  # fixed values by dotted name
     sigmas: Mapping[str, float] = field(default_factory=dict)  # where not the default
     fit: FitOptions = FitOptions()
     sample: SamplerSettings = SamplerSettings()

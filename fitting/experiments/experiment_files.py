@@ -32,7 +32,7 @@ from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
 from fitting.runtime import validation
-from fitting.runtime.validation import Constraint, Table, check_table, flatten, nest
+from fitting.runtime.validation import Constraint, Content, Table, check_table, flatten, nest
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
@@ -57,7 +57,7 @@ def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
     }
 
 
-def _values(table: Table, settings: type[Settings]) -> dict[str, Any]:
+def _values(table: Table, settings: type[Settings]) -> Content:
     return {name: _value(value, describe(settings)[name]) for name, value in table.items()}
 
 
@@ -148,7 +148,7 @@ def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSett
 
 def _clip_entry(value: object, path: Path) -> ClipEntry:
     table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
-    entry: dict[str, Any] = dict(table)
+    entry: Content = dict(table)
     for key in ("reference", "terrain"):
         if key not in table:
             raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
@@ -167,7 +167,7 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     Paths inside `folder` are written relative to it: those files move with it.
     """
     fit, sampler = experiment.fit, dataclasses.asdict(experiment.sample)
-    fit_table: dict[str, Any] = {"starts": fit.starts, "max_steps": fit.search.max_steps}
+    fit_table: Content = {"starts": fit.starts, "max_steps": fit.search.max_steps}
     search = dataclasses.replace(fit.search, max_steps=SearchSettings().max_steps)
     if changed := _changed(search):
         fit_table["search"] = changed
@@ -180,7 +180,7 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     return tomli_w.dumps(_plain(content, folder and folder.resolve()))
 
 
-def _changed(settings: Settings) -> dict[str, Any]:
+def _changed(settings: Settings) -> Content:
     """The settings that do not have their default value."""
     defaults = dataclasses.asdict(type(settings)())
     values = dataclasses.asdict(settings)

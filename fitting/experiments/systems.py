@@ -1,13 +1,13 @@
 """Systems by name: presets, other rules for some stages, parameters fixed or free."""
 
-from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import numpy as np
 
 import jaxik
+from fitting.inference.sensitivity import FreeTable
 from fitting.runtime import validation
 from fitting.runtime.validation import Table, check_keys, check_table, flatten
 from jaxik import presets
@@ -130,7 +130,7 @@ def leaf_names(ik: jaxik.FootIK) -> list[str]:
     return [f"{stage}.{leaf.name}" for stage, rule in vars(ik).items() for leaf in fields(rule)]
 
 
-def read_free_table(table: Table, where: str) -> dict[str, Mapping[str, Any]]:
+def read_free_table(table: Table, where: str) -> FreeTable:
     """The entries of a [free] table by dotted name; ValueError for a wrong key or value."""
     named = flatten(table, 2)
     return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in named.items()}

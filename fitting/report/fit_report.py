@@ -146,21 +146,23 @@ def _parameters(fitted: Fit) -> list[str]:
 
 
 def _identifiability(fitted: Fit) -> list[str]:
-    found = fitted.identifiability
-    names = ", ".join(f"`{name}`" for name in found.undetermined)
+    identifiability = fitted.identifiability
+    names = ", ".join(f"`{name}`" for name in identifiability.undetermined)
     parts = [
         "## What these clips do not determine",
         f"Undetermined: {names}." if names else "All free parameters are determined.",
         "Contraction is 1 where the clips alone decide and 0 where only the prior is known.",
         markdown(fit_tables.contraction_table(fitted.summary["parameters"])),
     ]
-    if found.correlated:
+    if identifiability.correlated:
         parts.append("Pairs of which these clips mostly determine one combination (correlation):")
         parts.append(
-            bullets([f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in found.correlated])
+            bullets(
+                [f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in identifiability.correlated]
+            )
         )
-    if found.weakest:
-        together = ", ".join(f"`{name}`" for name in found.weakest)
+    if identifiability.weakest:
+        together = ", ".join(f"`{name}`" for name in identifiability.weakest)
         parts.append(f"The least determined direction moves {together}.")
     return parts
 

@@ -108,19 +108,19 @@ def _opening(translation: Translation, fitted: Fit, clips: Sequence[Difference])
 def _parameters_of_both(translation: Translation, fitted: Fit) -> list[str]:
     """The section with the values of both systems side by side."""
     source, target = translation.names
-    both = translation.source.ik, fitted.ik
-    leaves = [systems.leaf_names(ik) for ik in both]
-    declarations = [parameter_tree.declarations(ik) for ik in both]
+    iks = translation.source.ik, fitted.ik
+    leaves = [systems.leaf_names(ik) for ik in iks]
+    declarations = [parameter_tree.declarations(ik) for ik in iks]
     table = [["parameter", "unit", source, f"{target}, fitted", "remarks"]]
     free_leaves = {name.partition("[")[0] for name in translation.experiment.free}
     for name in dict.fromkeys([*leaves[0], *leaves[1]]):
         units = [declared[name].unit for declared in declarations if name in declared]
         values = [
             _value_text(parameter_tree.get(ik, name)) if name in own else "–"
-            for ik, own in zip(both, leaves, strict=True)
+            for ik, own in zip(iks, leaves, strict=True)
         ]
         stage = name.partition(".")[0]
-        rules = {type(getattr(ik, stage)) for ik in both}
+        rules = {type(getattr(ik, stage)) for ik in iks}
         remarks = ["fitted"] if name in free_leaves else []
         remarks += ["of another rule"] if "–" not in values and len(rules) > 1 else []
         table.append([f"`{name}`", units[0] if units else "", *values, ", ".join(remarks)])

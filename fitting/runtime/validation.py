@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-Table: TypeAlias = Mapping[str, Any]  # as TOML reads it; values are checked before they are used
+Content: TypeAlias = dict[str, Any]  # tables as TOML or JSON reads them, not yet checked
+Table: TypeAlias = Mapping[str, Any]  # the same, to read only
 
 
 class Constraint(NamedTuple):
@@ -59,7 +60,7 @@ def list_of(description: str) -> Constraint:
     return Constraint(description, lambda value: isinstance(value, list))
 
 
-def read_toml(path: Path, description: str) -> dict[str, Any]:
+def read_toml(path: Path, description: str) -> Content:
     """The tables of a TOML file.
 
     Args:
@@ -125,9 +126,9 @@ def check_table(value: object, constraints: Mapping[str, Constraint], where: str
     return value
 
 
-def flatten(tables: Table, depth: int, prefix: str = "") -> dict[str, Any]:
+def flatten(tables: Table, depth: int, prefix: str = "") -> Content:
     """Nested TOML tables as one with dotted keys of up to `depth` parts: `lock.enabled`."""
-    flat: dict[str, Any] = {}
+    flat: Content = {}
     for key, value in tables.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping) and value and name.count(".") + 1 < depth:
@@ -137,9 +138,9 @@ def flatten(tables: Table, depth: int, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def nest(values: Table) -> dict[str, dict[str, Any]]:
+def nest(values: Table) -> dict[str, Content]:
     """Values by `stage.name` as one table per stage, the reverse of `flatten`."""
-    tables: dict[str, dict[str, Any]] = {}
+    tables: dict[str, Content] = {}
     for name, value in values.items():
         stage, _, leaf = name.partition(".")
         tables.setdefault(stage, {})[leaf] = value

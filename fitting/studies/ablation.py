@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +30,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.space import make_space
 from fitting.runtime import files
-from fitting.runtime.validation import error_context
+from fitting.runtime.validation import Table, error_context
 
 from .animations import Animation
 from .fit import search
@@ -266,7 +265,7 @@ def read(folder: Path) -> list[Row]:
         raise ValueError(f"{path}: not written by `jaxik ablate`: {error!r}") from None
 
 
-def _row(fields: Mapping[str, Any]) -> Row:
+def _row(fields: Table) -> Row:
     figures = {key: math.nan if v is None else v for key, v in fields["agreement"].items()}
     return Row(**{**fields, "agreement": Accuracy(**figures)})
 

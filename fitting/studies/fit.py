@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Literal, NotRequired, TypedDict
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +17,7 @@ from fitting.inference.identifiability import Identifiability, assess_identifiab
 from fitting.inference.optimisation.search import Starts, find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
+from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
 # Walkers start in a ball around the fit. Its width, in u, is the Laplace standard deviation, which
@@ -58,9 +59,9 @@ class FitSummary(TypedDict):
     steps: int
     seconds: float
     parameters: list[FittedParameter]
-    correlated: list[list[Any]]  # two names and their correlation
+    correlated: list[list[str | float]]  # two names and their correlation
     weakest: list[str]
-    history: list[dict[str, Any]]
+    history: list[Content]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +146,7 @@ def assess(
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
-    solution, space, found = fitted.solution, fitted.problem.space, fitted.identifiability
+    solution, space, known = fitted.solution, fitted.problem.space, fitted.identifiability
     declared = parameter_tree.declarations(space.system)
     before = np.asarray(space.values(space.u0))
     rows = []
@@ -160,10 +161,10 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             "before": float(before[i]),
             "low": parameter.low,
             "high": parameter.high,
-            "interval": [float(end) for end in found.interval[i]],
-            "contraction": float(found.contraction[i]),
-            "at_bound": found.at_bound[i],
-            "determined": parameter.name not in found.undetermined,
+            "interval": [float(end) for end in known.interval[i]],
+            "contraction": float(known.contraction[i]),
+            "at_bound": known.at_bound[i],
+            "determined": parameter.name not in known.undetermined,
         }
         if parameter.scale == "gain":
             row |= gain_readings(row["value"])  # type: ignore[operator]

@@ -11,10 +11,8 @@ translation.json        the remaining differences, as numbers
 difference.png          the remaining differences over time
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,6 +28,7 @@ from fitting.inference.optimisation.population import evaluate
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.state import Search, SearchState
 from fitting.inference.optimisation.sweep import sweep
+from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.runtime import files, validation
@@ -68,7 +67,7 @@ class TranslationRequest:
     source: NamedSystem  # whose motion is reproduced
     target: NamedSystem  # whose parameters are fitted, starting from these values
     animations: tuple[AnimationFiles, ...]
-    free: Mapping[str, Mapping[str, Any]] | None = None  # None: all that move these clips
+    free: FreeTable | None = None  # None: all that move these clips
     fps: float | None = None  # clips are resampled to this rate first
 
 
@@ -108,14 +107,14 @@ def load_named_system(text: str, option: str = "system") -> NamedSystem:
         return NamedSystem(text, text, systems.preset_system(text))
 
 
-def read_free(text: str, ik: jaxik.FootIK) -> dict[str, Mapping[str, Any]]:
+def read_free(text: str, ik: jaxik.FootIK) -> FreeTable:
     """Free parameters as `--free` names them: `name,name`, or a TOML file with a [free] table.
 
     Raises:
         ValueError: no parameter is named, one is unknown, or it cannot be what the table says.
     """
     path = Path(text)
-    free: dict[str, Mapping[str, Any]]
+    free: FreeTable
     if path.suffix.lower() == ".toml":
         content = validation.read_toml(path, "a free-parameter")
         validation.check_table(content, {"free": validation.TABLE}, text)
@@ -199,7 +198,7 @@ def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None
     return ClipData(solved, animation.clip, animation.terrain)
 
 
-def _changed_values(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, Any]:
+def _changed_values(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, object]:
     """Values in which a system differs from its preset, which has the same rules."""
     values = {name: np.asarray(parameter_tree.get(ik, name)) for name in systems.leaf_names(ik)}
     return {
