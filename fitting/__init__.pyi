@@ -1,3 +1,14 @@
+from . import analysis as analysis
+from . import bench as bench
+from . import cli as cli
+from . import datasets as datasets
+from . import experiments as experiments
+from . import inference as inference
+from . import jobs as jobs
+from . import problem as problem
+from . import report as report
+from . import runtime as runtime
+from . import studies as studies
 from .datasets.clip_frames import frames_from_clip as frames_from_clip
 from .datasets.clips import Clip as Clip
 from .datasets.clips import load_clip as load_clip
