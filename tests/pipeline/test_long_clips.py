@@ -1,4 +1,4 @@
-"""Long clips: cut into blocks, in bounded memory, and as good in 32 bits as in 64."""
+"""Long clips: computed in blocks, in bounded memory, and accurate in single precision."""
 
 import functools
 
@@ -18,7 +18,7 @@ from support.clips import assert_close
 pytestmark = pytest.mark.slow
 
 FPS = 60.0
-PLACE = 1e-4  # m, that single precision may cost
+PLACE = 1e-4  # m, tolerated error of single precision
 
 
 @functools.cache
@@ -28,7 +28,7 @@ def walk() -> tuple[jaxik.Rig, jaxik.Frame]:
 
 
 def repeated(count: int) -> jaxik.Frame:
-    """The walk again and again, `count` frames of it; each beginning is a jump."""
+    """The walk repeated to `count` frames; it jumps at each repetition."""
     return jax.tree.map(lambda leaf: leaf[jnp.arange(count) % leaf.shape[0]], walk()[1])
 
 
@@ -37,7 +37,7 @@ def ground() -> terrain.Terrain:
 
 
 @pytest.mark.parametrize("block", [16, 25, 80])
-def test_a_clip_in_blocks_is_the_clip_in_one(block):
+def test_a_clip_in_blocks_equals_the_clip_as_a_whole(block):
     rig, frames = walk()[0], repeated(50)
     ik = presets.record()
     whole = jaxik.run(ik, rig, ground(), frames)
@@ -45,7 +45,7 @@ def test_a_clip_in_blocks_is_the_clip_in_one(block):
 
 
 @pytest.mark.parametrize("block", [0, -3])
-def test_a_block_of_no_frames_is_refused(block):
+def test_a_block_without_frames_is_an_error(block):
     with pytest.raises(ValueError, match=f"at least 1 frame.*got {block}"):
         jaxik.run(presets.ozz(), walk()[0], ground(), repeated(5), block=block)
 
@@ -57,7 +57,7 @@ def summed(height: jax.Array, frames: jaxik.Frame, block: int | None = None) -> 
     return jnp.sum(result.pose.knee.pos**2)
 
 
-def test_reverse_mode_goes_through_blocks_and_holds_one_in_memory():
+def test_reverse_mode_works_through_blocks_and_keeps_one_in_memory():
     short, long = (
         jax.jit(lambda height, frames: jax.grad(summed)(height, frames, 32))
         .lower(0.02, repeated(count))
@@ -73,7 +73,7 @@ def test_reverse_mode_goes_through_blocks_and_holds_one_in_memory():
     assert large < 2 * small
 
 
-def test_in_single_precision_a_hundred_thousand_frames_stay_as_good_as_in_double():
+def test_a_hundred_thousand_frames_in_single_precision_stay_accurate():
     count = 100_000
     rig, frames = walk()[0], repeated(count)
     given = (presets.record(), rig, ground(), frames)

@@ -39,8 +39,8 @@ def test_600_frames_agree_with_the_reference(name, values, legs):
     )
     result = jaxik.run(to_ik(values), to_rig(rig), to_terrain(ground), to_frames(frames))
 
-    found = np.asarray(result.trace.sensed.foothold.found)
-    assert 0.2 < found.mean() < 0.98, "the clip meets both ground and misses"
+    hits = np.asarray(result.trace.sensed.foothold.found)
+    assert 0.2 < hits.mean() < 0.98, "the clip has both hits and misses"
     after = result.trace.advanced.state
     np.testing.assert_array_equal(np.asarray(after.lock.locked), expected["locked"])
     if values.get("lock.enabled", True):

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 POSITION = 1e-5  # m
 ANGLE = 1e-4  # rad
 FRAMES = 600
-STANDS = (0.05, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.95)  # from, to, ..., shares of the clip
+STANDS = (0.05, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.95)  # start, end, ..., fractions of the clip
 SYSTEMS: dict[str, Any] = {"ozz": ozz, "unreal": unreal, "mec": mec}
 CASES: list[tuple[str, str, dict[str, Any], int]] = [
     ("ozz", "as it is", {}, 2),
@@ -104,7 +104,7 @@ CASES: list[tuple[str, str, dict[str, Any], int]] = [
 ]
 UNLIKE_CASES = [("mec", {}, 2), ("mec", {"pelvis.enabled": False, "lock.plant_weight": 0.5}, 3)]
 JOINTS = ("hip", "knee", "ankle", "toe")
-OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # what only this system tells
+OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # outputs of one system only
     "ozz": {
         "lift": lambda result: result.trace.sensed.root_ws[:, 1],
         "foot_reached": lambda result: result.aimed,
@@ -127,11 +127,11 @@ OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # what only this s
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_defaults_are_those_of_the_reference(name):
     ik = getattr(jaxik.presets, name)()
-    wanted = SYSTEMS[name].DEFAULTS
-    for key in set(wanted) - {"probe.forward"}:  # a rig's foot axes say it in ours
+    expected = SYSTEMS[name].DEFAULTS
+    for key in set(expected) - {"probe.forward"}:  # ours takes it from the rig's foot axes
         stage, _, leaf = key.partition(".")
-        came = np.asarray(getattr(getattr(ik, stage), leaf))
-        np.testing.assert_allclose(came, wanted[key], rtol=1e-6, err_msg=key)
+        actual = np.asarray(getattr(getattr(ik, stage), leaf))
+        np.testing.assert_allclose(actual, expected[key], rtol=1e-6, err_msg=key)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_600_frames_agree_with_the_reference(name, values, legs):
 
 
 @pytest.mark.parametrize(("name", "values", "legs"), UNLIKE_CASES)
-def test_feet_with_an_up_of_their_own_agree_with_the_reference(name, values, legs):
+def test_feet_with_different_ups_agree_with_the_reference(name, values, legs):
     rng = np.random.default_rng(8)
     triangles = sample_poses.rough(rng, cells=14, size=4.5).triangles
     tilts = [maths.from_axis_angle(axis, 0.25) for axis in (maths.X, -maths.Z, maths.Z)]
@@ -159,7 +159,7 @@ def test_feet_with_an_up_of_their_own_agree_with_the_reference(name, values, leg
 def compare(
     name: str, values: dict[str, Any], legs: int, rng: np.random.Generator, plain: Any, ours: Any
 ) -> None:
-    """Every output of 600 frames."""
+    """Asserts that all outputs of 600 frames agree with the reference."""
     rig = sample_poses.make_rig(rng, legs)
     frames = wandering(rig, rng, FRAMES, stand=STANDS)
     system = SYSTEMS[name]
@@ -168,12 +168,14 @@ def compare(
     expected = system.run(parameters, rig, plain, frames)
     result = jaxik.run(to_ik(values, name), to_rig(rig), ours, to_frames(frames))
 
-    found = np.asarray(result.trace.sensed.foothold.found) > 0
-    np.testing.assert_array_equal(found, expected["found"])
-    assert 0.1 < found.mean() < 0.98, "the clip meets both ground and misses"
+    hits = np.asarray(result.trace.sensed.foothold.found) > 0
+    np.testing.assert_array_equal(hits, expected["found"])
+    assert 0.1 < hits.mean() < 0.98, "the clip has both hits and misses"
     advanced, sensed = result.trace.advanced, result.trace.sensed
     if name == "unreal" and values == {}:
-        assert np.abs(np.diff(expected["asleep"].astype(int))).sum() >= 6, "it sleeps and wakes"
+        assert np.abs(np.diff(expected["asleep"].astype(int))).sum() >= 6, (
+            "the latch sleeps and wakes"
+        )
     pairs = {
         "body_pos": result.body.pos,
         "body_offset_ws": sensed.root_ws + advanced.state.pelvis.offset_ws,
@@ -184,13 +186,13 @@ def compare(
         **{key: read(result) for key, read in OWN[name].items()},
     }
     if not values.get("leg.enabled", True):
-        del pairs["weight"]  # the reference tells that of the legs alone, ours that of the feet too
-    for key, came in pairs.items():
-        wanted = expected[key]
-        if key == "target_ws":  # a leg that is not solved has none
-            seen = (expected["weight"] > 0)[..., None]
-            came, wanted = np.where(seen, came, 0.0), np.where(seen, wanted, 0.0)
-        np.testing.assert_allclose(np.asarray(came), wanted, rtol=0, atol=POSITION, err_msg=key)
+        del pairs["weight"]  # the reference reports legs only, ours also feet
+    for key, actual in pairs.items():
+        theirs = expected[key]
+        if key == "target_ws":  # legs that are not solved have none
+            reported = (expected["weight"] > 0)[..., None]
+            actual, theirs = np.where(reported, actual, 0.0), np.where(reported, theirs, 0.0)
+        np.testing.assert_allclose(np.asarray(actual), theirs, rtol=0, atol=POSITION, err_msg=key)
     for joint in JOINTS:
         rot = np.asarray(getattr(result.pose, joint).rot)
         assert sample_poses.rotation_angle(rot, expected[f"{joint}_rot"]) < ANGLE, joint

@@ -1,4 +1,4 @@
-"""What every pipeline keeps: symmetries, memory, batches, dtypes, programs and finite slopes."""
+"""Properties of any pipeline: symmetries, memory, batches, dtypes, and numbers of programs."""
 
 import dataclasses
 import functools
@@ -39,14 +39,14 @@ from support.clips import (
     wandering,
 )
 
-EXACT = 1e-9  # m, and the length of a difference of unit quaternions
+EXACT = 1e-9  # m, and length of the difference of unit quaternions
 JOINTS = ("hip", "knee", "ankle", "toe")
 PARAMETERS = {"adult": {}, "odd": ODD}
 
 
 @functools.cache
 def wander(legs: int = 2) -> jaxik.Frame:
-    """A clip that meets everything, on a platform that drifts and turns."""
+    """A clip with a bit of everything, on a platform that drifts and turns."""
     frames = to_frames(wandering(make_rig(legs=legs), np.random.default_rng(1)))
     time = np.cumsum(np.asarray(frames.dt))
     angle = 0.1 * np.sin(2.0 * time)
@@ -64,35 +64,35 @@ def wandered(name: str, legs: int = 2) -> jaxik.Result:
 
 
 def offset_of(result: jaxik.Result) -> np.ndarray:
-    """The lock's offset, world, m (frames, legs, 3)."""
+    """The lock's offset, (frames, legs, 3), m, world space."""
     advanced, sensed = result.trace.advanced, result.trace.sensed
     lift = sensed.contact.lift[..., None] * sensed.up_ws[:, None]
     return np.asarray(advanced.effector.target_ws - advanced.foothold_ws - lift)
 
 
-def assert_same_rot(came, wanted, tolerance: float) -> None:
-    came, wanted = np.asarray(came), np.asarray(wanted)
+def assert_same_rot(actual, expected, tolerance: float) -> None:
+    actual, expected = np.asarray(actual), np.asarray(expected)
     apart = np.minimum(
-        np.linalg.norm(came - wanted, axis=-1), np.linalg.norm(came + wanted, axis=-1)
+        np.linalg.norm(actual - expected, axis=-1), np.linalg.norm(actual + expected, axis=-1)
     )
     assert apart.max() <= tolerance
 
 
-def assert_same_transform(came, wanted, tolerance: float = EXACT) -> None:
-    np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=tolerance)
-    assert_same_rot(came.rot, wanted.rot, tolerance)
+def assert_same_transform(actual, expected, tolerance: float = EXACT) -> None:
+    np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=tolerance)
+    assert_same_rot(actual.rot, expected.rot, tolerance)
 
 
-def assert_same_pose(came, wanted, tolerance: float = EXACT) -> None:
+def assert_same_pose(actual, expected, tolerance: float = EXACT) -> None:
     for joint in JOINTS:
-        assert_same_transform(getattr(came, joint), getattr(wanted, joint), tolerance)
+        assert_same_transform(getattr(actual, joint), getattr(expected, joint), tolerance)
 
 
 # Flat ground.
 
 
 def limits_kept(ik: jaxik.FootIK, frames: jaxik.Frame, result: jaxik.Result) -> np.ndarray:
-    """Frames in which no lock holds a foot back and no leg is beyond `soften` times its reach."""
+    """Frames where no lock holds a foot and no leg is beyond `soften` times its reach."""
     held = np.linalg.norm(offset_of(result), axis=-1).max(axis=-1) > 1e-6
     a, b = (np.asarray(bone) for bone in bone_lengths(frames.pose))
     free = parameter_tree.get(ik, "leg.soften") * np.sqrt(
@@ -110,7 +110,9 @@ def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre(seed):
     frames = dataclasses.replace(frames, world_from_model=along_heading(frames))
     result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
     kept = limits_kept(ik, frames, result)
-    assert kept.all(), "the feet stand still and no leg is too straight: nothing is left out"
+    assert kept.all(), (
+        "standing feet do not slip and no leg is too straight, so that all frames count"
+    )
     locks = np.diff(result.trace.advanced.state.lock.locked, axis=0)
     assert (locks == 1).any() and (locks == -1).any()
     assert_same_pose(result.pose, frames.pose, 1e-4)
@@ -119,18 +121,18 @@ def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre(seed):
 
 
 def along_heading(frames: jaxik.Frame) -> Transform:
-    """The root's travel turned with it, so that it walks where it looks."""
+    """The root, moved so that it walks in the direction it faces."""
     root = frames.world_from_model
     return Transform(quat.rotate(root.rot, root.pos), root.rot)
 
 
-def test_flat_ground_changes_feet_that_slip_only_by_their_locks():
+def test_flat_ground_changes_slipping_feet_only_by_their_locks():
     rig = make_rig()
     slipping = lambda time: [0.1 * max(time - 2.0, 0.0), 0.0, 0.6 * time]  # noqa: E731
     ik, frames = to_ik({}), to_frames(stepping(rig, place=slipping))
     result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
     kept = limits_kept(ik, frames, result)
-    assert 0.4 < kept.mean() < 0.6, "locks are at work, and only in the second half"
+    assert 0.4 < kept.mean() < 0.6, "locks act, but only in the second half"
     assert_same_pose(at(result.pose, kept), at(frames.pose, kept), 1e-4)
     offset = offset_of(result)
     assert np.abs(offset).max() > 0.01
@@ -141,12 +143,14 @@ def test_flat_ground_changes_feet_that_slip_only_by_their_locks():
 
 
 def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
-    """Left out: legs beyond `soften` times their reach. Ankles that roll over heel and ball move
-    while they stand, so a lock holds them: there the ankle goes by the lock's offset, no more.
+    """Except for legs beyond `soften` times their reach.
+
+    Ankles that roll over heel and ball move while they stand, and a lock holds them: these ankles
+    move by the lock's offset and no more.
     """
     clip = walker.walk(FRAMES / HZ, HZ, seed=3)
     rig, frames = clip.rig, frames_from_clip(clip)
-    # Names and joints are part of the program: ours save compiling another.
+    # Names and joints are static: keeping ours avoids compiling another program.
     names = {name: getattr(to_rig(make_rig()), name) for name in ("names", "joints", "pelvis")}
     rig = dataclasses.replace(rig, **names)
 
@@ -204,7 +208,7 @@ def some_move(kind: str) -> reference.Transform:
 
 @pytest.mark.parametrize("name", PARAMETERS)
 @pytest.mark.parametrize("kind", ["moved", "turned about up", "turned anyhow", "turned, up too"])
-def test_moving_and_turning_the_world_moves_and_turns_the_answer(kind, name):
+def test_moving_the_world_moves_the_result(kind, name):
     by = some_move(kind)
     ground = moved_ground(BROKEN, by)
     before = wandered(name)
@@ -226,7 +230,7 @@ def test_moving_and_turning_the_world_moves_and_turns_the_answer(kind, name):
 
 
 def mirrored(tree):
-    """Left for right: places, and rotations by their axes, in every transform."""
+    """Swaps left and right in all positions and rotation axes."""
 
     def flip(t):
         if not isinstance(t, Transform):
@@ -237,13 +241,13 @@ def mirrored(tree):
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_mirroring_the_world_mirrors_the_answer(name):
+def test_mirroring_the_world_mirrors_the_result(name):
     ik = to_ik(PARAMETERS[name])
     rig = to_rig(make_rig())
     other = dataclasses.replace(
         rig,
         side=-rig.side,
-        knee_axis_ls=rig.knee_axis_ls * jnp.array([1.0, -1, -1]),  # an axis of rotation
+        knee_axis_ls=rig.knee_axis_ls * jnp.array([1.0, -1, -1]),  # a rotation axis
         ankle_from_foot=rig.ankle_from_foot * jnp.array([1.0, 1, -1, -1]),
     )
     flip = np.array([-1.0, 1.0, 1.0])
@@ -256,7 +260,7 @@ def test_mirroring_the_world_mirrors_the_answer(name):
     np.testing.assert_allclose(offset_of(after), offset_of(before) * flip, atol=EXACT)
 
 
-def test_naming_the_legs_the_other_way_round_swaps_their_rows():
+def test_swapping_the_legs_swaps_their_results():
     rig, frames = to_rig(make_rig()), wander()
     swap = lambda tree: at(tree, jnp.array([1, 0]))  # noqa: E731
     rows = lambda tree: at(tree, (slice(None), jnp.array([1, 0])))  # noqa: E731
@@ -304,7 +308,9 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     )
     gap = np.linalg.norm(result.pose.ankle.pos - target, axis=-1)
     reached = np.asarray(result.reached) > 0.5
-    assert reached.any() == (name == "adult"), "a leg of weight 0.9 never quite arrives"
+    assert reached.any() == (name == "adult"), (
+        "a leg of weight 0.9 never reaches its target exactly"
+    )
     assert gap[reached].max(initial=0.0) < EXACT
 
 
@@ -341,7 +347,7 @@ def test_a_clip_cut_in_two_and_resumed_equals_the_whole(name):
 
 
 def walk_at(hz: float) -> jaxik.Frame:
-    """Two seconds up a slope with feet that slip, at any rate."""
+    """Two seconds up a slope with slipping feet, at any frame rate."""
     return to_frames(padded(stepping(make_rig(), drift=0.05, hz=hz, count=int(2 * hz))))
 
 
@@ -351,7 +357,7 @@ def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz()
         hz: jaxik.run(to_ik({}), to_rig(make_rig()), ground, walk_at(hz)) for hz in (30, 60, 120)
     }
     fine = at(runs[120], slice(0, FRAMES, 4))
-    for hz, most, mean in ((30, 3e-3, 1e-3), (60, 1.2e-3, 5e-4)):  # m; 2.3 and 0.8 mm measured
+    for hz, most, mean in ((30, 3e-3, 1e-3), (60, 1.2e-3, 5e-4)):  # m; measured: 2.3 and 0.8 mm
         coarse = at(runs[hz], slice(0, 2 * hz, hz // 30))
         apart = np.stack(
             [
@@ -366,7 +372,7 @@ def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz()
 
 
 def padded_leg(tree, legs: int, axis: int):
-    """Rows of nothing behind the legs: no place, no bones."""
+    """The tree with a padding leg: no position, no bones."""
 
     def widen(leaf):
         missing = legs - leaf.shape[axis]
@@ -376,17 +382,17 @@ def padded_leg(tree, legs: int, axis: int):
 
 
 def three_legged(rig: jaxik.Rig, frames: jaxik.Frame) -> tuple[jaxik.Rig, jaxik.Frame]:
-    """A rig and its clip with one leg of padding, which claims to take part."""
+    """A rig and its clip with one padding leg, whose weight is 1 all the same."""
     wide = padded_leg(rig, 3, axis=0)
     names, joints = to_rig(make_rig(legs=3)).names, to_rig(make_rig(legs=3)).joints
     wide = dataclasses.replace(wide, names=names, joints=joints, pelvis=12)
     pose = padded_leg(frames.pose, 3, axis=1)
     weight = jnp.concatenate([frames.weight, jnp.ones((FRAMES, 1))], axis=1)
-    told = {
+    stride_and_speeds = {
         name: padded_leg(getattr(frames, name), 3, axis=1)
         for name in ("foot_speed", "toe_speed", "stride")
     }
-    return wide, dataclasses.replace(frames, pose=pose, weight=weight, **told)
+    return wide, dataclasses.replace(frames, pose=pose, weight=weight, **stride_and_speeds)
 
 
 CROWD_GROUNDS = (BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)))
@@ -394,7 +400,7 @@ CROWD_GROUNDS = (BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.
 
 @functools.cache
 def crowd() -> tuple[jaxik.FootIK, jaxik.Rig, object, jaxik.Frame]:
-    """Two characters of two legs, padded, and one of three; rigs, grounds and parameters differ."""
+    """Two padded two-legged characters and a three-legged one, all different."""
     iks = [to_ik({}), to_ik(ODD), to_ik({"leg.soften": 0.9, "lock.enabled": False})]
     pairs = [three_legged(to_rig(make_rig(seed)), wander_of(seed)) for seed in range(2)]
     pairs.append((to_rig(make_rig(legs=3)), wander(3)))
@@ -433,7 +439,7 @@ def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
 
 
 @pytest.mark.slow
-def test_a_batched_character_of_three_legs_equals_itself_alone():
+def test_a_three_legged_character_in_a_batch_equals_itself_alone():
     ik, rig, ground, frames = at(crowd(), 2)
     assert_close(at(crowd_result(), 2), jaxik.run(ik, rig, ground, frames), EXACT)
 
@@ -443,7 +449,7 @@ def test_padded_legs_give_finite_numbers():
         assert np.isfinite(leaf).all()
 
 
-def test_one_bad_member_does_not_spoil_the_others_of_a_batch():
+def test_a_bad_member_does_not_affect_the_others_of_a_batch():
     ik, rig, ground, frames = crowd()
     spoiled = eqx.tree_at(
         lambda f: f.pose.ankle.pos, frames, frames.pose.ankle.pos.at[1, 40:50, 0].set(jnp.nan)
@@ -468,17 +474,17 @@ def single_inputs(ik: jaxik.FootIK):
 
 
 @pytest.mark.parametrize("gate", [jaxik.HARD, Smooth(1.0)])
-def test_a_program_of_single_precision_has_no_double_in_it(gate):
+def test_a_single_precision_program_contains_no_doubles(gate):
     inputs = (*single_inputs(to_ik(ODD)), single(gate))
     with jax.numpy_dtype_promotion("strict"):
         program = jax.make_jaxpr(jaxik.run)(*inputs)
     assert not list(doubles(program.jaxpr))
     leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(inputs[3].dt)
-    assert list(doubles(leak.jaxpr)), "a double that gets in is seen"
+    assert list(doubles(leak.jaxpr)), "the check notices doubles"
 
 
 def doubles(program):
-    """What a program computes in double precision; a Python number's double gives way (is weak)."""
+    """Double-precision values of a program; weak ones come from Python numbers and give way."""
     for equation in program.eqns:
         for variable in equation.outvars:
             if variable.aval.dtype == jnp.float64 and not variable.aval.weak_type:
@@ -501,9 +507,9 @@ def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
         result.trace.advanced.state.lock.locked, double.trace.advanced.state.lock.locked
     )
     for joint in JOINTS:
-        came, wanted = getattr(result.pose, joint), getattr(double.pose, joint)
-        np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-5)
-        assert_same_rot(came.rot, wanted.rot, 1e-4)
+        actual, expected = getattr(result.pose, joint), getattr(double.pose, joint)
+        np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=1e-5)
+        assert_same_rot(actual.rot, expected.rot, 1e-4)
     thigh = np.linalg.norm(result.pose.knee.pos - result.pose.hip.pos, axis=-1)
     np.testing.assert_allclose(thigh, sample_poses.THIGH, atol=1e-6)
 
@@ -513,7 +519,7 @@ def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
 
 @pytest.fixture
 def compilations():
-    """A list that grows by one with every program that XLA compiles."""
+    """A list that grows by one with each program that XLA compiles."""
     events: list[str] = []
 
     def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
@@ -543,14 +549,14 @@ def test_nothing_compiles_at_a_second_call_with_other_values(compilations):
         jaxik.resume(iks[i], rigs[i], grounds[i], state, clips[i])
 
     jax.block_until_ready(jnp.tanh(jnp.ones((2, 3, 5, 7))))
-    assert compilations, "a new program is noticed"
+    assert compilations, "the check notices new programs"
     calls(0)
     compilations.clear()
     calls(1)
     assert not compilations
 
 
-def test_the_hard_program_contains_no_sigmoid_and_the_smooth_one_does():
+def test_only_the_smooth_program_contains_a_sigmoid():
     inputs = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
     hard = str(jax.make_jaxpr(jaxik.run)(*inputs))
     smooth = str(jax.make_jaxpr(jaxik.run)(*inputs, Smooth(1.0)))

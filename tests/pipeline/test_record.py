@@ -1,4 +1,4 @@
-"""The game's record: bytes, CSV text, and the parameters they mean."""
+"""The parameter record: its bytes, CSV text, and the parameters they stand for."""
 
 import math
 import struct
@@ -35,11 +35,11 @@ def leaves_of(ik: jaxik.FootIK) -> dict[str, np.ndarray]:
 
 @settings(max_examples=200, deadline=None)
 @given(st.binary(min_size=record.SIZE, max_size=record.SIZE + 40))
-def test_any_bytes_come_back_as_they_were(data):
+def test_any_bytes_round_trip(data):
     assert record.to_bytes(record.from_bytes(data)) == data
 
 
-def test_nan_payloads_padding_bits_and_tail_come_back_as_they_were():
+def test_nan_payloads_padding_bits_and_tail_round_trip():
     data = bytearray(range(0x80)) + b"\x00tail\xff"
     data[1] = 0b10101_010
     data[4:8] = NAN_WITH_PAYLOAD
@@ -63,13 +63,13 @@ def test_fields_lie_where_the_layout_says():
         assert read.value(name) == np.float32(value)
 
 
-def test_too_few_bytes_are_refused():
+def test_too_few_bytes_are_an_error():
     with pytest.raises(ValueError, match="at least 128 bytes; these are 127"):
         record.from_bytes(bytes(127))
 
 
 @pytest.mark.parametrize("read", [Record().value, Record().flag])
-def test_a_name_that_the_record_lacks_is_answered_with_those_it_has(read):
+def test_an_unknown_name_is_an_error_that_lists_the_known_ones(read):
     with pytest.raises(ValueError, match=r"no (float|flag) 'knee'; it has \["):
         read("knee")
 
@@ -83,20 +83,20 @@ def test_a_name_that_the_record_lacks_is_answered_with_those_it_has(read):
         ({"floats": (b"\0\0\0\0",) * 30}, "padding and floats"),
     ],
 )
-def test_a_record_that_has_no_bytes_is_refused(wrong, message):
+def test_a_record_that_cannot_be_stored_is_an_error(wrong, message):
     with pytest.raises(ValueError, match=message):
         Record(**wrong)
 
 
-def test_the_adults_record_means_the_default_parameters():
+def test_the_record_of_an_adult_has_the_default_parameters():
     meant = leaves_of(record.to_ik(packed()))
     for name, default in leaves_of(jaxik.presets.record()).items():
-        # The defaults are given to seven digits, the record holds a float32.
+        # Defaults have seven digits, the record holds a float32.
         np.testing.assert_allclose(meant[name], default, rtol=2e-6, atol=1e-7, err_msg=name)
 
 
 @pytest.mark.parametrize("name", FLOAT_NAMES)
-def test_every_float_reaches_a_parameter_of_its_own(name):
+def test_each_float_sets_its_own_parameter(name):
     before = leaves_of(record.to_ik(packed()))
     after = leaves_of(record.to_ik(packed(**{name: ADULT[name] * 0.9 + 0.001})))
     changed = [key for key in before if not np.array_equal(before[key], after[key])]
@@ -105,14 +105,14 @@ def test_every_float_reaches_a_parameter_of_its_own(name):
 
 
 @pytest.mark.parametrize(("bit", "name"), list(enumerate(FLAG_NAMES)))
-def test_every_flag_reaches_a_switch_of_its_own(bit, name):
+def test_each_flag_sets_its_own_switch(bit, name):
     ours = ("lock.enabled", "probe.use_toe", "pelvis.vertical_only")
     ik = record.to_ik(Record(flags=0b111 & ~(1 << bit), floats=packed().floats))
     assert [bool(parameter_tree.get(ik, switch)) for switch in ours] == [i != bit for i in range(3)]
     assert not Record(flags=0b111 & ~(1 << bit)).flag(name)
 
 
-def test_what_the_record_lacks_keeps_its_default():
+def test_parameters_that_the_record_lacks_keep_their_defaults():
     ik = record.to_ik(packed(), Reading(tick_hz=60.0))
     assert parameter_tree.get(ik, "lock.lock_half_life") == 0.05 and np.isinf(
         parameter_tree.get(ik, "lock.max_speed")
@@ -123,7 +123,7 @@ def test_what_the_record_lacks_keeps_its_default():
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_float_that_is_not_finite_is_named(value):
+def test_a_float_that_is_not_finite_is_an_error_that_names_it(value):
     with pytest.raises(ValueError, match="undulationGain is .*finite"):
         record.to_ik(packed(undulationGain=value))
 
@@ -138,13 +138,13 @@ def test_centimetres_are_recognised_with_a_warning():
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("m", 0.16), ("cm", 0.0016)])
-def test_a_given_length_unit_is_taken_without_a_warning(unit, metres):
+def test_an_explicit_length_unit_is_used_without_a_warning(unit, metres):
     ik = record.to_ik(packed(), Reading(length_unit=unit))
     assert parameter_tree.get(ik, "contact.raised_height") == pytest.approx(metres)
     ik = record.to_ik(packed(raycastDistanceUp=6.0), Reading(length_unit="m"))
     assert parameter_tree.get(ik, "probe.ray_up") == 6.0
     assert parameter_tree.get(ik, "target.max_ankle_height") == pytest.approx(0.55), (
-        "other heights are in metres"
+        "other heights are always in metres"
     )
 
 
@@ -154,7 +154,7 @@ def test_a_cosine_out_of_range_is_degrees_with_a_warning():
     assert parameter_tree.get(ik, "leg.max_knee_angle") == pytest.approx(math.radians(170.0))
 
 
-def test_flexion_is_counted_from_the_straight_leg():
+def test_flexion_is_measured_from_the_straight_leg():
     # At least 8 and at most 140 degrees bent: the interior angle lies between 40 and 172.
     bent = packed(
         cosineMaxKneeAngle=math.cos(math.radians(140)), cosineMinKneeAngle=math.cos(math.radians(8))
@@ -172,7 +172,7 @@ def test_flexion_is_counted_from_the_straight_leg():
     assert again == bent
 
 
-def test_the_sign_of_the_lean_may_be_turned():
+def test_the_sign_of_the_lean_can_be_reversed():
     ik = record.to_ik(packed(), Reading(lean_sign=-1))
     names = ("forward_rate", "side_rate", "forward_rate_slide", "side_rate_slide", "gain")
     rates = [parameter_tree.get(ik, f"lean.{name}") for name in names]
@@ -189,12 +189,12 @@ def test_the_sign_of_the_lean_may_be_turned():
         ({"tick_hz": math.nan}, "tick_hz is nan"),
     ],
 )
-def test_a_reading_that_does_not_exist_is_refused(wrong, message):
+def test_an_unknown_reading_is_an_error(wrong, message):
     with pytest.raises(ValueError, match=message):
         Reading(**wrong)
 
 
-def test_the_knee_axis_is_the_enums():
+def test_the_knee_axis_follows_its_enum():
     axes = [record.knee_axis(Record(knee_axis_type=kind)) for kind in range(6)]
     np.testing.assert_array_equal(axes, [*np.eye(3), *-np.eye(3)])
     for call in (record.knee_axis, record.to_ik):
@@ -202,7 +202,7 @@ def test_the_knee_axis_is_the_enums():
             call(Record(knee_axis_type=6))
 
 
-def test_a_games_rig_takes_the_records_knee_axis_and_keeps_the_rest():
+def test_a_rig_gets_the_knee_axis_and_keeps_the_rest():
     rig = to_rig(sample_poses.make_rig(np.random.default_rng(0)))
     turned = record.with_knee_axis(rig, Record(knee_axis_type=3))
     np.testing.assert_array_equal(turned.knee_axis_ls, [[-1, 0, 0]] * 2)
@@ -216,7 +216,7 @@ def finite_records(count: int, seed: int = 0) -> list[Record]:
     records = []
     for _ in range(count):
         bits = rng.integers(0, 256, (31, 4), np.uint8)
-        exponents = rng.integers(90, 140, 31)  # 2^-37 to 2^12: what any unit keeps apart
+        exponents = rng.integers(90, 140, 31)  # 2^-37 to 2^12: distinct in all units
         bits[:, 3] = (bits[:, 3] & 0x80) | (exponents >> 1)
         bits[:, 2] = (bits[:, 2] & 0x7F) | ((exponents & 1) << 7)
         head = int(rng.integers(6)), int(rng.integers(256)), rng.bytes(2)
@@ -229,9 +229,7 @@ def finite_records(count: int, seed: int = 0) -> list[Record]:
 @pytest.mark.parametrize("length_unit", ["auto", "m", "cm"])
 @pytest.mark.parametrize("knee_convention", ["interior", "flexion"])
 @pytest.mark.parametrize("lean_sign", [1, -1])
-def test_parameters_of_a_record_give_the_record_again(
-    single, length_unit, knee_convention, lean_sign
-):
+def test_a_record_round_trips_through_parameters(single, length_unit, knee_convention, lean_sign):
     reading = Reading(length_unit, knee_convention, lean_sign)
     for kept in [packed(), *finite_records(10)]:
         ik = record.to_ik(kept, reading)
@@ -240,7 +238,7 @@ def test_parameters_of_a_record_give_the_record_again(
         assert record.to_bytes(record.from_ik(ik, kept, reading)) == record.to_bytes(kept)
 
 
-def test_a_record_made_from_parameters_alone_means_these_parameters():
+def test_parameters_round_trip_through_a_record():
     changes = {"lean.gain": 0.3, "leg.max_knee_angle": 2.8, "lock.enabled": False}
     ik = parameter_tree.replace(jaxik.presets.record(), changes)
     meant = record.to_ik(record.from_ik(ik))
@@ -254,21 +252,21 @@ def test_a_changed_parameter_changes_its_own_bytes_only():
     ik = parameter_tree.replace(
         record.to_ik(kept), {"pelvis.limit": 0.25, "pelvis.vertical_only": False}
     )
-    made = record.from_ik(ik, kept)
+    rebuilt = record.from_ik(ik, kept)
     changed = [
-        name for name, a, b in zip(FLOAT_NAMES, kept.floats, made.floats, strict=True) if a != b
+        name for name, a, b in zip(FLOAT_NAMES, kept.floats, rebuilt.floats, strict=True) if a != b
     ]
-    assert changed == ["heightOffsetLimit"] and made.value("heightOffsetLimit") == 0.25
-    assert (made.flags, made.tail) == (0b011, kept.tail)
+    assert changed == ["heightOffsetLimit"] and rebuilt.value("heightOffsetLimit") == 0.25
+    assert (rebuilt.flags, rebuilt.tail) == (0b011, kept.tail)
 
 
 def test_a_record_in_centimetres_stays_in_centimetres():
     kept = packed(**{name: 100.0 * ADULT[name] for name in LENGTHS})
     with pytest.warns(UserWarning, match="centimetres"):
         ik = record.to_ik(kept)
-    made = record.from_ik(parameter_tree.replace(ik, {"probe.ray_up": 0.6}), kept)
-    assert made.value("raycastDistanceUp") == pytest.approx(60.0)
-    assert made.value("raycastDistanceDown") == pytest.approx(80.0)
+    rebuilt = record.from_ik(parameter_tree.replace(ik, {"probe.ray_up": 0.6}), kept)
+    assert rebuilt.value("raycastDistanceUp") == pytest.approx(60.0)
+    assert rebuilt.value("raycastDistanceDown") == pytest.approx(80.0)
 
 
 def test_lengths_that_would_be_read_in_another_unit_are_not_written():
@@ -290,14 +288,14 @@ def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
         record.from_ik(parameter_tree.replace(ik, {"pelvis.limit": 1e39}))
 
 
-def test_csv_of_one_and_of_many_records_comes_back_to_the_byte():
+def test_records_round_trip_through_csv_byte_for_byte():
     odd = record.from_bytes(bytes([255, 255, 1, 2]) + NAN_WITH_PAYLOAD * 31 + b"\0\xff")
     plain = Record(floats=(b"\0\0\xc0\x7f", b"\0\0\x80\xff", b"\0\0\0\x80") + packed().floats[3:])
     for records in ([packed()], [odd, plain, *finite_records(40)], []):
         assert record.from_csv(record.to_csv(records)) == records
 
 
-def test_csv_is_written_under_the_records_own_names():
+def test_csv_uses_the_records_own_names():
     head, row = record.to_csv([packed()]).splitlines()
     assert head.split(",") == list(record.COLUMNS)
     cells = dict(zip(head.split(","), row.split(","), strict=True))
@@ -314,7 +312,7 @@ def test_csv_without_padding_and_in_another_order_is_read():
 
 
 def with_cell(name: str, cell: str) -> str:
-    """Two rows, the second with one cell exchanged."""
+    """Two rows, the second with one cell replaced."""
     head, row = record.to_csv([packed()]).splitlines()
     cells = row.split(",")
     cells[head.split(",").index(name)] = cell
@@ -322,7 +320,7 @@ def with_cell(name: str, cell: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("name", "cell", "wanted"),
+    ("name", "cell", "expected"),
     [
         ("heightOffsetLimit", "wide", "a 32-bit number"),
         ("heightOffsetLimit", "", "a 32-bit number"),
@@ -340,13 +338,13 @@ def with_cell(name: str, cell: str) -> str:
         ("pad3", "0", "bytes in hexadecimal"),
     ],
 )
-def test_a_cell_that_cannot_be_read_is_named_by_row_and_column(name, cell, wanted):
-    with pytest.raises(ValueError, match=f"row 3, column {name}: '.*' is not {wanted}") as caught:
+def test_an_unreadable_cell_is_an_error_that_names_row_and_column(name, cell, expected):
+    with pytest.raises(ValueError, match=f"row 3, column {name}: '.*' is not {expected}") as caught:
         record.from_csv(with_cell(name, cell))
     assert repr(cell) in str(caught.value)
 
 
-def test_columns_that_are_missing_unknown_or_double_are_named():
+def test_missing_unknown_or_duplicate_columns_are_an_error():
     head, row = record.to_csv([packed()]).splitlines()
     with pytest.raises(ValueError, match=r"no column \['undulationGain'\]"):
         record.from_csv(f"{head.replace('undulationGain,', 'undulatoinGain,')}\n{row}\n")

@@ -1,4 +1,4 @@
-"""The `record` reference by itself: facts that hold whatever the JAX stages do."""
+"""The NumPy reference of `record` by itself: facts that hold whatever the JAX code does."""
 
 import dataclasses
 import math
@@ -69,7 +69,7 @@ def test_the_ankle_arrives_at_a_reachable_target_and_no_bone_changes():
             rng.normal(size=3) * [1, 0, 1], maths.from_axis_angle(maths.Y, rng.uniform(-3, 3))
         )
         frame = make_frame(rig, ankles, 0.9, rng.uniform(-0.4, 0.4), world_from_model=root)
-        # Tilt the hinge, so that it is no more at right angles to thigh and shin.
+        # Tilt the hinge, so that it is no longer perpendicular to thigh and shin.
         frame.knee.rot[:] = [
             maths.multiply(maths.from_axis_angle(maths.Z, rng.uniform(-0.3, 0.3)), rot)
             for rot in frame.knee.rot
@@ -128,14 +128,14 @@ def test_the_sole_takes_the_slope_of_the_ground_when_limits_are_wide(use_toe):
     rng = np.random.default_rng(5)
     for _ in range(20):
         rig = make_rig(rng)
-        slopes = rng.uniform(-0.5, 0.5, size=2)
-        ground = plane(*slopes)
+        rises = rng.uniform(-0.5, 0.5, size=2)
+        ground = plane(*rises)
         root = Transform(np.zeros(3), maths.from_axis_angle(maths.Y, rng.uniform(-3, 3)))
         frame = make_frame(rig, standing(), world_from_model=root)
         _, output = step(
             Parameters(UNLIMITED | {"probe.use_toe": use_toe}), rig, ground, None, frame
         )
-        normal = maths.unit(np.array([-slopes[1], 1.0, -slopes[0]]), maths.Y)
+        normal = maths.unit(np.array([-rises[1], 1.0, -rises[0]]), maths.Y)
         for leg in range(2):
             foot = maths.multiply(output["ankle_rot"][leg], rig.ankle_from_foot[leg])
             sole = maths.rotate(root.rot, maths.rotate(foot, maths.Y))
@@ -159,7 +159,7 @@ def test_limits_mirror_and_stop_the_outer_edge():
     for leg in range(2):
         shin = maths.unit(output["ankle_pos"][leg] - output["knee_pos"][leg], -maths.Y)
         foot = maths.multiply(output["ankle_rot"][leg], rig.ankle_from_foot[leg])
-        # The limits are on the joint's angle to the shin, stated about the animated foot.
+        # Limits apply to the angle between foot and shin.
         joint = -math.asin(float(rig.side[leg] * maths.X @ shin))
         up = maths.rotate(foot, maths.Y)
         tilts.append(joint + math.atan2(-rig.side[leg] * up[0], up[1]))
@@ -167,7 +167,7 @@ def test_limits_mirror_and_stop_the_outer_edge():
     assert tilts == pytest.approx([0.1, -0.3], abs=EXACT)
 
 
-def test_the_ankle_stays_a_sole_above_the_slope():
+def test_the_ankle_stays_one_foot_height_above_a_slope():
     rig = make_rig(np.random.default_rng(7))
     slope = 0.4
     _, output = step(
@@ -177,7 +177,7 @@ def test_the_ankle_stays_a_sole_above_the_slope():
     assert np.allclose(output["target_ws"] @ normal, ANKLE, atol=EXACT)
 
 
-def test_a_lock_of_full_factor_keeps_the_foothold_exactly():
+def test_a_full_lock_keeps_the_foothold_exactly():
     rig = make_rig(np.random.default_rng(8))
     frames = [make_frame(rig, standing(forward=0.05 + 0.001 * i)) for i in range(40)]
     dragged = run(Parameters({"lock.lock_half_life": 0.0}), rig, plane(0.2, 0.1), frames)
@@ -187,7 +187,7 @@ def test_a_lock_of_full_factor_keeps_the_foothold_exactly():
     assert np.ptp(free["target_ws"][:, :, 2], axis=0).min() > 0.038
 
 
-def test_a_lock_rides_on_its_platform():
+def test_a_lock_moves_with_its_platform():
     rig = make_rig(np.random.default_rng(9))
     frames = [
         make_frame(rig, standing(), platform=Transform(np.array([0.002 * i, 0.0, 0.0]), STILL.rot))
@@ -243,7 +243,7 @@ def test_a_foot_locks_again_only_below_the_threshold():
     changes = {"lock.lock_half_life": 0.0, "lock.unlock_half_life": 0.1}
     output = run(Parameters(changes | {"lock.relock_threshold": 0.3}), rig, ground, frames)
     first = 4 + int(np.argmax(output["locked"][4:, 0]))
-    # FreeParameter since frame 1 with a factor of 2^(-frames / 6).
+    # Free since frame 1 with a factor of 2^(-frames / 6).
     assert 2 ** (-(first - 1) / 6) <= 0.3 < 2 ** (-(first - 2) / 6)
     assert not output["locked"][1:first].any() and output["locked"][first:].all()
 
@@ -281,12 +281,12 @@ def test_the_body_sinks_to_the_lower_foot_and_gains_mean_the_same_at_any_rate():
         assert output["pelvis_height"][-1] == pytest.approx(expected, abs=EXACT)
 
 
-def test_a_lean_rate_of_one_brings_the_bodys_up_onto_the_normal():
+def test_a_lean_rate_of_one_aligns_the_body_with_the_normal():
     rig = make_rig(np.random.default_rng(15))
     rates = {f"lean.{name}_rate": 1.0 for name in ("forward", "side")}
-    for slopes in ((0.3, 0.0), (0.0, 0.3)):
-        _, output = step(Parameters(rates), rig, plane(*slopes), None, make_frame(rig, standing()))
-        normal = maths.unit(np.array([-slopes[1], 1.0, -slopes[0]]), maths.Y)
+    for rises in ((0.3, 0.0), (0.0, 0.3)):
+        _, output = step(Parameters(rates), rig, plane(*rises), None, make_frame(rig, standing()))
+        normal = maths.unit(np.array([-rises[1], 1.0, -rises[0]]), maths.Y)
         assert np.allclose(maths.rotate(output["body_rot"], maths.Y), normal, atol=EXACT)
 
 
@@ -309,7 +309,7 @@ def test_without_ground_the_pose_is_as_animated():
     assert not output["locked"].any()
 
 
-def test_turning_and_tilting_the_world_turns_nothing_in_model_space():
+def test_rotating_the_world_changes_nothing_in_model_space():
     rng = np.random.default_rng(18)
     rig = make_rig(rng)
     ground = rough(rng)
@@ -343,12 +343,12 @@ def test_turning_and_tilting_the_world_turns_nothing_in_model_space():
     assert np.allclose(offsets, moved["offset_ws"].reshape(-1, 3), atol=EXACT)
 
 
-def test_mirroring_the_world_mirrors_the_answer():
+def test_mirroring_the_world_mirrors_the_result():
     rng = np.random.default_rng(19)
     rig = make_rig(rng)
     flip, flip_rot = np.array([-1.0, 1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])
     mirror_rig = Rig(
-        # A turn's axis is a pseudovector; the legs change places.
+        # A rotation axis is a pseudovector; the legs swap places.
         knee_axis_ls=(rig.knee_axis_ls * -flip)[::-1],
         ankle_from_foot=(rig.ankle_from_foot * flip_rot)[::-1],
         side=rig.side,
@@ -385,7 +385,7 @@ def test_mirroring_the_world_mirrors_the_answer():
     assert (plain["locked"] == mirror["locked"][:, ::-1]).all()
 
 
-def test_half_a_weight_moves_less_than_all_of_it_and_none_is_the_body_alone():
+def test_half_weight_moves_legs_less_and_no_weight_moves_only_the_body():
     rig = make_rig(np.random.default_rng(20))
     moves = []
     for weight in (0.0, 0.5, 1.0):
@@ -399,7 +399,7 @@ def test_half_a_weight_moves_less_than_all_of_it_and_none_is_the_body_alone():
 
 
 @pytest.mark.parametrize("twist", [0.0, 0.4])
-def test_the_hinge_keeps_its_heading_about_the_leg_but_for_the_twist(twist):
+def test_only_twist_turns_the_hinge_about_the_leg(twist):
     rng = np.random.default_rng(24)
     rig = make_rig(rng)
     frame = make_frame(rig, standing((ANKLE, 0.14)), hinge_yaw=0.5)
@@ -413,18 +413,18 @@ def test_the_hinge_keeps_its_heading_about_the_leg_but_for_the_twist(twist):
         assert turned == pytest.approx(twist, abs=EXACT)
 
 
-def test_a_leg_bent_against_its_axis_is_bent_the_right_way():
+def test_a_leg_bent_backwards_is_bent_the_right_way():
     rig = make_rig(np.random.default_rng(25))
     frame = make_frame(rig, standing())
     rig.knee_axis_ls *= -1.0
     _, output = step(Parameters(NO_LEAN), rig, plane(0.0, 0.0), None, frame)
     assert output["reached"].all()
     assert np.allclose(output["ankle_pos"], frame.ankle.pos, atol=EXACT)
-    # The knee was in front of the line from hip to ankle and is behind it now.
+    # The knee was in front of the line from hip to ankle and is now behind it.
     assert (frame.knee.pos[:, 2] > 0.1).all() and (output["knee_pos"][:, 2] < -0.1).all()
 
 
-def test_a_raised_foot_takes_nothing_from_the_ground_but_height():
+def test_a_raised_foot_takes_only_its_height_from_the_ground():
     rig = make_rig(np.random.default_rng(26))
     frame = make_frame(rig, standing((0.2, 0.2)))
     _, output = step(Parameters(UNLIMITED), rig, plane(0.3, 0.3), None, frame)
@@ -435,7 +435,7 @@ def test_a_raised_foot_takes_nothing_from_the_ground_but_height():
     assert (np.abs(output["ankle_pos"] - frame.ankle.pos)[:, 1] > 0.005).all()
 
 
-def test_the_body_leans_about_the_middle_of_the_hips_and_sinks_along_the_normal_if_told():
+def test_the_body_leans_about_its_hips_and_can_sink_along_the_normal():
     rig = make_rig(np.random.default_rng(27))
     frame = make_frame(rig, standing())
     normal = maths.unit(np.array([-0.2, 1.0, -0.3]), maths.Y)
@@ -448,7 +448,7 @@ def test_the_body_leans_about_the_middle_of_the_hips_and_sinks_along_the_normal_
         assert np.allclose(moved, output["pelvis_height"] * direction, atol=EXACT)
 
 
-def test_a_lock_waits_for_the_pelvis_when_only_then_the_leg_is_long_enough():
+def test_a_lock_waits_until_the_pelvis_brings_the_leg_within_reach():
     rig = make_rig(np.random.default_rng(28))
     frames = [make_frame(rig, standing())] * 2
     output = run(Parameters(), rig, plane(0.0, 0.0, -0.1), frames)
@@ -456,10 +456,10 @@ def test_a_lock_waits_for_the_pelvis_when_only_then_the_leg_is_long_enough():
 
 
 @pytest.mark.parametrize("height", [0.0, -0.1])
-def test_the_release_cone_sees_all_that_a_foot_was_kept_from_moving_from_the_sunk_hip(height):
+def test_the_release_cone_is_measured_from_the_lowered_hip(height):
     rig = make_rig(np.random.default_rng(29))
     places = [0.1 + 0.03 * i for i in range(5)]
-    # The pelvis settles in the first frame, so that the hip is as far from the sole as animated.
+    # The pelvis settles in the first frame, so the hip is as far from the sole as animated.
     frames = [make_frame(rig, standing(forward=place)) for place in [places[0], *places]]
     cone = math.radians(4.5)
     changes = {"lock.lock_half_life": 0.0, "lock.release_cone": cone}
@@ -480,7 +480,7 @@ def test_rays_meet_a_mesh_where_they_meet_its_planes():
         origin = rng.normal(size=3) + 3.0 * up
         hit = terrain.cast(origin, 6.0)
         assert hit.normal @ up > 0.0
-        # By another way: solve for barycentric coordinates triangle by triangle.
+        # An independent method: solve for barycentric coordinates, triangle by triangle.
         distances = []
         for a, b, c in corners:
             u, v, t = np.linalg.solve(np.stack([b - a, c - a, up], axis=-1), origin - a)
@@ -504,6 +504,6 @@ def test_rays_through_corners_and_edges_of_a_closed_surface_never_fall_through()
         assert hit.found and np.allclose(hit.point, point, atol=EXACT)
 
 
-def test_an_unknown_parameter_is_named():
+def test_an_unknown_parameter_is_an_error_that_names_it():
     with pytest.raises(ValueError, match="lock.speed"):
         Parameters({"lock.speed": 1.0})

@@ -1,4 +1,4 @@
-"""The `mec` reference by itself: rays, tilt, planting, fades, leg lengths, hints, ups."""
+"""The NumPy reference of `mec` by itself: facts that hold whatever the JAX code does."""
 
 import math
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from reference.systems import mec
 from reference.terrain import LegTerrains, Terrain
 
 EXACT = 1e-9  # m and rad
-DT = 1 / 60  # s, of the frames
+DT = 1 / 60  # s, frame time
 RIG = make_rig(np.random.default_rng(0))
 FLAT, DEEP = plane(0.0, 0.0), plane(0.0, 0.0, -9.0)
-STEP = Terrain(  # flat ground, and 0.06 m higher from 0.1 m ahead
+STEP = Terrain(  # flat, and 0.06 m higher from 0.1 m ahead
     maths.Y,
     planes=[(np.zeros(3), maths.Y)],
     triangles=np.array([[[-9.0, 0.06, 0.1], [9.0, 0.06, 0.1], [0.0, 0.06, 9.0]]]),
@@ -35,7 +35,7 @@ def step(
 
 
 def follow(grounds: Sequence[Ground], frames: Sequence[Frame], **changes: Any) -> list:
-    """The outputs of a clip over ground that is another in every frame."""
+    """The outputs of a clip with different ground in each frame."""
     state, outputs = None, []
     for ground, frame in zip(grounds, frames, strict=True):
         changed = {name.replace("__", "."): value for name, value in changes.items()}
@@ -53,7 +53,7 @@ def angle_of(rot: Array) -> float:
     return maths.angle_between(maths.rotate(rot, maths.Y), maths.Y)
 
 
-def test_pitch_is_read_from_the_toe_ray_and_roll_from_the_one_on_the_right():
+def test_pitch_comes_from_the_toe_ray_and_roll_from_the_corner_ray():
     _, output = step(STEP, stand())
     assert output["pitch"] == pytest.approx(math.atan2(0.06, 0.2))
     assert output["roll"] == pytest.approx(0.0)
@@ -81,11 +81,15 @@ def test_a_foot_lies_flat_on_a_slope_and_keeps_its_yaw(rise):
 def test_a_foot_rolls_first_and_pitches_then():
     pitch, roll = math.atan(0.4), math.atan(0.5)
     _, output = step(plane(0.4, 0.5), stand())
-    wanted = [-math.sin(roll), math.cos(roll) * math.cos(pitch), -math.cos(roll) * math.sin(pitch)]
-    assert maths.rotate(output["goal_rot"][0], maths.Y) == pytest.approx(wanted)
+    expected = [
+        -math.sin(roll),
+        math.cos(roll) * math.cos(pitch),
+        -math.cos(roll) * math.sin(pitch),
+    ]
+    assert maths.rotate(output["goal_rot"][0], maths.Y) == pytest.approx(expected)
 
 
-def test_another_forward_of_the_foot_turns_where_the_toe_ray_looks():
+def test_the_toe_ray_follows_the_forward_axis_of_the_foot():
     _, output = step(plane(0.3, 0.2), stand(), {"probe.forward": np.array([1.0, 0.4, 0.0])})
     assert output["pitch"] == pytest.approx(math.atan(0.2))
     assert output["roll"] == pytest.approx(math.atan(0.3))  # right of left is ahead
@@ -121,26 +125,24 @@ def test_a_tilt_is_limited_to_a_cone_about_its_own_axis():
         ({"probe.extra_min": 0.1}, 0.16, 0.0, 0.1),
     ],
 )
-def test_the_extra_ray_is_chosen_by_height_and_speed_and_is_what_a_foot_sees_further(
-    changes, height, speed, extra
-):
+def test_the_extra_ray_length_is_chosen_by_height_and_speed(changes, height, speed, extra):
     frame = stand(height=height, foot_speed=np.full(2, speed))
-    for margin, found in ((-0.001, True), (0.001, False)):
+    for margin, hits in ((-0.001, True), (0.001, False)):
         ground = plane(0.0, 0.0, height - ANKLE - extra - margin)
         _, output = step(ground, frame, changes)
         assert output["extra"] == pytest.approx(extra)
-        assert (output["found"] == found).all()
+        assert (output["found"] == hits).all()
 
 
-def test_rays_start_above_the_ankle_and_no_foot_that_is_inactive_meets_ground():
-    for ray_up, found in ((0.5, False), (0.6, True)):
+def test_rays_start_above_the_ankle_and_inactive_feet_find_no_ground():
+    for ray_up, hits in ((0.5, False), (0.6, True)):
         _, output = step(plane(0.0, 0.0, ANKLE + 0.55), stand(), {"probe.ray_up": ray_up})
-        assert (output["found"] == found).all()
+        assert (output["found"] == hits).all()
     _, output = step(FLAT, stand(), {"probe.active": [True, False]})
     assert output["found"].tolist() == [True, False] and output["weight"].tolist() == [1.0, 0.0]
 
 
-def test_rays_pass_through_layers_that_their_mask_lacks():
+def test_rays_pass_through_layers_outside_their_mask():
     ground = Terrain(maths.Y, [*FLAT.planes, (0.1 * maths.Y, maths.Y)], plane_layers=[0, 5])
     for mask, height in ((0xFFFFFFFF, 0.1), (1, 0.0), (1 << 5, 0.1)):
         _, output = step(ground, stand(), {"probe.layers": mask})
@@ -155,8 +157,8 @@ def test_the_weight_moves_linearly_over_the_transition_time_and_the_last_goal_is
     expected = [max(1 - i / 12, 0.0) for i in range(15)] + [min(i / 12, 1.0) for i in range(1, 16)]
     assert np.allclose(fade, expected, atol=EXACT)
     for index in range(1, 15):
-        wanted = frames[index].ankle.pos + 0.05 * maths.Y
-        assert np.allclose(outputs[index]["target_ws"], wanted, atol=EXACT)
+        expected = frames[index].ankle.pos + 0.05 * maths.Y
+        assert np.allclose(outputs[index]["target_ws"], expected, atol=EXACT)
     heights = [output["ankle_pos"][0, 1] - output["pelvis_height"] for output in outputs[:13]]
     assert (np.diff(heights) < 0.0).all() and heights[12] == pytest.approx(ANKLE)
     turned = [Transform(np.zeros(3), maths.from_axis_angle(maths.Y, angle)) for angle in (0.3, 0.5)]
@@ -166,7 +168,7 @@ def test_the_weight_moves_linearly_over_the_transition_time_and_the_last_goal_is
     normal = maths.unit(np.array([0.0, 1.0, -0.3]), maths.Y)
     assert maths.rotate(first["goal_rot"][0], maths.Y) == pytest.approx(normal)
     for rots in zip(first["goal_rot"], last["goal_rot"], strict=True):
-        # Seen from the world, the foot is turned from its animation as it was on the ground.
+        # In world space the foot keeps the rotation from its animation that it had on the ground.
         one, other = (
             maths.multiply(rot, maths.inverse(root.rot))
             for rot, root in zip(rots, turned, strict=True)
@@ -176,7 +178,7 @@ def test_the_weight_moves_linearly_over_the_transition_time_and_the_last_goal_is
     assert jumping[1]["fade"].tolist() == [0.0, 0.0]
 
 
-def test_a_planted_foot_stays_and_one_that_is_not_planted_follows_the_animation():
+def test_a_planted_foot_stays_and_a_free_foot_follows_the_animation():
     frames = [stand(0.05 + 0.03 * i) for i in range(3)]
     for changes, place in (
         ({}, 0.05),
@@ -202,7 +204,7 @@ def test_the_plant_weight_moves_by_its_speed():
     assert output["plant_weight"] == pytest.approx(0.7)
 
 
-def test_a_planted_foot_keeps_its_turn_and_its_place_on_a_platform_and_follows_the_ground():
+def test_a_planted_foot_keeps_its_pose_on_a_platform_and_follows_the_ground():
     slope = plane(0.3, 0.0)
     grounds = [slope, plane(0.0, 0.0, 0.04), plane(0.0, 0.0, 0.9)]
     outputs = follow(grounds, [stand(), stand(0.09), stand(0.09)], pelvis__enabled=False)
@@ -210,7 +212,7 @@ def test_a_planted_foot_keeps_its_turn_and_its_place_on_a_platform_and_follows_t
     assert angle_of(outputs[1]["goal_rot"][0]) == pytest.approx(math.atan(0.3))
     half = follow(grounds[:2], [stand(), stand(0.09)], lock__plant_weight=0.5)[1]
     assert angle_of(half["goal_rot"][0]) == pytest.approx(math.atan(0.3) / 2)
-    assert not outputs[2]["planted"].any()  # ground over the ray's start is no hit
+    assert not outputs[2]["planted"].any()  # ground above the start of the ray is not hit
     turned = Transform(np.array([0.1, 0.0, 0.2]), maths.from_axis_angle(maths.Y, 0.5))
     moved = follow([slope, FLAT], [stand(), stand(platform=turned)])[1]
     for leg in range(2):
@@ -220,7 +222,7 @@ def test_a_planted_foot_keeps_its_turn_and_its_place_on_a_platform_and_follows_t
         assert math.atan2(ahead[0], ahead[2]) == pytest.approx(0.5)
 
 
-def test_a_planted_foot_stays_at_its_height_where_the_ground_under_it_is_gone():
+def test_a_planted_foot_keeps_its_height_when_its_ground_disappears():
     ahead = Terrain(maths.Y, triangles=np.array([[[-9.0, 0.02, 0.2], [9.0, 0.02, 0.2], [0, 0, 9]]]))
     last = follow([FLAT, ahead], [stand(), stand(0.3)])[1]
     assert last["found"].all() and last["target_ws"][:, 1:] == pytest.approx(
@@ -228,24 +230,24 @@ def test_a_planted_foot_stays_at_its_height_where_the_ground_under_it_is_gone():
     )
 
 
-def test_planting_starts_anew_after_the_foot_was_in_the_air():
+def test_planting_starts_again_after_the_foot_was_in_the_air():
     frames = [stand(0.05), stand(0.1), stand(0.15)]
     outputs = follow([FLAT, DEEP, FLAT], frames)
     assert [output["planted"].all() for output in outputs] == [True, False, True]
     assert outputs[2]["target_ws"][:, 2] == pytest.approx(0.15)
 
 
-def test_the_pelvis_moves_just_as_far_as_leg_lengths_ask():
+def test_the_pelvis_moves_only_as_far_as_leg_lengths_require():
     far = -1.12 + math.sqrt(0.88**2 - 0.05**2)
     near = -0.37 + math.sqrt(0.5**2 - 0.05**2)
     for height, pelvis in ((-0.3, far), (0.45, near), (0.0, 0.0)):
         _, output = step(plane(0.0, 0.0, height), stand())
         assert output["pelvis_height"] == pytest.approx(pelvis, abs=EXACT)
-    # Not over-stretching the left leg wins over giving the right one its least length.
-    both = LegTerrains(FLAT, [plane(0.0, 0.0, -0.3), plane(0.0, 0.0, 0.45)])
-    assert step(both, stand())[1]["pelvis_height"] == pytest.approx(far)
+    # Not over-stretching the left leg takes precedence over the minimum length of the right.
+    uneven = LegTerrains(FLAT, [plane(0.0, 0.0, -0.3), plane(0.0, 0.0, 0.45)])
+    assert step(uneven, stand())[1]["pelvis_height"] == pytest.approx(far)
     lone = stand(weight=np.array([0.0, 1.0]))
-    assert step(both, lone)[1]["pelvis_height"] == pytest.approx(near)
+    assert step(uneven, lone)[1]["pelvis_height"] == pytest.approx(near)
     drawn_up = make_frame(RIG, standing((ANKLE, 0.6)))
     assert step(LegTerrains(FLAT, [FLAT, DEEP]), drawn_up)[1]["pelvis_height"] == 0.0
     for changes in ({"pelvis.min_length": 0.3}, {"pelvis.enabled": False}):
@@ -257,12 +259,16 @@ def test_the_pelvis_moves_just_as_far_as_leg_lengths_ask():
 def test_the_pelvis_is_damped_by_the_clamped_speed_law():
     state, _ = step(FLAT, stand())
     goal = -1.12 + math.sqrt(0.88**2 - 0.05**2)
-    for changes, share in (({}, 1 / 6), ({"pelvis.speed": 30.0}, 0.5), ({"pelvis.damp": False}, 1)):
+    for changes, weight in (
+        ({}, 1 / 6),
+        ({"pelvis.speed": 30.0}, 0.5),
+        ({"pelvis.damp": False}, 1),
+    ):
         _, output = step(plane(0.0, 0.0, -0.3), stand(), changes, state)
-        assert output["pelvis_height"] == pytest.approx(share * goal)
+        assert output["pelvis_height"] == pytest.approx(weight * goal)
 
 
-def test_the_knee_looks_at_the_toes_moved_by_the_calf_and_the_offset():
+def test_the_knee_points_at_the_hint():
     offset = np.array([0.2, 0.1, 0.0])
     root = Transform(np.array([0.3, 0.0, 0.2]), maths.from_axis_angle(maths.Y, 0.4))
     frame = stand(world_from_model=root)
@@ -280,7 +286,7 @@ def test_the_knee_looks_at_the_toes_moved_by_the_calf_and_the_offset():
         assert maths.across(knee - hip, along) @ maths.across(hint - hip, along) > 0.0
 
 
-def test_the_hint_is_over_the_toes_where_they_are_seen_and_below_the_ankle_without_ground():
+def test_the_hint_is_above_the_toe_hit_or_without_ground_below_the_ankle():
     frame = stand()
     calf = frame.knee.pos - frame.ankle.pos
     for ground, height in ((STEP, 0.06), (FLAT, 0.0), (DEEP, 0.0)):
@@ -288,13 +294,13 @@ def test_the_hint_is_over_the_toes_where_they_are_seen_and_below_the_ankle_witho
         assert step(ground, frame)[1]["hint_ws"] == pytest.approx(toes + calf)
 
 
-def test_heights_of_the_ankle_are_over_the_origin():
+def test_ankle_heights_are_relative_to_the_origin():
     up = Transform(2.0 * maths.Y, maths.IDENTITY)
     _, output = step(plane(0.0, 0.0, 2.0), stand(world_from_model=up))
     assert output["extra"] == pytest.approx(0.3) and output["found"].all()
 
 
-def test_each_foot_has_its_own_up_and_stands_on_a_wall_where_that_points_away_from_it():
+def test_a_foot_with_its_own_up_stands_on_a_wall():
     wall = Terrain(-maths.X, planes=[(0.15 * maths.X, maths.X)])
     _, output = step(LegTerrains(FLAT, [wall, FLAT]), stand())
     assert output["target_ws"][0] == pytest.approx([0.15 - ANKLE, ANKLE, 0.05])

@@ -1,7 +1,6 @@
-"""The `ozz`, `unreal` and `mec` references by themselves: facts that hold whatever JAX does.
+"""The NumPy references of `ozz`, `unreal` and `mec`: facts that hold whatever the JAX code does.
 
-What only the last does is in `test_reference_mec`, the leg of the first and the last in
-`test_reference_pole`.
+More about `mec` is in `test_reference_mec`.
 """
 
 import dataclasses
@@ -61,7 +60,7 @@ def foot_axis(output: dict[str, Array], leg: int, axis: Array) -> Array:
     return maths.rotate(maths.multiply(output["ankle_rot"][leg], RIG.ankle_from_foot[leg]), axis)
 
 
-# What all three share.
+# All three systems.
 
 
 @pytest.mark.parametrize("system", [ozz, unreal, mec])
@@ -97,7 +96,7 @@ def test_an_unknown_parameter_is_named_with_those_of_the_system():
 
 
 @pytest.mark.parametrize("mask, height", [(0b01, 0.0), (0b10, 0.1), (0b100, 0.2), (0b111, 0.2)])
-def test_a_ray_sees_only_surfaces_whose_layer_is_in_its_mask(mask, height):
+def test_a_ray_hits_only_layers_in_its_mask(mask, height):
     ground = Terrain(
         maths.Y,
         planes=[(maths.Y * 0.0, maths.Y), (maths.Y * 0.1, maths.Y)],
@@ -110,7 +109,7 @@ def test_a_ray_sees_only_surfaces_whose_layer_is_in_its_mask(mask, height):
     assert not ground.cast(np.array([-1.0, 1.0, 0.0]), math.inf, 0b100).found
 
 
-def test_a_stand_within_a_wandering_clip_has_no_speed_and_the_walk_has_its_own():
+def test_standing_parts_of_the_wandering_clip_have_no_speed():
     frames = clips.wandering(RIG, np.random.default_rng(2), 60, stand=(0.4, 0.6))
     speed = np.array([frame.speed for frame in frames])
     assert (speed[24:36] == 0.0).all()
@@ -136,7 +135,7 @@ def test_ozz_puts_the_sole_on_a_slope_and_keeps_the_heading_of_the_toes():
         assert abs(np.cross(normal, before) @ after) < EXACT and before @ after > 0.9
 
 
-def test_ozz_lifts_the_character_onto_the_ground_and_the_pelvis_does_where_that_is_off():
+def test_ozz_raises_the_root_or_else_the_pelvis_onto_the_ground():
     raised = plane(0.0, 0.0, 0.4)
     outputs = [step(ozz, raised, stand(), {"root.enabled": on})[1] for on in (True, False)]
     assert [float(output["lift"]) for output in outputs] == pytest.approx([0.4, 0.0])
@@ -158,7 +157,7 @@ def test_ozz_sinks_to_the_lowest_foot_and_bends_the_other_leg():
     assert level["pelvis_height"] == 0.0 and np.allclose(level["hip_pos"], frame.hip.pos)
 
 
-def test_ozz_leaves_a_leg_without_ground_as_animated_but_for_the_bodys_move():
+def test_ozz_moves_a_leg_without_ground_only_with_the_body():
     frame = stand(world_from_model=Transform(np.array([0.01, 0.0, 0.0]), maths.IDENTITY))
     _, output = step(ozz, LEFT_ONLY, frame, {"target.foot_height": 0.05})
     assert output["lift"] == pytest.approx(-0.1, abs=EXACT)
@@ -169,7 +168,7 @@ def test_ozz_leaves_a_leg_without_ground_as_animated_but_for_the_bodys_move():
 
 
 @pytest.mark.parametrize(
-    "changes, height, lift, found",
+    "changes, height, lift, hits",
     [
         ({"root.ray_up": 0.3}, 0.4, 0.0, True),
         ({"root.ray_down": 0.3}, -0.4, 0.0, True),
@@ -178,21 +177,21 @@ def test_ozz_leaves_a_leg_without_ground_as_animated_but_for_the_bodys_move():
         ({"root.enabled": False, "probe.ray_down": 0.4}, -0.4, 0.0, False),
     ],
 )
-def test_ozz_sees_no_further_than_its_rays(changes, height, lift, found):
+def test_ozz_finds_no_ground_beyond_its_rays(changes, height, lift, hits):
     _, output = step(ozz, plane(0.0, 0.0, height), stand(), changes)
-    assert output["lift"] == pytest.approx(lift) and (output["found"] == found).all()
-    moved = height if found else 0.0
+    assert output["lift"] == pytest.approx(lift) and (output["found"] == hits).all()
+    moved = height if hits else 0.0
     assert np.allclose(output["ankle_pos"], stand().ankle.pos + moved * maths.Y, atol=EXACT)
 
 
-def test_ozz_raises_the_ankle_over_a_slope_no_more_than_over_the_steepest_one():
+def test_ozz_limits_how_far_a_slope_raises_the_ankle():
     for slope, steepest, cosine in ((1.0, 1.5, math.sqrt(0.5)), (1.0, 0.3, math.cos(0.3))):
         _, output = step(ozz, plane(slope, 0.0), stand(), {"target.max_slope": steepest})
         assert output["target_ws"][:, 1] == pytest.approx(0.05 * slope + ANKLE / cosine)
 
 
 @pytest.mark.parametrize("leg, foot", [(False, True), (True, False), (False, False)])
-def test_ozz_switches_leg_and_foot_off_each_by_itself(leg, foot):
+def test_ozz_can_switch_off_leg_and_foot_separately(leg, foot):
     frame = stand()
     changes = {"leg.enabled": leg, "foot.enabled": foot, "pelvis.enabled": False}
     _, output = step(ozz, plane(0.3, 0.0, 0.05), frame, changes | {"root.enabled": False})
@@ -219,7 +218,7 @@ def test_ozz_aims_from_an_offset_and_leaves_the_foot_where_the_offset_is_too_far
 # unreal.
 
 
-def test_unreal_is_on_its_goals_in_the_first_frame_of_a_stand():
+def test_unreal_starts_at_its_goals():
     _, output = step(unreal, LEFT_LOW, stand())
     assert output["hip"] == pytest.approx(-0.1) and output["half_height"] == pytest.approx(0.85)
     assert np.allclose(output["effector"], [0.0, 0.1], atol=EXACT) and output["asleep"]
@@ -241,7 +240,7 @@ def test_unreal_moves_by_the_clamped_speed_law_and_its_latch_freezes_the_hip_sho
         assert output["asleep"].tolist() == [False] + [latch] * 4 + [False] * 2
 
 
-def test_unreal_falls_asleep_only_when_every_foot_that_takes_part_is_near_its_goal():
+def test_unreal_sleeps_only_when_all_active_feet_are_near_their_goals():
     for weight, naps in ((np.ones(2), False), (np.array([1.0, 0.0]), True)):
         frames = [stand(speed=1.0, weight=weight), stand(weight=weight)]
         output = unreal.run(parameters(unreal), RIG, LEFT_LOW, frames)
@@ -264,7 +263,7 @@ def test_unreal_falls_asleep_only_when_every_foot_that_takes_part_is_near_its_go
         ({"probe.ray_down": 0.52}, -0.51, 0.0),
     ],
 )
-def test_unreal_measures_from_the_origin_and_sees_no_further_than_its_ray(
+def test_unreal_measures_from_the_origin_and_finds_no_ground_beyond_its_ray(
     changes, height, effector
 ):
     _, output = step(unreal, plane(0.0, 0.0, height), stand(), changes)
@@ -285,7 +284,7 @@ def test_unreal_divides_effectors_by_the_scale_of_the_mesh_and_idles_below_a_spe
     assert output["hip"] == 0.0 and np.allclose(output["effector"], [-0.1, 0.0], atol=EXACT)
 
 
-# Numbers that no test above turns.
+# Parameters that no test above changes.
 
 OTHER_NUMBERS = {
     ozz: {
@@ -315,10 +314,10 @@ PLACES = ("hip_pos", "knee_pos", "ankle_pos", "toe_pos", "half_height")
 @pytest.mark.parametrize(
     "system, name", [(system, name) for system, names in OTHER_NUMBERS.items() for name in names]
 )
-def test_every_number_changes_what_comes_out(system, name):
+def test_each_parameter_changes_the_result(system, name):
     rig = clips.make_rig(1)
     frames = clips.wandering(rig, np.random.default_rng(1), 16, stand=(0.4, 0.8))
-    ground = clips.planes((0.4, 0.2, 1.35))  # uneven where the clip is, and not far
+    ground = clips.planes((0.4, 0.2, 1.35))  # uneven under the clip, and nearby
     plain = system.run(parameters(system), rig, ground, frames)
     value = OTHER_NUMBERS[system][name]
     changed = system.run(parameters(system, {name: value}), rig, ground, frames)

@@ -13,11 +13,11 @@ from test_systems_singular import (
     BENT,
     FOLDED,
     STRAIGHT,
-    backward_slopes,
     held,
+    reverse_gradients,
+    rotated_root,
     standing,
     tangents_of,
-    turned,
 )
 
 import jaxik
@@ -40,13 +40,13 @@ AT_WORK = {  # everything that is off by default
 }
 
 
-def known(fraction: float, **changes: Any) -> jaxik.Frame:
+def known_stride(fraction: float, **changes: Any) -> jaxik.Frame:
     """Feet half way of their stride in plan, after this fraction of its time."""
     frames = to_frames(swinging(fraction))
     return dataclasses.replace(frames, stride=dataclasses.replace(frames.stride, **changes))
 
 
-def unknown(velocity: float) -> jaxik.Frame:
+def unknown_stride(velocity: float) -> jaxik.Frame:
     """Feet half way of a stride predicted from the character's forward speed, m/s."""
     frames = to_frames(swinging(0.5, known=False))
     return dataclasses.replace(frames, velocity_ws=frames.velocity_ws * (velocity / 0.8))
@@ -54,25 +54,29 @@ def unknown(velocity: float) -> jaxik.Frame:
 
 def nowhere() -> jaxik.Frame:
     """A stride that ends where it starts."""
-    frames = known(0.5)
+    frames = known_stride(0.5)
     return dataclasses.replace(
         frames, stride=dataclasses.replace(frames.stride, next_ws=frames.stride.last_ws)
     )
 
 
 SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any]]] = {
-    "fraction 0": (known(0.0), UPHILL, {}),
-    "fraction 1": (known(1.0), UPHILL, {}),
-    "fraction at the end of the rise": (known(0.75), UPHILL, {"probe.rise_end": 0.75}),
-    "no time to rise": (known(0.5), UPHILL, {"probe.rise_start": 0.5, "probe.rise_end": 0.5}),
+    "fraction 0": (known_stride(0.0), UPHILL, {}),
+    "fraction 1": (known_stride(1.0), UPHILL, {}),
+    "fraction at the end of the rise": (known_stride(0.75), UPHILL, {"probe.rise_end": 0.75}),
+    "no time to rise": (
+        known_stride(0.5),
+        UPHILL,
+        {"probe.rise_start": 0.5, "probe.rise_end": 0.5},
+    ),
     "last is next": (nowhere(), UPHILL, {}),
-    "no velocity": (unknown(0.0), UPHILL, {}),
-    "hardly any velocity": (unknown(1e-12), UPHILL, {}),
-    "no ground": (known(0.5), FLAT, {"probe.layers": 0}),
-    "no ground, unknown": (unknown(0.8), FLAT, {"probe.layers": 0}),
-    "ground out of reach": (known(0.5), planes((0, 0, -0.9)), {}),
+    "no velocity": (unknown_stride(0.0), UPHILL, {}),
+    "hardly any velocity": (unknown_stride(1e-12), UPHILL, {}),
+    "no ground": (known_stride(0.5), FLAT, {"probe.layers": 0}),
+    "no ground, unknown": (unknown_stride(0.8), FLAT, {"probe.layers": 0}),
+    "ground out of reach": (known_stride(0.5), planes((0, 0, -0.9)), {}),
     "one leg out of reach": (standing(), planes((0, 4.0, 0)), {}),
-    "a wall": (known(0.5), planes((1e6, 0, 0)), {}),
+    "a wall": (known_stride(0.5), planes((1e6, 0, 0)), {}),
     "no weight": (standing(weight=0.0), UPHILL, {}),
     "half weight": (standing(weight=0.5), UPHILL, {}),
     "no time": (dataclasses.replace(standing(), dt=0.0 * standing().dt), UPHILL, {}),
@@ -85,8 +89,8 @@ SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any]]] = {
     "no thigh": (held([0, 0.5, 0], [0, 0.5, 0], [0, 0.1, 0]), FLAT, {}),
     "no foot": (held([0, 0.9, 0], [0, 0.5, 0.1], [0.0, 0.1, 0]), STEEP, {}),
     "no rise of the heel": (standing(), STEEP, {"effector.max_lift": 0.0}),
-    "looks straight up": (turned(0.5**0.5, -(0.5**0.5), 0.0, 0.0), UPHILL, {}),
-    "stands on its head": (turned(0.0, 0.0, 0.0, 1.0), FLAT, {}),
+    "looks straight up": (rotated_root(0.5**0.5, -(0.5**0.5), 0.0, 0.0), UPHILL, {}),
+    "stands on its head": (rotated_root(0.0, 0.0, 0.0, 1.0), FLAT, {}),
     "feet point along up": (standing(foot=np.pi / 2), FLAT, {}),
     "at once": (standing(), UPHILL, {name: 0.0 for name in AT_WORK if "half_life" in name}),
     "never": (standing(), UPHILL, {name: np.inf for name in AT_WORK if "half_life" in name}),
@@ -115,7 +119,7 @@ def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(preset: str,
     inputs = inputs_of(preset, name)
     tangents = tangents_of(inputs)
     forward = measured(inputs, tangents, HARD)[1]["everything"]
-    backward = jax.tree.map(np.asarray, backward_slopes(inputs))
+    backward = jax.tree.map(np.asarray, reverse_gradients(inputs))
     for path, slope in jax.tree_util.tree_leaves_with_path(backward):
         assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
     pairs = zip(jax.tree.leaves(backward), jax.tree.leaves(tangents), strict=True)
@@ -139,7 +143,7 @@ def gradients_of(inputs: tuple[Any, ...]) -> Any:
 def test_gradients_are_finite_with_an_absent_leg(present: list[bool]):
     """The leg has no position, no bones and no stride."""
     here = np.asarray(present)[:, None]
-    frames = known(0.5)
+    frames = known_stride(0.5)
     kept = jax.tree.map(
         lambda leaf: leaf * here if leaf.ndim == 3 else leaf * here[:, 0],
         (frames.pose, frames.stride, frames.foot_speed, frames.toe_speed),

@@ -1,4 +1,4 @@
-"""What the other systems keep: symmetries, ups of legs, padding, batches, dtypes, programs."""
+"""Properties of the other systems: symmetries, ups of legs, padding, batches, dtypes, programs."""
 
 import dataclasses
 import functools
@@ -34,7 +34,7 @@ from support.clips import BROKEN, assert_close, at, planes, to_ik, to_rig, to_te
 pytestmark = pytest.mark.slow
 
 PRESETS = ("ozz", "unreal", "mec", "stride", "by speed")
-AWAKE: dict[str, dict[str, Any]] = {  # rules at work all the way along the clip
+AWAKE: dict[str, dict[str, Any]] = {  # rules that act throughout the clip
     "ozz": {"root.enabled": False},
     "unreal": {"contact.idle_speed": 2.0, "effector.latch": False},
     "mec": {"probe.by_height": False},
@@ -58,9 +58,7 @@ def alone(preset: str) -> jaxik.Result:
 
 
 def crowd(preset: str, spoiled: bool = False) -> tuple[Any, ...]:
-    """The character with a leg of padding, in the world as it is and in one moved and turned, and
-    a third with other numbers on other ground.
-    """
+    """The character with a padding leg, itself in a moved world, and one with other parameters."""
     ik, rig, ground, frames = inputs(preset)
     by = some_move("turned, up too")
     rig, frames = three_legged(rig, frames)
@@ -85,14 +83,14 @@ def crowded(preset: str) -> jaxik.Result:
 
 
 def two_legs(result: jaxik.Result, member: int) -> jaxik.Result:
-    """A member's result with the poses of its first two legs."""
+    """The result of one member, with its first two legs."""
     result = at(result, member)
     pose = at(result.pose, (slice(None), slice(2)))
     return dataclasses.replace(result, pose=pose)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_the_system_works_on_the_clip(preset: str):
+def test_the_clip_exercises_the_system(preset: str):
     result = alone(preset)
     assert np.asarray(result.trace.sensed.foothold.found).mean() > 0.2
     moved = np.asarray(result.pose.ankle.pos - wander().pose.ankle.pos)
@@ -110,20 +108,20 @@ def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(preset: str):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_moving_and_turning_the_world_moves_and_turns_the_answer(preset: str):
+def test_moving_the_world_moves_the_result(preset: str):
     before, after = (two_legs(crowded(preset), member) for member in range(2))
-    # Mec stretches legs to their end, where the knee turns as the root of the distance: so does the
+    # Mec stretches legs fully, where the knee turns as the root of the distance: so does the
     # rounding.
     tolerance = 1e-7 if preset == "mec" else EXACT
     assert_same_pose(after.pose, before.pose, tolerance)
     assert_same_transform(after.body, before.body)
     for joint in ("hip", "knee", "ankle"):
-        came, wanted = (getattr(r.corrections, joint) for r in (after, before))
-        assert_same_rot(came[:, :2], wanted[:, :2], tolerance)
+        actual, expected = (getattr(r.corrections, joint) for r in (after, before))
+        assert_same_rot(actual[:, :2], expected[:, :2], tolerance)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_one_bad_member_does_not_spoil_the_others_of_a_batch(preset: str):
+def test_a_bad_member_does_not_affect_the_others_of_a_batch(preset: str):
     for leaf in jax.tree.leaves(crowded(preset)):
         assert not np.isnan(leaf).any()
     result = crowd_run(*crowd(preset, spoiled=True))
@@ -133,7 +131,7 @@ def test_one_bad_member_does_not_spoil_the_others_of_a_batch(preset: str):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_other_values_are_no_new_program(preset: str):
+def test_other_values_need_no_new_program(preset: str):
     crowded(preset)
     programs = crowd_run._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     ik, rig, ground, frames = crowd(preset)
@@ -145,16 +143,16 @@ def test_other_values_are_no_new_program(preset: str):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_legs_with_one_and_the_same_up_meet_the_same_ground(preset: str):
+def test_legs_with_the_same_up_find_the_same_ground(preset: str):
     ik, rig, ground, frames = inputs(preset)
     each = run(ik, rig, terrain.LegTerrains(ground, (ground, ground)), frames)
     np.testing.assert_allclose(each.trace.sensed.leg_up_ws[:, 1], ground.up_ws[None].repeat(240, 0))
-    for came, wanted in ((each.pose, alone(preset).pose), (each.body, alone(preset).body)):
-        assert_close(came, wanted, 1e-12)
+    for actual, expected in ((each.pose, alone(preset).pose), (each.body, alone(preset).body)):
+        assert_close(actual, expected, 1e-12)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_numbers_given_for_each_leg_do_what_shared_ones_do(preset: str):
+def test_equal_values_per_leg_act_like_a_shared_value(preset: str):
     ik, rig, ground, frames = inputs(preset)
 
     def widened(name: str) -> jax.Array:
@@ -175,14 +173,14 @@ def test_single_precision_stays_within_a_tenth_of_a_millimetre_of_double(preset:
         floating = jnp.issubdtype(leaf.dtype, jnp.floating)
         assert not floating or leaf.dtype == jnp.float32, jax.tree_util.keystr(path)
     for joint in JOINTS:
-        came, wanted = (getattr(r.pose, joint) for r in (result, alone(preset)))
-        np.testing.assert_allclose(came.pos, wanted.pos, rtol=0, atol=1e-4)
-        assert_same_rot(came.rot, wanted.rot, 1e-3)
+        actual, expected = (getattr(r.pose, joint) for r in (result, alone(preset)))
+        np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=1e-4)
+        assert_same_rot(actual.rot, expected.rot, 1e-3)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
-def test_a_program_of_single_precision_has_no_double_in_it(preset: str, gate: Any):
+def test_a_single_precision_program_contains_no_doubles(preset: str, gate: Any):
     with jax.numpy_dtype_promotion("strict"):
         program = jax.make_jaxpr(jaxik.run)(*single(inputs(preset)), single(gate))
     assert not list(doubles(program.jaxpr))

@@ -1,6 +1,6 @@
-"""Frames on which the other systems' formulas have no answer: values and slopes stay finite.
+"""Frames where the other systems' formulas are singular: values and gradients stay finite.
 
-Each frame lasts for a whole clip, so that memory lives through it and one program serves all.
+Each frame is repeated for a whole clip, which includes memory and lets all share one program.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ FOLDED = ([0, 0.5, 0], [0, 0.05, 0], [0, 0.48, 0])
 # Sums and differences without rounding: on the edge of a decision it would decide, and another way
 # in each program.
 BENT = ([0, 0.75, 0], [0, 0.375, 0.25], [0, 0, 0])
-BAREFOOT: dict[str, dict] = {  # ankles go to the ground itself
+BAREFOOT: dict[str, dict] = {  # ankles go to ground height
     "ozz": {"target.foot_height": 0.0},
     "unreal": {},
     "mec": {"target.foot_height": 0.0},
@@ -44,8 +44,8 @@ def standing(**changes: Any) -> jaxik.Frame:
     return to_frames(padded(animate(RIG, count=1, **changes)))
 
 
-def turned(*rot: float) -> jaxik.Frame:
-    """A character whose root is turned like this, wxyz."""
+def rotated_root(*rot: float) -> jaxik.Frame:
+    """A character with this rotation of its root, wxyz."""
     frames = standing()
     root = frames.world_from_model
     rots = jnp.broadcast_to(jnp.asarray(rot), root.rot.shape)
@@ -63,7 +63,7 @@ def hint(below: float) -> dict[str, Any]:
     return {"mec": STIFF | {"leg.hint_offset": hip + below * down - toe - (knee - ankle)}}
 
 
-# Frames, ground, the values of all systems, and those of some.
+# Frames, ground, values for all systems, and values for single systems.
 SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any], dict[str, dict[str, Any]]]] = {
     "straight": (held(*STRAIGHT), FLAT, {}, {}),
     "straight and too far": (held(*STRAIGHT), planes((0, 0, -0.3)), STIFF, {}),
@@ -85,8 +85,13 @@ SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any], dict[str, dict[str, 
     "no time": (dataclasses.replace(standing(), dt=0.0 * standing().dt), FLAT, {}, {}),
     "no weight": (standing(weight=0.0), FLAT, {}, {}),
     "half weight": (standing(weight=0.5), planes((0.2, 0, 0)), {}, {}),
-    "looks straight up": (turned(0.5**0.5, -(0.5**0.5), 0.0, 0.0), planes((0.1, 0, 0)), {}, {}),
-    "stands on its head": (turned(0.0, 0.0, 0.0, 1.0), FLAT, {}, {}),
+    "looks straight up": (
+        rotated_root(0.5**0.5, -(0.5**0.5), 0.0, 0.0),
+        planes((0.1, 0, 0)),
+        {},
+        {},
+    ),
+    "stands on its head": (rotated_root(0.0, 0.0, 0.0, 1.0), FLAT, {}, {}),
     "plane on edge": (standing(), planes((1e6, 0, 0)), {}, {}),
     "feet point along up": (standing(foot=np.pi / 2), FLAT, {}, {}),
     "feet upside down": (standing(foot=np.pi), FLAT, {}, {}),
@@ -150,28 +155,28 @@ def tangents_of(inputs: Inputs) -> Any:
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
-def backward_slopes(inputs: Inputs) -> Any:
-    """How the sum of everything changes with each float."""
+def reverse_gradients(inputs: Inputs) -> Any:
+    """Gradient of a weighted sum of all outputs with respect to all floats."""
     floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
     return jax.grad(lambda floats: read(floats, rest, HARD)[0]["everything"])(floats)
 
 
 @pytest.mark.parametrize(("preset", "name"), BOTH)
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
-def test_values_and_slopes_are_finite(preset: str, name: str, gate: Any):
+def test_values_and_derivatives_are_finite(preset: str, name: str, gate: Any):
     inputs = inputs_of(preset, name)
-    values, slopes, after = measured(inputs, tangents_of(inputs), gate)
-    for numbers in (values, slopes):
+    values, gradients, after = measured(inputs, tangents_of(inputs), gate)
+    for numbers in (values, gradients):
         assert np.isfinite(list(numbers.values())).all(), numbers
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
 
 
 @pytest.mark.parametrize(("preset", "name"), BOTH)
-def test_slopes_are_finite_and_the_same_both_ways(preset: str, name: str):
+def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(preset: str, name: str):
     inputs = inputs_of(preset, name)
     tangents = tangents_of(inputs)
     forward = measured(inputs, tangents, HARD)[1]["everything"]
-    backward = jax.tree.map(np.asarray, backward_slopes(inputs))
+    backward = jax.tree.map(np.asarray, reverse_gradients(inputs))
     for path, slope in jax.tree_util.tree_leaves_with_path(backward):
         assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
     pairs = zip(jax.tree.leaves(backward), jax.tree.leaves(tangents), strict=True)
