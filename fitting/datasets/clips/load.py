@@ -44,9 +44,8 @@ def load_clip(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in formats.SUFFIXES:
-        *first, last = formats.SUFFIXES
-        raise ValueError(f"{path}: wanted a {', '.join(first)} or {last} file")
+    if suffix not in (*formats.READERS, ".npz"):
+        raise ValueError(f"{path}: wanted a {', '.join(formats.READERS)} or .npz file")
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     overrides = Overrides(scale, fps, up, joints)

@@ -12,8 +12,8 @@ To add a format:
    that takes a clip then accept the format.
 4. If a joint naming convention is new, add a line to `clips.joint_roles.DIALECTS`.
 
-A test writes a file of a few frames as text and compares `load_clip`'s joints with positions worked
-out by hand; see `tests/datasets/test_clips_bvh.py`.
+`tests/datasets/test_clip_formats.py` adds a format of a few lines and loads a clip with it;
+`tests/datasets/test_clips_bvh.py` shows what a reader should be tested for.
 
 `npz` differs: an archive holds a complete clip, so its reader returns a `Clip`, not a `Recording`.
 """
@@ -30,4 +30,3 @@ READERS: Mapping[str, Callable[[Path], Recording]] = {
     ".bvh": read_bvh,
     ".amc": read_asfamc,
 }
-SUFFIXES = (*READERS, ".npz")
