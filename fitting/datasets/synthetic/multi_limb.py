@@ -61,7 +61,7 @@ class Route:
     """Where a body goes, and how regular its footholds are."""
 
     start: float = 0.0  # m, position along the path at the start
-    bend: float = 0.09  # rad, by which the path turns away from +z to either side, about
+    bend: float = 0.09  # rad, about how far the path turns away from +z to either side
     jitter: float = 0.015  # m, standard deviation of footholds, along the path and across
 
 
@@ -89,11 +89,17 @@ def _pair(left: Limb, right_phase: float) -> tuple[Limb, Limb]:
 # A large dog or a pony. Lateral sequence: each hind foot is followed by the fore foot of its side.
 QUADRUPED = Body(
     "quadruped",
-    (
-        *_pair(Limb("fore", (0.11, 0.68, 0.36), (0.10, 0.42), (0.0, 0.0, -1.0), (0.35, 0.37), 0.25),
-               0.75),
-        *_pair(Limb("hind", (0.10, 0.68, -0.36), (0.11, -0.30), (0.0, 0.0, 1.0), (0.37, 0.36), 0.0),
-               0.5),
+    limbs=(
+        *_pair(
+            Limb("fore", root=(0.11, 0.68, 0.36), home=(0.10, 0.42), pole=(0.0, 0.0, -1.0),
+                 bones=(0.35, 0.37), phase_offset=0.25),
+            right_phase=0.75,
+        ),
+        *_pair(
+            Limb("hind", root=(0.10, 0.68, -0.36), home=(0.11, -0.30), pole=(0.0, 0.0, 1.0),
+                 bones=(0.37, 0.36), phase_offset=0.0),
+            right_phase=0.5,
+        ),
     ),
     height=0.72, stride=0.80, period=0.85, stance_fraction=0.62, lift=0.09, toe_drop=0.5, bob=0.008,
     ankle_to_ball=(0.05, 0.06), ball_height=0.03,
@@ -102,11 +108,17 @@ QUADRUPED = Body(
 # An adult facing the wall, always on three limbs. Elbows hang, knees open sideways.
 CLIMBER = Body(
     "climber",
-    (
-        *_pair(Limb("hand", (0.19, 0.30, 0.26), (0.28, 0.62), (0.5, 0.4, -0.6), (0.30, 0.27), 0.0),
-               0.5),
-        *_pair(Limb("foot", (0.09, 0.30, -0.26), (0.26, -0.66), (0.9, 0.3, 0.3), (0.43, 0.41), 0.75
-                    ), 0.25),
+    limbs=(
+        *_pair(
+            Limb("hand", root=(0.19, 0.30, 0.26), home=(0.28, 0.62), pole=(0.5, 0.4, -0.6),
+                 bones=(0.30, 0.27), phase_offset=0.0),
+            right_phase=0.5,
+        ),
+        *_pair(
+            Limb("foot", root=(0.09, 0.30, -0.26), home=(0.26, -0.66), pole=(0.9, 0.3, 0.3),
+                 bones=(0.43, 0.41), phase_offset=0.75),
+            right_phase=0.25,
+        ),
     ),
     height=0.32, stride=0.40, period=3.0, stance_fraction=0.75, lift=0.10, toe_drop=0.3, bob=0.0,
     ankle_to_ball=(0.04, 0.10), ball_height=0.03,
@@ -202,10 +214,10 @@ def _foot_motion(body: Body, limb: Limb, travel: _Travel, rng: np.random.Generat
     yaws = path.yaw(along)
 
     ease = smoothstep(swing)
-    here, there = step + 1, step + 2
-    ball = footholds[here] + ease[:, None] * (footholds[there] - footholds[here])
+    last, next_ = step + 1, step + 2
+    ball = footholds[last] + ease[:, None] * (footholds[next_] - footholds[last])
     ball[:, 1] += body.lift * arc
-    yaw = yaws[here] + ease * (yaws[there] - yaws[here])
+    yaw = yaws[last] + ease * (yaws[next_] - yaws[last])
     heading = Rotation.from_rotvec(yaw[:, None] * UP)
     tilt = Rotation.from_rotvec((body.toe_drop * arc)[:, None] * [1.0, 0.0, 0.0])
     rot = heading * tilt

@@ -101,14 +101,7 @@ def slope() -> Mesh:
 def steps() -> Mesh:
     """Flat, four irregular steps up, and flat again."""
     flight = stairs(Point(1.0, -0.25))
-    return strip(
-        [
-            Point(-1.5, -0.25),
-            Point(1.0, -0.25),
-            *flight,
-            Point(7.0, flight[-1].height),
-        ]
-    )
+    return strip([Point(-1.5, -0.25), Point(1.0, -0.25), *flight, Point(7.0, flight[-1].height)])
 
 
 def rubble() -> Mesh:
@@ -128,18 +121,18 @@ def uneven_walk() -> Mesh:
     on which the walk slides; flat; a slope up.
     """
     down = stairs(Point(4.6, 0.32), (-0.08, -0.18, -0.10, -0.14))
-    foot = down[-1]
-    stones = Point(foot.z + 2.8, -0.08)
-    up = stairs(Point(stones.z + 0.5, -0.08), (0.09, 0.16, 0.13))
+    bottom = down[-1]
+    rubble_end = Point(bottom.z + 2.8, -0.08)
+    up = stairs(Point(rubble_end.z + 0.5, -0.08), (0.09, 0.16, 0.13))
     top = up[-1]
     return join(
         strip([
             Point(-1.5, 0.0), Point(1.6, 0.0), Point(1.9, 0.05, -0.12), Point(3.2, 0.32, -0.12),
             Point(3.6, 0.32), Point(4.6, 0.32), *down,
         ]),
-        rubble_patch(foot, stones, seed=5),
+        rubble_patch(bottom, rubble_end, seed=5),
         strip([
-            stones, Point(stones.z + 0.5, -0.08), *up, Point(top.z + 0.3, top.height),
+            rubble_end, Point(rubble_end.z + 0.5, -0.08), *up, Point(top.z + 0.3, top.height),
             Point(top.z + 0.8, 0.23, 0.14), Point(top.z + 1.5, 0.09, 0.14),
             Point(top.z + 2.1, -0.01, -0.12), Point(top.z + 3.4, -0.25, -0.12),
             Point(top.z + 3.8, -0.28), Point(top.z + 4.3, -0.28),
@@ -154,26 +147,21 @@ def stop_and_go() -> Mesh:
     It stops half-way up a tilted slope, with one foot on each side of a riser, and on rubble.
     """
     down = stairs(Point(3.9, 0.25), (-0.12, -0.20, -0.08), tread=1.0)
-    foot = Point(6.4, down[-1].height)
-    stones = Point(8.4, -0.10)
+    bottom = Point(6.4, down[-1].height)
+    rubble_end = Point(8.4, -0.10)
     return join(
         strip([
             Point(-1.5, 0.0), Point(1.4, 0.0), Point(1.7, 0.03, 0.1), Point(3.4, 0.25, 0.1),
-            Point(3.9, 0.25), *down[:-1], foot,
+            Point(3.9, 0.25), *down[:-1], bottom,
         ]),
-        rubble_patch(foot, stones, seed=7),
-        strip([stones, Point(9.0, 0.0, -0.1), Point(11.0, 0.0, -0.1)]),
+        rubble_patch(bottom, rubble_end, seed=7),
+        strip([rubble_end, Point(9.0, 0.0, -0.1), Point(11.0, 0.0, -0.1)]),
     )  # fmt: skip
 
 
 def meadow() -> Mesh:
     """Tussocks on gently rolling ground, 8 m long."""
-    profile = (
-        Point(-1.5, 0.0),
-        Point(1.5, 0.08, 0.06),
-        Point(4.0, -0.08, -0.05),
-        Point(6.5, 0.05),
-    )
+    profile = Point(-1.5, 0.0), Point(1.5, 0.08, 0.06), Point(4.0, -0.08, -0.05), Point(6.5, 0.05)
     pieces = zip(profile, profile[1:], strict=False)
     return join(
         *(rubble_patch(*ends, seed=13 + piece, size=0.04) for piece, ends in enumerate(pieces))
