@@ -1,21 +1,22 @@
-"""Makes all data of the project from its seeds: `python data/make.py`.
+"""Generates the shipped terrain and clips from seeds: `python data/make.py [-o FOLDER]`.
 
-Terrains (`terrains/*.ply`), and in `clips/` flat bases, made on the floor y = 0:
+Terrains, `terrains/*.ply`. Flat animations over the floor y = 0, in `clips/`:
 
-- `uneven_walk_base.npz`: a walk whose root runs ahead of the feet by 6 % for a while, then lags
-  behind, as game roots do, so that feet slide and locks have work; on the slope down the character
-  slides.
-- `stop_and_go_base.npz`: a walk that stands exactly still three times, on a slope, on a step and on
+- `uneven_walk_base.npz`: a walk whose root runs 6 % faster than the feet step for a while, then
+  slower, as game roots do. Feet therefore slide, and locks have something to correct. On the slope
+  down the character slides.
+- `stop_and_go_base.npz`: a walk that stands exactly still three times: on a slope, on a step and on
   rubble.
 - `quadruped_base.npz` and `climber_base.npz`: bodies on four limbs; the climber is on the wall
   z = 0.
 
-and for each of the experiments with a known truth (`MADE`) two more:
+Two files for each experiment whose true parameters are known (`REFERENCES`), also in `clips/`:
 
-- `NAME.npz`, the reference: what a preset with known parameters makes of the base, plus noise.
-- `NAME_truth.toml`: those parameters and the noise.
+- `NAME.npz`: the reference motion, which a preset with the true parameters makes of the flat
+  animation, plus noise.
+- `NAME_truth.toml`: the true parameters and the noise.
 
-Numbers in clips are kept to 2⁻²⁴, which halves the files. The same bytes come out every time.
+Numbers in clips are rounded to 2⁻²⁴, which halves the files. The same bytes come out every time.
 """
 
 import argparse
@@ -47,35 +48,35 @@ TERRAINS = {
     "meadow": terrain_meshes.meadow,
     "wall": terrain_meshes.wall,
 }
-SECONDS, FPS, NOISE_SEED = 12.0, 30.0, 11
-SLIPS = (Slip(0.6, 4.4, 0.06), Slip(5.6, 8.6, -0.06))
-SLIDES = (Slide(8.8, 10.4),)
+SECONDS, FPS = 12.0, 30.0
+SLIPS_AND_SLIDE = (Slip(0.6, 4.4, 0.06), Slip(5.6, 8.6, -0.06), Slide(8.8, 10.4))
 STOPS = (Stop(1.6, 3.7), Stop(5.0, 7.2), Stop(8.6, 10.6))
-POSITION_NOISE, ROTATION_NOISE = 0.002, float(np.radians(0.5))  # m a coordinate, rad an axis
-GRAIN = 2.0**-24  # m, and of quaternions; 6e-8
+POSITION_NOISE = 0.002  # m, per coordinate of a joint
+ROTATION_NOISE = float(np.radians(0.5))  # rad, per axis of a joint
+RESOLUTION = 2.0**-24  # m, and of quaternion components; 6e-8
 
 
 def uneven_walk() -> Clip:
-    """The flat base of the uneven walk."""
-    return walker.walk(SECONDS, FPS, 2, (*SLIPS, *SLIDES))
+    """A walk with slips and a slide."""
+    return walker.walk(SECONDS, FPS, 2, SLIPS_AND_SLIDE)
 
 
 def stop_and_go() -> Clip:
-    """The flat base of the walk that stops."""
+    """A walk that stops."""
     return walker.walk(SECONDS, FPS, 4, STOPS)
 
 
 def quadruped() -> Clip:
-    """A quadruped's walk."""
+    """A quadruped that walks."""
     return multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, FPS, 3)
 
 
 def climber() -> Clip:
-    """A climb."""
+    """A climber on a wall."""
     return multi_limb.climb(6.0, FPS, 5)
 
 
-BASES: Mapping[str, Callable[[], Clip]] = {
+FLAT_ANIMATIONS: Mapping[str, Callable[[], Clip]] = {
     "uneven_walk": uneven_walk,
     "stop_and_go": stop_and_go,
     "quadruped": quadruped,
@@ -84,17 +85,17 @@ BASES: Mapping[str, Callable[[], Clip]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
-    """A reference made by a system with known parameters."""
+class SyntheticReference:
+    """A reference motion made by a system with known parameters."""
 
     name: str
-    base: str  # of `BASES`, and of the terrain
+    base: str  # key of `FLAT_ANIMATIONS`, and name of the terrain
     preset: str
-    truth: Mapping[str, float | bool]  # where the system differs from the preset
+    truth: Mapping[str, float | bool]  # parameters that differ from the preset's
     seed: int  # of the noise
 
 
-RECORD = {
+RECORD_TRUTH = {
     "contact.planted_height": 0.125,
     "contact.raised_height": 0.20,
     "target.rise_half_life": 0.04,
@@ -119,7 +120,7 @@ RECORD = {
     "foot.max_pitch": 0.26,
     "foot.max_roll": 0.12,
 }
-OZZ = {
+OZZ_TRUTH = {
     "target.foot_height": 0.09,
     "leg.soften": 0.94,
     "leg.twist": 0.15,
@@ -127,7 +128,7 @@ OZZ = {
     "foot.twist": -0.12,
     "foot.weight": 0.8,
 }
-UNREAL = {
+UNREAL_TRUTH = {
     "contact.idle_speed": 0.3,
     "target.adjust": 0.03,
     "pelvis.speed": 6.0,
@@ -136,8 +137,8 @@ UNREAL = {
     "leg.twist": 0.12,
     "leg.weight": 0.9,
 }
-MEC = {
-    "root.enabled": True,  # the ground under this walk is not the floor on which it was made
+MEC_TRUTH = {
+    "root.enabled": True,  # the terrain differs from the floor on which the walk was made
     "probe.foot_length": 0.16,
     "probe.half_width": 0.035,
     "probe.stable_height": 0.095,
@@ -150,62 +151,61 @@ MEC = {
     "leg.twist": 0.12,
     "foot.max_tilt": 0.2,
 }
-MADE = (
-    Made("uneven_walk", "uneven_walk", "record", RECORD, NOISE_SEED),
-    Made("stop_and_go_ozz", "stop_and_go", "ozz", OZZ, 21),
-    Made("stop_and_go_unreal", "stop_and_go", "unreal", UNREAL, 22),
-    Made("stop_and_go_mec", "stop_and_go", "mec", MEC, 23),
+REFERENCES = (
+    SyntheticReference("uneven_walk", "uneven_walk", "record", RECORD_TRUTH, 11),
+    SyntheticReference("stop_and_go_ozz", "stop_and_go", "ozz", OZZ_TRUTH, 21),
+    SyntheticReference("stop_and_go_unreal", "stop_and_go", "unreal", UNREAL_TRUTH, 22),
+    SyntheticReference("stop_and_go_mec", "stop_and_go", "mec", MEC_TRUTH, 23),
 )
 
 
-def base(name: str) -> Clip:
-    """A flat base by its name, as it is kept."""
-    return kept(BASES[name]())
+def flat_animation(name: str) -> Clip:
+    """One of `FLAT_ANIMATIONS`, as it is stored."""
+    return rounded(FLAT_ANIMATIONS[name]())
 
 
-def reference(made: Made, flat: Clip, terrain: Terrain) -> Clip:
-    """The flat base as the pipeline with the true parameters has it, without noise."""
-    ik = parameter_tree.replace(systems.preset_system(made.preset), made.truth)
+def reference_motion(reference: SyntheticReference, flat: Clip, terrain: Terrain) -> Clip:
+    """What the pipeline with the true parameters makes of a flat animation, without noise."""
+    ik = parameter_tree.replace(systems.preset_system(reference.preset), reference.truth)
     result = jaxik.run(ik, flat.rig, terrain, clip_frames.frames_from_clip(flat))
-    return dataclasses.replace(
-        clip_frames.clip_from_result(flat, result), source=made.name.replace("_", " ")
-    )
+    solved = clip_frames.clip_from_result(flat, result)
+    return dataclasses.replace(solved, source=reference.name.replace("_", " "))
 
 
-def noisy(clip: Clip, seed: int) -> Clip:
-    """The clip as a camera might see it: independent normal noise on every joint."""
+def with_noise(clip: Clip, seed: int) -> Clip:
+    """The clip with independent normal noise on every joint in every frame."""
     rng = np.random.default_rng(seed)
     positions = clip.positions_ws + rng.normal(0.0, POSITION_NOISE, clip.positions_ws.shape)
-    shaken = Rotation.from_rotvec(rng.normal(0.0, ROTATION_NOISE, (positions[..., 0].size, 3)))
-    turned = shaken * Rotation.from_quat(clip.rotations_ws.reshape(-1, 4), scalar_first=True)
-    rotations = turned.as_quat(scalar_first=True).reshape(clip.rotations_ws.shape)
+    noise = Rotation.from_rotvec(rng.normal(0.0, ROTATION_NOISE, (positions[..., 0].size, 3)))
+    noisy = noise * Rotation.from_quat(clip.rotations_ws.reshape(-1, 4), scalar_first=True)
+    rotations = noisy.as_quat(scalar_first=True).reshape(clip.rotations_ws.shape)
     return clip.with_motion(positions, rotations)
 
 
-def kept(clip: Clip) -> Clip:
-    """The clip with its motion rounded to multiples of `GRAIN`."""
+def rounded(clip: Clip) -> Clip:
+    """The clip with its motion rounded to multiples of `RESOLUTION`."""
     return dataclasses.replace(
         clip,
-        positions_ws=np.round(clip.positions_ws / GRAIN) * GRAIN,
-        rotations_ws=np.round(clip.rotations_ws / GRAIN) * GRAIN,
+        positions_ws=np.round(clip.positions_ws / RESOLUTION) * RESOLUTION,
+        rotations_ws=np.round(clip.rotations_ws / RESOLUTION) * RESOLUTION,
     )
 
 
-def truth_text(made: Made) -> str:
-    """The true parameters and the noise as TOML, a table a rule."""
-    lines = [f"# What made {made.name}.npz of {made.base}_base.npz; all else as in the preset."]
-    lines += [f'preset = "{made.preset}"', ""]
-    for room in dict.fromkeys(name.partition(".")[0] for name in made.truth):
-        own = [(name, value) for name, value in made.truth.items() if name.startswith(f"{room}.")]
-        lines += [
-            f"[{room}]",
-            *(f"{name.partition('.')[2]} = {_toml(value)}" for name, value in own),
-            "",
-        ]
+def truth_text(reference: SyntheticReference) -> str:
+    """The true parameters and the noise as TOML, with one table per rule."""
+    base = f"{reference.base}_base.npz"
+    lines = [f"# What made {reference.name}.npz of {base}; all else as in the preset."]
+    lines += [f'preset = "{reference.preset}"', ""]
+    for rule in dict.fromkeys(name.partition(".")[0] for name in reference.truth):
+        lines.append(f"[{rule}]")
+        for name, value in reference.truth.items():
+            if name.startswith(f"{rule}."):
+                lines.append(f"{name.partition('.')[2]} = {_toml(value)}")
+        lines.append("")
     lines += ["[noise]  # standard deviations, independent in every frame"]
     lines += [f"position = {POSITION_NOISE!r}  # m, a coordinate of a joint"]
     lines += [f"rotation = {ROTATION_NOISE!r}  # rad, about an axis of a joint"]
-    lines += [f"seed = {made.seed}"]
+    lines += [f"seed = {reference.seed}"]
     return "\n".join(lines) + "\n"
 
 
@@ -214,25 +214,25 @@ def _toml(value: float | bool) -> str:
 
 
 def make(folder: Path) -> None:
-    """Writes everything below `folder`."""
+    """Writes all files to `folder`."""
     terrains, clips = folder / "terrains", folder / "clips"
     terrains.mkdir(parents=True, exist_ok=True)
     clips.mkdir(parents=True, exist_ok=True)
     for name, mesh in TERRAINS.items():
         mesh_files.save_mesh(terrains / f"{name}.ply", *mesh())
-    bases = {name: base(name) for name in BASES}
-    for name, flat in bases.items():
+    flat_animations = {name: flat_animation(name) for name in FLAT_ANIMATIONS}
+    for name, flat in flat_animations.items():
         save_clip(clips / f"{name}_base.npz", flat)
-    for made in MADE:
-        terrain = mesh_files.load_terrain(terrains / f"{made.base}.ply")
-        solved = reference(made, bases[made.base], terrain)
-        save_clip(clips / f"{made.name}.npz", kept(noisy(solved, made.seed)))
-        truth = clips / f"{made.name}_truth.toml"
-        truth.write_text(truth_text(made), encoding="utf-8", newline="\n")
+    for reference in REFERENCES:
+        terrain = mesh_files.load_terrain(terrains / f"{reference.base}.ply")
+        motion = reference_motion(reference, flat_animations[reference.base], terrain)
+        save_clip(clips / f"{reference.name}.npz", rounded(with_noise(motion, reference.seed)))
+        truth = clips / f"{reference.name}_truth.toml"
+        truth.write_text(truth_text(reference), encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Makes all data of the project.")
+    parser = argparse.ArgumentParser(description="Generates the terrain and clips of this folder.")
     parser.add_argument("-o", "--output", type=Path, default=HERE, help="folder to write to")
     jax.config.update("jax_enable_x64", True)
     make(parser.parse_args().output)
