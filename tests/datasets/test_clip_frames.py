@@ -1,4 +1,4 @@
-"""Clips as frames of the pipeline, and its results as clips."""
+"""Conversion of clips to frames of the pipeline, and of its results to clips."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 
 FPS = 60.0
-SLOPE = 0.15  # rise per metre of z
+SLOPE = 0.15  # m per metre of z
 
 
 @pytest.fixture(scope="module")
@@ -31,41 +31,41 @@ def result(clip):
     return jaxik.run(ik, clip.rig, ground, clip_frames.frames_from_clip(clip))
 
 
-def test_frames_hold_the_clip_in_model_space_over_the_floor(clip):
-    made = clip_frames.frames_from_clip(clip, floor=-0.1)
-    pose = made.pose
+def test_frames_hold_the_clip_in_model_space_above_the_floor(clip):
+    frames = clip_frames.frames_from_clip(clip, floor=-0.1)
+    pose = frames.pose
     for role, joint in enumerate((pose.hip, pose.knee, pose.ankle, pose.toe)):
-        back = made.world_from_model
+        world = frames.world_from_model
         for leg in range(2):
-            placed = Rotation.from_quat(np.array(back.rot), scalar_first=True).apply(
+            placed = Rotation.from_quat(np.array(world.rot), scalar_first=True).apply(
                 np.array(joint.pos[:, leg])
             )
             np.testing.assert_allclose(
-                placed + back.pos, clip.joints_ws(role)[:, leg], rtol=0, atol=1e-9
+                placed + world.pos, clip.joints_ws(role)[:, leg], rtol=0, atol=1e-9
             )
     assert float(pose.ankle.pos[..., 1].min()) == pytest.approx(gait.ANKLE_HEIGHT + 0.1)
-    assert made.weight.shape == (clip.frame_count, 2)
-    np.testing.assert_allclose(made.dt, 1 / FPS)
-    np.testing.assert_array_equal(made.slide, clip.slide)
-    np.testing.assert_allclose(made.speed, gait.STRIDE / gait.PERIOD, rtol=0.02)
+    assert frames.weight.shape == (clip.frame_count, 2)
+    np.testing.assert_allclose(frames.dt, 1 / FPS)
+    np.testing.assert_array_equal(frames.slide, clip.slide)
+    np.testing.assert_allclose(frames.speed, gait.STRIDE / gait.PERIOD, rtol=0.02)
 
 
-def test_a_single_frame_stands_and_does_not_slide(clip):
-    made = clip_frames.frames_from_clip(dataclasses.replace(clip, slide=None).select(slice(0, 1)))
-    np.testing.assert_array_equal(made.speed, [0.0])
-    np.testing.assert_array_equal(made.slide, [0.0])
+def test_a_single_frame_has_no_speed_and_no_slide(clip):
+    frames = clip_frames.frames_from_clip(dataclasses.replace(clip, slide=None).select(slice(0, 1)))
+    np.testing.assert_array_equal(frames.speed, [0.0])
+    np.testing.assert_array_equal(frames.slide, [0.0])
 
 
-def test_the_solved_clip_has_the_solved_legs_and_carries_the_rest_with_the_body(clip, result):
+def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(clip, result):
     solved = clip_frames.clip_from_result(clip, result)
     world = clip.world_from_model()
     for leg, joints in enumerate(clip.rig.joints):
-        parts = (result.pose.hip, result.pose.knee, result.pose.ankle, result.pose.toe)
-        for joint, part in zip(joints, parts, strict=True):
+        joints_ms = (result.pose.hip, result.pose.knee, result.pose.ankle, result.pose.toe)
+        for joint, part in zip(joints, joints_ms, strict=True):
             for frame in (0, 40, 119):
-                turn = Rotation.from_quat(np.array(world.rot[frame]), scalar_first=True)
-                place = turn.apply(np.array(part.pos[frame, leg])) + world.pos[frame]
-                np.testing.assert_allclose(solved.positions_ws[frame, joint], place, atol=1e-9)
+                rot = Rotation.from_quat(np.array(world.rot[frame]), scalar_first=True)
+                position = rot.apply(np.array(part.pos[frame, leg])) + world.pos[frame]
+                np.testing.assert_allclose(solved.positions_ws[frame, joint], position, atol=1e-9)
     before = clip.positions_ws[:, 1] - clip.positions_ws[:, 0]
     after = solved.positions_ws[:, 1] - solved.positions_ws[:, 0]
     lengths = np.linalg.norm(before, axis=-1), np.linalg.norm(after, axis=-1)
@@ -75,9 +75,9 @@ def test_the_solved_clip_has_the_solved_legs_and_carries_the_rest_with_the_body(
     assert solved.rig.joints == clip.rig.joints
 
 
-def test_joints_above_the_pelvis_and_below_a_foot_keep_their_places_on_their_parents(clip, result):
-    turned = Rotation.from_quat(clip.rotations_ws[:, 4], scalar_first=True)
-    tip = clip.positions_ws[:, 4] + turned.apply([0.01, -0.02, 0.05])
+def test_joints_above_the_pelvis_and_below_a_foot_stay_rigid_on_their_parents(clip, result):
+    rot = Rotation.from_quat(clip.rotations_ws[:, 4], scalar_first=True)
+    tip = clip.positions_ws[:, 4] + rot.apply([0.01, -0.02, 0.05])
     head = clip.positions_ws[:, 0] + [0.0, 0.6, 0.0]
     longer = dataclasses.replace(
         clip,
@@ -93,51 +93,55 @@ def test_joints_above_the_pelvis_and_below_a_foot_keep_their_places_on_their_par
     )  # fmt: skip
     solved = clip_frames.clip_from_result(longer, result)
     for joint, parent, offset in ((9, 4, [0.01, -0.02, 0.05]), (10, 0, [0.0, 0.6, 0.0])):
-        holder = Rotation.from_quat(solved.rotations_ws[:, parent], scalar_first=True)
-        hung = solved.positions_ws[:, parent] + holder.apply(offset)
-        np.testing.assert_allclose(solved.positions_ws[:, joint], hung, rtol=0, atol=1e-9)
-        same = np.abs(np.sum(solved.rotations_ws[:, joint] * solved.rotations_ws[:, parent], -1))
-        np.testing.assert_allclose(same, 1.0, atol=1e-12)
+        parent_rot = Rotation.from_quat(solved.rotations_ws[:, parent], scalar_first=True)
+        attached = solved.positions_ws[:, parent] + parent_rot.apply(offset)
+        np.testing.assert_allclose(solved.positions_ws[:, joint], attached, rtol=0, atol=1e-9)
+        cosine = np.abs(np.sum(solved.rotations_ws[:, joint] * solved.rotations_ws[:, parent], -1))
+        np.testing.assert_allclose(cosine, 1.0, atol=1e-12)
 
 
-def test_on_flat_ground_the_solved_clip_is_the_clip_away_from_its_limits(clip):
+def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):
     quiet = {"lock.enabled": jnp.array(False), "leg.max_knee_angle": 3.1415, "leg.soften": 1.0}
     ik = parameter_tree.replace(jaxik.presets.record(), quiet)
     result = jaxik.run(ik, clip.rig, terrain.plane(), clip_frames.frames_from_clip(clip))
     solved = clip_frames.clip_from_result(clip, result)
     np.testing.assert_allclose(solved.positions_ws, clip.positions_ws, rtol=0, atol=1e-4)
-    same = np.abs(np.sum(solved.rotations_ws * clip.rotations_ws, axis=-1))
-    assert same.min() > np.cos(0.5e-3)
+    cosine = np.abs(np.sum(solved.rotations_ws * clip.rotations_ws, axis=-1))
+    assert cosine.min() > np.cos(0.5e-3)
 
 
-def test_strides_lead_from_stance_to_stance(clip):
-    made, stance = clip_frames.frames_from_clip(clip).stride, clip.stance_labels()
-    np.testing.assert_array_equal(made.standing, stance)
-    np.testing.assert_array_equal(made.known, 1.0)
+def test_strides_go_from_stance_to_stance(clip):
+    stride, stance = clip_frames.frames_from_clip(clip).stride, clip.stance_labels()
+    np.testing.assert_array_equal(stride.standing, stance)
+    np.testing.assert_array_equal(stride.known, 1.0)
     balls = clip.joints_ws(3)
     for leg in range(2):
-        spells = contacts.runs(stance[:, leg])
-        middles = [np.median(balls[a : b + 1, leg], axis=0) for a, b in spells]
-        for (first, last), (then, _), here, there in zip(
-            spells, spells[1:], middles, middles[1:], strict=False
+        stances = contacts.runs(stance[:, leg])
+        middles = [np.median(balls[a : b + 1, leg], axis=0) for a, b in stances]
+        for (first, last), (next_first, _), position, next_position in zip(
+            stances, stances[1:], middles, middles[1:], strict=False
         ):
-            np.testing.assert_array_equal(made.last_ws[first:then, leg], [here] * (then - first))
-            np.testing.assert_array_equal(made.next_ws[first:then, leg], [there] * (then - first))
-            np.testing.assert_array_equal(made.fraction[first : last + 1, leg], 0.0)
+            np.testing.assert_array_equal(
+                stride.last_ws[first:next_first, leg], [position] * (next_first - first)
+            )
+            np.testing.assert_array_equal(
+                stride.next_ws[first:next_first, leg], [next_position] * (next_first - first)
+            )
+            np.testing.assert_array_equal(stride.fraction[first : last + 1, leg], 0.0)
             np.testing.assert_allclose(
-                np.diff(made.fraction[last:then, leg]), 1 / (then - last), rtol=1e-9
+                np.diff(stride.fraction[last:next_first, leg]), 1 / (next_first - last), rtol=1e-9
             )
 
 
-def test_a_foot_that_never_stands_knows_no_stride(clip):
+def test_a_foot_that_never_stands_has_an_unknown_stride(clip):
     stance = clip.stance_labels().copy()
     stance[:, 1] = False
-    made = clip_frames.frames_from_clip(dataclasses.replace(clip, stance=stance)).stride
-    np.testing.assert_array_equal(made.known, np.broadcast_to([1.0, 0.0], stance.shape))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(made))
+    stride = clip_frames.frames_from_clip(dataclasses.replace(clip, stance=stance)).stride
+    np.testing.assert_array_equal(stride.known, np.broadcast_to([1.0, 0.0], stance.shape))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(stride))
 
 
-def test_toes_are_as_fast_as_they_move(clip):
-    made = clip_frames.frames_from_clip(clip)
+def test_toe_speed_is_that_of_the_toes(clip):
+    frames = clip_frames.frames_from_clip(clip)
     steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
-    np.testing.assert_allclose(made.toe_speed[1:], steps, rtol=1e-9)
+    np.testing.assert_allclose(frames.toe_speed[1:], steps, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""ASF and AMC: order, axes, limits over several lines, and what is refused."""
+"""ASF and AMC files: rotation order, axes, limits over several lines, and malformed files."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ def pair(tmp_path):
     return write
 
 
-def test_a_bone_turns_by_c_m_c_inverse_at_its_start(pair):
+def test_a_bone_rotates_by_c_m_c_inverse_about_its_start(pair):
     recording = read_asfamc(*pair())
     assert recording.names == ("root", "lfemur", "ltibia", "lfoot", "lfoot_end")
     assert recording.parents == (-1, 0, 1, 2, 3)
@@ -85,11 +85,11 @@ def test_a_bone_turns_by_c_m_c_inverse_at_its_start(pair):
     x, y, z = (Rotation.from_euler(axis, angle, degrees=True) for axis, angle in
                (("x", 5), ("y", 6), ("z", 7)))  # fmt: skip
     rest = Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
-    wanted = rest * (z * y * x) * rest.inv()
-    assert abs(recording.rotations_ls[0, 1] @ wanted.as_quat(scalar_first=True)) > 1 - 1e-14
+    expected = rest * (z * y * x) * rest.inv()
+    assert abs(recording.rotations_ls[0, 1] @ expected.as_quat(scalar_first=True)) > 1 - 1e-14
     knee = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.0])
-    wanted = Rotation.from_rotvec(np.radians(40) * knee)
-    assert abs(recording.rotations_ls[0, 2] @ wanted.as_quat(scalar_first=True)) > 1 - 1e-14
+    expected = Rotation.from_rotvec(np.radians(40) * knee)
+    assert abs(recording.rotations_ls[0, 2] @ expected.as_quat(scalar_first=True)) > 1 - 1e-14
     assert np.allclose(recording.rotations_ls[:, 3], [1, 0, 0, 0])  # no degrees of freedom
     assert recording.metres_per_unit == pytest.approx(0.0254 / 0.45)
 
@@ -105,20 +105,20 @@ def test_crlf_radians_and_a_missing_last_newline_change_nothing(pair):
     assert np.allclose(plain.rotations_ls, read_asfamc(*pair(amc=radians)).rotations_ls)
 
 
-def test_the_skeleton_is_found_beside_the_motion_or_asked_for(pair, tmp_path):
+def test_the_skeleton_is_found_beside_the_motion_unless_it_is_named(pair, tmp_path):
     amc, asf = pair()
     one_leg = {"pelvis": "root", "hip_l": "lfemur", "knee_l": "ltibia", "ankle_l": "lfoot"}
     assert load_clip(amc, joints=one_leg).rig.names == ("left",)
-    assert load_clip(amc, asf=asf).measured_rig is None  # one leg is no pair
+    assert load_clip(amc, asf=asf).measured_rig is None  # one leg is not a pair
     asf.rename(tmp_path / "b.asf")
-    assert load_clip(amc).frame_count == 2  # the only one there
+    assert load_clip(amc).frame_count == 2  # the only skeleton there
     (tmp_path / "c.asf").write_text(ASF)
     with pytest.raises(ValueError, match=r"wanted a_01\.asf or a\.asf .*b\.asf.*c\.asf"):
         load_clip(amc)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("direction 0 -1 0", "direction 0 -1", r"a\.asf:15: wanted 3 finite numbers of direction"),
         ("length 7", "length long", r"a\.asf:16: wanted 1 numbers of length"),
@@ -131,14 +131,14 @@ def test_the_skeleton_is_found_beside_the_motion_or_asked_for(pair, tmp_path):
         ("  begin\n    id 1", "    id 1", r"a\.asf:12: wanted begin"),
     ],
 )  # fmt: skip
-def test_malformed_skeletons_are_answered_with_file_and_line(pair, old, new, said):
+def test_errors_in_a_skeleton_name_file_and_line(pair, old, new, message):
     assert old in ASF
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_asfamc(*pair(ASF.replace(old, new, 1)))
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("lfemur 5 6 7", "lfemur 5 6", r"a_01\.amc:6: wanted 3 finite numbers of lfemur"),
         ("lfemur 5 6 7", "lfemur 5 6 7x", r"a_01\.amc:6: wanted 3 numbers of lfemur"),
@@ -150,9 +150,9 @@ def test_malformed_skeletons_are_answered_with_file_and_line(pair, old, new, sai
         ("1\nroot", "root", r"a_01\.amc:4: wanted a frame number"),
     ],
 )  # fmt: skip
-def test_malformed_motions_are_answered_with_file_and_line(pair, old, new, said):
+def test_errors_in_a_motion_name_file_and_line(pair, old, new, message):
     assert old in AMC
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_asfamc(*pair(amc=AMC.replace(old, new, 1)))
 
 

@@ -1,4 +1,4 @@
-"""BVH as it is found in the wild."""
+"""BVH files with the variations found in circulation, and malformed ones."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,9 @@ from support.sample_clips import BVH
 
 
 @pytest.fixture
-def written(tmp_path):
+def write_bvh(tmp_path):
+    """A function that writes a BVH file and returns its path."""
+
     def write(text: str | bytes):
         path = tmp_path / "clip.bvh"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -19,9 +21,9 @@ def written(tmp_path):
     return write
 
 
-def same(one, other) -> bool:
+def same(first, second) -> bool:
     return all(
-        np.array_equal(getattr(one, name), getattr(other, name))
+        np.array_equal(getattr(first, name), getattr(second, name))
         for name in ("names", "parents", "offsets_ls", "positions_ls", "rotations_ls")
     )
 
@@ -49,47 +51,49 @@ def header_crlf(text: str) -> str:
         lambda text: text.replace("rotation", "Rotation").replace("MOTION", "Motion"),
     ],
 )
-def test_spelling_changes_nothing(written, change):
-    plain = read_bvh(written(BVH))
+def test_variations_of_the_syntax_change_nothing(write_bvh, change):
+    plain = read_bvh(write_bvh(BVH))
     assert change(BVH) != BVH
-    assert same(plain, read_bvh(written(change(BVH))))
+    assert same(plain, read_bvh(write_bvh(change(BVH))))
 
 
-def test_tiny_numbers_are_numbers(written):
-    recording = read_bvh(written(BVH.replace("0 87 0 0 0 0", "1e-14 87 -0 0 -1E-14 0")))
+def test_numbers_may_have_exponents(write_bvh):
+    recording = read_bvh(write_bvh(BVH.replace("0 87 0 0 0 0", "1e-14 87 -0 0 -1E-14 0")))
     assert recording.positions_ls[0, 0, 0] == 1e-14
 
 
 @pytest.mark.parametrize(
-    ("written_time", "rate"),
+    ("frame_time", "rate"),
     [(".0083333", 120), ("0.008333", 120), ("0.0333333", 30), ("0.0417083750417", 24),
      ("0.04", 25), ("0.01666667", 60), ("0.1", 10)],
 )  # fmt: skip
-def test_the_rate_snaps_to_the_usual_one_and_the_raw_one_is_kept(written, written_time, rate):
-    clip = load_clip(written(BVH.replace("0.0083333", written_time)))
+def test_the_rate_is_rounded_to_a_common_one_and_the_frame_time_is_kept(
+    write_bvh, frame_time, rate
+):
+    clip = load_clip(write_bvh(BVH.replace("0.0083333", frame_time)))
     assert clip.fps == pytest.approx(rate)
-    assert clip.raw_frame_time == float(written_time)
-    assert load_clip(written(BVH), fps=48.0).fps == 48.0
+    assert clip.raw_frame_time == float(frame_time)
+    assert load_clip(write_bvh(BVH), fps=48.0).fps == 48.0
     assert any("not a usual" in remark for remark in clip.remarks) == (rate == 10)
 
 
-def test_rotation_order_is_each_joints_own(written):
-    recording = read_bvh(written(BVH.replace("0 -20 0 40 0 0", "1 2 3 4 5 6")))
+def test_each_joint_has_its_own_rotation_order(write_bvh):
+    recording = read_bvh(write_bvh(BVH.replace("0 -20 0 40 0 0", "1 2 3 4 5 6")))
     hip, knee = (recording.names.index(name) for name in ("LeftUpLeg", "LeftLeg"))
     for joint, order, angles in ((hip, "ZXY", [1, 2, 3]), (knee, "XYZ", [4, 5, 6])):
-        wanted = Rotation.from_euler(order, angles, degrees=True).as_quat(scalar_first=True)
-        assert abs(recording.rotations_ls[0, joint] @ wanted) == pytest.approx(1, abs=1e-14)
+        expected = Rotation.from_euler(order, angles, degrees=True).as_quat(scalar_first=True)
+        assert abs(recording.rotations_ls[0, joint] @ expected) == pytest.approx(1, abs=1e-14)
 
 
-def test_rotations_may_be_listed_before_positions(written):
+def test_rotations_may_be_listed_before_positions(write_bvh):
     channels = "Xposition Yposition Zposition Zrotation Xrotation Yrotation"
     swapped = "Zrotation Xrotation Yrotation Xposition Yposition Zposition"
     text = BVH.replace("0 87 2 0 0 9 ", "0 0 9 0 87 2 ").replace("0 87 1 0 0 5 ", "0 0 5 0 87 1 ")
     text = text.replace("0 87 0 0 0 0 ", "0 0 0 0 87 0 ").replace(channels, swapped)
-    assert same(read_bvh(written(BVH)), read_bvh(written(text)))
+    assert same(read_bvh(write_bvh(BVH)), read_bvh(write_bvh(text)))
 
 
-def test_positions_replace_the_offset_on_any_joint(written):
+def test_positions_replace_the_offset_on_any_joint(write_bvh):
     """Six channels everywhere, with the travel on a child of the root."""
     text = """HIERARCHY
 ROOT joint_Root
@@ -107,20 +111,20 @@ MOTION
 Frames: 2
 Frame Time: 0.0333333
 """
-    legs, row = "", ""
-    for side, out in (("L", 10), ("R", -10)):
+    legs, frame = "", ""
+    for side, left in (("L", 10), ("R", -10)):
         names = (f"UpperLeg_{side}", f"LowerLeg_{side}", f"Foot_{side}", f"Toes_{side}")
         for name, (x, y, z) in zip(
-            names, ((out, 0, 0), (0, -42, 0), (0, -40, 0), (0, -5, 12)), strict=True
+            names, ((left, 0, 0), (0, -42, 0), (0, -40, 0), (0, -5, 12)), strict=True
         ):
             channels = "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation"
             legs += f"JOINT {name}\n{{\nOFFSET 99 99 99\n{channels}\n"
-            row += f" {x} {y} {z} 0 0 0"
+            frame += f" {x} {y} {z} 0 0 0"
         legs += "End Site\n{\nOFFSET 0 0 0\n}\n" + "}\n" * 4
     text = text.replace("LEGS\n", legs)
     for z in (0, 50):
-        text += f"0 0 0 0 0 0  0 90 {z} 0 0 0{row}\n"
-    clip = load_clip(written(text))
+        text += f"0 0 0 0 0 0  0 90 {z} 0 0 0{frame}\n"
+    clip = load_clip(write_bvh(text))
     assert clip.dialect == "Bandai" and clip.scale == 0.01
     pelvis = clip.positions_ws[:, clip.rig.pelvis]
     assert np.allclose(pelvis, [[0, 0.9, 0], [0, 0.9, 0.5]])
@@ -130,23 +134,23 @@ Frame Time: 0.0333333
     assert np.array_equal(clip.positions_ws[:, ends], clip.positions_ws[:, toes])
 
 
-def test_only_the_listed_components_of_a_place_are_replaced(written):
+def test_only_the_listed_components_of_a_position_are_replaced(write_bvh):
     text = BVH.replace("CHANNELS 6 Xposition Yposition Zposition", "CHANNELS 4 Zposition")
     for z in range(3):
         text = text.replace(f"0 87 {z} ", f"{z} ")
-    assert np.allclose(read_bvh(written(text)).positions_ls[:, 0], [[0, 90, z] for z in range(3)])
+    assert np.allclose(read_bvh(write_bvh(text)).positions_ls[:, 0], [[0, 90, z] for z in range(3)])
 
 
-def test_z_up_files_are_turned_upright(written):
-    def stand(text: str) -> str:  # (x, y, z) -> (x, -z, y): our y up becomes z up
-        out = []
+def test_z_up_files_are_rotated_to_y_up(write_bvh):
+    def with_z_up(text: str) -> str:  # (x, y, z) becomes (x, -z, y)
+        lines = []
         for line in text.split("\n"):
             words = line.split()
             if words[:1] == ["OFFSET"]:
                 x, y, z = map(float, words[1:])
                 line = f"OFFSET {x} {-z} {y}"
-            out.append(line)
-        text = "\n".join(out).replace("Xposition Yposition Zposition", "Xposition Zposition YPOS")
+            lines.append(line)
+        text = "\n".join(lines).replace("Xposition Yposition Zposition", "Xposition Zposition YPOS")
         swaps = (("Zrotation", "YROT"), ("Yrotation", "Zrotation"), ("YROT", "Yrotation"))
         for old, new in swaps:
             text = text.replace(old, new)
@@ -154,26 +158,28 @@ def test_z_up_files_are_turned_upright(written):
 
     motion = "0 87 0 0 0 0 0 -20 0 40 0 0 0 0 0 0 10 0 5 0 0 0 0 0"
     still = f"{BVH.split('MOTION')[0]}MOTION\nFrames: 1\nFrame Time: 0.01\n{motion}"
-    upright, lying = load_clip(written(still)), load_clip(written(stand(still)))
+    upright, lying = load_clip(write_bvh(still)), load_clip(write_bvh(with_z_up(still)))
     assert (upright.up_axis, lying.up_axis) == ("y", "z")
     assert np.allclose(lying.positions_ws, upright.positions_ws, atol=1e-12)
-    assert np.allclose(load_clip(written(stand(still)), up="y").positions_ws[0, 0], [0, 0, 0.87])
+    assert np.allclose(
+        load_clip(write_bvh(with_z_up(still)), up="y").positions_ws[0, 0], [0, 0, 0.87]
+    )
 
 
-def test_zero_length_feet_get_axes_from_the_pelvis(written):
-    clip = load_clip(written(BVH.replace("OFFSET 0 -5 12", "OFFSET 0 0 0")))
+def test_feet_of_zero_length_point_where_the_pelvis_does(write_bvh):
+    clip = load_clip(write_bvh(BVH.replace("OFFSET 0 -5 12", "OFFSET 0 0 0")))
     assert np.allclose(clip.rig.foot, 0.0)
     assert np.isfinite(np.asarray(clip.rig.ankle_from_foot)).all()
 
 
-def test_more_rows_than_declared_are_left_out_with_a_remark(written):
-    clip = load_clip(written(BVH.replace("Frames: 3", "Frames: 2")))
+def test_frames_beyond_the_declared_count_are_left_out_with_a_remark(write_bvh):
+    clip = load_clip(write_bvh(BVH.replace("Frames: 3", "Frames: 2")))
     assert clip.frame_count == 2
     assert any("2 frames are declared and 3 found" in remark for remark in clip.remarks)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "said"),
+    ("old", "new", "line", "message"),
     [
         ("HIERARCHY", "HIERARCHIE", 1, "wanted HIERARCHY"),
         ("Frames: 3", "Frames: 4", 51, "frame 4 of 4 declared; got 'the end of the file'"),
@@ -192,39 +198,39 @@ def test_more_rows_than_declared_are_left_out_with_a_remark(written):
         ("}\nMOTION", "MOTION", 44, "in Hips"),
     ],
 )  # fmt: skip
-def test_malformed_text_is_answered_with_file_and_line(written, old, new, line, said):
+def test_errors_name_file_and_line(write_bvh, old, new, line, message):
     assert old in BVH
-    with pytest.raises(ValueError, match=rf"clip\.bvh:{line}: .*{said}"):
-        load_clip(written(BVH.replace(old, new, 1)))
+    with pytest.raises(ValueError, match=rf"clip\.bvh:{line}: .*{message}"):
+        load_clip(write_bvh(BVH.replace(old, new, 1)))
 
 
-def test_a_file_that_is_no_motion_is_refused(written, tmp_path):
+def test_files_that_are_not_motion_are_refused(write_bvh, tmp_path):
     with pytest.raises(ValueError, match=r"clip\.bvh:1: wanted HIERARCHY"):
-        load_clip(written(bytes(range(256))))
+        load_clip(write_bvh(bytes(range(256))))
     with pytest.raises(ValueError, match="wanted HIERARCHY"):
-        load_clip(written(""))
+        load_clip(write_bvh(""))
     with pytest.raises(ValueError, match="no such file"):
         load_clip(tmp_path / "none.bvh")
     with pytest.raises(ValueError, match="wanted a .bvh, .amc or .npz file"):
         load_clip(tmp_path / "clip.fbx")
 
 
-def test_bodies_without_size_or_stance_are_remarked(written):
+def test_bodies_without_size_or_upright_pelvis_get_a_remark(write_bvh):
     head = "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n}\n"
-    clip = load_clip(written(head + "MOTION\nFrames: 1\nFrame Time: 0.01\n0 0 0\n"))
+    clip = load_clip(write_bvh(head + "MOTION\nFrames: 1\nFrame Time: 0.01\n0 0 0\n"))
     assert clip.scale == 1.0 and any("no bone has a length" in note for note in clip.remarks)
     lying = BVH  # along x
     for row, z in (("0 87 0 0 0 0", 0), ("0 87 1 0 0 5", 1), ("0 87 2 0 0 9", 2)):
         lying = lying.replace(row, f"0 87 {z} 90 0 0")
-    clip = load_clip(written(lying))
+    clip = load_clip(write_bvh(lying))
     assert any("not above the feet" in remark for remark in clip.remarks)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("arguments", "message"),
     [({"scale": -1.0}, "scale is -1"), ({"fps": 0.0}, "fps is 0"), ({"up": "x"}, "wanted 'y'"),
      ({"variant": "base"}, "variant 'base'")],
 )  # fmt: skip
-def test_wrong_arguments_are_refused(written, wrong, said):
-    with pytest.raises(ValueError, match=said):
-        load_clip(written(BVH), **wrong)
+def test_arguments_out_of_range_are_refused(write_bvh, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        load_clip(write_bvh(BVH), **arguments)

@@ -1,4 +1,4 @@
-"""Edits of clips and what inspect says of them."""
+"""Edits of clips, and their summaries."""
 
 import json
 from dataclasses import replace
@@ -11,12 +11,12 @@ from fitting.datasets.clips.contacts import detect_stances
 from fitting.datasets.clips.joint_roles import find_roles
 from fitting.datasets.clips.rigs import measure_rig
 from fitting.datasets.clips.summary import as_json, as_text, describe
-from support.sample_clips import BVH, walker
+from support.sample_clips import BVH, stair_walk
 
 
 @pytest.fixture(scope="module")
 def walk():
-    return walker()
+    return stair_walk()
 
 
 def bones(clip) -> np.ndarray:
@@ -25,11 +25,11 @@ def bones(clip) -> np.ndarray:
     return np.linalg.norm(clip.positions_ws[:, joints] - clip.positions_ws[:, parents], axis=-1)
 
 
-def test_the_same_rate_gives_the_same_clip(walk):
+def test_resampling_to_the_same_rate_returns_the_same_clip(walk):
     assert edit.resample(walk, walk.fps) is walk
 
 
-def test_half_the_rate_takes_every_second_frame(walk):
+def test_half_the_rate_keeps_every_second_frame(walk):
     half = edit.resample(walk, 30.0)
     assert half.fps == 30.0 and half.frame_count == (walk.frame_count + 1) // 2
     assert np.allclose(half.positions_ws, walk.positions_ws[::2], atol=1e-12)
@@ -37,24 +37,24 @@ def test_half_the_rate_takes_every_second_frame(walk):
 
 
 @pytest.mark.parametrize("fps", [120.0, 50.0, 24.0, 144.0])
-def test_resampling_keeps_time_and_bones(walk, fps):
+def test_resampling_keeps_duration_and_bone_lengths(walk, fps):
     other = edit.resample(walk, fps)
     assert 0 <= walk.seconds - other.seconds < 1 / fps
     assert np.allclose(bones(other)[:, [1, 2, 5, 6]], bones(walk)[0, [1, 2, 5, 6]], atol=1e-12)
-    at = np.arange(other.frame_count) * walk.fps / fps
+    time = np.arange(other.frame_count) * walk.fps / fps
     for axis in range(3):
-        wanted = np.interp(at, np.arange(walk.frame_count), walk.positions_ws[:, 4, axis])
-        assert np.abs(other.positions_ws[:, 4, axis] - wanted).max() < 2e-3
+        expected = np.interp(time, np.arange(walk.frame_count), walk.positions_ws[:, 4, axis])
+        assert np.abs(other.positions_ws[:, 4, axis] - expected).max() < 2e-3
 
 
-def test_frames_made_from_a_masked_one_are_masked(walk):
+def test_frames_interpolated_from_a_masked_one_are_masked(walk):
     mask = np.ones(walk.frame_count, bool)
     mask[7] = False
     fine = edit.resample(replace(walk, mask=mask), 120.0)
     assert np.flatnonzero(fine.mask == 0).tolist() == [13, 14, 15]
 
 
-def test_rates_that_are_none_are_refused(walk):
+def test_impossible_rates_are_refused(walk):
     with pytest.raises(ValueError, match="fps is 0"):
         edit.resample(walk, 0.0)
 
@@ -71,33 +71,33 @@ def test_trim_keeps_both_ends(walk):
 
 
 def with_t_pose(tmp_path, ramp: int):
-    """The small BVH, 40 frames of it, after a T-pose and `ramp` frames of the way out of it."""
+    """The small BVH with 40 frames of motion, after a T-pose and a ramp of `ramp` frames."""
     head = BVH.split("Frames:")[0]
     first = np.zeros(24)
     first[1] = 87
-    rows = [first]
+    frames = [first]
     walk = [
         first + np.eye(24)[7] * (5 * np.sin(f / 9) - 30) + np.eye(24)[9] * (60 + 5 * np.cos(f / 9))
         for f in range(40)
     ]
-    rows += [first + (walk[0] - first) * (step + 1) / (ramp + 1) for step in range(ramp)]
-    rows += [*walk, walk[-1], walk[-1]]
-    text = "\n".join(" ".join(map(str, row)) for row in rows)
+    frames += [first + (walk[0] - first) * (step + 1) / (ramp + 1) for step in range(ramp)]
+    frames += [*walk, walk[-1], walk[-1]]
+    text = "\n".join(" ".join(map(str, frame)) for frame in frames)
     path = tmp_path / "t.bvh"
-    path.write_text(f"{head}Frames: {len(rows)}\nFrame Time: 0.0083333\n{text}")
+    path.write_text(f"{head}Frames: {len(frames)}\nFrame Time: 0.0083333\n{text}")
     return load_clip(path)
 
 
 @pytest.mark.parametrize("ramp", [0, 4])
-def test_a_t_pose_its_ramp_and_repeated_last_frames_go(tmp_path, ramp):
+def test_a_t_pose_its_ramp_and_repeated_last_frames_are_dropped(tmp_path, ramp):
     clip = with_t_pose(tmp_path, ramp)
     assert edit.motion_span(clip) == (1 + ramp, ramp + 40)
     moving = edit.drop_t_pose(clip)
     assert moving.frame_count == 40
     assert edit.drop_t_pose(moving) is moving
-    told = describe(clip)
-    assert f"starts with a T-pose; the motion begins at frame {1 + ramp}" in told["warnings"]
-    assert "the last frame is repeated 2 times" in told["warnings"]
+    summary = describe(clip)
+    assert f"starts with a T-pose; the motion begins at frame {1 + ramp}" in summary["warnings"]
+    assert "the last frame is repeated 2 times" in summary["warnings"]
 
 
 def test_a_clip_without_t_pose_or_motion_is_left_alone(walk):
@@ -115,7 +115,7 @@ def test_a_popped_marker_is_masked(walk):
     assert not edit.pops(walk).any()
     again = edit.mask_pops(replace(walk, mask=popped.mask))
     assert again.mask is not None and (again.mask == popped.mask).all()
-    assert any("markers pop in 3 frames" in told for told in describe(popped)["warnings"])
+    assert any("markers pop in 3 frames" in warning for warning in describe(popped)["warnings"])
 
 
 def test_a_clip_mirrored_twice_is_the_clip(walk):
@@ -148,7 +148,7 @@ def test_a_mirrored_clip_measures_as_its_mirrored_rig(mocap):
     assert gap.min() > 1 - 1e-9
 
 
-def test_a_one_sided_body_has_no_mirror(walk):
+def test_an_asymmetric_skeleton_cannot_be_mirrored(walk):
     names = tuple(name.replace("right_knee", "peg") for name in walk.joint_names)
     parents = list(walk.parents)
     parents[names.index("peg")] = 0
@@ -169,18 +169,19 @@ def test_marker_pops_and_t_poses_of_the_reference_files(mocap):
         assert edit.motion_span(load_clip(mocap / "clips" / file)) == span
 
 
-def test_a_clip_is_described_as_data_and_text(walk):
-    told = describe(walk)
-    assert json.loads(as_json(told)) == told
-    assert told["joint_map"]["knee_left"] == "left_knee"
-    assert told["legs"]["left"]["contacts"] == 3 and told["legs"]["left"]["contacts_from"] == "file"
-    assert told["legs"]["right"]["thigh"] == pytest.approx(0.5)
-    text = as_text(told)
-    for part in ("walker: 162 frames", "60 Hz", "y up", "hip left_hip", "stands 3 times"):
+def test_a_clip_is_summarised_as_data_and_text(walk):
+    summary = describe(walk)
+    assert json.loads(as_json(summary)) == summary
+    assert summary["joint_map"]["knee_left"] == "left_knee"
+    legs = summary["legs"]
+    assert (legs["left"]["contacts"], legs["left"]["contacts_from"]) == (3, "file")
+    assert legs["right"]["thigh"] == pytest.approx(0.5)
+    text = as_text(summary)
+    for part in ("stair walk: 162 frames", "60 Hz", "y up", "hip left_hip", "stands 3 times"):
         assert part in text
 
 
-def test_a_clip_without_legs_is_described_too(walk):
+def test_a_clip_without_legs_is_summarised_too(walk):
     text = as_text(describe(replace(walk, measured_rig=None, remarks=("no legs recognised",))))
     assert "no legs recognised" in text and "hip" in text
     assert describe(replace(walk, measured_rig=None))["legs"] == {}

@@ -1,4 +1,4 @@
-"""Every reference file against an independent reading of it."""
+"""All reference files against an independent reading of them, `facts.json`."""
 
 import hashlib
 import json
@@ -34,30 +34,30 @@ def case(request, mocap, facts) -> tuple[Clip, dict]:
     return load_clip(path), fact
 
 
-def test_no_reference_file_is_left_out(facts):
+def test_all_reference_files_are_tested(facts):
     assert sorted(facts) == sorted(FILES)
 
 
-def test_positions_and_rotations_are_those_of_the_reference(case):
+def test_positions_and_rotations_agree_with_the_reference(case):
     clip, fact = case
     axes = Y_UP_FROM_Z_UP if fact["up_axis"] == "z" else np.eye(3)
     worst = 0.0
     for key, suffix in (("positions", ""), ("bone_start_positions", ""),
                         ("bone_end_positions", "_end")):  # fmt: skip
         for frame, joints in fact.get(key, {}).items():
-            for name, wanted in joints.items():
+            for name, expected in joints.items():
                 if name + suffix in clip.joint_names:
                     joint = clip.joint_names.index(name + suffix)
-                    gap = clip.positions_ws[int(frame), joint] - clip.scale * axes @ wanted
-                    worst = max(worst, float(np.abs(gap).max()))
+                    error = clip.positions_ws[int(frame), joint] - clip.scale * axes @ expected
+                    worst = max(worst, float(np.abs(error).max()))
                 else:
                     assert suffix, f"{name} is missing"
     assert worst <= TOLERANCE * clip.body_height
     for frame, joints in fact["world_rotations"].items():
-        for name, wanted in joints.items():
+        for name, expected in joints.items():
             rot = clip.rotations_ws[int(frame), clip.joint_names.index(name)]
             matrix = Rotation.from_quat(rot, scalar_first=True).as_matrix()
-            assert np.abs(matrix - axes @ np.array(wanted) @ axes.T).max() < TOLERANCE
+            assert np.abs(matrix - axes @ np.array(expected) @ axes.T).max() < TOLERANCE
 
 
 def test_frames_rate_scale_and_up_axis_are_recognised(case):
@@ -80,13 +80,13 @@ def test_legs_are_recognised_and_measured(case):
     assert clip.joint_names[rig.pelvis] == fact["joint_map"]["pelvis"]
     for joints, letter in zip(rig.joints, "lr", strict=True):
         for joint, part in zip(joints, ("hip", "knee", "ankle", "ball"), strict=True):
-            wanted = fact["joint_map"][f"{part}_{letter}"]
-            if wanted is None:  # no toe joint: the foot's end site
-                wanted = fact["joint_map"][f"tip_{letter}"].replace("/End Site", "_end")
-            assert clip.joint_names[joint] == wanted
+            expected = fact["joint_map"][f"{part}_{letter}"]
+            if expected is None:  # no toe joint: the foot's end site
+                expected = fact["joint_map"][f"tip_{letter}"].replace("/End Site", "_end")
+            assert clip.joint_names[joint] == expected
     for name in ("thigh", "shin", "foot") if "bone_lengths_m" in fact else ():
-        wanted = [fact["bone_lengths_m"][f"{name}_{letter}"] for letter in "lr"]
-        assert np.allclose(getattr(rig, name), wanted, atol=1e-6)
+        expected = [fact["bone_lengths_m"][f"{name}_{letter}"] for letter in "lr"]
+        assert np.allclose(getattr(rig, name), expected, atol=1e-6)
 
 
 def test_knees_open_about_their_measured_axis(case):
@@ -95,25 +95,25 @@ def test_knees_open_about_their_measured_axis(case):
         return
     rig = clip.rig
     for leg, (hip, knee, ankle, _) in enumerate(rig.joints):
-        turn = Rotation.from_quat(clip.rotations_ws[:, knee], scalar_first=True)
-        axis_ws = turn.apply(np.array(rig.knee_axis_ls[leg]))
+        rot = Rotation.from_quat(clip.rotations_ws[:, knee], scalar_first=True)
+        axis_ws = rot.apply(np.array(rig.knee_axis_ls[leg]))
         p = clip.positions_ws
         flexing = np.cross(p[:, knee] - p[:, hip], p[:, ankle] - p[:, knee])
         bent = np.linalg.norm(flexing, axis=-1) > 0.05 * np.median(np.linalg.norm(flexing, axis=-1))
         assert np.mean(np.sum(flexing[bent] * axis_ws[bent], axis=-1) < 0) > 0.98
-    if fact["format"] == "ASF/AMC":  # hinges about x of a frame turned by 20 degrees about z
-        turned = [[-np.cos(np.radians(20)), sign * np.sin(np.radians(20)), 0] for sign in (-1, 1)]
-        assert np.allclose(rig.knee_axis_ls, turned, atol=1e-6)
+    if fact["format"] == "ASF/AMC":  # hinge about x of axes rotated by 20 degrees about z
+        axes_ls = [[-np.cos(np.radians(20)), sign * np.sin(np.radians(20)), 0] for sign in (-1, 1)]
+        assert np.allclose(rig.knee_axis_ls, axes_ls, atol=1e-6)
 
 
-def test_foot_axes_of_a_standing_foot_are_level_and_point_ahead(case):
+def test_axes_of_a_standing_foot_are_level_and_point_forward(case):
     clip, fact = case
-    if fact["joint_map"] is None or "poser" in fact["file"]:  # whose feet slide
+    if fact["joint_map"] is None or "poser" in fact["file"]:  # its feet slide
         return
     rig = clip.rig
     ahead = np.cross(clip.left_ws(), [0.0, 1.0, 0.0])
     for leg, (_, _, ankle, _) in enumerate(rig.joints):
         foot = Rotation.from_quat(np.asarray(rig.ankle_from_foot[leg]), scalar_first=True)
-        turn = Rotation.from_quat(clip.rotations_ws[:, ankle], scalar_first=True) * foot
-        assert np.median(turn.apply([0.0, 1.0, 0.0])[:, 1]) > 0.8
-        assert np.median(np.sum(turn.apply([0.0, 0.0, 1.0]) * ahead, axis=-1)) > 0.75
+        rot = Rotation.from_quat(clip.rotations_ws[:, ankle], scalar_first=True) * foot
+        assert np.median(rot.apply([0.0, 1.0, 0.0])[:, 1]) > 0.8
+        assert np.median(np.sum(rot.apply([0.0, 0.0, 1.0]) * ahead, axis=-1)) > 0.75

@@ -1,4 +1,4 @@
-"""NumPy archives: our own, and the blocks benchmark."""
+"""NumPy archives: saved clips, and files of the blocks benchmark."""
 
 from dataclasses import fields, replace
 
@@ -9,17 +9,17 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.clips.edit import mask_pops
-from support.sample_clips import walker
+from support.sample_clips import stair_walk
 
 
 @pytest.fixture(scope="module")
 def walk():
-    return replace(mask_pops(walker()), remarks=("one", "two"))
+    return replace(mask_pops(stair_walk()), remarks=("first", "second"))
 
 
-def assert_same(one, other):
-    for field in fields(one):
-        first, second = getattr(one, field.name), getattr(other, field.name)
+def assert_same(clip, expected_clip):
+    for field in fields(clip):
+        first, second = getattr(clip, field.name), getattr(expected_clip, field.name)
         if field.name == "measured_rig":
             assert jax.tree.structure(first) == jax.tree.structure(second)
             for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
@@ -30,7 +30,7 @@ def assert_same(one, other):
             assert type(first) is type(second) and first == second
 
 
-def test_a_saved_clip_comes_back_exactly(walk, tmp_path):
+def test_a_saved_clip_is_loaded_exactly(walk, tmp_path):
     save_clip(tmp_path / "clip.npz", walk)
     assert_same(load_clip(tmp_path / "clip.npz"), walk)
     bare = replace(walk, measured_rig=None, stance=None, mask=None, dialect=None, remarks=())
@@ -53,13 +53,13 @@ def test_a_save_that_fails_leaves_the_old_file_and_nothing_else(walk, tmp_path, 
     assert (tmp_path / "clip.npz").read_bytes() == before
 
 
-def test_arrays_of_a_clip_cannot_be_written_to(walk):
+def test_arrays_of_a_clip_are_read_only(walk):
     for array in (walk.positions_ws, walk.rotations_ws, walk.stance, walk.mask):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
 
 
-def test_archives_that_are_no_clips_are_refused(walk, tmp_path):
+def test_archives_that_are_not_clips_are_refused(walk, tmp_path):
     path = tmp_path / "clip.npz"
     path.write_bytes(b"not an archive")
     with pytest.raises(ValueError, match="wanted a NumPy archive"):
@@ -69,7 +69,7 @@ def test_archives_that_are_no_clips_are_refused(walk, tmp_path):
         load_clip(path)
     save_clip(path, walk)
     content = dict(np.load(path))
-    for change, said in (
+    for change, message in (
         ({"format": np.array("jaxik clip 9")}, "wanted the format"),
         ({"fps": None}, r"without the arrays \['fps'\]"),
         (
@@ -79,7 +79,7 @@ def test_archives_that_are_no_clips_are_refused(walk, tmp_path):
     ):
         changed = {key: value for key, value in (content | change).items() if value is not None}
         np.savez(path, **changed)  # pyright: ignore[reportArgumentType]
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             load_clip(path)
     save_clip(path, walk)
     with pytest.raises(ValueError, match="only blocks files have the variant 'base'"):
@@ -89,7 +89,7 @@ def test_archives_that_are_no_clips_are_refused(walk, tmp_path):
 
 
 def write_blocks(path, walk, **change):
-    """The walker as a blocks file, the base being the same motion 10 cm lower."""
+    """Writes the walk as a blocks file whose base is the same motion 10 cm lower."""
     content = {"fps": np.array(walk.fps), "stance": walk.stance, "leg_lengths": np.ones((2, 2))}
     content["pelvis_rot"] = walk.rotations_ws[:, 0].astype(np.float32)
     content["foot_rot"] = walk.rotations_ws[:, [3, 7]].astype(np.float32)
@@ -100,7 +100,7 @@ def write_blocks(path, walk, **change):
     np.savez(path, **{key: value for key, value in (content | change).items() if value is not None})
 
 
-def test_blocks_files_load_captured_and_base(walk, tmp_path):
+def test_a_blocks_file_has_a_captured_clip_and_a_base(walk, tmp_path):
     path = tmp_path / "blocks.npz"
     write_blocks(path, walk)
     for variant, lower in (("captured", 0.0), ("base", 0.1)):
@@ -116,16 +116,16 @@ def test_blocks_files_with_wrong_arrays_are_refused(walk, tmp_path):
     write_blocks(path, walk)
     with pytest.raises(ValueError, match=r"no variant 'flat'; there are \['captured', 'base'\]"):
         load_clip(path, variant="flat")
-    for change, said in (
+    for change, message in (
         ({"knee": walk.joints_ws(1)[:5]}, r"knee is \(5, 2, 3\); wanted"),
         ({"foot_rot": None}, r"without the arrays \['foot_rot'\]"),
     ):
         write_blocks(path, walk, **change)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             load_clip(path)
 
 
-def test_the_blocks_benchmark_loads_as_it_is(mocap):
+def test_the_blocks_benchmark_is_loaded_unchanged(mocap):
     raw = np.load(mocap / "blocks/03_03.npz")
     for variant, prefix in (("captured", ""), ("base", "base_")):
         clip = load_clip(mocap / "blocks/03_03.npz", variant=variant)
@@ -135,8 +135,8 @@ def test_the_blocks_benchmark_loads_as_it_is(mocap):
         assert np.allclose(clip.rig.thigh, raw["leg_lengths"][:, 0], atol=1e-6)
         assert np.allclose(clip.rig.shin, raw["leg_lengths"][:, 1], atol=1e-6)
         assert np.allclose(clip.rig.knee_axis_ls, [-1, 0, 0], atol=0.01)
-        for leg, joints in enumerate(clip.rig.joints):  # bones lie along -y of their joints
-            turn = Rotation.from_quat(clip.rotations_ws[:, joints[0]], scalar_first=True)
+        for leg, joints in enumerate(clip.rig.joints):  # bones point along -y of their joints
+            rot = Rotation.from_quat(clip.rotations_ws[:, joints[0]], scalar_first=True)
             bone = np.array(clip.joints_ws(1)[:, leg] - clip.joints_ws(0)[:, leg])
-            along = turn.inv().apply(bone)
-            assert np.abs(along[:, [0, 2]]).max() < 1e-6 and along[:, 1].max() < 0
+            bone_ls = rot.inv().apply(bone)
+            assert np.abs(bone_ls[:, [0, 2]]).max() < 1e-6 and bone_ls[:, 1].max() < 0

@@ -1,4 +1,4 @@
-"""Joints recognised, rigs measured, and clips as poses of legs."""
+"""Joint roles, measured rigs, contact labels, and legs and roots of clips."""
 
 from dataclasses import replace
 
@@ -16,14 +16,14 @@ from fitting.datasets.clips.kinematics import local_from_world, world_from_local
 from fitting.datasets.clips.rigs import LegMotion, knee_axis
 from jaxik.maths import quat
 from jaxik.world.skeleton import Transform, forward_kinematics
-from support.sample_clips import BVH, walker
+from support.sample_clips import BVH, stair_walk
 
 PARTS = ("pelvis", "hip", "knee", "ankle", "toe")
 
 
 @pytest.fixture(scope="module")
 def walk():
-    return walker()
+    return stair_walk()
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def walk():
         "Pelvis L_Hip L_Knee L_Ankle L_Foot R_Hip R_Knee R_Ankle R_Foot",
     ],
 )  # fmt: skip
-def test_a_dialect_is_recognised_by_its_names(names):
+def test_naming_conventions_are_recognised(names):
     roles = find_roles(tuple(names.split()), (-1, 0, 1, 2, 3, 0, 5, 6, 7))
     assert roles.pelvis == 0
     assert [(leg.name, leg.side, leg.joints) for leg in roles.legs] == [
@@ -49,7 +49,7 @@ def test_a_dialect_is_recognised_by_its_names(names):
     ]
 
 
-def test_a_leg_that_is_not_found_is_answered_with_the_joints():
+def test_the_error_for_a_missing_leg_lists_the_joints():
     with pytest.raises(ValueError, match=r"no pair of legs.*\['Hips', 'Tail'\].*MotionBuilder"):
         find_roles(("Hips", "Tail"), (-1, 0))
     feet = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot")
@@ -57,7 +57,7 @@ def test_a_leg_that_is_not_found_is_answered_with_the_joints():
         find_roles(feet, (-1, 0, 1, 2))
 
 
-def test_any_number_of_legs_is_given_by_hand():
+def test_any_number_of_legs_can_be_named():
     names, parents, joints = ["body"], [-1], {"pelvis": "body"}
     for leg in ("fl", "fr", "hl", "hr", "tail"):
         for index, part in enumerate(PARTS[1:]):
@@ -69,7 +69,7 @@ def test_any_number_of_legs_is_given_by_hand():
     assert roles.legs[2].joints == (9, 10, 11, 12)
 
 
-def test_sides_by_hand_are_told_by_the_end_of_the_suffix():
+def test_the_end_of_a_suffix_decides_the_side_of_a_named_leg():
     suffixes = ("fore_left", "fore_right", "left", "r", "weft", "light")
     names, parents, joints = ["body"], [-1], {"pelvis": "body"}
     for leg in suffixes:
@@ -83,7 +83,7 @@ def test_sides_by_hand_are_told_by_the_end_of_the_suffix():
 
 
 @pytest.mark.parametrize(
-    ("joints", "said"),
+    ("joints", "message"),
     [
         ({"pelvis": "Hips"}, "wanted pelvis and for each leg"),
         ({"pelvis": "Hips", "hip_l": "LeftUpLeg", "knee_l": "LeftLeg"}, "wanted pelvis and"),
@@ -92,13 +92,13 @@ def test_sides_by_hand_are_told_by_the_end_of_the_suffix():
          r"no joints named \['Thigh'\]; there are .*LeftUpLeg"),
     ],
 )  # fmt: skip
-def test_a_wrong_map_is_answered_with_what_is_wanted(tmp_path, joints, said):
+def test_the_error_for_a_wrong_joint_map_says_what_is_wanted(tmp_path, joints, message):
     (tmp_path / "a.bvh").write_text(BVH)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         load_clip(tmp_path / "a.bvh", joints=joints)
 
 
-def test_partners_are_the_other_sides():
+def test_partners_are_the_joints_of_the_other_side():
     names = (
         "lfemur", "rfemur", "lowerback", "root", "LeftLeg", "RightLeg", "Foot_L", "Foot_R",
              "LThumb", "RThumb", "left_hip", "right_hip", "head", "rig:l_hand", "rig:r_hand",
@@ -107,7 +107,7 @@ def test_partners_are_the_other_sides():
 
 
 @pytest.mark.slow
-def test_placing_agrees_with_the_jax_kinematics_and_localising_undoes_it(tmp_path):
+def test_forward_kinematics_agrees_with_that_in_jax_and_is_inverted(tmp_path):
     (tmp_path / "a.bvh").write_text(BVH)
     recording = read_bvh(tmp_path / "a.bvh")
     positions_ws, rotations_ws = world_from_local(
@@ -125,14 +125,14 @@ def test_placing_agrees_with_the_jax_kinematics_and_localising_undoes_it(tmp_pat
     assert np.abs(np.abs(np.sum(back_rot * recording.rotations_ls, axis=-1)) - 1).max() < 1e-14
 
 
-def test_a_hinge_is_found_in_any_knee_axes_and_a_still_one_from_geometry():
+def test_the_knee_axis_is_found_from_motion_or_for_a_stiff_knee_from_geometry():
     rng = np.random.default_rng(3)
     left = np.array([1.0, 0.0, 0.0])
     bend = np.linspace(0.3, 1.2, 40)
-    for turns in (bend, np.full(40, 0.6)):
+    for flexion in (bend, np.full(40, 0.6)):
         for skew in Rotation.random(5, rng):
             thigh = Rotation.from_rotvec(rng.normal(size=(40, 3)) * 0.3)
-            shin = thigh * Rotation.from_rotvec(turns[:, None] * left)
+            shin = thigh * Rotation.from_rotvec(flexion[:, None] * left)
             hip = np.zeros((40, 3))
             knee = thigh.apply([0.0, -0.4, 0.0])
             ankle = knee + shin.apply([0.0, -0.4, 0.0])
@@ -145,7 +145,7 @@ def test_a_hinge_is_found_in_any_knee_axes_and_a_still_one_from_geometry():
             assert np.allclose(axis, skew.inv().apply(-left), atol=1e-6)
 
 
-def test_the_rig_of_a_made_walker_is_the_one_it_was_made_with(walk):
+def test_the_rig_measured_from_a_synthetic_walk_is_the_true_one(walk):
     rig = walk.rig
     assert np.allclose(rig.knee_axis_ls, [[-1, 0, 0], [-1, 0, 0]], atol=1e-9)
     assert np.allclose(rig.ankle_from_foot, [[1, 0, 0, 0]] * 2, atol=1e-9)
@@ -155,7 +155,7 @@ def test_the_rig_of_a_made_walker_is_the_one_it_was_made_with(walk):
     assert rig.thigh.dtype == np.float64
 
 
-def test_turning_about_the_knee_axis_opens_the_knee(walk):
+def test_a_positive_rotation_about_the_knee_axis_opens_the_knee(walk):
     pose, rig = walk.leg_pose_ws(), walk.rig
     opened = quat.multiply(pose.knee.rot, quat.from_axis_angle(rig.knee_axis_ls, jnp.array(0.1)))
     moved = pose.knee.pos + quat.rotate(
@@ -166,7 +166,7 @@ def test_turning_about_the_knee_axis_opens_the_knee(walk):
     assert (reach > before)[before < 0.95].all()
 
 
-def test_leg_poses_have_the_session_precision(walk):
+def test_leg_poses_have_the_default_precision_of_jax(walk):
     assert walk.leg_pose_ws().knee.pos.shape == (walk.frame_count, 2, 3)
     assert walk.leg_pose_ws().knee.pos.dtype == jnp.float64
     with jax.enable_x64(False):
@@ -175,23 +175,23 @@ def test_leg_poses_have_the_session_precision(walk):
         assert walk.world_from_model().pos.dtype == jnp.float32
 
 
-def test_the_model_root_is_on_the_floor_under_the_pelvis_and_faces_ahead(walk):
+def test_the_model_root_is_on_the_floor_below_the_pelvis_and_faces_forward(walk):
     root = walk.world_from_model(floor=0.25)
     assert np.allclose(root.pos[:, 1], 0.25)
     assert np.allclose(root.pos[:, [0, 2]], walk.positions_ws[:, 0][:, [0, 2]])
     assert np.allclose(root.rot, [1, 0, 0, 0], atol=1e-12)
 
 
-def test_the_heading_turns_on_smoothly_past_half_a_turn(walk):
+def test_the_heading_is_continuous_beyond_half_a_turn(walk):
     yaw = np.linspace(0.0, 3 * np.pi, walk.frame_count)
     spin = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0])
     positions = np.stack(
         [spin.apply(np.array(walk.positions_ws[:, joint])) for joint in range(9)], axis=1
     )
-    turned = walk.with_motion(positions, walk.rotations_ws).world_from_model()
-    assert isinstance(turned, Transform)
-    assert np.sum(turned.rot[1:] * turned.rot[:-1], axis=-1).min() > 0.99
-    assert np.allclose(turned.rot[:, 0], np.cos(yaw / 2), atol=1e-9)
+    rotated = walk.with_motion(positions, walk.rotations_ws).world_from_model()
+    assert isinstance(rotated, Transform)
+    assert np.sum(rotated.rot[1:] * rotated.rot[:-1], axis=-1).min() > 0.99
+    assert np.allclose(rotated.rot[:, 0], np.cos(yaw / 2), atol=1e-9)
 
 
 def test_a_lying_character_keeps_its_last_heading(walk):
@@ -201,40 +201,40 @@ def test_a_lying_character_keeps_its_last_heading(walk):
     assert np.allclose(root.rot, [1, 0, 0, 0], atol=1e-9)
 
 
-def test_contacts_of_a_made_walker_are_its_stances(walk):
-    found = detect_stances(walk.joints_ws(3), walk.fps)
-    assert (found == walk.stance).mean() > 0.9
-    assert len(runs(found[:, 0])) == len(runs(walk.stance[:, 0]))
+def test_detected_stances_of_a_synthetic_walk_are_the_true_ones(walk):
+    detected = detect_stances(walk.joints_ws(3), walk.fps)
+    assert (detected == walk.stance).mean() > 0.9
+    assert len(runs(detected[:, 0])) == len(runs(walk.stance[:, 0]))
 
 
 def test_a_foot_hanging_still_in_the_air_does_not_stand():
     height = np.interp(np.arange(120), [0, 40, 50, 70, 80, 120], [0, 0, 0.3, 0.3, 0, 0])
     ball = np.stack([0 * height, height, 0 * height], axis=-1)[:, None]
-    found = detect_stances(ball, 60.0)[:, 0]
-    assert found[:35].all() and found[85:].all() and not found[42:78].any()
+    detected = detect_stances(ball, 60.0)[:, 0]
+    assert detected[:35].all() and detected[85:].all() and not detected[42:78].any()
 
 
-def test_contacts_agree_with_the_labels_of_the_blocks(mocap):
+def test_detected_stances_agree_with_the_labels_of_the_blocks_benchmark(mocap):
     clip = load_clip(mocap / "blocks/03_03.npz")
-    rows = np.genfromtxt(
+    listed = np.genfromtxt(
         mocap / "blocks/stances_03_03.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
     )
     labels = np.zeros((clip.frame_count, 2), bool)
-    for row in rows:
-        labels[row["first_frame"] : row["last_frame"] + 1, "lr".index(row["side"])] = True
+    for stance in listed:
+        labels[stance["first_frame"] : stance["last_frame"] + 1, "lr".index(stance["side"])] = True
     assert np.array_equal(labels, clip.stance_labels())
-    found = detect_stances(clip.joints_ws(3), clip.fps)
-    assert (found == labels).mean() > 0.99  # 0.9954 when written
-    assert [len(runs(found[:, leg])) for leg in (0, 1)] == [28, 26]
+    detected = detect_stances(clip.joints_ws(3), clip.fps)
+    assert (detected == labels).mean() > 0.99  # 0.9954 when written
+    assert [len(runs(detected[:, leg])) for leg in (0, 1)] == [28, 26]
 
 
-def test_a_character_that_always_lies_on_its_side_looks_along_z(walk):
+def test_a_character_that_always_lies_on_its_side_faces_z(walk):
     positions = np.array(walk.positions_ws)
     positions[:, [1, 5]] = positions[:, [0]] + [[0, 0.1, 0], [0, -0.1, 0]]
     root = walk.with_motion(positions, walk.rotations_ws).world_from_model()
     assert np.array_equal(root.rot, np.tile([1.0, 0.0, 0.0, 0.0], (walk.frame_count, 1)))
 
 
-def test_a_clip_made_without_legs_says_so(walk):
-    with pytest.raises(ValueError, match="walker was loaded without legs"):
+def test_the_rig_of_a_clip_without_legs_raises_an_error(walk):
+    with pytest.raises(ValueError, match="stair walk was loaded without legs"):
         _ = replace(walk, measured_rig=None).rig

@@ -1,4 +1,4 @@
-"""Flat bases made from clips over uneven ground."""
+"""Flat animations derived from clips on uneven ground."""
 
 from dataclasses import replace
 
@@ -15,31 +15,31 @@ from fitting.datasets.flat_animation import (
     load_flat_animation,
     with_rigid_legs,
 )
-from support.sample_clips import stairs, walker
+from support.sample_clips import stair_walk, stairs
 
 
 @pytest.fixture(scope="module")
 def walk():
-    return walker()
+    return stair_walk()
 
 
 @pytest.fixture(scope="module")
-def base(walk):
+def flat(walk):
     return flatten_clip(walk, stairs)
 
 
-def test_standing_feet_are_on_the_flat_floor_and_nothing_else_of_them_changes(walk, base):
-    balls, before = base.joints_ws(3), walk.joints_ws(3)
+def test_standing_feet_are_on_the_flat_floor_and_otherwise_unchanged(walk, flat):
+    balls, before = flat.joints_ws(3), walk.joints_ws(3)
     assert np.abs(balls[walk.stance][:, 1]).max() < 1e-9
     assert np.allclose(balls[..., [0, 2]], before[..., [0, 2]], atol=1e-9)
-    assert np.allclose(balls - base.joints_ws(2), before - walk.joints_ws(2), atol=1e-9)
+    assert np.allclose(balls - flat.joints_ws(2), before - walk.joints_ws(2), atol=1e-9)
     assert (
-        np.abs(np.sum(base.rotations_ws[:, 3] * walk.rotations_ws[:, 3], axis=-1)).min() > 1 - 1e-9
+        np.abs(np.sum(flat.rotations_ws[:, 3] * walk.rotations_ws[:, 3], axis=-1)).min() > 1 - 1e-9
     )
 
 
-def test_the_pelvis_keeps_one_height_and_its_way_over_the_plan(walk, base):
-    pelvis = base.positions_ws[:, 0]
+def test_the_pelvis_has_a_constant_height_and_keeps_its_path(walk, flat):
+    pelvis = flat.positions_ws[:, 0]
     assert np.ptp(pelvis[:, 1]) < 1e-12
     assert np.allclose(pelvis[:, [0, 2]], walk.positions_ws[:, 0][:, [0, 2]])
     assert flatten_clip(walk, stairs, pelvis_height=0.8).positions_ws[0, 0, 1] == pytest.approx(0.8)
@@ -47,31 +47,31 @@ def test_the_pelvis_keeps_one_height_and_its_way_over_the_plan(walk, base):
 
 def test_bones_keep_their_lengths_even_out_of_reach(walk):
     for height in (0.7, 0.85, 1.2):
-        base = flatten_clip(walk, stairs, pelvis_height=height)
-        hip, knee, ankle = (base.joints_ws(role) for role in range(3))
+        flat = flatten_clip(walk, stairs, pelvis_height=height)
+        hip, knee, ankle = (flat.joints_ws(role) for role in range(3))
         assert np.allclose(np.linalg.norm(knee - hip, axis=-1), 0.5, atol=1e-9)
         assert np.allclose(np.linalg.norm(ankle - knee, axis=-1), 0.48, atol=1e-9)
-        assert np.isfinite(base.rotations_ws).all()
+        assert np.isfinite(flat.rotations_ws).all()
 
 
-def test_thigh_and_shin_turn_with_their_bones(base):
+def test_thigh_and_shin_rotate_with_their_bones(flat):
     for joint in (1, 2, 5, 6):
-        turn = Rotation.from_quat(base.rotations_ws[:, joint], scalar_first=True)
-        bone = base.positions_ws[:, joint + 1] - base.positions_ws[:, joint]
-        down = turn.apply([0.0, -1.0, 0.0])
+        rot = Rotation.from_quat(flat.rotations_ws[:, joint], scalar_first=True)
+        bone = flat.positions_ws[:, joint + 1] - flat.positions_ws[:, joint]
+        down = rot.apply([0.0, -1.0, 0.0])
         assert np.allclose(down * np.linalg.norm(bone, axis=-1, keepdims=True), bone, atol=1e-9)
 
 
-def test_a_walk_on_a_flat_floor_is_its_own_base():
-    walk = walker(lambda points: np.zeros(len(points)))
-    base = flatten_clip(walk, lambda points: np.zeros(len(points)))
-    assert np.abs(base.positions_ws - walk.positions_ws)[:, [3, 4, 7, 8]].max() < 1e-9
+def test_a_walk_on_a_flat_floor_keeps_its_feet():
+    walk = stair_walk(lambda points: np.zeros(len(points)))
+    flat = flatten_clip(walk, lambda points: np.zeros(len(points)))
+    assert np.abs(flat.positions_ws - walk.positions_ws)[:, [3, 4, 7, 8]].max() < 1e-9
     level = flatten_clip(walk, lambda points: np.zeros(len(points)), pelvis_height=0.8)
     again = flatten_clip(level, lambda points: np.zeros(len(points)), pelvis_height=0.8)
     assert np.abs(again.positions_ws - level.positions_ws).max() < 1e-9
 
 
-def test_between_stances_the_ground_goes_over_smoothly(walk):
+def test_the_ground_height_changes_smoothly_between_stances(walk):
     ground = ground_heights(walk, walk.stance, stairs)
     for leg in (0, 1):
         for first, last in runs(walk.stance[:, leg]):
@@ -79,7 +79,7 @@ def test_between_stances_the_ground_goes_over_smoothly(walk):
     assert np.abs(np.diff(ground, axis=0)).max() < 0.02
 
 
-def test_ground_that_is_not_known_is_refused(walk):
+def test_unknown_ground_heights_are_refused(walk):
     with pytest.raises(
         ValueError, match="finite ground heights under the stances of the left foot"
     ):
@@ -88,55 +88,55 @@ def test_ground_that_is_not_known_is_refused(walk):
         flatten_clip(replace(walk, stance=np.zeros_like(walk.stance)), stairs)
 
 
-def test_labels_are_found_where_the_clip_has_none(walk, base):
-    found = flatten_clip(replace(walk, stance=None), stairs)
-    assert (found.stance == walk.stance).mean() > 0.9
-    assert np.abs(found.joints_ws(3) - base.joints_ws(3)).max() < 0.05
+def test_stances_are_detected_if_the_clip_has_no_labels(walk, flat):
+    detected = flatten_clip(replace(walk, stance=None), stairs)
+    assert (detected.stance == walk.stance).mean() > 0.9
+    assert np.abs(detected.joints_ws(3) - flat.joints_ws(3)).max() < 0.05
 
 
-def test_the_base_of_the_blocks_is_the_one_that_comes_with_them(mocap):
+def test_the_flat_animation_of_the_blocks_benchmark_agrees_with_its_own(mocap):
     """With their rule for the ground, 5.5 cm under the median ball, and their pelvis height.
 
     Theirs stretches the bones of the right leg by up to 4 % where the leg does not reach the floor,
     and near the straight leg there is no plane to agree on; ours keeps the bones.
     """
     captured = load_clip(mocap / "blocks/03_03.npz")
-    wanted = load_clip(mocap / "blocks/03_03.npz", variant="base")
-    base = flatten_clip(
+    expected = load_clip(mocap / "blocks/03_03.npz", variant="base")
+    flat = flatten_clip(
         captured,
         lambda points: points[:, 1] - 0.055,
-        pelvis_height=float(wanted.positions_ws[0, 0, 1]),
+        pelvis_height=float(expected.positions_ws[0, 0, 1]),
     )
-    gaps = np.linalg.norm(base.positions_ws - wanted.positions_ws, axis=-1)
-    assert gaps[:, [0, 1, 5]].max() < 1e-6  # pelvis and hips
-    assert gaps[:, [3, 4]].max() < 1e-6  # left ankle and ball
-    assert (gaps[:, [7, 8]] < 1e-6).mean() > 0.97 and gaps[:, [7, 8]].max() < 0.04
-    assert (gaps[:, [2, 6]] < 1e-3).mean() > 0.97
-    assert np.sqrt(np.mean(gaps[:, [3, 7]] ** 2)) < 0.002 and np.median(gaps[:, [2, 6]]) < 1e-6
-    free = flatten_clip(captured, lambda points: points[:, 1] - 0.055)
-    assert abs(free.positions_ws[0, 0, 1] - wanted.positions_ws[0, 0, 1]) < 0.003
+    errors = np.linalg.norm(flat.positions_ws - expected.positions_ws, axis=-1)
+    assert errors[:, [0, 1, 5]].max() < 1e-6  # pelvis and hips
+    assert errors[:, [3, 4]].max() < 1e-6  # left ankle and ball
+    assert (errors[:, [7, 8]] < 1e-6).mean() > 0.97 and errors[:, [7, 8]].max() < 0.04
+    assert (errors[:, [2, 6]] < 1e-3).mean() > 0.97
+    assert np.sqrt(np.mean(errors[:, [3, 7]] ** 2)) < 0.002 and np.median(errors[:, [2, 6]]) < 1e-6
+    own_height = flatten_clip(captured, lambda points: points[:, 1] - 0.055)
+    assert abs(own_height.positions_ws[0, 0, 1] - expected.positions_ws[0, 0, 1]) < 0.003
 
 
-def test_what_hangs_on_a_foot_goes_with_it(mocap):
+def test_joints_below_a_foot_move_with_it(mocap):
     clip = load_clip(mocap / "clips/cmu_asfamc/02_01.amc")
-    base = flatten_clip(clip, lambda points: points[:, 1] - 0.05)
+    flat = flatten_clip(clip, lambda points: points[:, 1] - 0.05)
     for toe, tip in (("ltoes", "ltoes_end"), ("rtoes", "rtoes_end")):
         ends = [clip.joint_names.index(toe), clip.joint_names.index(tip)]
-        before, after = (np.diff(c.positions_ws[:, ends], axis=1) for c in (clip, base))
+        before, after = (np.diff(c.positions_ws[:, ends], axis=1) for c in (clip, flat))
         assert np.abs(after - before).max() < 1e-9
     head = clip.joint_names.index("head")
-    lift = (base.positions_ws - clip.positions_ws)[:, [0, head]]
+    lift = (flat.positions_ws - clip.positions_ws)[:, [0, head]]
     assert np.allclose(lift[:, 0], lift[:, 1])
 
 
 def stretched(walk):
-    """The walk with its left ankle and what hangs on it pulled a little off the shin."""
+    """The walk with its left foot pulled 3 cm off the shin for half a second."""
     positions = walk.positions_ws.copy()
     positions[10:40, 3:5, 1] -= 0.03
     return replace(walk, positions_ws=positions)
 
 
-def test_legs_that_stretch_are_made_rigid_and_the_rest_is_left_alone(walk):
+def test_stretched_legs_become_rigid_and_all_else_is_unchanged(walk):
     rigid = with_rigid_legs(stretched(walk))
     hip, knee, ankle = (rigid.joints_ws(role) for role in range(3))
     thigh, shin = (np.asarray(length) for length in (walk.rig.thigh, walk.rig.shin))
@@ -150,25 +150,25 @@ def test_legs_that_stretch_are_made_rigid_and_the_rest_is_left_alone(walk):
     assert np.allclose(toe, walk.positions_ws[:, 4] - walk.positions_ws[:, 3], atol=1e-9)
 
 
-def test_a_clip_whose_bones_keep_their_lengths_is_returned_as_it_is(walk, base):
-    assert with_rigid_legs(walk) is walk and with_rigid_legs(base) is base
+def test_a_clip_whose_bones_keep_their_lengths_is_returned_unchanged(walk, flat):
+    assert with_rigid_legs(walk) is walk and with_rigid_legs(flat) is flat
 
 
-def test_a_base_is_loaded_from_any_clip_and_of_the_blocks_the_flat_one(walk, tmp_path, mocap):
+def test_the_flat_animation_of_a_blocks_file_is_its_base(walk, tmp_path, mocap):
     save_clip(tmp_path / "walk.npz", walk)
     assert np.array_equal(
         load_flat_animation(tmp_path / "walk.npz").positions_ws, walk.positions_ws
     )
     blocks = mocap / "blocks" / "03_03.npz"
-    wanted, loaded = load_clip(blocks, variant="base"), load_flat_animation(blocks)
+    expected, loaded = load_clip(blocks, variant="base"), load_flat_animation(blocks)
     hips = [0, 1, 5]
-    assert np.allclose(loaded.positions_ws[:, hips], wanted.positions_ws[:, hips], atol=1e-12)
+    assert np.allclose(loaded.positions_ws[:, hips], expected.positions_ws[:, hips], atol=1e-12)
     hip, knee, ankle = (loaded.joints_ws(role) for role in range(3))
     for bone, length in ((knee - hip, loaded.rig.thigh), (ankle - knee, loaded.rig.shin)):
         assert np.abs(np.linalg.norm(bone, axis=-1) - np.asarray(length)).max() < 1e-6
 
 
-def test_a_base_without_legs_is_refused_with_its_file(walk, tmp_path):
+def test_the_error_for_an_animation_without_legs_names_the_file(walk, tmp_path):
     names = tuple(f"joint {i}" for i in range(len(walk.joint_names)))
     save_clip(tmp_path / "odd.npz", replace(walk, joint_names=names, measured_rig=None))
     with pytest.raises(ValueError, match=r"odd\.npz: no pair of legs recognised"):

@@ -1,4 +1,4 @@
-"""Terrain files: formats, scenes, units and up axes, and what is refused."""
+"""Terrain files: formats, scenes, units, up axes, and files that are refused."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,13 +22,13 @@ def height(ground: terrain.Terrain, x: float, z: float) -> float:
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "off", "glb"])
-def test_every_usual_format_gives_the_same_ground(tmp_path, suffix):
+def test_all_common_formats_give_the_same_terrain(tmp_path, suffix):
     path = tmp_path / f"ramp.{suffix}"
     ramp().export(path)
     assert height(mesh_files.load_terrain(path), 0.4, 0.3) == pytest.approx(0.2, abs=1e-6)
 
 
-def test_geometries_of_a_scene_are_placed_by_their_transforms(tmp_path):
+def test_the_transforms_of_a_scene_are_applied(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(ramp(), node_name="here", geom_name="ramp")
     scene.add_geometry(
@@ -42,7 +42,7 @@ def test_geometries_of_a_scene_are_placed_by_their_transforms(tmp_path):
     assert height(ground, 10.3, 0.4) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_file_with_z_up_is_tipped_into_our_world_and_scaled(tmp_path):
+def test_a_file_with_z_up_is_rotated_and_scaled(tmp_path):
     centimetres = ramp()
     corners = centimetres.vertices.copy() * 100
     centimetres.vertices = np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], axis=-1)
@@ -63,7 +63,7 @@ def test_up_layer_dtype_and_slack_reach_the_terrain(tmp_path):
     assert terrain.cast(ground, origin, 9.0, terrain.layer_mask(0)).found == 0.0
 
 
-def test_the_real_blocks_are_read_in_metres_with_y_up(mocap):
+def test_the_terrain_of_the_blocks_benchmark_is_in_metres_with_y_up(mocap):
     ground = mesh_files.load_terrain(mocap / "blocks" / "terrain.ply")
     (surface,) = ground.surfaces
     assert isinstance(surface, terrain.Mesh)
@@ -74,7 +74,7 @@ def test_the_real_blocks_are_read_in_metres_with_y_up(mocap):
 
 
 @pytest.mark.parametrize(
-    "name, text, said",
+    "name, text, message",
     [
         ("ground.fbx", "x", "trimesh reads .*ply.*; not '.fbx'"),
         ("ground.ply", "not a ply", "cannot read it"),
@@ -83,19 +83,19 @@ def test_the_real_blocks_are_read_in_metres_with_y_up(mocap):
         ("ground.off", "OFF\n3 1 0\n0 0 0\n1 0 nan\n0 0 1\n3 0 1 2\n", "vertices are not finite"),
     ],
 )
-def test_files_that_are_not_terrain_are_refused_by_name(tmp_path, name, text, said):
+def test_the_error_for_a_file_without_terrain_names_it(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=f"(?s){name}.*{said}"):
+    with pytest.raises(ValueError, match=f"(?s){name}.*{message}"):
         mesh_files.load_terrain(tmp_path / name)
 
 
-def test_a_missing_file_is_said_to_be_missing(tmp_path):
+def test_the_error_for_a_missing_file_names_it(tmp_path):
     with pytest.raises(ValueError, match="nowhere.ply: there is no such file"):
         mesh_files.load_terrain(tmp_path / "nowhere.ply")
 
 
 @pytest.mark.parametrize(
-    "wrong, said",
+    "arguments, message",
     [
         ({"up": (0.0, 0.0, 0.0)}, "up is a direction"),
         ({"layer": 32}, "from 0 to 31"),
@@ -103,7 +103,7 @@ def test_a_missing_file_is_said_to_be_missing(tmp_path):
         ({"file_up": "x"}, "'y' or 'z'; got 'x'"),
     ],
 )
-def test_options_that_mean_nothing_are_refused(tmp_path, wrong, said):
+def test_arguments_out_of_range_are_refused(tmp_path, arguments, message):
     ramp().export(tmp_path / "ramp.ply")
-    with pytest.raises(ValueError, match=said):
-        mesh_files.load_terrain(tmp_path / "ramp.ply", **wrong)
+    with pytest.raises(ValueError, match=message):
+        mesh_files.load_terrain(tmp_path / "ramp.ply", **arguments)

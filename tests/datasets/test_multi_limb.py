@@ -1,4 +1,4 @@
-"""Made motion on many limbs: feet that stand still, bones that keep their lengths, usual speeds."""
+"""Synthetic quadruped and climber: still feet, constant bone lengths, plausible speeds."""
 
 from dataclasses import replace
 
@@ -27,48 +27,49 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def clip(name):
-    made = {"quadruped": multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, 60.0, 1)}
-    return made[name] if name in made else multi_limb.climb(6.0, 60.0, 1)
+    if name == "climber":
+        return multi_limb.climb(6.0, 60.0, 1)
+    return multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, 60.0, 1)
 
 
 @pytest.fixture(scope="module")
 def on_floor(name, clip):
-    """Joints, m, over a floor with y up and z ahead, also of the climber."""
+    """Joint positions, m, over a floor with y up and z ahead; the climber's wall is laid down."""
     return clip.positions_ws @ WALL if name == "climber" else clip.positions_ws
 
 
 def test_the_ball_of_a_standing_foot_lies_on_the_ground_and_does_not_move(name, clip, on_floor):
     for leg, (_, _, ankle, toe) in enumerate(clip.rig.joints):
-        spells = contacts.runs(clip.stance[:, leg])
-        assert len(spells) >= 2
-        for first, last in spells:
+        stances = contacts.runs(clip.stance[:, leg])
+        assert len(stances) >= 2
+        for first, last in stances:
             for joint, height in (
                 (toe, BODIES[name].ball_height),
                 (ankle, BODIES[name].ball_height + BODIES[name].ankle_to_ball[0]),
             ):
-                place = on_floor[first : last + 1, joint]
-                assert np.ptp(place, axis=0).max() < EXACT
-                np.testing.assert_allclose(place[:, 1], height, rtol=0, atol=EXACT)
+                positions = on_floor[first : last + 1, joint]
+                assert np.ptp(positions, axis=0).max() < EXACT
+                np.testing.assert_allclose(positions[:, 1], height, rtol=0, atol=EXACT)
 
 
-def test_no_foot_sinks_into_the_ground_and_no_knee_comes_near_it(name, clip, on_floor):
+def test_feet_stay_above_the_ground_and_knees_well_above_it(name, clip, on_floor):
     for _, knee, ankle, toe in clip.rig.joints:
         assert on_floor[:, toe, 1].min() > BODIES[name].ball_height - EXACT
         assert on_floor[:, [knee, ankle], 1].min() > 0.06
 
 
-def test_bones_keep_their_lengths_and_limbs_hang_rigidly_on_the_trunk(name, clip):
+def test_bones_keep_their_lengths_and_limbs_are_rigid_on_the_trunk(name, clip):
     for limb, joints in zip(BODIES[name].limbs, clip.rig.joints, strict=True):
-        places = [clip.positions_ws[:, joint] for joint in joints]
-        wanted = (*limb.bones, np.hypot(*BODIES[name].ankle_to_ball))
-        for a, b, length in zip(places, places[1:], wanted, strict=False):
+        positions = [clip.positions_ws[:, joint] for joint in joints]
+        expected = (*limb.bones, np.hypot(*BODIES[name].ankle_to_ball))
+        for a, b, length in zip(positions, positions[1:], expected, strict=False):
             distance = np.linalg.norm(b - a, axis=-1)
             np.testing.assert_allclose(distance, length, rtol=0, atol=EXACT)
     positions_ls, _ = local_from_world(clip.parents, clip.positions_ws, clip.rotations_ws)
     assert np.ptp(positions_ls[:, 1:], axis=0).max() < EXACT
 
 
-def test_the_legs_are_named_by_limb_with_sides_flat_feet_and_hinges_that_flex(name, clip):
+def test_limbs_have_their_names_sides_flat_feet_and_flexing_hinges(name, clip):
     rig = clip.rig
     assert rig.names == tuple(limb.name for limb in BODIES[name].limbs)
     np.testing.assert_array_equal(rig.side, [1.0, -1.0, 1.0, -1.0])
@@ -76,7 +77,7 @@ def test_the_legs_are_named_by_limb_with_sides_flat_feet_and_hinges_that_flex(na
     np.testing.assert_allclose(rig.ankle_from_foot, [[1.0, 0.0, 0.0, 0.0]] * 4, rtol=0, atol=0.03)
 
 
-def test_limbs_stay_bent_the_way_that_they_bend(name, clip, on_floor):
+def test_limbs_stay_bent_towards_their_pole(name, clip, on_floor):
     for limb, (hip, knee, ankle, _) in zip(BODIES[name].limbs, clip.rig.joints, strict=True):
         a, b, c = (on_floor[:, joint] for joint in (hip, knee, ankle))
         stretch = np.linalg.norm(c - a, axis=-1) / sum(limb.bones)
@@ -86,18 +87,18 @@ def test_limbs_stay_bent_the_way_that_they_bend(name, clip, on_floor):
         assert (out @ np.array(limb.pole)).min() > 0.0
 
 
-def test_the_quadruped_walks_in_lateral_sequence_with_two_feet_or_more_down():
+def test_the_quadruped_walks_in_lateral_sequence_on_two_feet_or_more():
     clip = multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, 60.0, 1)
     assert clip.stance is not None
     landings = {
         name: [first for first, _ in contacts.runs(clip.stance[:, leg]) if first > 0]
         for leg, name in enumerate(clip.rig.names)
     }
-    order = sorted((frame, name) for name, those in landings.items() for frame in those)
+    order = sorted((frame, name) for name, frames in landings.items() for frame in frames)
     names = [name for _, name in order]
     start = names.index("hind_left")
-    wanted = ["hind_left", "fore_left", "hind_right", "fore_right"] * 5
-    assert names[start : start + 12] == wanted[:12]
+    expected = ["hind_left", "fore_left", "hind_right", "fore_right"] * 5
+    assert names[start : start + 12] == expected[:12]
     assert clip.stance.sum(axis=1).min() >= 2
     speed = np.linalg.norm(np.diff(clip.positions_ws[:, 0], axis=0), axis=-1) * 60.0
     assert 0.8 < speed.min() and speed.max() < 1.3
@@ -117,18 +118,18 @@ def test_the_climber_moves_one_limb_at_a_time_and_goes_straight_up_the_wall():
 
 def test_on_a_wall_the_root_lies_on_it_with_the_normal_as_its_up():
     clip = multi_limb.climb(2.0, 30.0)
-    made = clip_frames.frames_from_clip(clip, up_ws=terrain_meshes.WALL_UP)
-    root = made.world_from_model
+    frames = clip_frames.frames_from_clip(clip, up_ws=terrain_meshes.WALL_UP)
+    root = frames.world_from_model
     trunk = clip.positions_ws[:, 0]
     np.testing.assert_allclose(root.pos, trunk * [1.0, 1.0, 0.0], rtol=0, atol=1e-12)
-    for axis, wanted in ((0, (1, 0, 0)), (1, terrain_meshes.WALL_UP), (2, (0, 1, 0))):
+    for axis, expected in ((0, (1, 0, 0)), (1, terrain_meshes.WALL_UP), (2, (0, 1, 0))):
         ends = root.apply(jnp.eye(3)[axis]) - root.pos
-        np.testing.assert_allclose(ends, np.tile(wanted, (60, 1)), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(ends, np.tile(expected, (60, 1)), rtol=0, atol=1e-12)
     speed = multi_limb.CLIMBER.stride / multi_limb.CLIMBER.period
-    np.testing.assert_allclose(made.speed, speed, rtol=1e-9)
+    np.testing.assert_allclose(frames.speed, speed, rtol=1e-9)
 
 
-def test_an_animal_may_start_elsewhere_and_a_seed_gives_the_same_steps():
+def test_a_seed_gives_the_same_steps_and_a_route_may_start_elsewhere():
     first, same, other = (
         multi_limb.locomotion(multi_limb.QUADRUPED, 2.0, 30.0, s) for s in (4, 4, 5)
     )
@@ -138,7 +139,7 @@ def test_an_animal_may_start_elsewhere_and_a_seed_gives_the_same_steps():
     assert ahead.positions_ws[0, 0, 2] == pytest.approx(3.0)
 
 
-def test_a_clip_of_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
+def test_a_clip_with_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
     save_clip(tmp_path / "clip.npz", clip)
     loaded = load_clip(tmp_path / "clip.npz")
     np.testing.assert_array_equal(loaded.positions_ws, clip.positions_ws)
@@ -146,18 +147,18 @@ def test_a_clip_of_four_legs_is_loaded_as_it_was_saved(tmp_path, clip):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("animal", "mesh"), [("quadruped", "meadow"), ("climber", "wall")])
-def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh):
-    up = terrain_meshes.WALL_UP if animal == "climber" else (0.0, 1.0, 0.0)
-    clip = {
+@pytest.mark.parametrize(("body", "mesh"), [("quadruped", "meadow"), ("climber", "wall")])
+def test_foot_ik_moves_four_limbs_over_their_terrain(tmp_path, body, mesh):
+    up = terrain_meshes.WALL_UP if body == "climber" else (0.0, 1.0, 0.0)
+    clips = {
         "quadruped": multi_limb.locomotion(multi_limb.QUADRUPED, 1.0),
         "climber": multi_limb.climb(1.0),
     }
-    clip = clip[animal]
+    clip = clips[body]
     mesh_files.save_mesh(tmp_path / "ground.ply", *getattr(terrain_meshes, mesh)())
     ground = mesh_files.load_terrain(tmp_path / "ground.ply", up=up)
-    made = clip_frames.frames_from_clip(clip, up_ws=up)
-    result = jaxik.run(jaxik.presets.record(), clip.rig, ground, made)
+    frames = clip_frames.frames_from_clip(clip, up_ws=up)
+    result = jaxik.run(jaxik.presets.record(), clip.rig, ground, frames)
     assert np.asarray(result.trace.sensed.ground.ankle.found).min() == 1.0
     assert np.asarray(result.reached).mean() > 0.95
     solved = clip_frames.clip_from_result(clip, result, up_ws=up)
@@ -167,7 +168,7 @@ def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh
 
 
 @pytest.mark.parametrize(
-    "body, seconds, said",
+    "body, seconds, message",
     [
         (multi_limb.QUADRUPED, 0.0, "above 0, got 0.0 s"),
         (
@@ -177,6 +178,6 @@ def test_the_record_carries_four_limbs_over_their_terrain(tmp_path, animal, mesh
         ),
     ],
 )
-def test_impossible_crawls_are_refused(body, seconds, said):
-    with pytest.raises(ValueError, match=said):
+def test_impossible_locomotion_is_refused(body, seconds, message):
+    with pytest.raises(ValueError, match=message):
         multi_limb.locomotion(body, seconds)

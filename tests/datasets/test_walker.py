@@ -1,4 +1,4 @@
-"""The made walk: feet that stand still, bones that keep their lengths, what its options do."""
+"""The synthetic walk: still feet, constant bone lengths, and the effect of its events."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from fitting.datasets.synthetic import gait, speed_profile, walker
 FPS = 60.0
 STRAIGHT = walker.WalkStyle(bend=0.0)
 EXACT = 1e-9  # m
-PENETRATION = 0.002  # m, of the heel in the last frames of a swing; standing feet have none
+PENETRATION = 0.002  # m, of the heel in the last frames of a swing; 0 for standing feet
 
 
 @pytest.fixture(scope="module", params=[0, 1, 2])
@@ -32,17 +32,17 @@ def stances(clip, leg):
 def heel(clip, leg):
     """The rear end of a sole, m."""
     ankle = clip.rig.joints[leg][2]
-    turn = Rotation.from_quat(clip.rotations_ws[:, ankle], scalar_first=True)
-    return clip.positions_ws[:, ankle] + turn.apply([0, -gait.ANKLE_HEIGHT, -gait.HEEL])
+    rot = Rotation.from_quat(clip.rotations_ws[:, ankle], scalar_first=True)
+    return clip.positions_ws[:, ankle] + rot.apply([0, -gait.ANKLE_HEIGHT, -gait.HEEL])
 
 
 def test_the_ball_of_a_standing_foot_does_not_move(clip):
     balls_stand(clip, 9)
 
 
-def balls_stand(clip, least):
+def balls_stand(clip, minimum):
     for leg, joints in enumerate(clip.rig.joints):
-        assert len(stances(clip, leg)) >= least
+        assert len(stances(clip, leg)) >= minimum
         for first, last in stances(clip, leg):
             ball = clip.positions_ws[first : last + 1, joints[3]]
             assert np.ptp(ball, axis=0).max() < EXACT
@@ -67,25 +67,27 @@ def test_no_foot_sinks_into_the_floor(clip):
         assert heel(clip, leg)[:, 1].min() > -PENETRATION
 
 
-def test_bones_keep_their_lengths_and_joints_their_places_on_each_other(clip):
+def test_bones_keep_their_lengths_and_joints_are_rigid_on_their_parents(clip):
     rig = clip.rig
     for joints in rig.joints:
-        places = [clip.positions_ws[:, joint] for joint in joints]
-        lengths = [np.linalg.norm(b - a, axis=-1) for a, b in zip(places, places[1:], strict=False)]
-        for length, wanted in zip(lengths, (gait.THIGH, gait.SHIN, gait.FOOT), strict=True):
-            np.testing.assert_allclose(length, wanted, rtol=0, atol=EXACT)
+        positions = [clip.positions_ws[:, joint] for joint in joints]
+        lengths = [
+            np.linalg.norm(b - a, axis=-1) for a, b in zip(positions, positions[1:], strict=False)
+        ]
+        for length, expected in zip(lengths, (gait.THIGH, gait.SHIN, gait.FOOT), strict=True):
+            np.testing.assert_allclose(length, expected, rtol=0, atol=EXACT)
     positions_ls, _ = local_from_world(clip.parents, clip.positions_ws, clip.rotations_ws)
     assert np.ptp(positions_ls[:, 1:], axis=0).max() < EXACT
 
 
-def test_the_legs_are_recognised_with_flat_feet_and_knees_that_bend_forward(clip):
+def test_legs_are_recognised_with_flat_feet_and_forward_knees(clip):
     rig = clip.rig
     assert rig.names == ("left", "right")
     np.testing.assert_allclose(rig.knee_axis_ls, [[-1.0, 0.0, 0.0]] * 2, rtol=0, atol=0.02)
     np.testing.assert_allclose(rig.ankle_from_foot, [[1.0, 0.0, 0.0, 0.0]] * 2, rtol=0, atol=0.02)
 
 
-def test_stride_cadence_and_pelvis_are_those_of_the_measured_walk():
+def test_stride_cadence_and_pelvis_height_are_those_of_the_measured_walk():
     clip = walker.walk(12.6, FPS, style=walker.WalkStyle(bend=0.0, variation=0.0))
     pelvis = clip.positions_ws[:, 0]
     speed = gait.STRIDE / gait.PERIOD
@@ -103,31 +105,33 @@ def test_stride_cadence_and_pelvis_are_those_of_the_measured_walk():
     assert 0.2 < swing < 0.3
 
 
-def test_motion_is_smooth_where_a_foot_is_taken_up_and_put_down(clip):
+def test_motion_is_smooth_where_a_foot_lifts_off_and_lands(clip):
     joints = [joint for leg in clip.rig.joints for joint in leg[2:]]
     speeds = np.linalg.norm(np.diff(clip.positions_ws[:, joints], axis=0), axis=-1) * FPS
     assert speeds.max() < 6.0
     assert np.abs(np.diff(speeds, axis=0)).max() * FPS < 120.0
 
 
-def test_a_seed_gives_the_same_walk_and_another_one_another():
+def test_the_seed_determines_the_walk():
     first, same, other = (walker.walk(3.0, FPS, seed) for seed in (4, 4, 5))
     np.testing.assert_array_equal(first.positions_ws, same.positions_ws)
     assert np.abs(first.positions_ws - other.positions_ws).max() > 0.01
 
 
-def test_a_slip_carries_standing_feet_along_by_its_share():
-    share, start, end = 0.06, 2.0, 5.0
-    slipping = walker.walk(8.0, FPS, events=[speed_profile.Slip(start, end, share)], style=STRAIGHT)
+def test_a_slip_moves_standing_feet_by_its_speed_change():
+    change, start, end = 0.06, 2.0, 5.0
+    slipping = walker.walk(
+        8.0, FPS, events=[speed_profile.Slip(start, end, change)], style=STRAIGHT
+    )
     still = walker.walk(8.0, FPS, style=STRAIGHT)
     moved = slipping.positions_ws - still.positions_ws
     np.testing.assert_allclose(moved, moved[:, :1] * np.ones((1, 9, 1)), rtol=0, atol=EXACT)
     assert np.abs(moved[: round(start * FPS)]).max() < EXACT
-    full = (end - start - speed_profile.EASE) * share * gait.STRIDE / gait.PERIOD
+    full = (end - start - speed_profile.EASE) * change * gait.STRIDE / gait.PERIOD
     assert moved[-1, 0, 2] == pytest.approx(full, rel=0.01)
 
 
-def test_a_slide_freezes_the_walk_with_both_feet_down_and_keeps_the_speed():
+def test_a_slide_freezes_the_walk_on_both_feet_and_keeps_the_speed():
     clip = walker.walk(8.0, FPS, events=[speed_profile.Slide(3.0, 5.0)])
     assert clip.slide is not None
     np.testing.assert_array_equal(np.flatnonzero(clip.slide), np.arange(180, 300))
@@ -148,7 +152,7 @@ def stopping():
     )
 
 
-def test_a_stop_stands_exactly_still_on_two_flat_feet_and_walks_on(stopping):
+def test_in_a_stop_the_walk_stands_exactly_still_on_two_flat_feet(stopping):
     speed = np.asarray(clip_frames.frames_from_clip(stopping).speed)
     stands = contacts.runs(speed == 0.0)
     assert len(stands) == 2
@@ -160,13 +164,13 @@ def test_a_stop_stands_exactly_still_on_two_flat_feet_and_walks_on(stopping):
         assert all(len(contacts.runs(stopping.stance[first:last, leg])) == 1 for leg in (0, 1))
         for _, _, ankle, toe in stopping.rig.joints:
             for joint, height in ((ankle, gait.ANKLE_HEIGHT), (toe, gait.BALL_HEIGHT)):
-                place = stopping.positions_ws[still, joint]
-                assert np.ptp(place, axis=0).max() < 1e-6
-                np.testing.assert_allclose(place[:, 1], height, rtol=0, atol=1e-6)
+                positions = stopping.positions_ws[still, joint]
+                assert np.ptp(positions, axis=0).max() < 1e-6
+                np.testing.assert_allclose(positions[:, 1], height, rtol=0, atol=1e-6)
     np.testing.assert_allclose(speed[-30:], gait.STRIDE / gait.PERIOD, rtol=0.02)
 
 
-def test_the_foot_in_front_stays_flat_as_the_walk_goes_on(stopping):
+def test_the_front_foot_stays_flat_as_the_walk_resumes(stopping):
     for end in (3.7, 7.2):
         frame = round(end * FPS)
         ahead = int(np.argmax(stopping.joints_ws(3)[frame, :, 2]))
@@ -176,7 +180,7 @@ def test_the_foot_in_front_stays_flat_as_the_walk_goes_on(stopping):
         np.testing.assert_allclose(ankle[:, 1], gait.ANKLE_HEIGHT, rtol=0, atol=1e-6)
 
 
-def test_the_pelvis_of_a_standing_body_breathes_up_and_down_only(stopping):
+def test_the_pelvis_of_a_standing_body_only_moves_up_and_down(stopping):
     speed = np.asarray(clip_frames.frames_from_clip(stopping).speed)
     for first, last in contacts.runs(speed == 0.0):
         range_of = np.ptp(stopping.positions_ws[first : last + 1, 0], axis=0)
@@ -184,14 +188,14 @@ def test_the_pelvis_of_a_standing_body_breathes_up_and_down_only(stopping):
         assert 0.0005 < range_of[1] < 0.004
 
 
-def test_feet_bones_and_smoothness_of_a_walk_that_stops_are_as_without(stopping):
+def test_a_walk_that_stops_is_as_exact_and_smooth_as_any_other(stopping):
     balls_stand(stopping, 3)
-    test_bones_keep_their_lengths_and_joints_their_places_on_each_other(stopping)
-    test_motion_is_smooth_where_a_foot_is_taken_up_and_put_down(stopping)
+    test_bones_keep_their_lengths_and_joints_are_rigid_on_their_parents(stopping)
+    test_motion_is_smooth_where_a_foot_lifts_off_and_lands(stopping)
     test_no_foot_sinks_into_the_floor(stopping)
 
 
-def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
+def test_the_slide_is_stored_and_trimmed_with_the_clip_and_may_be_absent(tmp_path):
     clip = walker.walk(6.0, FPS, events=[speed_profile.Slide(3.0, 5.0)])
     save_clip(tmp_path / "walk.npz", clip)
     loaded, trimmed = load_clip(tmp_path / "walk.npz"), clip.select(slice(0, 200))
@@ -202,7 +206,7 @@ def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options, said",
+    "options, message",
     [
         ({"seconds": 0.0}, "above 0, got 0.0 s"),
         ({"fps": -60.0}, "-60.0 fps"),
@@ -211,6 +215,6 @@ def test_the_slide_is_stored_trimmed_and_absent_where_there_is_none(tmp_path):
         ({"events": [speed_profile.Stop(-1.0, 2.0)]}, r"Stop\(start=-1.0, end=2.0\)"),
     ],
 )
-def test_impossible_walks_are_refused(options, said):
-    with pytest.raises(ValueError, match=said):
+def test_impossible_walks_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
         walker.walk(**{"seconds": 5.0, **options})
