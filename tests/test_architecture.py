@@ -19,8 +19,6 @@ WINGS = {  # in import order: a wing may import those before it
 STAGES = ["inputs", "contact", "root", "probe", "stride_probe", "target", "lean", "lock", "pelvis"]
 STAGES += ["effector", "leg", "foot"]
 LIBRARIES_OF_JAXIK = {"jax", "equinox", "jaxtyping", "numpy", "lazy_loader"}
-UPWARD_IMPORTS = {  # still to be removed
-}
 ONLY_IMPORTED_BY = {
     "trimesh": "fitting/datasets/terrain/mesh_files.py",
     "optimistix": "fitting/inference/optimisation/levenberg_marquardt.py",
@@ -80,7 +78,6 @@ def test_a_wing_imports_only_wings_before_it(path):
     package, own = package_and_wing(path)
     order = WINGS[package]
     later = imported_wings(path) - set(order[: order.index(own)])
-    later -= UPWARD_IMPORTS.get(path.relative_to(ROOT).as_posix(), set())
     assert not later, f"{own} comes before {sorted(later)} in {order}"
 
 
@@ -108,3 +105,13 @@ def test_a_heavy_library_is_imported_by_one_module_only(library, module):
 def test_everything_public_has_a_docstring(path):
     assert ast.get_docstring(TREES[path]), "the module has no docstring"
     assert not PACKAGES[package_and_wing(path)[0]].undocumented(path)
+
+
+@pytest.mark.parametrize("name", house.PACKAGES)
+def test_the_figures_of_a_package_are_within_their_limits(name):
+    missed = [str(figure) for figure in house.package_figures(name) if not figure.is_within_limits]
+    assert not missed, "\n".join(missed)
+
+
+def test_the_figures_of_the_readme_are_within_their_limits():
+    assert house.readme_figure().is_within_limits
