@@ -156,11 +156,8 @@ def _identifiability(fitted: Fit) -> list[str]:
     ]
     if identifiability.correlated:
         parts.append("Pairs of which these clips mostly determine one combination (correlation):")
-        parts.append(
-            bullets(
-                [f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in identifiability.correlated]
-            )
-        )
+        pairs = [f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in identifiability.correlated]
+        parts.append(bullets(pairs))
     if identifiability.weakest:
         together = ", ".join(f"`{name}`" for name in identifiability.weakest)
         parts.append(f"The least determined direction moves {together}.")

@@ -1,4 +1,4 @@
-"""Files are written as a whole or not at all."""
+"""Files are written completely or not at all."""
 
 import os
 import stat
@@ -12,7 +12,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_text_takes_the_place_of_the_one_before(tmp_path):
+def test_a_text_replaces_the_one_before(tmp_path):
     path = tmp_path / "notes.md"
     files.write_text(path, "first")
     files.write_text(path, "half-life 0.2 s, π")
@@ -21,9 +21,9 @@ def test_a_text_takes_the_place_of_the_one_before(tmp_path):
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_what_fails_while_writing_leaves_the_file_before_and_nothing_else(tmp_path, error):
+def test_a_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, error):
     path = tmp_path / "clip.npz"
-    files.write_text(path, "whole")
+    files.write_text(path, "intact")
 
     def fill(temporary):
         temporary.write_text("ha")
@@ -31,16 +31,16 @@ def test_what_fails_while_writing_leaves_the_file_before_and_nothing_else(tmp_pa
 
     with pytest.raises(error):
         files.write(path, fill)
-    assert path.read_text() == "whole" and names(tmp_path) == ["clip.npz"]
+    assert path.read_text() == "intact" and names(tmp_path) == ["clip.npz"]
 
 
-def test_the_temporary_file_lies_beside_the_file_and_has_its_suffix(tmp_path):
-    seen = []
-    files.write(tmp_path / "plot.png", lambda path: (seen.append(path), path.write_text("x")))
-    assert seen[0].parent == tmp_path and seen[0].suffix == ".png" and not seen[0].exists()
+def test_the_temporary_file_is_in_the_same_folder_with_the_same_suffix(tmp_path):
+    paths = []
+    files.write(tmp_path / "plot.png", lambda path: (paths.append(path), path.write_text("x")))
+    assert paths[0].parent == tmp_path and paths[0].suffix == ".png" and not paths[0].exists()
 
 
-def test_a_file_may_be_read_by_those_who_may_read_new_files(tmp_path):
+def test_a_file_has_the_permissions_of_any_new_file(tmp_path):
     mask = os.umask(0o027)
     try:
         files.write_text(tmp_path / "shared.txt", "x")
@@ -49,7 +49,7 @@ def test_a_file_may_be_read_by_those_who_may_read_new_files(tmp_path):
     assert stat.S_IMODE((tmp_path / "shared.txt").stat().st_mode) == 0o640
 
 
-def test_a_place_where_no_file_can_be_is_refused_before_anything_is_computed(tmp_path):
+def test_an_impossible_path_is_rejected_before_anything_is_computed(tmp_path):
     (tmp_path / "run").mkdir()
 
     def fill(path):
@@ -62,7 +62,7 @@ def test_a_place_where_no_file_can_be_is_refused_before_anything_is_computed(tmp
     assert names(tmp_path) == ["run"]
 
 
-def test_what_the_system_refuses_is_told_with_the_file(tmp_path, monkeypatch):
+def test_an_error_of_the_system_is_reported_with_the_file(tmp_path, monkeypatch):
     def refuse(**_):
         raise PermissionError(13, "Permission denied")
 
