@@ -1,4 +1,4 @@
-"""Rules by name: in experiments and parameter files, and through everything that keeps them."""
+"""Rules: what they say of themselves, and their names in experiments and parameter files."""
 
 import dataclasses
 import json
@@ -31,36 +31,56 @@ RULES = 'rules = { pelvis = "CapsulePelvis", contact = "IdleContact" }'
 FREE = "pelvis.speed = {}\nfoot.max_pitch = { low = 0.1 }"
 
 
-def written(folder, text):
+def write_parameters(folder, text):
     path = folder / "parameters.toml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_every_rule_that_a_preset_has_is_known_at_its_stage():
-    assert list(systems.STAGES) == [one.name for one in dataclasses.fields(jaxik.FootIK)]
+def test_the_fields_of_all_rules_have_a_sentence_of_meaning():
+    for rules in systems.STAGES.values():
+        for rule in rules.values():
+            docs = parameter_tree.docs(rule())
+            assert list(docs) == [field.name for field in dataclasses.fields(rule)], rule.__name__
+            for name, sentence in docs.items():
+                assert sentence[0].isupper() and sentence.endswith("."), f"{rule.__name__}.{name}"
+            for declaration in parameter_tree.declarations(rule()).values():
+                assert declaration.doc in docs.values()
+
+
+def test_printing_a_preset_lists_its_rules_and_parameters_with_units():
+    lines = repr(presets.unreal()).splitlines()
+    assert lines[0] == "FootIK"
+    assert "  pelvis    CapsulePelvis" in lines
+    assert "    speed        15 1/s" in lines and "    half_height  0.9 m" in lines
+    assert "    max_knee_angle  3.142 rad (180°)" in lines
+    assert "  lean      NoLean" in lines
+
+
+def test_all_rules_of_the_presets_are_known_at_their_stages():
+    assert list(systems.STAGES) == [field.name for field in dataclasses.fields(jaxik.FootIK)]
     for name in PRESETS:
-        for stage, there in systems.rule_names(systems.preset_system(name)).items():
-            assert there in systems.STAGES[stage]
+        for stage, rule in systems.rule_names(systems.preset_system(name)).items():
+            assert rule in systems.STAGES[stage]
     assert systems.STAGES["leg"]["PoleLeg"] is leg.PoleLeg
     abstract = [n for rules in systems.STAGES.values() for n in rules if n.startswith("Abstract")]
     assert not abstract
 
 
-def test_an_exchanged_rule_has_its_defaults_and_one_that_is_there_keeps_its_values():
+def test_a_new_rule_has_its_defaults_and_a_present_one_keeps_its_values():
     ozz = presets.ozz()
-    made = systems.with_rules(ozz, {"pelvis": "CapsulePelvis", "probe": "FootProbe"}, "here")
-    assert type(made.pelvis) is pelvis.CapsulePelvis
+    changed = systems.with_rules(ozz, {"pelvis": "CapsulePelvis", "probe": "FootProbe"}, "here")
+    assert type(changed.pelvis) is pelvis.CapsulePelvis
     np.testing.assert_array_equal(
-        parameter_tree.get(made, "pelvis.speed"), pelvis.CapsulePelvis().speed
+        parameter_tree.get(changed, "pelvis.speed"), pelvis.CapsulePelvis().speed
     )
-    assert made.probe is ozz.probe and np.isinf(parameter_tree.get(made, "probe.ray_down"))
-    assert systems.changed_rules(made, ozz) == {"pelvis": "CapsulePelvis"}
+    assert changed.probe is ozz.probe and np.isinf(parameter_tree.get(changed, "probe.ray_down"))
+    assert systems.changed_rules(changed, ozz) == {"pelvis": "CapsulePelvis"}
     assert systems.changed_rules(ozz, presets.ozz()) == {}
 
 
 @pytest.mark.parametrize(
-    ("rules", "said"),
+    ("rules", "message"),
     [
         ({"pelvs": "LowestPelvis"}, "here: unknown key 'pelvs'; nearest is 'pelvis' of"),
         ({"pelvis": "LowPelvis"}, "here: pelvis has no rule 'LowPelvis'; it has .'LowestPelvis',"),
@@ -70,20 +90,20 @@ def test_an_exchanged_rule_has_its_defaults_and_one_that_is_there_keeps_its_valu
         ({"pelvis": ["LowestPelvis"]}, r"pelvis has no rule \['LowestPelvis'\]"),
     ],
 )
-def test_an_unknown_stage_or_rule_is_refused_with_what_exists(rules, said):
-    with pytest.raises(ValueError, match=said):
+def test_an_unknown_stage_or_rule_is_an_error_that_lists_what_exists(rules, message):
+    with pytest.raises(ValueError, match=message):
         systems.with_rules(presets.record(), rules, "here")
 
 
 # Parameter files
 
 
-def test_rules_come_back_from_a_parameter_file_with_their_values(tmp_path):
+def test_rules_and_values_round_trip_through_a_parameter_file(tmp_path):
     names = {"pelvis": "LegLengthPelvis", "leg": "PoleLeg", "contact": "IdleContact"}
     ik = systems.with_rules(presets.record(), names, "here")
     ik = parameter_tree.replace(ik, {"pelvis.max_length": 0.91, "contact.idle_speed": 0.07})
     text = parameter_files.system_to_toml(ik)
-    back, preset = parameter_files.load_system(written(tmp_path, text))
+    back, preset = parameter_files.load_system(write_parameters(tmp_path, text))
     assert preset == "record" and systems.rule_names(back) == systems.rule_names(ik)
     for name in systems.leaf_names(ik):
         np.testing.assert_array_equal(
@@ -91,13 +111,13 @@ def test_rules_come_back_from_a_parameter_file_with_their_values(tmp_path):
         )
 
 
-def test_a_preset_s_own_rules_are_not_written():
+def test_the_rules_of_a_preset_itself_are_not_written():
     for name in PRESETS:
         assert "rules" not in parameter_files.system_to_toml(systems.preset_system(name), name)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("rules = 3", "parameters.toml: rules is 3; wanted a table"),
         ("[rules]\npelvs = 'x'", r"parameters.toml \[rules\]: unknown key 'pelvs'"),
@@ -108,13 +128,13 @@ def test_a_preset_s_own_rules_are_not_written():
         ),
     ],
 )
-def test_wrong_rules_of_a_parameter_file_are_refused(tmp_path, text, said):
-    with pytest.raises(ValueError, match=said):
-        parameter_files.load_system(written(tmp_path, text))
+def test_wrong_rules_of_a_parameter_file_are_an_error(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        parameter_files.load_system(write_parameters(tmp_path, text))
 
 
-def test_a_record_with_another_rule_is_no_record(tmp_path, capsys):
-    path = written(tmp_path, "[rules]\npelvis = 'CapsulePelvis'\n")
+def test_a_system_with_other_rules_cannot_become_a_record(tmp_path, capsys):
+    path = write_parameters(tmp_path, "[rules]\npelvis = 'CapsulePelvis'\n")
     words = ["record", "to-bytes", str(path), "-o", str(tmp_path / "a.bin")]
     assert main.main(words) == main.MISTAKE
     assert "rules {'pelvis': 'CapsulePelvis'}; only those of 'record'" in capsys.readouterr().err
@@ -124,7 +144,7 @@ def test_a_record_with_another_rule_is_no_record(tmp_path, capsys):
 # Experiments
 
 
-def test_an_experiment_may_exchange_rules_and_free_their_parameters(tmp_path):
+def test_an_experiment_can_exchange_rules_and_free_their_parameters(tmp_path):
     rest = "[parameters]\ncontact.idle_speed = 0.5"
     read = experiment_files.load_experiment(write(tmp_path, top=RULES, free=FREE, rest=rest))
     assert read.rules == {"pelvis": "CapsulePelvis", "contact": "IdleContact"}
@@ -137,19 +157,19 @@ def test_an_experiment_may_exchange_rules_and_free_their_parameters(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("top", "said"),
+    ("top", "message"),
     [
         ("rules = 3", "rules is 3; wanted a table"),
         ("rules = { pelvs = 'x' }", r"\[rules\]: unknown key 'pelvs'; nearest is 'pelvis'"),
         ("rules = { pelvis = 'Low' }", r"\[rules\]: pelvis has no rule 'Low'; it has \["),
     ],
 )
-def test_wrong_rules_of_an_experiment_are_refused(tmp_path, top, said):
-    with pytest.raises(ValueError, match=said):
+def test_wrong_rules_of_an_experiment_are_an_error(tmp_path, top, message):
+    with pytest.raises(ValueError, match=message):
         experiment_files.load_experiment(write(tmp_path, top=top))
 
 
-def test_a_parameter_of_a_rule_that_was_exchanged_is_unknown(tmp_path):
+def test_parameters_of_an_exchanged_rule_are_unknown(tmp_path):
     read = experiment_files.load_experiment(write(tmp_path, top=RULES))
     with pytest.raises(ValueError, match="no parameter named 'pelvis.on_gain'"):
         problems.make_problem(read)
@@ -171,13 +191,13 @@ def test_rules_are_kept_through_a_run(tmp_path):
     values = np.asarray(problem.space.values(problem.space.u0 * 0 + u))
     names = problem.space.names
     solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
-    found = Identifiability(
+    identifiability = Identifiability(
         names, np.ones(2), np.array([[0.1, 0.2]] * 2), np.ones(2), ("", ""), np.ones(2), (), (),
         {}, 0.0,
     )  # fmt: skip
     run = tmp_path / "run"
     run_folder.save_solution(run, read, problem, solution)
-    run_folder.save_fit(run, Fit(read, problem, solution, found))
+    run_folder.save_fit(run, Fit(read, problem, solution, identifiability))
     reloaded, summary = run_folder.load_fit(run)
     assert reloaded.rules == read.rules
     assert json.loads((run / run_folder.FIT).read_text())["parameters"] == summary["parameters"]
@@ -238,15 +258,15 @@ def test_variants_are_kept_through_a_run_s_own_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "message"),
     [
         ("without = 3", r"without is 3; wanted \[\[without\]\], one for each variant"),
         ("without = [3]", r"\[\[without\]\] is 3; wanted a table"),
         ("[[without]]\nrules = { pelvis = 'CapsulePelvis' }", "a variant without a name"),
         ("[[without]]\nname = ' '\nparameters = { leg.soften = 1 }", "a variant without a name"),
         ("[[without]]\nname = 3", "name is 3; wanted a text"),
-        ("[[without]]\nname = 'a'", "a: nothing is otherwise"),
-        ("[[without]]\nname = 'a'\nrules = { leg = 'TwoBone' }", "a: nothing is otherwise"),
+        ("[[without]]\nname = 'a'", "a: changes nothing"),
+        ("[[without]]\nname = 'a'\nrules = { leg = 'TwoBone' }", "a: changes nothing"),
         ("[[without]]\nname = 'a'\nrule = 3", "unknown key 'rule'; nearest is 'rules'"),
         ("[[without]]\nname = 'a'\nrules = 3", "rules is 3; wanted a table"),
         ("[[without]]\nname = 'a'\nrules = { leg = 'x' }", "a: rules: leg has no rule 'x'; it has"),
@@ -266,7 +286,7 @@ def test_variants_are_kept_through_a_run_s_own_file(tmp_path):
         (2 * "[[without]]\nname = 'a'\nparameters = { leg.soften = 1 }\n", "a variant named 'a'"),
     ],
 )
-def test_a_wrong_variant_is_refused(tmp_path, table, said):
+def test_a_wrong_variant_is_refused(tmp_path, table, message):
     place = "top" if table.startswith("without") else "rest"
-    with pytest.raises(ValueError, match=f"experiment.toml.*{said}"):
+    with pytest.raises(ValueError, match=f"experiment.toml.*{message}"):
         experiment_files.load_experiment(write(tmp_path, **{place: table}))
