@@ -22,8 +22,11 @@ from fitting.report.plots import comparison_plots, style
 from fitting.runtime import program_cache
 from fitting.studies import comparison
 from fitting.studies.animations import Animation
+from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support.experiments import ROOT
+
+pytestmark = pytest.mark.slow
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
@@ -287,5 +290,9 @@ def test_presets_that_leave_heights_to_their_game_stand_on_the_ground_by_default
     options = [("--presets", "mec,ozz,record")]
     grounded = comparison.named_systems(options)
     animated = comparison.named_systems(options, on_ground=False)
-    assert grounded["mec"].root.enabled and not animated["mec"].root.enabled
-    assert grounded["ozz"].root.enabled and animated["ozz"].root.enabled
+    assert parameter_tree.get(grounded["mec"], "root.enabled") and not parameter_tree.get(
+        animated["mec"], "root.enabled"
+    )
+    assert parameter_tree.get(grounded["ozz"], "root.enabled") and parameter_tree.get(
+        animated["ozz"], "root.enabled"
+    )
