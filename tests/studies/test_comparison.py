@@ -196,7 +196,6 @@ def size_of_png(path: Path) -> tuple[int, int]:
     return struct.unpack(">II", path.read_bytes()[16:24])
 
 
-@pytest.mark.slow
 def test_the_terminal_shows_the_table_and_how_long_each_system_took(folder, compared, capsys):
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
     assert main.main([*map(str, words), "-o", str(folder / "again")]) == 0
