@@ -87,7 +87,7 @@ def _draw_plan(axes: Axes, terrain: Reconstruction, margin: float, legs: tuple[s
     axes.set_xlabel("x, m")
     axes.set_ylabel("z, m")
     axes.set_title(
-        f"{terrain.chosen.capitalize()} from above, and the height measured at each stance"
+        f"{terrain.chosen.capitalize()} from above, with the\nheight measured at each stance"
     )
 
 
