@@ -235,7 +235,7 @@ class BatchEvaluator:
         carry = values[consts : consts + carried]
         results_batched: list[bool] = []
 
-        def body(before: list[Array], xs: list[Array]) -> tuple[list[Array], list[Array]]:
+        def body(before: list, xs: list) -> tuple[list, list]:
             old = _values(before, _batched(carry))
             new = _values(xs, _batched(inputs))
             results = self.evaluate(closed.jaxpr, closed.consts, [*shared, *old, *new])

@@ -296,8 +296,8 @@ def test_a_crowd_moves_as_its_members_do_alone(preset, ground, gate):
     terrain = flat if ground == "plane" else workloads.ground(workloads.mesh_field(30))
     ik = workloads.single(getattr(presets, preset)())
 
-    def run(row):
-        return jaxik.run(ik, crowd.rig, terrain, crowd.member(row)[1], gate, block=4)
+    def run(member):
+        return jaxik.run(ik, crowd.rig, terrain, crowd.character(member)[1], gate, block=4)
 
     quick = functools.partial(jax.jit, compiler_options=QUICK)
-    assert_same(quick(lanes(run))(crowd.rows), quick(jax.vmap(run))(crowd.rows), 2e-5)
+    assert_same(quick(lanes(run))(crowd.members), quick(jax.vmap(run))(crowd.members), 2e-5)
