@@ -74,8 +74,8 @@ class HeightContact(AbstractInstantContact):
         lifted = gate.above(lift, self.raised_height, band=HEIGHT_BAND)
         span = self.raised_height - self.planted_height
         fraction = vec.safe_divide(self.raised_height - lift, span)
-        zero, one = jnp.zeros_like(lift), jnp.ones_like(lift)
-        ramp = gate.clip(fraction, zero, one, band=0.1)
+        zeros, ones = jnp.zeros_like(lift), jnp.ones_like(lift)
+        ramp = gate.clip(fraction, zeros, ones, band=0.1)
         return Contact(lift, jnp.where(span > 0, ramp, planted), planted, lifted)
 
 
@@ -84,8 +84,8 @@ class StandingContact(AbstractInstantContact):
 
     def sense(self, inputs: Inputs) -> Contact:
         lift = inputs.frame.pose.ankle.pos[..., 1]
-        one, zero = jnp.ones_like(lift), jnp.zeros_like(lift)
-        return Contact(lift, one, one, zero)
+        ones, zeros = jnp.ones_like(lift), jnp.zeros_like(lift)
+        return Contact(lift, ones, ones, zeros)
 
 
 class IdleContact(AbstractInstantContact):
@@ -199,9 +199,9 @@ class SpeedContact(AbstractContact):
     ) -> tuple[SpeedState, Contact]:
         gate = now.gate
         before = jnp.where(now.started, state.standing, contact.planted)
-        one, zero = jnp.ones_like(before), jnp.zeros_like(before)
-        standing = gate.choose(contact.planted, one, before)
-        standing = gate.choose(contact.lifted, zero, standing)
+        ones, zeros = jnp.ones_like(before), jnp.zeros_like(before)
+        standing = gate.choose(contact.planted, ones, before)
+        standing = gate.choose(contact.lifted, zeros, standing)
         fraction = now.progress(smoothing.fraction_of_half_life(self.half_life, now.dt))
         weight = smoothing.lerp(state.weight, standing, fraction)
         return SpeedState(standing, weight), Contact(contact.lift, weight, standing, 1.0 - standing)

@@ -47,7 +47,7 @@ class AbstractFoot(Rule):
 
     @abstractmethod
     def pose(
-        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
     ) -> SolvedFoot:
         """The solved legs with their feet turned."""
 
@@ -101,7 +101,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
     )
 
     def pose(
-        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
     ) -> SolvedFoot:
         rig, frame, gate = inputs.rig, inputs.frame, inputs.gate
         up = sensed.leg_up_ws
@@ -112,7 +112,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
 
         pitch, roll = vec.stacked_barrier(*ground_angles(sensed, ahead, right, rig.side))
         shin = vec.normalize(
-            bend.pose.ankle.pos - bend.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
+            leg.pose.ankle.pos - leg.pose.knee.pos, vec.constant((0.0, -1.0, 0.0), up)
         )
         shin = quat.rotate(frame.world_from_model.rot, shin)
         wanted_pitch, wanted_roll = pitch, roll
@@ -126,7 +126,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
         )
         lost = jnp.abs(pitch - wanted_pitch) + jnp.abs(roll - wanted_roll)
         unlimited = gate.below(lost, jnp.full_like(lost, SAME_ANGLE), band=ANGLE_BAND)
-        return turn_feet(frame, effector, bend, quat.multiply(tilt, effector.rot_ws), unlimited)
+        return turn_feet(frame, effector, leg, quat.multiply(tilt, effector.rot_ws), unlimited)
 
 
 class AimFoot(AbstractAnimatedFoot):
@@ -154,22 +154,22 @@ class AimFoot(AbstractAnimatedFoot):
     )
 
     def pose(
-        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
     ) -> SolvedFoot:
         rig, frame = inputs.rig, inputs.frame
-        carried = bend.pose.ankle
+        carried = leg.pose.ankle
         model_from_world = frame.world_from_model.inverse()
         foot = quat.multiply(carried.rot, rig.ankle_from_foot)
         aim = model_from_world.apply(effector.target_ws + sensed.ground.ankle.normal) - carried.pos
         upward, ahead = (quat.rotate(foot, vec.constant(axis, aim)) for axis in (UP, FORWARD))
         start = quat.rotate(foot, self.offset)
-        turn, reached = aim_rotation(
+        aim_rot, reached = aim_rotation(
             PoleTarget(aim, ahead, self.twist), upward, start, ahead, inputs.gate
         )
         weight = jnp.where(self.enabled, effector.weight * sensed.foothold.found, 0.0)
-        turn = quat.nlerp(quat.identity(turn.dtype), turn, weight * self.weight)
+        aim_rot = quat.nlerp(quat.identity(aim_rot.dtype), aim_rot, weight * self.weight)
         full = jnp.where(weight * self.weight >= 1, 1.0, 0.0)
-        return with_ankle(frame, bend, quat.multiply(turn, carried.rot), reached * full)
+        return with_ankle(frame, leg, quat.multiply(aim_rot, carried.rot), reached * full)
 
 
 class FlatFoot(AbstractFoot):
@@ -194,40 +194,40 @@ class FlatFoot(AbstractFoot):
         return quat.nlerp(animated_ankles(inputs.frame).rot, flat, ground.ankle.found)
 
     def pose(
-        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
     ) -> SolvedFoot:
-        return turn_feet(inputs.frame, effector, bend, effector.rot_ws, sensed.ground.ankle.found)
+        return turn_feet(inputs.frame, effector, leg, effector.rot_ws, sensed.ground.ankle.found)
 
 
 class KeepFoot(AbstractAnimatedFoot):
     """Feet keep their animated rotation in the world (Unreal)."""
 
     def pose(
-        self, inputs: Inputs, sensed: Sensed, effector: Effector, bend: SolvedLeg
+        self, inputs: Inputs, sensed: Sensed, effector: Effector, leg: SolvedLeg
     ) -> SolvedFoot:
         return turn_feet(
-            inputs.frame, effector, bend, effector.rot_ws, jnp.ones_like(effector.weight)
+            inputs.frame, effector, leg, effector.rot_ws, jnp.ones_like(effector.weight)
         )
 
 
 def turn_feet(
-    frame: Frame, effector: Effector, bend: SolvedLeg, rot_ws: Array, reached: Array
+    frame: Frame, effector: Effector, leg: SolvedLeg, rot_ws: Array, reached: Array
 ) -> SolvedFoot:
     """The legs with ankle rotations `rot_ws`, world space, each by its weight of foot IK."""
-    wanted = quat.multiply(quat.conjugate(frame.world_from_model.rot), rot_ws)
-    rot = quat.nlerp(bend.pose.ankle.rot, wanted, effector.weight)
+    rot_ms = quat.multiply(quat.conjugate(frame.world_from_model.rot), rot_ws)
+    rot = quat.nlerp(leg.pose.ankle.rot, rot_ms, effector.weight)
     full = jnp.where(effector.weight >= 1, 1.0, 0.0)
-    return with_ankle(frame, bend, rot, reached * full)
+    return with_ankle(frame, leg, rot, reached * full)
 
 
-def with_ankle(frame: Frame, bend: SolvedLeg, rot: Array, reached: Array) -> SolvedFoot:
+def with_ankle(frame: Frame, leg: SolvedLeg, rot: Array, reached: Array) -> SolvedFoot:
     """The legs with ankle rotations `rot`, model space; toes move with their ankles."""
-    carried = bend.pose.ankle
+    carried = leg.pose.ankle
     ankle, toe = frame.pose.ankle, frame.pose.toe
-    turn = quat.multiply(rot, quat.conjugate(ankle.rot))
-    ball = quat.rotate(turn, toe.pos - ankle.pos)
-    toe = Transform(carried.pos + ball, quat.multiply(turn, toe.rot))
-    pose = LegPose(bend.pose.hip, bend.pose.knee, Transform(carried.pos, rot), toe)
+    from_animated = quat.multiply(rot, quat.conjugate(ankle.rot))
+    ball = quat.rotate(from_animated, toe.pos - ankle.pos)
+    toe = Transform(carried.pos + ball, quat.multiply(from_animated, toe.rot))
+    pose = LegPose(leg.pose.hip, leg.pose.knee, Transform(carried.pos, rot), toe)
     return SolvedFoot(pose, quat.multiply(quat.conjugate(carried.rot), rot), reached)
 
 
