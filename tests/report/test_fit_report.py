@@ -1,6 +1,5 @@
-"""Reports: numbers in texts and tables, pictures that are there, sections that do not pile up."""
+"""Reports of fits and posteriors: numbers in texts and tables, and the plots that they link."""
 
-import json
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -13,22 +12,18 @@ import jaxik
 from fitting.analysis import limit_activity, playback
 from fitting.datasets.synthetic import walker
 from fitting.experiments import known_values
-from fitting.experiments.experiment import (
-    ClipEntry,
-    Experiment,
-    free_parameters,
-    make_scene,
-    system,
-)
+from fitting.experiments.experiment import ClipEntry, Experiment
+from fitting.experiments.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
-from fitting.inference.threshold_profile import Profile
-from fitting.inference.optimisation import search
+from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior
+from fitting.inference.threshold_profile import Profile
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
-from fitting.report import fit_report
-from fitting.studies import run_folder, study
+from fitting.report import fit_report, posterior_report
+from fitting.studies import run_folder
+from fitting.studies.fit import Fit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 
@@ -59,18 +54,18 @@ def experiment(tmp_path_factory) -> Experiment:
 
 
 @pytest.fixture(scope="module")
-def fitted(experiment) -> study.Fit:
-    """A fit of a two-second walk uphill that nothing has solved: its numbers are made up."""
+def fitted(experiment) -> Fit:
+    """A two-second walk uphill with an invented fit; no search has run."""
     clip = walker.walk(seconds=2.0, fps=15.0)
     ground = terrain.plane(point=(0.0, 0.02, 0.0), normal=(0.1, 1.0, -0.3))
-    ik = system(experiment)
-    space = make_space(ik, free_parameters(experiment, ik))
-    scene = make_scene(clip, clip, ground, SIGMAS)
+    ik = experiment.starting_system()
+    space = make_space(ik, experiment.free_parameters(ik))
+    scene = make_scene(ClipData(clip, clip, ground), SIGMAS)
     problem = Problem(space, (scene,), residuals.residuals_of_scenes)
     u = np.asarray(space.pack(VALUES))
-    history = [search.Progress("start", 0, 0, 900.0, 900.0, 1.0)]
-    history += [search.Progress("blocks", 0, i, 800.0 / i, 800.0 / i, 1.0 + i) for i in range(1, 9)]
-    solution = search.Solution(
+    history = [Progress("start", 0, 0, 900.0, 900.0, 1.0)]
+    history += [Progress("blocks", 0, i, 800.0 / i, 800.0 / i, 1.0 + i) for i in range(1, 9)]
+    solution = Solution(
         names=space.names,
         u=u,
         values=np.asarray(space.values(jnp.asarray(u))),
@@ -85,7 +80,7 @@ def fitted(experiment) -> study.Fit:
     )
     sides = np.array([0.0, 0.4])
     profile = Profile(sides, sides, (0.10, 0.12), (7.5, -0.25))
-    identification = Identifiability(
+    identifiability = Identifiability(
         names=space.names,
         contraction=np.array([0.99, 0.97, 0.1]),
         interval=np.array([[0.10, 0.12], [0.2, 0.4], [0.81, 0.99]]),
@@ -97,10 +92,11 @@ def fitted(experiment) -> study.Fit:
         profiles={"contact.planted_height": profile},
         improvement=0.25,
     )
-    return study.Fit(experiment, problem, solution, identification)
+    known = known_values.load_known_values(experiment)
+    return Fit(experiment, problem, solution, identifiability, known)
 
 
-def made_posterior(stuck: list[int] | None = None) -> Posterior:
+def invented_posterior(stuck: list[int] | None = None) -> Posterior:
     """Normal draws around known values."""
     random = np.random.default_rng(0)
     u = random.normal(size=(120, 12, 3))
@@ -132,7 +128,7 @@ def line_of(text: str, name: str) -> str:
     return next(line for line in text.splitlines() if line.strip("| ").startswith(name))
 
 
-def test_the_truth_is_that_of_the_first_clip_that_has_one(experiment):
+def test_known_values_are_those_of_the_first_clip_that_has_any(experiment):
     assert known_values.load_known_values(experiment) == {
         "contact.planted_height": 0.10,
         "pelvis.on_gain": 0.5,
@@ -144,13 +140,13 @@ def test_the_truth_is_that_of_the_first_clip_that_has_one(experiment):
     assert known_values.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
 
 
-def test_the_truth_of_one_leg_is_that_of_all(experiment):
+def test_the_known_value_of_one_leg_is_that_of_all_legs(experiment):
     one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
     truth = known_values.load_known_values(one_leg)
     assert truth is not None and truth["pelvis.on_gain[1]"] == 0.5
 
 
-def test_a_truth_that_is_no_toml_is_refused_with_its_name(experiment, tmp_path):
+def test_a_truth_file_that_is_not_toml_is_rejected_by_name(experiment, tmp_path):
     path = tmp_path / "broken.toml"
     path.write_text("contact = [")
     entry = replace(experiment.clips[0], truth=path)
@@ -158,10 +154,8 @@ def test_a_truth_that_is_no_toml_is_refused_with_its_name(experiment, tmp_path):
         known_values.load_known_values(replace(experiment, clips=(entry,)))
 
 
-def test_the_terminal_tells_values_truth_bounds_and_what_is_undetermined(fitted, experiment):
-    text = fit_report.fit_text(
-        run_folder.describe_fit(fitted), known_values.load_known_values(experiment)
-    )
+def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(fitted):
+    text = fit_report.fit_text(fitted)
     assert text.startswith("Not converged")
     assert "Cost 900 before, 100 after" in text
     # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.01 to 0.95.
@@ -174,8 +168,8 @@ def test_the_terminal_tells_values_truth_bounds_and_what_is_undetermined(fitted,
     assert text.endswith("1 of 2 determined parameters within 5 % of their range")
 
 
-def test_a_gain_is_told_as_half_life_and_at_30_and_60_hz(fitted):
-    text = fit_report.fit_text(run_folder.describe_fit(fitted), None)
+def test_a_gain_is_shown_as_half_life_and_at_30_and_60_hz(fitted):
+    text = fit_report.fit_text(replace(fitted, known_values=None))
     cells = text.split("gain at 60 Hz")[1].split()[-5:]
     half_life = np.log(0.5) / np.log(0.7) / 30.0
     assert cells[0] == "pelvis.on_gain"
@@ -186,51 +180,54 @@ def test_a_gain_is_told_as_half_life_and_at_30_and_60_hz(fitted):
 
 
 @pytest.mark.slow
-def test_a_run_gets_a_summary_and_every_picture_that_it_links(fitted, tmp_path):
+def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     fit_report.write_fit(tmp_path, fitted)
     text = (tmp_path / run_folder.SUMMARY).read_text()
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
-    wanted = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
-    wanted |= {"worst.png"}
-    assert set(names) == wanted
-    assert {path.name for path in tmp_path.iterdir()} == wanted | {run_folder.SUMMARY}
+    plots = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
+    plots |= {"worst.png"}
+    assert set(names) == plots
+    assert {path.name for path in tmp_path.iterdir()} == plots | {run_folder.SUMMARY}
     for name in names:
-        wide, high = size_of_png(tmp_path / name)
-        assert 1000 < wide < 2000 and 400 < high < 2500, name
+        width, height = size_of_png(tmp_path / name)
+        assert 1000 < width < 2000 and 400 < height < 2500, name
     assert "| contact.planted_height | 0.11 | m |" in text
     assert "Undetermined: `leg.soften`." in text
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | 0.100 | undetermined |" in text
     assert "+7.5" in line_of(text.split("threshold moves")[1], "contact.planted_height")
     scene = fitted.problem.data[0]
-    asked = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
-    share = f"{100 * asked.limits['pelvis.limit']:.1f} %"
-    assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {share} |"
+    activity = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
+    fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
+    assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
 
 
-def test_the_second_of_two_clips_has_pictures_of_its_own(fitted, tmp_path, monkeypatch):
-    monkeypatch.setattr(fit_report, "_keep", lambda run, name, caption, figure: {name: caption})
+def test_the_second_of_two_clips_has_its_own_plots(fitted, tmp_path, monkeypatch):
+    def save_nothing(run, name, caption, figure):
+        return {name: caption}
+
+    monkeypatch.setattr(fit_report, "save_plot", save_nothing)
     problem = fitted.problem
     twice = Problem(problem.space, problem.data * 2, problem.residual_function, problem.loss)
-    played = playback.play(problem.data[0], playback.run(fitted.ik, problem.data[0]))
-    pictures = fit_report._draw_clip(tmp_path, replace(fitted, problem=twice), 1, played)
-    assert set(pictures) == {
+    double = replace(fitted, problem=twice)
+    after = playback.play(problem.data[0], playback.run(fitted.ik, problem.data[0]))
+    plots = fit_report._draw_clip(tmp_path, double, 1, after, after)
+    assert set(plots) == {
         "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png"
     }  # fmt: skip
-    assert all(caption.startswith("hill, clip 2: ") for caption in pictures.values())
-    section = fit_report._worst(tmp_path, replace(fitted, problem=twice), [played, played])
-    assert [part for part in section if part.startswith("![")] == [
-        f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)" for number in (1, 2)
-    ]
+    assert all(caption.startswith("hill, clip 2: ") for caption in plots.values())
+    for number in (1, 2):
+        _, plot = fit_report._worst_window(tmp_path, double, number - 1, after)
+        assert plot == f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)"
 
 
 @pytest.mark.slow
-def test_a_playback_sees_the_residuals_that_the_fit_sees(fitted):
+def test_a_playback_has_the_residuals_of_the_fit(fitted):
     scene = fitted.problem.data[0]
     played = playback.play(scene, playback.run(fitted.ik, scene))
     assert played.fitted_kinds == list(playback.RESIDUAL_KINDS)
-    rows = np.concatenate([np.ravel(played.residuals[kind]) for kind in playback.RESIDUAL_KINDS])
-    np.testing.assert_allclose(rows, residuals.residuals_of_scene(fitted.ik, scene), atol=1e-9)
+    shown = np.concatenate([np.ravel(played.residuals[kind]) for kind in playback.RESIDUAL_KINDS])
+    np.testing.assert_allclose(shown, residuals.residuals_of_scene(fitted.ik, scene), atol=1e-9)
 
 
 def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
@@ -245,7 +242,7 @@ def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
     np.testing.assert_allclose(np.cos(captured.knee_angle), cosine, atol=1e-6)
 
 
-def test_limits_act_where_they_are_tight_and_never_at_the_end_of_their_range(fitted):
+def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitted):
     scene = fitted.problem.data[0]
     values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}
     ik = parameter_tree.replace(fitted.ik, values)
@@ -258,22 +255,22 @@ def test_limits_act_where_they_are_tight_and_never_at_the_end_of_their_range(fit
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
 
 
-def test_counters_count_feet_that_lock_release_and_find_ground(fitted):
+def test_activity_counts_locks_releases_and_ground(fitted):
     scene = fitted.problem.data[0]
-    asked = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
+    activity = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
     result = jaxik.run(fitted.ik, scene.rig, scene.terrain, scene.frames)
     locked = np.asarray(result.trace.advanced.state.lock.locked)
-    assert asked.frames == 30 and asked.seconds == pytest.approx(2.0)
-    assert asked.locks == tuple(int(n) for n in (np.diff(locked, axis=0) == 1).sum(axis=0))
-    assert sum(asked.locks) > 0 and sum(asked.releases) > 0
-    np.testing.assert_allclose(asked.locked, locked.mean(axis=0))
+    assert activity.frames == 30 and activity.seconds == pytest.approx(2.0)
+    assert activity.locks == tuple(int(n) for n in (np.diff(locked, axis=0) == 1).sum(axis=0))
+    assert sum(activity.locks) > 0 and sum(activity.releases) > 0
+    np.testing.assert_allclose(activity.locked, locked.mean(axis=0))
     ankle = np.asarray(walker.walk(seconds=2.0, fps=15.0).leg_pose_ws().ankle.pos)
     below = ankle[..., 1] + 0.5 - (0.02 - 0.1 * ankle[..., 0] + 0.3 * ankle[..., 2])
-    np.testing.assert_allclose(asked.grounded, ((0 <= below) & (below <= 1.3)).mean(axis=0))
-    assert asked.grounded.max() < 1.0, "the hill rises out of reach of the rays"
+    np.testing.assert_allclose(activity.grounded, ((0 <= below) & (below <= 1.3)).mean(axis=0))
+    assert activity.grounded.max() < 1.0, "the hill rises out of reach of the rays"
 
 
-def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
+def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     scene, space = fitted.problem.data[0], fitted.problem.space
     base = parameter_tree.replace(space.system, {"lock.enabled": False})
     unlocked = make_space(base, space.parameters)
@@ -282,15 +279,15 @@ def test_decisions_flip_as_often_as_ankles_lie_between_the_thresholds(fitted):
         "contact.planted_height"
     ]
     lift = np.asarray(scene.frames.pose.ankle.pos[..., 1])
-    # Of four decisions a foot and frame only `planted` follows the threshold.
+    # Of the four decisions per foot and frame, only `planted` depends on the threshold.
     assert down == pytest.approx(np.mean((0.07 < lift) & (lift <= 0.11)) / 4)
     assert up == pytest.approx(np.mean((0.11 < lift) & (lift <= 0.15)) / 4)
     assert down > 0 and up > 0
 
 
-def test_the_terminal_tells_a_posterior_with_its_health():
-    posterior = made_posterior(stuck=[3])
-    text = fit_report.posterior_text(
+def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():
+    posterior = invented_posterior(stuck=[3])
+    text = posterior_report.posterior_text(
         posterior, {"contact.planted_height": 0.106, "leg.soften": 0.8}
     )
     first = posterior.summary[0]
@@ -302,39 +299,41 @@ def test_the_terminal_tells_a_posterior_with_its_health():
     assert "12 walkers, 240 steps, the first 40 left out" in text
     assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3;" in text
     assert "Converged: the chain is long enough." in text
-    assert "The 95 % intervals cover the truth of 1 of 2 parameters." in text
-    assert "truth" not in fit_report.posterior_text(posterior, None)
+    assert "The 95 % intervals contain the true values of 1 of 2 parameters." in text
+    assert "truth" not in posterior_report.posterior_text(posterior, None)
 
 
-def test_a_posterior_is_written_after_the_fit_and_once_only(fitted, experiment, tmp_path):
-    (tmp_path / run_folder.FIT).write_text(json.dumps(run_folder.describe_fit(fitted)))
-    (tmp_path / run_folder.SUMMARY).write_text("# hill\n\n## Parameters\n\nof the fit\n")
-    fit_report.write_posterior(tmp_path, experiment, made_posterior())
-    once = (tmp_path / run_folder.SUMMARY).read_text()
-    fit_report.write_posterior(tmp_path, experiment, made_posterior())
-    assert (tmp_path / run_folder.SUMMARY).read_text() == once
-    assert once.startswith("# hill\n\n## Parameters\n\nof the fit\n\n## Posterior\n")
-    assert (
-        "the truth of 1 of 2 parameters; of those that the fit calls determined, of 1 of 2." in once
+def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> None:
+    posterior_report.write_posterior(
+        run, fitted.experiment, posterior, fitted.summary["parameters"], fitted.known_values
     )
-    assert "| pelvis.on_gain | 1/tick |" in once
+
+
+def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
+    (tmp_path / run_folder.SUMMARY).write_text("# hill\n\n## Parameters\n\nof the fit\n")
+    write_posterior(tmp_path, fitted, invented_posterior())
+    text = (tmp_path / run_folder.SUMMARY).read_text()
+    write_posterior(tmp_path, fitted, invented_posterior())
+    assert (tmp_path / run_folder.SUMMARY).read_text() == text
+    assert text.startswith("# hill\n\n## Parameters\n\nof the fit\n\n## Posterior\n")
+    covered = "of 1 of 2 parameters; among those that the fit calls determined, of 1 of 2."
+    assert f"contain the true values {covered}" in text
+    assert "| pelvis.on_gain | 1/tick |" in text
     for name in ("corner.png", "chain.png"):
-        assert f"({name})" in once
+        assert f"({name})" in text
         assert min(size_of_png(tmp_path / name)) > 400
 
 
-def test_a_posterior_makes_its_own_summary_where_there_is_none(fitted, experiment, tmp_path):
-    (tmp_path / run_folder.FIT).write_text(json.dumps(run_folder.describe_fit(fitted)))
-    clips = (replace(experiment.clips[0], truth=None),)
-    fit_report.write_posterior(tmp_path, replace(experiment, clips=clips), made_posterior([0]))
+def test_a_posterior_starts_a_summary_where_there_is_none(fitted, tmp_path):
+    unknown = replace(fitted, known_values=None)
+    write_posterior(tmp_path, unknown, invented_posterior([0]))
     text = (tmp_path / run_folder.SUMMARY).read_text()
-    assert text.startswith("# hill\n\n## Posterior\n") and "truth" not in text
+    assert text.startswith("# hill\n\n## Posterior\n") and "true value" not in text
 
 
-def test_a_parameter_that_never_moves_still_has_a_corner(fitted, experiment, tmp_path):
-    (tmp_path / run_folder.FIT).write_text(json.dumps(run_folder.describe_fit(fitted)))
-    posterior = made_posterior()
-    still = posterior.values.copy()
-    still[..., 2] = 0.9
-    fit_report.write_posterior(tmp_path, experiment, replace(posterior, values=still))
+def test_a_parameter_that_never_moves_can_be_drawn(fitted, tmp_path):
+    posterior = invented_posterior()
+    values = posterior.values.copy()
+    values[..., 2] = 0.9
+    write_posterior(tmp_path, fitted, replace(posterior, values=values))
     assert min(size_of_png(tmp_path / "corner.png")) > 400

@@ -176,7 +176,8 @@ def test_a_target_that_does_not_follow_is_reported_with_its_worst_place(run):
     still = parameter_tree.replace(presets.record(), {"leg.weight": 0.0, "lock.enabled": False})
     measured = difference.measure(scene, playback.run(still, scene))
     numbers = difference_report.numbers([measured])["all frames"]
-    assert numbers["ankle"]["reproduced"] < 0.3
+    reproduced = numbers["ankle"]["reproduced"]
+    assert reproduced is not None and reproduced < 0.3
     sentence, *_ = difference_report.shortcomings([measured], "a", "b")
     assert sentence.startswith("Ankles: ") and "(rms) remain of" in sentence
     worst = 1000 * measured.remaining["ankle"].max()
@@ -187,7 +188,7 @@ def test_standing_and_moving_frames_are_counted_separately():
     frames = np.arange(4)
     zeros, ones = np.zeros((4, 2)), np.ones((4, 2))
     late = np.stack([np.array([0.0, 0.0, 1.0, 1.0])] * 2, axis=1)
-    correction = dict.fromkeys(difference.QUANTITIES, ones)
+    correction: dict[str, np.ndarray] = dict.fromkeys(difference.QUANTITIES, ones)
     remaining = correction | {"ankle": late, "knee": zeros}
     half = difference.Difference(("left", "right"), frames * 0.1, frames < 2, correction, remaining)
     numbers = difference_report.numbers([half])
@@ -200,7 +201,7 @@ def test_standing_and_moving_frames_are_counted_separately():
 
 
 def test_a_quantity_that_the_source_does_not_correct_has_no_fraction():
-    correction = dict.fromkeys(difference.QUANTITIES, np.zeros((3, 1)))
+    correction: dict[str, np.ndarray] = dict.fromkeys(difference.QUANTITIES, np.zeros((3, 1)))
     remaining = correction | {"foot": np.full((3, 1), 0.02)}
     rotated = difference.Difference(
         ("left",), np.arange(3.0), np.zeros(3, bool), correction, remaining
