@@ -108,18 +108,21 @@ def carousel(time: float) -> characters.Transform:
 
 
 def clip(
-    legs: int = 2, known: bool = True, rides: bool = False, leaps: bool = False
+    legs: int = 2, footholds_known: bool = True, rides: bool = False, leaps: bool = False
 ) -> list[characters.Frame]:
     """A walk across all blocks and beyond, with slipping, turning and partly weighted feet.
 
-    Told, the stride is unknown for a while; the labels are doubtful for another. It may ride on a
-    platform, and leap at first and once again: then its feet are too fast to stand.
+    Even known footholds are unknown for a while, and contact labels are uncertain for another. The
+    walk can ride on a platform, and leap at the start and once again with feet too fast to stand.
     """
     rig, rng = rig_of(legs), np.random.default_rng(5)
-    frames = walk(rig, FRAMES, known=known, heading=0.12, start=(-0.5, 0.03, -3.7), speed=0.8)
+    frames = walk(
+        rig, FRAMES, known=footholds_known, heading=0.12, start=(-0.5, 0.03, -3.7), speed=0.8
+    )
     changed = []
     for index, frame in enumerate(frames):
         fraction, time = index / FRAMES, index / 60
+        assert frame.stride is not None
         weight, known = np.ones(legs), frame.stride.known
         standing = frame.stride.standing
         if 0.5 < fraction < 0.55:

@@ -65,7 +65,7 @@ def flat_floor(clip: Clip) -> np.ndarray:
     """The plane y = a x + b z + c nearest to the soles of standing feet, by absolute distance."""
     balls = clip.joints_ws(3)[clip.stance_labels()]
     coordinates = np.column_stack([balls[:, [0, 2]], np.ones(len(balls))])
-    weight = np.ones(len(balls))
+    weight, plane = np.ones(len(balls)), np.zeros(3)
     for _ in range(20):
         plane = np.linalg.lstsq(coordinates * weight[:, None], balls[:, 1] * weight, rcond=None)[0]
         weight = 1.0 / np.sqrt(np.maximum(np.abs(coordinates @ plane - balls[:, 1]), 0.003))
