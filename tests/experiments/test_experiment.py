@@ -245,7 +245,7 @@ def test_settings_of_the_search_and_the_sampler_can_be_overridden(tmp_path):
     rest = "[fit]\nstarts = 2\nmax_steps = 50\n[fit.search]\nelite = 4\nensemble_spreads = [1, 0.3]"
     path = write(tmp_path, rest=f"{rest}\n[sample]\nmax_steps = 300\ncheck_every = 30")
     loaded = experiment_files.load_experiment(path)
-    search = SearchSettings(max_steps=50, elite=4, ensemble_spreads=(1, 0.3))
+    search = SearchSettings(max_steps=50, elite=4, ensemble_spreads=(1.0, 0.3))
     assert loaded.fit == FitOptions(2, search)
     assert loaded.sample == SamplerSettings(max_steps=300, check_every=30)
     again = tmp_path / "again.toml"
