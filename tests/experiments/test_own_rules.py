@@ -5,6 +5,7 @@ import pytest
 import fitting
 import jaxik
 from fitting.experiments import experiment_files, parameter_files, systems
+from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.stages.lean import NoLean
 from support.experiments import write
@@ -28,7 +29,7 @@ def test_a_registered_rule_is_known_to_parameter_files(registered, tmp_path):
     path.write_text('rules.lean = "FixedLean"\nlean.angle = 0.2\n', encoding="utf-8")
     ik, _ = parameter_files.load_system(path)
     assert type(ik.lean) is registered
-    assert float(ik.lean.angle) == pytest.approx(0.2)
+    assert float(parameter_tree.get(ik, "lean.angle")) == pytest.approx(0.2)
 
 
 def test_a_registered_rule_is_known_to_experiments(registered, tmp_path):

@@ -21,13 +21,17 @@ gains = st.sampled_from([0.0, 1e-6, 0.999, 1.0]) | numbers(0, 1)
 half_lives = st.sampled_from([0.0, 1e-6, 1e-3]) | numbers(0.005, 3)
 
 X = np.array([0.1, 0.4, 0.7])
+MOTION = smoothing.Motion(jnp.asarray(X), jnp.asarray(-X))
 FUNCTIONS = {
     "lerp": (smoothing.lerp, (X, -X, X)),
     "fraction_of_gain": (smoothing.fraction_of_gain, (X, X, 30 * X)),
     "fraction_of_half_life": (smoothing.fraction_of_half_life, (X, X)),
     "fraction_of_speed": (smoothing.fraction_of_speed, (X, X, X)),
-    "spring": (smoothing.spring, (smoothing.Motion(X, -X), 2 * X, X, X)),
-    "follow": (smoothing.follow, (smoothing.Motion(X, -X), 2 * X, X, X, X > 0.3)),
+    "spring": (smoothing.spring, (MOTION, 2 * X, X, X)),
+    "follow": (
+        smoothing.follow,
+        (MOTION, 2 * X, X, X, X > 0.3),
+    ),
     "half_life_of_gain": (smoothing.half_life_of_gain, (X, 30 * X)),
     "gain_of_half_life": (smoothing.gain_of_half_life, (X, 30 * X)),
     "half_life_of_speed": (smoothing.half_life_of_speed, (X, X)),
@@ -214,7 +218,7 @@ def test_following_a_goal_that_changes_every_frame_solves_the_equation_of_each_f
             atol=1e-12,
         ).y[:, -1]
         fraction = call(smoothing.fraction_of_half_life, half_life, dt)
-        sprung = np.array(follow(*sprung, goal, fraction, dt, True))
+        sprung = np.array(follow(sprung[0], sprung[1], goal, fraction, dt, True))
         assert_allclose(sprung, expected, atol=1e-8)
         value, velocity = follow(eased, 3.0, goal, fraction, dt, False)
         assert_allclose(value, goal + (eased - goal) * 2 ** (-dt / half_life), rtol=1e-12)

@@ -122,9 +122,9 @@ def clip(
     changed = []
     for index, frame in enumerate(frames):
         fraction, time = index / FRAMES, index / 60
-        assert frame.stride is not None
-        weight, known = np.ones(legs), frame.stride.known
-        standing = frame.stride.standing
+        stride = frame.stride
+        assert stride is not None
+        weight, known, standing = np.ones(legs), stride.known, stride.standing
         if 0.5 < fraction < 0.55:
             weight[0] = 0.5
         if 0.6 < fraction < 0.62:
@@ -148,7 +148,7 @@ def clip(
                     rot=np.array([maths.multiply(wobble, r) for r in frame.ankle.rot])
                 ),
                 weight=weight,
-                stride=dataclasses.replace(frame.stride, known=known, standing=standing),
+                stride=dataclasses.replace(stride, known=known, standing=standing),
                 platform=carousel(time) if rides else frame.platform,
             )
         )

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from jaxik.maths import quat
-from jaxik.maths.gate import HARD, Smooth
+from jaxik.maths.gate import HARD, AbstractGate, Smooth
 from jaxik.solvers import aim
 from jaxik.solvers.pole import PoleTarget
 from support.gradients import (
@@ -26,7 +26,7 @@ X, Y, Z = np.eye(3)
 ZERO, NO_TWIST = np.zeros(3), np.float64(0.0)
 
 
-def aim_rotation(to_target, forward, offset, up, pole, twist, gate=HARD):
+def aim_rotation(to_target, forward, offset, up, pole, twist, gate: AbstractGate = HARD):
     """`aim.aim_rotation` of plain arrays."""
     arrays = map(jnp.asarray, (to_target, forward, offset, up, pole, twist))
     to_target, forward, offset, up, pole, twist = arrays

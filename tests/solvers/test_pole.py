@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from jaxik.maths import quat, vec
-from jaxik.maths.gate import HARD, Smooth
+from jaxik.maths.gate import HARD, AbstractGate, Smooth
 from jaxik.solvers import pole as poles
 from jaxik.solvers.two_bone import Limb
 from support.gradients import (
@@ -28,7 +28,7 @@ X, Y, Z = np.eye(3)
 ONE, NONE = np.float64(1.0), np.float64(0.0)
 
 
-def bend(to_hip, to_ankle, hinge, to_target, pole, soften, twist, gate=HARD):
+def bend(to_hip, to_ankle, hinge, to_target, pole, soften, twist, gate: AbstractGate = HARD):
     """`bend_to_pole` of plain arrays."""
     arrays = map(jnp.asarray, (to_hip, to_ankle, hinge, to_target, pole, soften, twist))
     to_hip, to_ankle, hinge, to_target, pole, soften, twist = arrays

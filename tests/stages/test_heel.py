@@ -36,9 +36,8 @@ def search_angle(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length:
     best = minimize_scalar(distance, bounds=(0.0, np.pi), method="bounded", options={"xatol": 1e-9})
     if distance(best.x) >= length:
         return float(best.x)
-    return brentq(
-        lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12, full_output=False
-    )
+    root = brentq(lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12)
+    return root  # pyright: ignore[reportReturnType]  # a float without `full_output`
 
 
 def random_legs(count: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:

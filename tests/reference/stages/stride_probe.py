@@ -47,8 +47,9 @@ def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bo
     """The swing from the labels of the animation; without them, from the character's velocity."""
     stride = frame.stride
     if stride.known[leg] > 0.5:
-        ends = (level(frame, up, pos[leg]) for pos in (stride.last_ws, stride.next_ws))
-        return Swing(*ends, float(stride.fraction[leg]))
+        last_ws = level(frame, up, stride.last_ws[leg])
+        next_ws = level(frame, up, stride.next_ws[leg])
+        return Swing(last_ws, next_ws, float(stride.fraction[leg]))
     stance_time = parameters.of_leg("probe.stance_time", leg)
     swing_time = parameters.of_leg("probe.swing_time", leg)
     velocity = across(frame.travel_ws, up)
