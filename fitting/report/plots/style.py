@@ -5,6 +5,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
@@ -89,7 +90,7 @@ def earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
     axes.set_ylim(low, high)
 
 
-def legend(figure: Figure, *entries: Any, columns: int = 4) -> None:
+def legend(figure: Figure, *entries: Artist, columns: int = 4) -> None:
     """Adds a legend below the figure."""
     figure.legend(handles=entries, loc="outside lower center", ncols=min(columns, len(entries)))
 
