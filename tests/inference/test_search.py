@@ -244,6 +244,16 @@ def test_steps_on_the_compressed_rows_are_those_of_optimistix_on_all_rows():
     np.testing.assert_allclose(jacobian, problem.jacobian(state.u), rtol=1e-12)
 
 
+def test_all_steps_of_a_descent_are_one_program():
+    """A weak type in the state, say, would compile the second step anew."""
+    problem = curve_problem()
+    model = models.HardModel(problem, problem.space.u0)
+    before = levenberg_marquardt.begin(model, problem.space.u0)
+    after = levenberg_marquardt.step(model, before)
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert jax.tree.map(jax.typeof, before) == jax.tree.map(jax.typeof, after)
+
+
 def test_a_jacobian_is_computed_only_where_the_cost_is_low_enough():
     problem = curve_problem()
     u, cost = problem.space.u0, problem.cost(problem.space.u0)

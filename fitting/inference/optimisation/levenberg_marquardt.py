@@ -56,7 +56,8 @@ def step(model: Model, state: LMState) -> LMState:
     compressed = compress(model, before.y_eval, state.cost)
     u, after, _ = SOLVER.step(compressed.as_function, state.u, None, state=before, **OPTIONS)
     accepted = after.num_accepted_steps > before.num_accepted_steps
-    return LMState(u, after.f_info.as_min(), accepted, after)
+    # As a strong type like that of `begin`, or the next step would be another program.
+    return LMState(u, after.f_info.as_min(), jnp.asarray(accepted, bool), after)
 
 
 def evaluate(model: Model, u: Float[Array, " free"]) -> LMState:
