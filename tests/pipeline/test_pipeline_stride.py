@@ -75,9 +75,14 @@ SUPPORT = {
 SPRUNG = {"target.spring": True, "pelvis.spring": True}
 CASES: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
     ("as it is", "stride", {}, {}),
-    ("untold", "stride", LOCKS, {"told": False}),
+    ("unknown footholds", "stride", LOCKS, {"footholds_known": False}),
     ("odd", "stride", ODD | REACH | {"leg.weight": np.array([1.0, 0.9])}, {}),
-    ("odd, sprung and untold", "stride", ODD | REACH | SPRUNG, {"told": False}),
+    (
+        "odd, sprung and without footholds",
+        "stride",
+        ODD | REACH | SPRUNG,
+        {"footholds_known": False},
+    ),
     (
         "held by the ankle and softened",
         "stride",
@@ -85,7 +90,7 @@ CASES: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
         {},
     ),
     ("on a platform", "stride", LOCKS | {"lock.release_heading": 0.06}, {"rides": True}),
-    ("as it is", "by speed", {}, {"told": False, "leaps": True}),
+    ("as it is", "by speed", {}, {"footholds_known": False, "leaps": True}),
     ("odd and sprung", "by speed", ODD | SUPPORT | SPRUNG, {}),
 ]
 compiled = jax.jit(jaxik.run, compiler_options=QUICK)
