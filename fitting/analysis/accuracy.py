@@ -21,32 +21,50 @@ JOINTS = ("pelvis", "hip", "knee", "ankle")
 class Accuracy:
     """How far a solved motion is from the captured one; NaN where no frame counts."""
 
-    pelvis: float  # m, height, rms
-    ankle: float  # m, rms
-    ankle_stance: float  # m, rms over the frames in which the captured foot stands
-    knee: float  # m, rms
-    knee_stance: float  # m, likewise
-    knee_angle: float  # rad, rms
-    knee_angle_stance: float  # rad, likewise
-    straight: float  # fraction of frames and legs
-    pop: float  # m per frame, largest
-    added_slip: float  # m per frame, mean
-    bone_length: float  # m, largest error
+    pelvis: float
+    """m, height, rms."""
+    ankle: float
+    """m, rms."""
+    ankle_stance: float
+    """m, rms over the frames in which the captured foot stands."""
+    knee: float
+    """m, rms."""
+    knee_stance: float
+    """m, likewise."""
+    knee_angle: float
+    """rad, rms."""
+    knee_angle_stance: float
+    """rad, likewise."""
+    straight: float
+    """Fraction of frames and legs."""
+    pop: float
+    """m per frame, largest."""
+    added_slip: float
+    """m per frame, mean."""
+    bone_length: float
+    """m, largest error."""
 
 
 @dataclass(frozen=True)
 class Errors:
     """Frame by frame what `Accuracy` summarises; `changes` run from one frame to the next."""
 
-    pelvis: Float[np.ndarray, " frames"]  # m, height
-    ankle: Float[np.ndarray, "frames legs"]  # m
-    knee: Float[np.ndarray, "frames legs"]  # m
-    knee_angle: Float[np.ndarray, "frames legs"]  # rad
+    pelvis: Float[np.ndarray, " frames"]
+    """m, height."""
+    ankle: Float[np.ndarray, "frames legs"]
+    """Metres."""
+    knee: Float[np.ndarray, "frames legs"]
+    """Metres."""
+    knee_angle: Float[np.ndarray, "frames legs"]
+    """Radians."""
     stance: Bool[np.ndarray, "frames legs"]
     straight: Bool[np.ndarray, "frames legs"]
-    lift: Float[np.ndarray, "changes legs"]  # m, change of the ankle's height over the animated one
-    slip: Float[np.ndarray, " standing"]  # m, horizontal, beyond the captured, of standing feet
-    bones: Float[np.ndarray, "frames legs 2"]  # m, of thigh and shin
+    lift: Float[np.ndarray, "changes legs"]
+    """m, change of the ankle's height over the animated one."""
+    slip: Float[np.ndarray, " standing"]
+    """m, horizontal, beyond the captured, of standing feet."""
+    bones: Float[np.ndarray, "frames legs 2"]
+    """m, of thigh and shin."""
 
 
 def errors(

@@ -25,19 +25,25 @@ class Difference:
     """Differences in one clip, by quantity; a column for each leg, or one for the body."""
 
     legs: tuple[str, ...]
-    time: Float[np.ndarray, " frames"]  # s
-    standing: Bool[np.ndarray, " frames"]  # of the character, not of a foot
-    correction: Mapping[str, Float[np.ndarray, "frames columns"]]  # reference - animation, m or rad
-    remaining: Mapping[str, Float[np.ndarray, "frames columns"]]  # reference - system, m or rad
+    time: Float[np.ndarray, " frames"]
+    """Seconds."""
+    standing: Bool[np.ndarray, " frames"]
+    """Of the character, not of a foot."""
+    correction: Mapping[str, Float[np.ndarray, "frames columns"]]
+    """Reference - animation, m or rad."""
+    remaining: Mapping[str, Float[np.ndarray, "frames columns"]]
+    """Reference - system, m or rad."""
 
 
 @dataclass(frozen=True)
 class Remainder:
     """What remains of the correction of one quantity, m or rad."""
 
-    correction: float  # rms
+    correction: float
+    """Rms."""
     rms: float
-    p95: float  # 95th percentile
+    p95: float
+    """95th percentile."""
     max: float
 
     @property

@@ -26,13 +26,19 @@ class ClipActivity:
     legs: tuple[str, ...]
     frames: int
     seconds: float
-    grounded: Float[np.ndarray, " legs"]  # fraction with ground under the foot
-    in_contact: Float[np.ndarray, " legs"]  # fraction with a contact weight above 0
-    reached: Float[np.ndarray, " legs"]  # fraction with the ankle at its target
-    locked: Float[np.ndarray, " legs"]  # fraction
-    locks: tuple[int, ...]  # how often each foot locks
+    grounded: Float[np.ndarray, " legs"]
+    """Fraction with ground under the foot."""
+    in_contact: Float[np.ndarray, " legs"]
+    """Fraction with a contact weight above 0."""
+    reached: Float[np.ndarray, " legs"]
+    """Fraction with the ankle at its target."""
+    locked: Float[np.ndarray, " legs"]
+    """Fraction."""
+    locks: tuple[int, ...]
+    """How often each foot locks."""
     releases: tuple[int, ...]
-    limits: dict[str, float]  # fraction in which a limit changes the pose, by parameter name
+    limits: dict[str, float]
+    """Fraction in which a limit changes the pose, by parameter name."""
 
 
 def measure(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> ClipActivity:

@@ -28,25 +28,38 @@ class Measures:
     `fitting.report.labels.MEASURES` defines each of them.
     """
 
-    penetration_mean: float  # m
-    penetration_max: float  # m
-    clearance: float  # m
-    slide: float  # m per stance
-    pop_max: float  # m in a 60th of a second
-    pops: float  # count
-    knee_jerk: float  # rad/s³
-    pelvis_jerk: float  # m/s³
-    reached: float  # fraction of targets
-    straight: float  # fraction of frames and legs
+    penetration_mean: float
+    """Metres."""
+    penetration_max: float
+    """Metres."""
+    clearance: float
+    """Metres."""
+    slide: float
+    """m per stance."""
+    pop_max: float
+    """m in a 60th of a second."""
+    pops: float
+    """Count."""
+    knee_jerk: float
+    """Rad/s³."""
+    pelvis_jerk: float
+    """m/s³."""
+    reached: float
+    """Fraction of targets."""
+    straight: float
+    """Fraction of frames and legs."""
 
 
 @dataclass(frozen=True)
 class FootStates:
     """What is known of each foot in each frame, beside its joints."""
 
-    gap: Float64[np.ndarray, "frames legs"]  # m, see `gaps`; NaN where there is no ground
-    stance: Bool[np.ndarray, "frames legs"]  # where the animation says that the foot stands
-    reached: Float64[np.ndarray, "frames legs"]  # 1 or 0; NaN where there is no target
+    gap: Float64[np.ndarray, "frames legs"]
+    """m, see `gaps`; NaN where there is no ground."""
+    stance: Bool[np.ndarray, "frames legs"]
+    """Where the animation says that the foot stands."""
+    reached: Float64[np.ndarray, "frames legs"]
+    """1 or 0; NaN where there is no target."""
 
 
 def measure(motion: Motion, animated: Motion, feet: FootStates, fps: float) -> Measures:

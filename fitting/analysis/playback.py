@@ -49,27 +49,43 @@ class Motion(eqx.Module):
 class Playback(eqx.Module):
     """One clip before and after foot IK, and as captured. Weights are 0..1."""
 
-    before: Motion  # the animation on its flat floor
+    before: Motion
+    """The animation on its flat floor."""
     after: Motion
     captured: Motion
     up_ws: Float[Series, "3"]
     forward_ws: Float[Series, "frames 3"]
-    ground_ws: Float[Series, "frames legs 3"]  # under the captured ankles
-    grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
-    ball_ground_ws: Float[Series, "frames legs 3"]  # under the captured toe joints
-    ball_grounded: Float[Series, "frames legs"]  # 1 where there is ground under them
-    floor: Float[Series, " frames"]  # m, height of the animation's floor
-    dt: Float[Series, " frames"]  # s
-    contact: Float[Series, "frames legs"]  # contact weight of the system
-    locked: Float[Series, "frames legs"]  # 1 where the foot is locked
-    reached: Float[Series, "frames legs"]  # 1 where the ankle is at its target
-    stance: Float[Series, "frames legs"]  # captured contact labels; all 0 where there are none
-    slide: Float[Series, " frames"]  # weight with which the character slides
-    seen: Bool[Series, " frames"]  # False in frames that the fit leaves out
-    errors: Mapping[str, Float[Series, "frames_of_kind ..."]]  # after - captured, m, rad, ...
-    residuals: Mapping[str, Float[Series, "frames_of_kind ..."]]  # as the fit sees them, in sigmas
+    ground_ws: Float[Series, "frames legs 3"]
+    """Under the captured ankles."""
+    grounded: Float[Series, "frames legs"]
+    """1 where there is ground under them."""
+    ball_ground_ws: Float[Series, "frames legs 3"]
+    """Under the captured toe joints."""
+    ball_grounded: Float[Series, "frames legs"]
+    """1 where there is ground under them."""
+    floor: Float[Series, " frames"]
+    """m, height of the animation's floor."""
+    dt: Float[Series, " frames"]
+    """Seconds."""
+    contact: Float[Series, "frames legs"]
+    """Contact weight of the system."""
+    locked: Float[Series, "frames legs"]
+    """1 where the foot is locked."""
+    reached: Float[Series, "frames legs"]
+    """1 where the ankle is at its target."""
+    stance: Float[Series, "frames legs"]
+    """Captured contact labels; all 0 where there are none."""
+    slide: Float[Series, " frames"]
+    """Weight with which the character slides."""
+    seen: Bool[Series, " frames"]
+    """False in frames that the fit leaves out."""
+    errors: Mapping[str, Float[Series, "frames_of_kind ..."]]
+    """After - captured, m, rad, ..."""
+    residuals: Mapping[str, Float[Series, "frames_of_kind ..."]]
+    """As the fit sees them, in sigmas."""
     sigmas: Mapping[str, Float[Series, ""]]
-    label: str = eqx.field(static=True)  # what pictures call the captured motion
+    label: str = eqx.field(static=True)
+    """What pictures call the captured motion."""
 
     @cached_property
     def time(self) -> Float[np.ndarray, " frames"]:

@@ -21,9 +21,12 @@ class SoleGap:
 
     mean: float
     rms: float
-    frames: int  # how many standing feet, counted frame by frame
-    largest: float  # the one with the largest magnitude
-    frame: int  # where that is
+    frames: int
+    """How many standing feet, counted frame by frame."""
+    largest: float
+    """The one with the largest magnitude."""
+    frame: int
+    """Where that is."""
     leg: int
 
 
@@ -31,19 +34,32 @@ class SoleGap:
 class WorstWindow:
     """The window with the largest residuals, and what they consist of."""
 
-    start: int  # frame
-    end: int  # frame, the last of the window
-    rms: float  # of the residuals in the window, sigmas
-    clip_rms: float  # of the residuals of the whole clip, sigmas
-    fractions: Mapping[str, float]  # of the squared residuals, by kind, the largest first
-    leg_fractions: Float[np.ndarray, " legs"]  # of the legs' squared residuals
-    frame: int  # where the error of the largest kind is largest
-    leg: int | None  # whose error that is; None for a kind that belongs to the body
-    size: float  # of that error, in the unit of its sigma
-    offset: Float[np.ndarray, "3"] | None  # m up, forward, left of captured; None for other kinds
-    out_of_reach: float  # fraction of the window's frames and legs
-    pelvis: float  # m, mean height above the captured pelvis; NaN where nothing was seen
-    sole_gap: SoleGap | None  # None where no captured foot stands above ground
+    start: int
+    """Frame."""
+    end: int
+    """Frame, the last of the window."""
+    rms: float
+    """Of the residuals in the window, sigmas."""
+    clip_rms: float
+    """Of the residuals of the whole clip, sigmas."""
+    fractions: Mapping[str, float]
+    """Of the squared residuals, by kind, the largest first."""
+    leg_fractions: Float[np.ndarray, " legs"]
+    """Of the legs' squared residuals."""
+    frame: int
+    """Where the error of the largest kind is largest."""
+    leg: int | None
+    """Whose error that is; None for a kind that belongs to the body."""
+    size: float
+    """Of that error, in the unit of its sigma."""
+    offset: Float[np.ndarray, "3"] | None
+    """m up, forward, left of captured; None for other kinds."""
+    out_of_reach: float
+    """Fraction of the window's frames and legs."""
+    pelvis: float
+    """m, mean height above the captured pelvis; NaN where nothing was seen."""
+    sole_gap: SoleGap | None
+    """None where no captured foot stands above ground."""
 
     @property
     def kind(self) -> str:

@@ -19,7 +19,8 @@ class Hardware(TypedDict):
 
     cpu: str
     cores: int | None
-    threads: int  # used
+    threads: int
+    """Used."""
     memory_gb: float | None
     device: str
     jax: str

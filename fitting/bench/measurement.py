@@ -28,10 +28,13 @@ class FigureSpec:
 
     what: str
     unit: str = "times"
-    scale: float = 1.0  # figure = scale * seconds, or scale / seconds for a rate
+    scale: float = 1.0
+    """Figure = scale * seconds, or scale / seconds for a rate."""
     rate: bool = False
-    threads: int = 1  # that share the work
-    floats: str = ""  # float32 or float64, where not that of the whole benchmark
+    threads: int = 1
+    """That share the work."""
+    floats: str = ""
+    """Float32 or float64, where not that of the whole benchmark."""
     at_most: float | None = None
     at_least: float | None = None
     note: str = ""
@@ -46,14 +49,21 @@ class Figure:
     """One number of a benchmark, with its target and its physical limit."""
 
     what: str
-    value: float  # the median
+    value: float
+    """The median."""
     unit: str
-    at_most: float | None = None  # target
-    at_least: float | None = None  # target
-    spread: tuple[float, float] | None = None  # lowest and highest of the runs
-    busy: float | None = None  # the figure by CPU time, divided by the threads that work
-    limit: float | None = None  # the figure if nothing but `bound` took time
-    bound: str = ""  # memory, arithmetic or dispatch
+    at_most: float | None = None
+    """Target."""
+    at_least: float | None = None
+    """Target."""
+    spread: tuple[float, float] | None = None
+    """Lowest and highest of the runs."""
+    busy: float | None = None
+    """The figure by CPU time, divided by the threads that work."""
+    limit: float | None = None
+    """The figure if nothing but `bound` took time."""
+    bound: str = ""
+    """Memory, arithmetic or dispatch."""
     note: str = ""
 
     @property
@@ -82,7 +92,8 @@ class Figure:
 class Series:
     """Run time against one size; `seconds` has a list for each curve."""
 
-    size: str  # its name
+    size: str
+    """Its name."""
     sizes: list[int]
     seconds: dict[str, list[float]]
 
@@ -108,19 +119,27 @@ class Measurement:
     name: str
     title: str
     repeats: int
-    floats: str = ""  # float32 or float64; empty where figures say it, or there are none
-    progress: Callable[[str], None] = _ignore  # called with what is being done
-    ceilings: dict[str, float] = field(default_factory=dict)  # see `roofline.lower_bound`
+    floats: str = ""
+    """Float32 or float64; empty where figures say it, or there are none."""
+    progress: Callable[[str], None] = _ignore
+    """Called with what is being done."""
+    ceilings: dict[str, float] = field(default_factory=dict)
+    """See `roofline.lower_bound`."""
     figures: list[Figure] = field(default_factory=list)
     compile_s: dict[str, float] = field(default_factory=dict)
-    samples: dict[str, list[float]] = field(default_factory=dict)  # s
-    busy: dict[str, list[float]] = field(default_factory=dict)  # s of CPU time
+    samples: dict[str, list[float]] = field(default_factory=dict)
+    """Seconds."""
+    busy: dict[str, list[float]] = field(default_factory=dict)
+    """s of CPU time."""
     work: dict[str, Work] = field(default_factory=dict)
     series: list[Series] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    failures: list[str] = field(default_factory=list)  # errors that ended the benchmark
-    load: float = 0.0  # load average at the start
-    seconds: float = 0.0  # duration of the whole benchmark
+    failures: list[str] = field(default_factory=list)
+    """Errors that ended the benchmark."""
+    load: float = 0.0
+    """Load average at the start."""
+    seconds: float = 0.0
+    """Duration of the whole benchmark."""
 
     def compile(
         self, name: str, function: Callable, *arguments: PyTree, sparse: PyTree = ()

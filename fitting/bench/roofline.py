@@ -30,9 +30,12 @@ REDUCTIONS = frozenset("reduce_sum reduce_max reduce_min argmin argmax cumsum cu
 class Work:
     """The least that a program has to do, and the memory it uses."""
 
-    operations: float = 0.0  # on floats
-    moved: float = 0.0  # bytes of arguments and results
-    workspace: float = 0.0  # bytes besides those
+    operations: float = 0.0
+    """On floats."""
+    moved: float = 0.0
+    """Bytes of arguments and results."""
+    workspace: float = 0.0
+    """Bytes besides those."""
 
     def __mul__(self, times: int | float) -> "Work":
         """The work of several runs, which use the same workspace again."""

@@ -20,10 +20,13 @@ class Benchmark:
     """Something to be measured, and how."""
 
     title: str
-    floats: str  # float32, float64, or empty where the figures differ or have none
+    floats: str
+    """Float32, float64, or empty where the figures differ or have none."""
     measure: Callable[[Measurement, Sizes], None]
-    x64: bool = False  # whether JAX's 64-bit types are enabled meanwhile
-    long: bool = False  # left out of a quick run, unless it is named
+    x64: bool = False
+    """Whether JAX's 64-bit types are enabled meanwhile."""
+    long: bool = False
+    """Left out of a quick run, unless it is named."""
 
 
 @dataclasses.dataclass

@@ -7,28 +7,44 @@ import dataclasses
 class Sizes:
     """Sizes of workloads and numbers of runs; the defaults are those of a full run."""
 
-    repeats: int = 7  # samples of each call
+    repeats: int = 7
+    """Samples of each call."""
     legs: int = 200_000
     feet: int = 100_000
     characters: int = 4096
-    frames: int = 600  # of a clip; 10 s
-    derived: int = 512  # characters whose gradient is taken
-    chunk: int = 64  # characters computed at once
-    crowd_repeats: int = 3  # samples of a crowd and of rays
-    cells: int = 500  # along a side of the mesh; 2 cells² triangles
+    frames: int = 600
+    """Of a clip; 10 s."""
+    derived: int = 512
+    """Characters whose gradient is taken."""
+    chunk: int = 64
+    """Characters computed at once."""
+    crowd_repeats: int = 3
+    """Samples of a crowd and of rays."""
+    cells: int = 500
+    """Along a side of the mesh; 2 cells² triangles."""
     rays: int = 1_000_000
-    read: int = 1 << 26  # floats read to measure memory bandwidth
-    side: int = 2048  # of the matrices multiplied to measure arithmetic
-    fits: int = 3  # samples of warm fits, and of cold fits of each kind
-    cold: bool = True  # whether to run cold fits, and SciPy with finite differences
-    floats: tuple[str, ...] = ("float64", "float32")  # of the residuals
+    read: int = 1 << 26
+    """Floats read to measure memory bandwidth."""
+    side: int = 2048
+    """Of the matrices multiplied to measure arithmetic."""
+    fits: int = 3
+    """Samples of warm fits, and of cold fits of each kind."""
+    cold: bool = True
+    """Whether to run cold fits, and SciPy with finite differences."""
+    floats: tuple[str, ...] = ("float64", "float32")
+    """Of the residuals."""
     walkers: int = 64
-    steps: int = 1000  # of the sampler
-    chains: int = 1  # samples of the sampler
+    steps: int = 1000
+    """Of the sampler."""
+    chains: int = 1
+    """Samples of the sampler."""
     # Sizes of the scaling curves.
-    batches: tuple[int, ...] = (2, 10, 100, 1000, 10_000, 100_000, 1_000_000)  # legs
-    lengths: tuple[int, ...] = (100, 1000, 10_000, 100_000)  # frames
-    grids: tuple[int, ...] = (7, 22, 71, 224, 707, 2236)  # cells a side: 10² to 10⁷ triangles
+    batches: tuple[int, ...] = (2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
+    """Legs."""
+    lengths: tuple[int, ...] = (100, 1000, 10_000, 100_000)
+    """Frames."""
+    grids: tuple[int, ...] = (7, 22, 71, 224, 707, 2236)
+    """Cells a side: 10² to 10⁷ triangles."""
     parameters: tuple[int, ...] = (5, 10, 20, 40)
     legs_each: tuple[int, ...] = (2, 4, 6, 8)
 

@@ -136,9 +136,11 @@ class LegBatch(eqx.Module):
 
     ik: jaxik.FootIK
     rig: jaxik.Rig
-    frame: jaxik.Frame  # what belongs to a character is repeated for each of its legs
+    frame: jaxik.Frame
+    """What belongs to a character is repeated for each of its legs."""
     sensed: Sensed
-    target_ms: Float[Array, "legs 3"]  # m, of the ankles
+    target_ms: Float[Array, "legs 3"]
+    """m, of the ankles."""
 
     @property
     def count(self) -> int:
@@ -188,21 +190,29 @@ def _by_leg(tree: Tree) -> Tree:
 class Member(NamedTuple):
     """What is different about one character of a crowd, or about several."""
 
-    drawn: dict[str, Float[Array, "*characters"]]  # parameters by name
-    place_ws: Float[Array, "*characters 3"]  # m, of the first frame
-    first: Int[Array, "*characters"]  # frame of the crowd's `motion` with which it starts
+    drawn: dict[str, Float[Array, "*characters"]]
+    """Parameters by name."""
+    place_ws: Float[Array, "*characters 3"]
+    """m, of the first frame."""
+    first: Int[Array, "*characters"]
+    """Frame of the crowd's `motion` with which it starts."""
 
 
 class Crowd(eqx.Module):
     """Characters with different parameters, places and starting frames, in one shared clip."""
 
-    ik: jaxik.FootIK  # shared, except for the parameters in `drawn`
+    ik: jaxik.FootIK
+    """Shared, except for the parameters in `drawn`."""
     rig: jaxik.Rig
-    motion: jaxik.Frame  # twice as long as each character needs
+    motion: jaxik.Frame
+    """Twice as long as each character needs."""
     drawn: dict[str, Float[Array, " characters"]]
-    place_ws: Float[Array, "characters 3"]  # m, of the first frame
-    first: Int[Array, " characters"]  # frame of `motion` with which each starts
-    frame_count: int = eqx.field(static=True)  # of each
+    place_ws: Float[Array, "characters 3"]
+    """m, of the first frame."""
+    first: Int[Array, " characters"]
+    """Frame of `motion` with which each starts."""
+    frame_count: int = eqx.field(static=True)
+    """Of each."""
 
     def character(self, member: Member) -> tuple[jaxik.FootIK, jaxik.Frame]:
         """The system and the frames of one character."""

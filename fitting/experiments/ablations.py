@@ -24,9 +24,12 @@ class Ablation:
     """What differs from the experiment, under a name."""
 
     name: str
-    rules: Mapping[str, str] = field(default_factory=dict)  # by stage
-    parameters: Mapping[str, object] = field(default_factory=dict)  # by dotted name
-    free: FreeTable = field(default_factory=dict)  # by dotted name
+    rules: Mapping[str, str] = field(default_factory=dict)
+    """By stage."""
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    """By dotted name."""
+    free: FreeTable = field(default_factory=dict)
+    """By dotted name."""
 
 
 KEYS = {"name": validation.TEXT} | dict.fromkeys(("rules", "parameters", "free"), validation.TABLE)

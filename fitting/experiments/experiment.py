@@ -31,15 +31,23 @@ DEFAULT_SIGMAS = {  # what a good fit of captured motion leaves
 class ClipEntry:
     """One clip of an experiment."""
 
-    reference: Path  # the captured motion
+    reference: Path
+    """The captured motion."""
     terrain: Path
-    base: Path | None = None  # the flat animation; None makes one from the reference
-    truth: Path | None = None  # parameters that made a synthetic reference, for the report
-    start: float = 0.0  # s
-    end: float | None = None  # s
-    file_up: str = "y"  # up axis of the terrain's file
-    label: str = "captured"  # what plots call the reference
-    mask_pops: bool = True  # ignores frames in which a captured marker jumps
+    base: Path | None = None
+    """The flat animation; None makes one from the reference."""
+    truth: Path | None = None
+    """Parameters that made a synthetic reference, for the report."""
+    start: float = 0.0
+    """Seconds."""
+    end: float | None = None
+    """Seconds."""
+    file_up: str = "y"
+    """Up axis of the terrain's file."""
+    label: str = "captured"
+    """What plots call the reference."""
+    mask_pops: bool = True
+    """Ignores frames in which a captured marker jumps."""
 
 
 @dataclass(frozen=True)
@@ -54,21 +62,29 @@ class FitOptions:
 class Experiment:
     """What is fitted to what."""
 
-    path: Path  # of the file; relative paths in it start from there
+    path: Path
+    """Of the file; relative paths in it start from there."""
     clips: tuple[ClipEntry, ...]
-    free: FreeTable  # by dotted name, with overrides of the declaration
+    free: FreeTable
+    """By dotted name, with overrides of the declaration."""
     preset: str = "record"
     name: str = ""
-    fps: float | None = None  # clips are resampled to this rate
+    fps: float | None = None
+    """Clips are resampled to this rate."""
     loss: Loss = "squares"
-    independent_every: float = 0.0  # s, spacing at which residuals are independent; 0: all are
+    independent_every: float = 0.0
+    """s, spacing at which residuals are independent; 0: all are."""
     seed: int = 0
-    rules: Mapping[str, str] = field(default_factory=dict)  # by stage, where not the preset's
-    parameters: Mapping[str, object] = field(default_factory=dict)  # fixed values by dotted name
-    sigmas: Mapping[str, float] = field(default_factory=dict)  # where not the default
+    rules: Mapping[str, str] = field(default_factory=dict)
+    """By stage, where not the preset's."""
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    """Fixed values by dotted name."""
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+    """Where not the default."""
     fit: FitOptions = FitOptions()
     sample: SamplerSettings = SamplerSettings()
-    without: tuple[Ablation, ...] = ()  # what `jaxik ablate` leaves out in turn
+    without: tuple[Ablation, ...] = ()
+    """What `jaxik ablate` leaves out in turn."""
 
     def preset_system(self) -> jaxik.FootIK:
         """The preset with the experiment's rules."""

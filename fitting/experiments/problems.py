@@ -32,7 +32,8 @@ class ClipData(NamedTuple):
     """What an entry of an experiment loads, over the same frames."""
 
     reference: Clip
-    base: Clip  # the flat animation
+    base: Clip
+    """The flat animation."""
     terrain: Terrain
 
 

@@ -32,15 +32,23 @@ class Identifiability:
     """How well each free parameter is determined; arrays in the order of the names."""
 
     names: tuple[str, ...]
-    contraction: Float[np.ndarray, " free"]  # 0: only the prior is known, 1: the data decide
-    interval: Float[np.ndarray, "free 2"]  # 95 %, in the parameter's unit
-    sd: Float[np.ndarray, " free"]  # of u; NaN for thresholds
+    contraction: Float[np.ndarray, " free"]
+    """0: only the prior is known, 1: the data decide."""
+    interval: Float[np.ndarray, "free 2"]
+    """95 %, in the parameter's unit."""
+    sd: Float[np.ndarray, " free"]
+    """Of u; NaN for thresholds."""
     at_bound: tuple[Bound, ...]
-    eigenvalues: Float[np.ndarray, " smooth"]  # rising; information in units of the prior's
-    weakest: tuple[str, ...]  # parameters in the direction of the smallest eigenvalue
-    correlated: tuple[tuple[str, str, float], ...]  # strongest first
-    profiles: dict[str, Profile]  # of thresholds
-    improvement: float  # how far a profile fell below the solution's cost; 0 at a minimum
+    eigenvalues: Float[np.ndarray, " smooth"]
+    """Rising; information in units of the prior's."""
+    weakest: tuple[str, ...]
+    """Parameters in the direction of the smallest eigenvalue."""
+    correlated: tuple[tuple[str, str, float], ...]
+    """Strongest first."""
+    profiles: dict[str, Profile]
+    """Of thresholds."""
+    improvement: float
+    """How far a profile fell below the solution's cost; 0 at a minimum."""
 
     @property
     def undetermined(self) -> tuple[str, ...]:

@@ -14,13 +14,18 @@ from typing import Any
 class Setting:
     """What is known of one setting."""
 
-    meaning: str  # one sentence
-    unit: str  # "1" for a ratio
-    low: int | float  # of each number, where there are several
+    meaning: str
+    """One sentence."""
+    unit: str
+    """"1" for a ratio."""
+    low: int | float
+    """Of each number, where there are several."""
     high: int | float
     integer: bool
-    several: bool = False  # a tuple of numbers
-    optional: bool = False  # None stands for a number that is chosen later
+    several: bool = False
+    """a tuple of numbers."""
+    optional: bool = False
+    """None stands for a number that is chosen later."""
 
     @property
     def range(self) -> str:

@@ -23,10 +23,14 @@ FOLLOWING_STEPS = 2  # Gauss-Newton steps by which the smooth parameters follow
 class Profile:
     """Cost over one threshold, the smooth parameters following."""
 
-    values: Float[np.ndarray, " points"]  # in the parameter's unit, rising
-    rises: Float[np.ndarray, " points"]  # of the cost, above the solution's
-    interval: tuple[float, float]  # 95 %: where the rise above the minimum stays below 1.92
-    nudged: tuple[float, float]  # rise if it alone moves down or up by a tenth of its range
+    values: Float[np.ndarray, " points"]
+    """In the parameter's unit, rising."""
+    rises: Float[np.ndarray, " points"]
+    """Of the cost, above the solution's."""
+    interval: tuple[float, float]
+    """95 %: where the rise above the minimum stays below 1.92."""
+    nudged: tuple[float, float]
+    """Rise if it alone moves down or up by a tenth of its range."""
 
 
 def profile(problem: Problem, solution: Solution, name: str) -> Profile:

@@ -19,14 +19,18 @@ OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
 class FreeParameter:
     """One free parameter: a leaf of the system, or one leg's element of it."""
 
-    name: str  # dotted, with [leg] for one element
+    name: str
+    """Dotted, with [leg] for one element."""
     low: float
     high: float
-    prior_mean: float  # in the parameter's unit
-    prior_sd: float  # in u
+    prior_mean: float
+    """In the parameter's unit."""
+    prior_sd: float
+    """In u."""
     kind: parameter_tree.ParameterKind
     scale: parameter_tree.Scale
-    above: str | None  # dotted name of the leaf that the value stays above
+    above: str | None
+    """Dotted name of the leaf that the value stays above."""
 
     @property
     def leaf(self) -> str:

@@ -11,25 +11,38 @@ from jaxik.world.terrain import Terrain
 class Sigmas(eqx.Module):
     """Standard deviations of the residuals, by kind; an infinite one switches its kind off."""
 
-    ankle: Float[Array, ""]  # m
-    knee: Float[Array, ""]  # m
-    pelvis: Float[Array, ""]  # m
-    foot: Float[Array, ""]  # rad, orientation of the ankle joint
-    body: Float[Array, ""]  # rad, orientation of the pelvis
-    contact: Float[Array, ""]  # of the contact weight, 0..1
-    smooth: Float[Array, ""]  # m/s², of the ankle's acceleration
-    correlation: Float[Array, ""]  # AR(1) coefficient between frames, 0 if they are independent
+    ankle: Float[Array, ""]
+    """Metres."""
+    knee: Float[Array, ""]
+    """Metres."""
+    pelvis: Float[Array, ""]
+    """Metres."""
+    foot: Float[Array, ""]
+    """rad, orientation of the ankle joint."""
+    body: Float[Array, ""]
+    """rad, orientation of the pelvis."""
+    contact: Float[Array, ""]
+    """Of the contact weight, 0..1."""
+    smooth: Float[Array, ""]
+    """m/s², of the ankle's acceleration."""
+    correlation: Float[Array, ""]
+    """AR(1) coefficient between frames, 0 if they are independent."""
 
 
 class Reference(eqx.Module):
     """The motion that a system should reproduce; world space, frames first."""
 
-    pelvis: Transform  # frames
+    pelvis: Transform
+    """Frames."""
     knee_ws: Float[Array, "frames legs 3"]
-    ankle: Transform  # frames legs
-    contact: Float[Array, "frames legs"]  # 0 or 1
-    observed: Bool[Array, " frames"]  # False where a marker jumped or nothing was captured
-    label: str = eqx.field(static=True, default="captured")  # what plots call it
+    ankle: Transform
+    """Frames legs."""
+    contact: Float[Array, "frames legs"]
+    """0 or 1."""
+    observed: Bool[Array, " frames"]
+    """False where a marker jumped or nothing was captured."""
+    label: str = eqx.field(static=True, default="captured")
+    """What plots call it."""
 
 
 class Scene(eqx.Module):
@@ -38,7 +51,8 @@ class Scene(eqx.Module):
     rig: jaxik.Rig
     terrain: Terrain
     frames: jaxik.Frame
-    pelvis: Transform  # frames, of the flat animation, model space
+    pelvis: Transform
+    """Frames, of the flat animation, model space."""
     reference: Reference
     sigmas: Sigmas
 

@@ -38,13 +38,18 @@ System = TypeVar("System", bound=eqx.Module)
 class Space(eqx.Module, Generic[System]):
     """The free parameters of a system as one unbounded vector `u`; `make_space` builds it."""
 
-    system: System  # what is not free keeps the values it has here
-    u0: Float[Array, " free"]  # centre of the prior, and where a fit starts
-    prior_sd: Float[Array, " free"]  # in u
-    low: Float[Array, " free"]  # in the parameters' units, like high
+    system: System
+    """What is not free keeps the values it has here."""
+    u0: Float[Array, " free"]
+    """Centre of the prior, and where a fit starts."""
+    prior_sd: Float[Array, " free"]
+    """In u."""
+    low: Float[Array, " free"]
+    """In the parameters' units, like high."""
     high: Float[Array, " free"]
     parameters: tuple[FreeParameter, ...] = eqx.field(static=True)
-    order: tuple[int, ...] = eqx.field(static=True)  # a parameter comes after the one it is above
+    order: tuple[int, ...] = eqx.field(static=True)
+    """a parameter comes after the one it is above."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ class Label(NamedTuple):
 
     name: str
     unit: str
-    factor: float  # shown value / value in SI units and radians
+    factor: float
+    """Shown value / value in SI units and radians."""
 
 
 RESIDUALS = {
@@ -39,8 +40,10 @@ class Column:
 
     heading: str
     unit: str
-    factor: float  # shown value / value in SI units and radians
-    digits: int  # after the decimal point
+    factor: float
+    """Shown value / value in SI units and radians."""
+    digits: int
+    """After the decimal point."""
     meaning: str
 
     def format(self, value: float) -> str:

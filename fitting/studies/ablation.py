@@ -42,14 +42,19 @@ NUMBERS = "contribution.json"
 class Row:
     """A variant, fitted and measured."""
 
-    key: str  # digest of everything the row follows from
+    key: str
+    """Digest of everything the row follows from."""
     variant: str
-    part: int  # the part that was held out, from 1; 0 where everything was fitted and measured
+    part: int
+    """The part that was held out, from 1; 0 where everything was fitted and measured."""
     agreement: Accuracy
-    values: Mapping[str, float]  # fitted, by name
+    values: Mapping[str, float]
+    """Fitted, by name."""
     converged: bool
-    message: str  # of the fit
-    seconds: float  # duration of the fit
+    message: str
+    """Of the fit."""
+    seconds: float
+    """Duration of the fit."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,8 @@ class Split:
 
     name: str
     fitted: Sequence[tuple[ClipEntry, ClipData]]
-    measured: Sequence[tuple[ClipData, slice]]  # clips, and the frames of them that count
+    measured: Sequence[tuple[ClipData, slice]]
+    """Clips, and the frames of them that count."""
 
 
 def ablate(

@@ -22,17 +22,21 @@ class AnimationFiles:
 
     clip: Path
     terrain: Path
-    file_up: str = "y"  # up axis of the terrain's file
-    floor: float = 0.0  # m, height of the floor on which the clip was animated
+    file_up: str = "y"
+    """Up axis of the terrain's file."""
+    floor: float = 0.0
+    """m, height of the floor on which the clip was animated."""
 
 
 @dataclass(frozen=True)
 class Animation:
     """A flat animation on a terrain."""
 
-    clip: Clip  # with bones of the rig's lengths, as `load_flat_animation` gives it
+    clip: Clip
+    """With bones of the rig's lengths, as `load_flat_animation` gives it."""
     terrain: Terrain
-    floor: float = 0.0  # m, height of the floor on which the clip was animated
+    floor: float = 0.0
+    """m, height of the floor on which the clip was animated."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:

@@ -33,8 +33,10 @@ class Comparison:
     title: str
     legs: tuple[str, ...]
     fps: float
-    ground: Float64[np.ndarray, "frames legs"]  # m, height under the animated ankles, or NaN
-    groundless: float  # fraction of all points of soles that have no ground under them
+    ground: Float64[np.ndarray, "frames legs"]
+    """m, height under the animated ankles, or NaN."""
+    groundless: float
+    """Fraction of all points of soles that have no ground under them."""
     motions: Mapping[str, Motion]
     measures: Mapping[str, Measures]
 

@@ -31,19 +31,25 @@ class FittedParameter(TypedDict):
     """A free parameter after a fit, as `fit.json` holds it."""
 
     name: str
-    kind: str  # smooth or threshold
+    kind: str
+    """Smooth or threshold."""
     unit: str
     u: float
-    start_sd: float  # of u, where walkers start
+    start_sd: float
+    """Of u, where walkers start."""
     value: float
-    before: float  # the value before the fit
+    before: float
+    """The value before the fit."""
     low: float
     high: float
-    interval: list[float]  # 95 %
-    contraction: float  # 0 where only the prior is known, 1 where the clips decide
+    interval: list[float]
+    """95 %."""
+    contraction: float
+    """0 where only the prior is known, 1 where the clips decide."""
     at_bound: Literal["", "low", "high"]
     determined: bool
-    half_life: NotRequired[float]  # s, of a gain
+    half_life: NotRequired[float]
+    """s, of a gain."""
     gain_at_30_hz: NotRequired[float]
     gain_at_60_hz: NotRequired[float]
 
@@ -59,7 +65,8 @@ class FitSummary(TypedDict):
     steps: int
     seconds: float
     parameters: list[FittedParameter]
-    correlated: list[list[str | float]]  # two names and their correlation
+    correlated: list[list[str | float]]
+    """Two names and their correlation."""
     weakest: list[str]
     history: list[Content]
 
@@ -72,8 +79,10 @@ class Fit:
     problem: Problem[jaxik.FootIK]
     solution: Solution
     identifiability: Identifiability
-    known_values: Mapping[str, float] | None = None  # what made a synthetic reference
-    run: Path | None = None  # the folder where it is written
+    known_values: Mapping[str, float] | None = None
+    """What made a synthetic reference."""
+    run: Path | None = None
+    """The folder where it is written."""
 
     @cached_property
     def ik(self) -> jaxik.FootIK:

@@ -55,7 +55,8 @@ SOURCE = "source.toml"
 class NamedSystem:
     """A system under the name by which the user asked for it."""
 
-    name: str  # of a preset, or the stem of a parameter file
+    name: str
+    """Of a preset, or the stem of a parameter file."""
     preset: str
     ik: jaxik.FootIK
 
@@ -64,11 +65,15 @@ class NamedSystem:
 class TranslationRequest:
     """Which system is fitted to which, and on what."""
 
-    source: NamedSystem  # whose motion is reproduced
-    target: NamedSystem  # whose parameters are fitted, starting from these values
+    source: NamedSystem
+    """Whose motion is reproduced."""
+    target: NamedSystem
+    """Whose parameters are fitted, starting from these values."""
     animations: tuple[AnimationFiles, ...]
-    free: FreeTable | None = None  # None: all that move these clips
-    fps: float | None = None  # clips are resampled to this rate first
+    free: FreeTable | None = None
+    """None: all that move these clips."""
+    fps: float | None = None
+    """Clips are resampled to this rate first."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +83,11 @@ class Translation:
     source: NamedSystem
     target: NamedSystem
     experiment: Experiment
-    motions: tuple[Clip, ...]  # of the source, for each clip
+    motions: tuple[Clip, ...]
+    """Of the source, for each clip."""
     problem: Problem[jaxik.FootIK]
-    free_was_chosen: bool  # by the user, and not by a sweep over all parameters
+    free_was_chosen: bool
+    """By the user, and not by a sweep over all parameters."""
 
     @property
     def names(self) -> tuple[str, str]:

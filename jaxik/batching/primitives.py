@@ -36,8 +36,10 @@ ALONG_AXES = frozenset(
 class Value(NamedTuple):
     """A value of the trace."""
 
-    array: Any  # an array, a tracer or a literal
-    batched: bool  # whether it has a batch axis, which is then the last
+    array: Any
+    """An array, a tracer or a literal."""
+    batched: bool
+    """Whether it has a batch axis, which is then the last."""
 
     def broadcast(self, size: int) -> Array:
         """The array with a batch axis of this size."""

@@ -21,7 +21,8 @@ class Motion(NamedTuple):
     """A smoothed value and its velocity."""
 
     value: Float[Array, "*b"]
-    velocity: Float[Array, "*#b"]  # per second
+    velocity: Float[Array, "*#b"]
+    """Per second."""
 
 
 def lerp(value: Array, goal: Array, fraction: Array) -> Array:

@@ -49,7 +49,8 @@ class FootIK(Rule):
 class State:
     """The pipeline's memory between frames; each stage's part belongs to its rule."""
 
-    started: Bool[Array, "*b"]  # False before the first frame, where memory jumps to its goals
+    started: Bool[Array, "*b"]
+    """False before the first frame, where memory jumps to its goals."""
     contact: PyTree
     target: PyTree
     lean: PyTree
@@ -62,11 +63,13 @@ class State:
 class Advanced:
     """Output of the stages with memory, in one frame."""
 
-    foothold_ws: Float[Array, "legs 3"]  # m, smoothed and limited, not yet locked
+    foothold_ws: Float[Array, "legs 3"]
+    """m, smoothed and limited, not yet locked."""
     hold: Hold
     lean: Lean
     effector: Effector
-    state: State  # after this frame
+    state: State
+    """After this frame."""
 
 
 @struct
@@ -90,12 +93,17 @@ class Trace:
 class Result:
     """One frame after foot IK."""
 
-    pose: LegPose  # solved legs, model space
-    body: Transform  # moves the animated body to its solved place, model space
+    pose: LegPose
+    """Solved legs, model space."""
+    body: Transform
+    """Moves the animated body to its solved place, model space."""
     corrections: Corrections
-    reached: Float[Array, "*b legs"]  # 1 where the ankle is at its target, else 0
-    aimed: Float[Array, "*b legs"]  # 1 where the foot has the rotation its rule wants, else 0
-    trace: Trace | None  # None from a `step` without `trace=True`
+    reached: Float[Array, "*b legs"]
+    """1 where the ankle is at its target, else 0."""
+    aimed: Float[Array, "*b legs"]
+    """1 where the foot has the rotation its rule wants, else 0."""
+    trace: Trace | None
+    """None from a `step` without `trace=True`."""
 
 
 def init(ik: FootIK, rig: Rig) -> State:

@@ -16,9 +16,12 @@ from .two_bone import Limb, LimbBend, triangle_half_angle
 class PoleTarget:
     """Where a joint is to point, and which way up; all in one space."""
 
-    to_target: Float[Array, "*t 3"]  # m, from the joint
-    pole: Float[Array, "*p 3"]  # direction, of any length
-    twist: Float[Array, "*w"]  # rad, about the target's direction, applied last
+    to_target: Float[Array, "*t 3"]
+    """m, from the joint."""
+    pole: Float[Array, "*p 3"]
+    """Direction, of any length."""
+    twist: Float[Array, "*w"]
+    """rad, about the target's direction, applied last."""
 
 
 def bend_to_pole(limb: Limb, target: PoleTarget, soften: Array, gate: AbstractGate) -> LimbBend:

@@ -19,19 +19,25 @@ from .rotations import DOWN, clip_cosine, safe_arc
 class Limb:
     """A limb as seen from its middle joint; all in one space."""
 
-    to_hip: Float[Array, "*h 3"]  # m, from the knee
-    to_ankle: Float[Array, "*a 3"]  # m, from the knee
-    hinge: Float[Array, "*i 3"]  # unit; a positive rotation opens the knee
+    to_hip: Float[Array, "*h 3"]
+    """m, from the knee."""
+    to_ankle: Float[Array, "*a 3"]
+    """m, from the knee."""
+    hinge: Float[Array, "*i 3"]
+    """Unit; a positive rotation opens the knee."""
 
 
 @struct
 class LimbBend:
     """The rotations that bend a limb."""
 
-    swing: Float[Array, "*b 4"]  # of the hip, on the left of its rotation
-    half_cos: Float[Array, "*k"]  # of half the knee's rotation about its hinge, before the swing
+    swing: Float[Array, "*b 4"]
+    """Of the hip, on the left of its rotation."""
+    half_cos: Float[Array, "*k"]
+    """Of half the knee's rotation about its hinge, before the swing."""
     half_sin: Float[Array, "*k"]
-    reached: Float[Array, "*r"]  # 1 where the ankle can be at the target, else 0
+    reached: Float[Array, "*r"]
+    """1 where the ankle can be at the target, else 0."""
 
 
 def hinge_half_angle(limb: Limb, reach: Array) -> tuple[Array, Array]:

@@ -124,8 +124,10 @@ class LabelContact(AbstractInstantContact):
 class SpeedState:
     """Contact after a frame."""
 
-    standing: Float[Array, " legs"]  # 0 or 1
-    weight: Float[Array, " legs"]  # 0..1, smoothed `standing`
+    standing: Float[Array, " legs"]
+    """0 or 1."""
+    weight: Float[Array, " legs"]
+    """0..1, smoothed `standing`."""
 
 
 class SpeedContact(AbstractContact):

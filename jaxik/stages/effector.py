@@ -21,9 +21,12 @@ ANGLE_BAND = 0.035  # rad, 2 degrees
 class Effector:
     """What the legs are solved for."""
 
-    target_ws: Float[Array, "legs 3"]  # m, of the ankles
-    rot_ws: Float[Array, "legs 4"]  # of the ankles, for the foot rule
-    weight: Float[Array, " legs"]  # 0..1, how much foot IK each leg gets
+    target_ws: Float[Array, "legs 3"]
+    """m, of the ankles."""
+    rot_ws: Float[Array, "legs 4"]
+    """Of the ankles, for the foot rule."""
+    weight: Float[Array, " legs"]
+    """0..1, how much foot IK each leg gets."""
 
 
 class AbstractEffector(Rule):
@@ -154,8 +157,10 @@ def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[
 class BodyState:
     """Heights of the feet relative to the body."""
 
-    height: Float[Array, " legs"]  # m, of the ankles above their animation on the moved body
-    asleep: Float[Array, ""]  # 0 or 1
+    height: Float[Array, " legs"]
+    """m, of the ankles above their animation on the moved body."""
+    asleep: Float[Array, ""]
+    """0 or 1."""
 
 
 class BodyEffector(AbstractEffector):
@@ -233,9 +238,12 @@ class BodyEffector(AbstractEffector):
 class FadeState:
     """How far each leg has faded in, and where its last ground put it."""
 
-    weight: Float[Array, " legs"]  # 0..1
-    offset_ws: Float[Array, "legs 3"]  # m, from the animated ankle to the target
-    rot_ws: Float[Array, "legs 4"]  # from the animated rotation of the ankle to the target
+    weight: Float[Array, " legs"]
+    """From 0 to 1."""
+    offset_ws: Float[Array, "legs 3"]
+    """m, from the animated ankle to the target."""
+    rot_ws: Float[Array, "legs 4"]
+    """From the animated rotation of the ankle to the target."""
 
 
 class FadeEffector(AbstractEffector):

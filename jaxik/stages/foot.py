@@ -33,9 +33,12 @@ LEFT = (1.0, 0.0, 0.0)  # foot axes
 class SolvedFoot:
     """Legs with their feet turned."""
 
-    pose: LegPose  # legs, model space
-    ankle: Float[Array, "legs 4"]  # local correction, right-multiplied
-    reached: Float[Array, " legs"]  # 1 where the foot has the rotation its rule wants, else 0
+    pose: LegPose
+    """Legs, model space."""
+    ankle: Float[Array, "legs 4"]
+    """Local correction, right-multiplied."""
+    reached: Float[Array, " legs"]
+    """1 where the foot has the rotation its rule wants, else 0."""
 
 
 class AbstractFoot(Rule):

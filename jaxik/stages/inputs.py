@@ -24,8 +24,10 @@ class Inputs:
 class Moment:
     """What every `advance` reads, whatever its stage remembers."""
 
-    dt: Float[Array, ""]  # s, since the frame before
-    started: Bool[Array, ""]  # False on the first frame, where memory jumps to its goals
+    dt: Float[Array, ""]
+    """s, since the frame before."""
+    started: Bool[Array, ""]
+    """False on the first frame, where memory jumps to its goals."""
     gate: AbstractGate
 
     def progress(self, fraction: Array) -> Array:

@@ -18,8 +18,10 @@ from .inputs import Inputs, SensedMoment
 class Lean:
     """How the body leans."""
 
-    rot_ws: Float[Array, "4"]  # rotation of the body about its pivot, world axes
-    normal_ws: Float[Array, "3"]  # unit, the smoothed ground normal
+    rot_ws: Float[Array, "4"]
+    """Rotation of the body about its pivot, world axes."""
+    normal_ws: Float[Array, "3"]
+    """Unit, the smoothed ground normal."""
 
 
 class AbstractLean(Rule):
@@ -42,11 +44,16 @@ class AbstractLean(Rule):
 class LeanState:
     """Smoothed slope and sliding weight."""
 
-    forward: Float[Array, ""]  # rad
-    side: Float[Array, ""]  # rad
-    slide: Float[Array, ""]  # 0..1, smoothed `Frame.slide`
-    forward_speed: Float[Array, ""]  # rad/s; 0 unless it follows as a spring
-    side_speed: Float[Array, ""]  # rad/s, likewise
+    forward: Float[Array, ""]
+    """Radians."""
+    side: Float[Array, ""]
+    """Radians."""
+    slide: Float[Array, ""]
+    """0..1, smoothed `Frame.slide`."""
+    forward_speed: Float[Array, ""]
+    """rad/s; 0 unless it follows as a spring."""
+    side_speed: Float[Array, ""]
+    """rad/s, likewise."""
 
 
 class SlopeLean(AbstractLean):

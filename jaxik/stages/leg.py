@@ -25,25 +25,33 @@ from .inputs import Inputs
 class SolvedLeg:
     """Legs after two-bone IK, their feet not yet turned."""
 
-    pose: LegPose  # legs, model space
-    hip: Float[Array, "legs 4"]  # local correction, right-multiplied
-    knee: Float[Array, "legs 4"]  # local correction, right-multiplied
-    reached: Float[Array, " legs"]  # 1 where the ankle is at its target, else 0
+    pose: LegPose
+    """Legs, model space."""
+    hip: Float[Array, "legs 4"]
+    """Local correction, right-multiplied."""
+    knee: Float[Array, "legs 4"]
+    """Local correction, right-multiplied."""
+    reached: Float[Array, " legs"]
+    """1 where the ankle is at its target, else 0."""
 
 
 @struct
 class LegGoal:
     """What the legs are solved for."""
 
-    pose: LegPose  # legs, animated, on the moved body, model space
-    target_ms: Float[Array, "legs 3"]  # m, of the ankles
-    weight: Float[Array, " legs"]  # 0..1, how much foot IK each leg gets
+    pose: LegPose
+    """Legs, animated, on the moved body, model space."""
+    target_ms: Float[Array, "legs 3"]
+    """m, of the ankles."""
+    weight: Float[Array, " legs"]
+    """0..1, how much foot IK each leg gets."""
 
 
 class AbstractLeg(Rule):
     """Solves the legs for their targets."""
 
-    weight: eqx.AbstractVar[Array]  # 0..1, how much foot IK each leg gets
+    weight: eqx.AbstractVar[Array]
+    """0..1, how much foot IK each leg gets."""
 
     @abstractmethod
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:

@@ -23,9 +23,12 @@ FACTOR_BAND = 0.05
 class Hold:
     """How locks change the footholds."""
 
-    offset_ws: Float[Array, "legs 3"]  # m, from the foothold
-    rot_ws: Float[Array, "legs 4"]  # of the ankles
-    locked: Float[Array, " legs"]  # 1 where the foot keeps its place
+    offset_ws: Float[Array, "legs 3"]
+    """m, from the foothold."""
+    rot_ws: Float[Array, "legs 4"]
+    """Of the ankles."""
+    locked: Float[Array, " legs"]
+    """1 where the foot keeps its place."""
 
 
 class AbstractLock(Rule):
@@ -67,12 +70,18 @@ class NoLock(AbstractLock):
 class LockState:
     """Which feet are locked, and how far that holds them from their footholds."""
 
-    locked: Float[Array, " legs"]  # 0 or 1
-    factor: Float[Array, " legs"]  # 0..1, rises while locked, decays after release
-    offset: Float[Array, "legs 3"]  # m, platform axes
-    foothold: Float[Array, "legs 3"]  # m, of the frame before, platform space
-    ball: Float[Array, "legs 3"]  # m, likewise
-    ahead: Float[Array, "legs 3"]  # unit, foot direction when it locked, platform axes
+    locked: Float[Array, " legs"]
+    """0 or 1."""
+    factor: Float[Array, " legs"]
+    """0..1, rises while locked, decays after release."""
+    offset: Float[Array, "legs 3"]
+    """m, platform axes."""
+    foothold: Float[Array, "legs 3"]
+    """m, of the frame before, platform space."""
+    ball: Float[Array, "legs 3"]
+    """m, likewise."""
+    ahead: Float[Array, "legs 3"]
+    """Unit, foot direction when it locked, platform axes."""
 
 
 class OffsetLock(AbstractLock):
@@ -258,11 +267,16 @@ class OffsetLock(AbstractLock):
 class PlantState:
     """Where planted feet stand."""
 
-    locked: Float[Array, " legs"]  # 0 or 1
-    weight: Float[Array, " legs"]  # 0..1, how much planting planting
-    foothold: Float[Array, "legs 3"]  # m, platform space
-    clearance: Float[Array, " legs"]  # m, of that foothold above the ground below it
-    rot: Float[Array, "legs 4"]  # of the ankles, platform axes
+    locked: Float[Array, " legs"]
+    """0 or 1."""
+    weight: Float[Array, " legs"]
+    """0..1, how much planting planting."""
+    foothold: Float[Array, "legs 3"]
+    """m, platform space."""
+    clearance: Float[Array, " legs"]
+    """m, of that foothold above the ground below it."""
+    rot: Float[Array, "legs 4"]
+    """Of the ankles, platform axes."""
 
 
 class PlantLock(AbstractLock):

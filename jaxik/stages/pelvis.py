@@ -33,11 +33,16 @@ FAR = 1e6  # m, beyond any leg
 class PelvisState:
     """The offset of the body from its animation."""
 
-    height: Float[Array, ""]  # m
-    velocity: Float[Array, ""]  # m/s; 0 unless it follows as a spring
-    goal: Float[Array, ""]  # m, where the height is going
-    offset_ws: Float[Array, "3"]  # m
-    half_height: Float[Array, ""]  # m, of the capsule; 0 where a rule has none
+    height: Float[Array, ""]
+    """Metres."""
+    velocity: Float[Array, ""]
+    """m/s; 0 unless it follows as a spring."""
+    goal: Float[Array, ""]
+    """m, where the height is going."""
+    offset_ws: Float[Array, "3"]
+    """Metres."""
+    half_height: Float[Array, ""]
+    """m, of the capsule; 0 where a rule has none."""
 
     @classmethod
     def level(cls, rig: Rig) -> "PelvisState":
@@ -57,7 +62,8 @@ class PelvisMoment(SensedMoment):
     """A moment, with what only the pelvis reads."""
 
     lean: Lean
-    awake: Float[Array, ""]  # 0 while the body is to stay where it is, else 1
+    awake: Float[Array, ""]
+    """0 while the body is to stay where it is, else 1."""
 
 
 class AbstractPelvis(Rule):

@@ -237,7 +237,8 @@ class StrideProbe(AbstractProbe):
 class Level:
     """The plane through the character's root, perpendicular to each leg's up."""
 
-    origin_ws: Float[Array, "3"]  # m
+    origin_ws: Float[Array, "3"]
+    """Metres."""
     up_ws: Float[Array, "*legs 3"]
 
     def height(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs"]:

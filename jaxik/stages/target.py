@@ -21,7 +21,8 @@ HEIGHT_BAND = 0.01  # m
 class AbstractTarget(Rule):
     """Places each foot's foothold."""
 
-    foot_height: eqx.AbstractVar[Array]  # m, sole to ankle
+    foot_height: eqx.AbstractVar[Array]
+    """m, sole to ankle."""
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:
@@ -50,8 +51,10 @@ class AbstractInstantTarget(AbstractTarget):
 class TargetState:
     """Smoothed height of each foothold."""
 
-    height: Float[Array, " legs"]  # m, along up
-    velocity: Float[Array, " legs"]  # m/s; 0 unless it follows as a spring
+    height: Float[Array, " legs"]
+    """m, along up."""
+    velocity: Float[Array, " legs"]
+    """m/s; 0 unless it follows as a spring."""
 
 
 class SlopeTarget(AbstractTarget):

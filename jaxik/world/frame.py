@@ -23,11 +23,16 @@ class Stride:
     `last_ws` is its present position.
     """
 
-    standing: Float[Array, "*b legs"]  # 0..1, contact label of the animation
-    last_ws: Float[Array, "*b legs 3"]  # m
-    next_ws: Float[Array, "*b legs 3"]  # m
-    fraction: Float[Array, "*b legs"]  # 0..1, time of the swing that has passed; 0 while standing
-    known: Float[Array, "*b legs"]  # 1, or 0 where positions have to be predicted from velocity
+    standing: Float[Array, "*b legs"]
+    """0..1, contact label of the animation."""
+    last_ws: Float[Array, "*b legs 3"]
+    """Metres."""
+    next_ws: Float[Array, "*b legs 3"]
+    """Metres."""
+    fraction: Float[Array, "*b legs"]
+    """0..1, time of the swing that has passed; 0 while standing."""
+    known: Float[Array, "*b legs"]
+    """1, or 0 where positions have to be predicted from velocity."""
 
     @classmethod
     def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":
@@ -41,15 +46,23 @@ class Frame:
     """One frame of animation, before foot IK."""
 
     world_from_model: Transform
-    pose: LegPose  # legs, model space
-    weight: Float[Array, "*b legs"]  # 0..1, how much foot IK each leg gets
-    slide: Float[Array, "*b"]  # 0..1; 1 while the character slides
-    velocity_ws: Float[Array, "*b 3"]  # m/s, of the character
-    foot_speed: Float[Array, "*b legs"]  # m/s, of the animated ankles, world space
-    toe_speed: Float[Array, "*b legs"]  # m/s, of the animated toes, world space
+    pose: LegPose
+    """Legs, model space."""
+    weight: Float[Array, "*b legs"]
+    """0..1, how much foot IK each leg gets."""
+    slide: Float[Array, "*b"]
+    """0..1; 1 while the character slides."""
+    velocity_ws: Float[Array, "*b 3"]
+    """m/s, of the character."""
+    foot_speed: Float[Array, "*b legs"]
+    """m/s, of the animated ankles, world space."""
+    toe_speed: Float[Array, "*b legs"]
+    """m/s, of the animated toes, world space."""
     stride: Stride
-    dt: Float[Array, "*b"]  # s, since the previous frame
-    platform: Transform  # world_from_platform: the ground's own motion
+    dt: Float[Array, "*b"]
+    """s, since the previous frame."""
+    platform: Transform
+    """`world_from_platform`: the ground's own motion."""
 
     @property
     def speed(self) -> Float[Array, "*b"]:
@@ -66,8 +79,10 @@ class Frame:
 class Rays:
     """How far above and below a foothold the probe looks, and which layers it hits."""
 
-    above: Float[Array, " legs"]  # m
-    below: Float[Array, " legs"]  # m
+    above: Float[Array, " legs"]
+    """Metres."""
+    below: Float[Array, " legs"]
+    """Metres."""
     layers: UInt[Array, "*legs"]
 
 
@@ -75,64 +90,94 @@ class Rays:
 class GroundHits:
     """The ground under each leg: what its rays hit."""
 
-    ankle: Hit  # legs
-    toe: Hit  # legs; `found` is 0 where no toe ray was cast
-    corner: Hit  # legs, beside the ankle; `found` is 0 where no such ray was cast
-    rays: Rays  # for stages that cast further rays
+    ankle: Hit
+    """Legs."""
+    toe: Hit
+    """Legs; `found` is 0 where no toe ray was cast."""
+    corner: Hit
+    """Legs, beside the ankle; `found` is 0 where no such ray was cast."""
+    rays: Rays
+    """For stages that cast further rays."""
 
 
 @struct
 class Contact:
     """Which feet stand, according to the animation."""
 
-    lift: Float[Array, " legs"]  # m, of the animated ankle above the animation's own ground
-    weight: Float[Array, " legs"]  # 0..1, 1 for a standing foot
-    planted: Float[Array, " legs"]  # decision: low enough to stand
-    lifted: Float[Array, " legs"]  # decision: high enough to have left the ground
+    lift: Float[Array, " legs"]
+    """m, of the animated ankle above the animation's own ground."""
+    weight: Float[Array, " legs"]
+    """0..1, 1 for a standing foot."""
+    planted: Float[Array, " legs"]
+    """Decision: low enough to stand."""
+    lifted: Float[Array, " legs"]
+    """Decision: high enough to have left the ground."""
 
 
 @struct
 class Foothold:
     """Where each foot would stand. The ankle is `lift` above that point along up."""
 
-    point_ws: Float[Array, "legs 3"]  # m
-    lift: Float[Array, " legs"]  # m
-    height: Float[Array, " legs"]  # m, of the point along up
-    ankle_height_ms: Float[Array, " legs"]  # m, of the ankle above it, model space
-    climb: Float[Array, "*legs"]  # model-space height gained per metre along up
-    found: Float[Array, " legs"]  # 0..1
+    point_ws: Float[Array, "legs 3"]
+    """Metres."""
+    lift: Float[Array, " legs"]
+    """Metres."""
+    height: Float[Array, " legs"]
+    """m, of the point along up."""
+    ankle_height_ms: Float[Array, " legs"]
+    """m, of the ankle above it, model space."""
+    climb: Float[Array, "*legs"]
+    """Model-space height gained per metre along up."""
+    found: Float[Array, " legs"]
+    """From 0 to 1."""
 
 
 @struct
 class Slope:
     """Slope of the ground under the feet; positive where it rises ahead and to the right."""
 
-    forward: Float[Array, ""]  # rad
-    side: Float[Array, ""]  # rad
-    forward_ws: Float[Array, "3"]  # unit, horizontal
-    right_ws: Float[Array, "3"]  # unit
+    forward: Float[Array, ""]
+    """Radians."""
+    side: Float[Array, ""]
+    """Radians."""
+    forward_ws: Float[Array, "3"]
+    """Unit, horizontal."""
+    right_ws: Float[Array, "3"]
+    """Unit."""
 
 
 @struct
 class Sensed:
     """What the stages derive from one frame without memory of earlier ones."""
 
-    up_ws: Float[Array, "3"]  # up of the body
-    leg_up_ws: Float[Array, "*legs 3"]  # up of each leg, or one for all
+    up_ws: Float[Array, "3"]
+    """Up of the body."""
+    leg_up_ws: Float[Array, "*legs 3"]
+    """Up of each leg, or one for all."""
     dt: Float[Array, ""]
     slide: Float[Array, ""]
     platform: Transform
     present: Bool[Array, " legs"]
-    weight: Float[Array, " legs"]  # 0..1, how much foot IK each leg gets
-    root_ws: Float[Array, "3"]  # m, offset that put the character on its ground
-    hip_ws: Float[Array, "legs 3"]  # m, animated, with that offset
-    ankle_ws: Float[Array, "legs 3"]  # m, likewise
-    ankle_rot_ws: Float[Array, "legs 4"]  # animated
-    ball_ws: Float[Array, "legs 3"]  # m, animated toes, likewise
-    ahead_ws: Float[Array, "legs 3"]  # unit, horizontal direction of each animated foot
-    rot_ws: Float[Array, "legs 4"]  # ankle rotations that the foot rule wants
-    thigh: Float[Array, " legs"]  # m, in this frame
-    shin: Float[Array, " legs"]  # m
+    weight: Float[Array, " legs"]
+    """0..1, how much foot IK each leg gets."""
+    root_ws: Float[Array, "3"]
+    """m, offset that put the character on its ground."""
+    hip_ws: Float[Array, "legs 3"]
+    """m, animated, with that offset."""
+    ankle_ws: Float[Array, "legs 3"]
+    """m, likewise."""
+    ankle_rot_ws: Float[Array, "legs 4"]
+    """Animated."""
+    ball_ws: Float[Array, "legs 3"]
+    """m, animated toes, likewise."""
+    ahead_ws: Float[Array, "legs 3"]
+    """Unit, horizontal direction of each animated foot."""
+    rot_ws: Float[Array, "legs 4"]
+    """Ankle rotations that the foot rule wants."""
+    thigh: Float[Array, " legs"]
+    """m, in this frame."""
+    shin: Float[Array, " legs"]
+    """Metres."""
     ground: GroundHits
     contact: Contact
     foothold: Foothold

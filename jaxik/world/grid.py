@@ -21,19 +21,28 @@ from .cells import SPLIT
 class Grid(eqx.Module):
     """Lists of triangles per cell, in a frame whose y is up. No gradient passes through it."""
 
-    centre_ws: Float[
-        Array, "*t 3"
-    ]  # m, the frame's origin, in the middle of the mesh for small rounding
-    axes_ws: Float[Array, "*t 3 3"]  # rows: the frame's x, y (up) and z
-    corners: Float[Array, "*t triangles 9"]  # m; x z y of each corner in the frame, same winding
-    visible: UInt[Array, "*t triangles"]  # one bit per layer; none for walls and lines
-    corner: Float[Array, "*t 2"]  # m, x and z of the first cell's corner
-    pitch: Float[Array, "*t"]  # m, side of an unsplit cell
-    first: Int[Array, "*t cells_and_end"]  # start of each cell's list in `members`
-    children: Int[Array, "*t cells"]  # first part of a split cell, -1 where not split
-    members: Int[Array, "*t entries"]  # triangles, cell by cell
-    shape: tuple[int, int] = eqx.field(static=True)  # unsplit cells along x and z
-    depth: int = eqx.field(static=True)  # levels of split cells
+    centre_ws: Float[Array, "*t 3"]
+    """m, the frame's origin, in the middle of the mesh for small rounding."""
+    axes_ws: Float[Array, "*t 3 3"]
+    """Rows: the frame's x, y (up) and z."""
+    corners: Float[Array, "*t triangles 9"]
+    """m; x z y of each corner in the frame, same winding."""
+    visible: UInt[Array, "*t triangles"]
+    """One bit per layer; none for walls and lines."""
+    corner: Float[Array, "*t 2"]
+    """m, x and z of the first cell's corner."""
+    pitch: Float[Array, "*t"]
+    """m, side of an unsplit cell."""
+    first: Int[Array, "*t cells_and_end"]
+    """Start of each cell's list in `members`."""
+    children: Int[Array, "*t cells"]
+    """First part of a split cell, -1 where not split."""
+    members: Int[Array, "*t entries"]
+    """Triangles, cell by cell."""
+    shape: tuple[int, int] = eqx.field(static=True)
+    """Unsplit cells along x and z."""
+    depth: int = eqx.field(static=True)
+    """Levels of split cells."""
 
     def with_vertices(
         self,

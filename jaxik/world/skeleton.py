@@ -12,8 +12,10 @@ from jaxik.maths.struct import struct
 class Transform:
     """A rigid transform. Named `a_from_b`, it maps points of space b to space a."""
 
-    pos: Float[Array, "*b 3"]  # m
-    rot: Float[Array, "*b 4"]  # wxyz
+    pos: Float[Array, "*b 3"]
+    """Metres."""
+    rot: Float[Array, "*b 4"]
+    """Unit quaternions, wxyz."""
 
     @classmethod
     def identity(cls, dtype=None) -> "Transform":
@@ -48,9 +50,11 @@ class Transform:
 class Skeleton(eqx.Module):
     """A tree of joints, parents before children."""
 
-    offsets: Float[Array, "joints 3"]  # m, in the parent's space
+    offsets: Float[Array, "joints 3"]
+    """m, in the parent's space."""
     names: tuple[str, ...] = eqx.field(static=True)
-    parents: tuple[int, ...] = eqx.field(static=True)  # -1 at a root
+    parents: tuple[int, ...] = eqx.field(static=True)
+    """-1 at a root."""
 
     def __check_init__(self) -> None:
         if not len(self.names) == len(self.parents) == self.offsets.shape[0]:
@@ -96,7 +100,8 @@ def forward_kinematics(
 class LegPose:
     """The four joints of each leg; `toe` is the ball of the foot."""
 
-    hip: Transform  # legs, model space
+    hip: Transform
+    """Legs, model space."""
     knee: Transform
     ankle: Transform
     toe: Transform
@@ -110,16 +115,26 @@ class LegPose:
 class Rig:
     """What a leg is, apart from its pose. The legs of one character may all differ."""
 
-    knee_axis_ls: Float[Array, "*b legs 3"]  # unit, knee space; positive rotation opens the knee
-    ankle_from_foot: Float[Array, "*b legs 4"]  # foot axes (x left, y up, z forward) in ankle space
-    thigh: Float[Array, "*b legs"]  # m, hip to knee
-    shin: Float[Array, "*b legs"]  # m, knee to ankle
-    foot: Float[Array, "*b legs"]  # m, ankle to ball
-    side: Float[Array, "*b legs"]  # +1 left, -1 right, 0 in the middle
-    present: Bool[Array, "*b legs"]  # False for legs that only pad a batch of mixed leg counts
-    names: tuple[str, ...] = eqx.field(static=True)  # one per leg
-    joints: tuple[tuple[int, int, int, int], ...] = eqx.field(static=True)  # hip knee ankle toe
-    pelvis: int = eqx.field(static=True)  # joint index
+    knee_axis_ls: Float[Array, "*b legs 3"]
+    """Unit, knee space; positive rotation opens the knee."""
+    ankle_from_foot: Float[Array, "*b legs 4"]
+    """Foot axes (x left, y up, z forward) in ankle space."""
+    thigh: Float[Array, "*b legs"]
+    """m, hip to knee."""
+    shin: Float[Array, "*b legs"]
+    """m, knee to ankle."""
+    foot: Float[Array, "*b legs"]
+    """m, ankle to ball."""
+    side: Float[Array, "*b legs"]
+    """+1 left, -1 right, 0 in the middle."""
+    present: Bool[Array, "*b legs"]
+    """False for legs that only pad a batch of mixed leg counts."""
+    names: tuple[str, ...] = eqx.field(static=True)
+    """One per leg."""
+    joints: tuple[tuple[int, int, int, int], ...] = eqx.field(static=True)
+    """Hip knee ankle toe."""
+    pelvis: int = eqx.field(static=True)
+    """Joint index."""
 
 
 def bone_lengths(pose: LegPose) -> tuple[Array, Array]:

@@ -28,17 +28,22 @@ HORIZON = 1e4  # m; longer rays, infinite ones too, end here
 class Hit:
     """What a ray hit. A miss has `found` 0, the end of the ray as its point and up as normal."""
 
-    point: Float[Array, "*b 3"]  # m, world
-    normal: Float[Array, "*b 3"]  # unit, on the side of the ray's origin: never points down
-    distance: Float[Array, "*b"]  # m from the origin; the full length of the ray for a miss
-    found: Float[Array, "*b"]  # 1 or 0
+    point: Float[Array, "*b 3"]
+    """m, world."""
+    normal: Float[Array, "*b 3"]
+    """Unit, on the side of the ray's origin: never points down."""
+    distance: Float[Array, "*b"]
+    """m from the origin; the full length of the ray for a miss."""
+    found: Float[Array, "*b"]
+    """1 or 0."""
 
 
 @struct
 class Terrain:
     """Surfaces under one up direction."""
 
-    up_ws: Float[Array, "*t 3"]  # unit; rays run along its opposite
+    up_ws: Float[Array, "*t 3"]
+    """Unit; rays run along its opposite."""
     surfaces: tuple[AbstractSurface, ...]
 
     @property
@@ -75,8 +80,10 @@ class LegTerrains:
     each distinct up needs its own copy of the mesh; legs with the same up can share a terrain.
     """
 
-    body: Terrain  # up of the body, and the ground that rays of the root hit
-    legs: tuple[Terrain, ...]  # one per leg
+    body: Terrain
+    """Up of the body, and the ground that rays of the root hit."""
+    legs: tuple[Terrain, ...]
+    """One per leg."""
 
     @property
     def up_ws(self) -> Float[Array, "3"]:

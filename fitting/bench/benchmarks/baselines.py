@@ -30,9 +30,12 @@ class Legs(NamedTuple):
 class KneeLimits(NamedTuple):
     """Limits of a knee, as parameters of `jaxik.stages.leg.TwoBone`."""
 
-    min_angle: float  # rad
-    max_angle: float  # rad
-    soften: float  # fraction of the longest reach from which on the leg resists
+    min_angle: float
+    """Radians."""
+    max_angle: float
+    """Radians."""
+    soften: float
+    """Fraction of the longest reach from which on the leg resists."""
 
 
 def two_bone(legs: Legs, limits: KneeLimits) -> tuple[Rotations, Rotations]:

@@ -75,10 +75,13 @@ class SplitWork(NamedTuple):
     `sparse` are arrays of which a run reads little.
     """
 
-    function: Callable  # of `shared` and of some of the items
+    function: Callable
+    """Of `shared` and of some of the items."""
     shared: PyTree
-    items: PyTree  # arrays
-    axis: int = -1  # along which the items are counted
+    items: PyTree
+    """Arrays."""
+    axis: int = -1
+    """Along which the items are counted."""
     sparse: PyTree = ()
 
 

@@ -26,21 +26,36 @@ class Clip:
     """
 
     joint_names: tuple[str, ...]
-    parents: tuple[int, ...]  # index of each joint's parent, -1 at the root; parents come first
-    offsets_ls: Float64[np.ndarray, "joints 3"]  # m, rest pose, in the parents' spaces
-    positions_ws: Float64[np.ndarray, "frames joints 3"]  # m
-    rotations_ws: Float64[np.ndarray, "frames joints 4"]  # wxyz
-    fps: float  # frames per second, rounded to a common rate
-    raw_frame_time: float  # s, as written in the file
-    source: str  # file name
-    scale: float  # metres per unit of the file
-    up_axis: str  # of the file: y or z
-    dialect: str | None  # naming convention by which the legs were recognised
-    measured_rig: Rig | None  # float64; None where no leg was recognised
-    stance: Bool[np.ndarray, "frames legs"] | None = None  # contact labels stored with the clip
-    mask: Bool[np.ndarray, " frames"] | None = None  # False where a frame must not be trusted
-    slide: Float64[np.ndarray, " frames"] | None = None  # 0..1, 1 while the character slides
-    remarks: tuple[str, ...] = ()  # guesses and oddities, for the user
+    parents: tuple[int, ...]
+    """Index of each joint's parent, -1 at the root; parents come first."""
+    offsets_ls: Float64[np.ndarray, "joints 3"]
+    """m, rest pose, in the parents' spaces."""
+    positions_ws: Float64[np.ndarray, "frames joints 3"]
+    """Metres."""
+    rotations_ws: Float64[np.ndarray, "frames joints 4"]
+    """Unit quaternions, wxyz."""
+    fps: float
+    """Frames per second, rounded to a common rate."""
+    raw_frame_time: float
+    """s, as written in the file."""
+    source: str
+    """File name."""
+    scale: float
+    """Metres per unit of the file."""
+    up_axis: str
+    """Of the file: y or z."""
+    dialect: str | None
+    """Naming convention by which the legs were recognised."""
+    measured_rig: Rig | None
+    """Float64; None where no leg was recognised."""
+    stance: Bool[np.ndarray, "frames legs"] | None = None
+    """Contact labels stored with the clip."""
+    mask: Bool[np.ndarray, " frames"] | None = None
+    """False where a frame must not be trusted."""
+    slide: Float64[np.ndarray, " frames"] | None = None
+    """0..1, 1 while the character slides."""
+    remarks: tuple[str, ...] = ()
+    """Guesses and oddities, for the user."""
 
     def __post_init__(self) -> None:
         for name in ("offsets_ls", "positions_ws", "rotations_ws", "stance", "mask", "slide"):

@@ -68,10 +68,14 @@ def merge_runs(separate: list[tuple[int, int]], gap: int) -> list[tuple[int, int
 class Footfalls:
     """Where one foot stands, and between which two stances it is in each frame."""
 
-    positions_ws: Float64[np.ndarray, "stances 3"]  # m, median position of the ball
-    last: Int64[np.ndarray, " frames"]  # index of the current stance, or of the one it has left
-    next: Int64[np.ndarray, " frames"]  # index of the following one; at both ends of a clip `last`
-    swing_fraction: Float64[np.ndarray, " frames"]  # 0..1, of the swing's duration that has passed
+    positions_ws: Float64[np.ndarray, "stances 3"]
+    """m, median position of the ball."""
+    last: Int64[np.ndarray, " frames"]
+    """Index of the current stance, or of the one it has left."""
+    next: Int64[np.ndarray, " frames"]
+    """Index of the following one; at both ends of a clip `last`."""
+    swing_fraction: Float64[np.ndarray, " frames"]
+    """0..1, of the swing's duration that has passed."""
 
 
 def footfalls(

@@ -31,15 +31,18 @@ class Leg:
     """One leg's joints by index; the toe is the ball of the foot, or the joint nearest to it."""
 
     name: str
-    side: float  # +1 left, -1 right, 0 neither
-    joints: tuple[int, int, int, int]  # hip, knee, ankle, toe
+    side: float
+    """+1 left, -1 right, 0 neither."""
+    joints: tuple[int, int, int, int]
+    """Hip, knee, ankle, toe."""
 
 
 @dataclass(frozen=True)
 class Roles:
     """The joints of a rig, by index."""
 
-    dialect: str  # key of `DIALECTS`, or "by hand"
+    dialect: str
+    """Key of `DIALECTS`, or "by hand"."""
     pelvis: int
     legs: tuple[Leg, ...]
 

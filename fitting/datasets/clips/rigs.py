@@ -25,22 +25,28 @@ FLAT_FRACTION = 0.25  # of the stance frames, those with the slowest ankle: the 
 class LegMotion:
     """World transforms of one leg's joints over the frames."""
 
-    hip: Vectors  # m
+    hip: Vectors
+    """Metres."""
     knee: Vectors
     ankle: Vectors
     toe: Vectors
-    hip_rot: Rotations  # wxyz
+    hip_rot: Rotations
+    """Unit quaternions, wxyz."""
     knee_rot: Rotations
     ankle_rot: Rotations
-    left_ws: Vectors  # unit, to the character's left
+    left_ws: Vectors
+    """Unit, to the character's left."""
 
 
 class LegMeasurement(NamedTuple):
     """What a rig needs to know of one leg."""
 
-    knee_axis_ls: Float64[np.ndarray, "3"]  # unit, knee space
-    ankle_from_foot: Float64[np.ndarray, "4"]  # wxyz
-    lengths: Float64[np.ndarray, "3"]  # m, thigh, shin and foot
+    knee_axis_ls: Float64[np.ndarray, "3"]
+    """Unit, knee space."""
+    ankle_from_foot: Float64[np.ndarray, "4"]
+    """Unit quaternions, wxyz."""
+    lengths: Float64[np.ndarray, "3"]
+    """m, thigh, shin and foot."""
 
 
 def measure_rig(

@@ -14,15 +14,21 @@ ROLES = ("hip", "knee", "ankle", "toe")
 class LegSummary(TypedDict):
     """One leg; lengths in metres."""
 
-    side: float  # 1 left, -1 right, 0 neither
+    side: float
+    """1 left, -1 right, 0 neither."""
     thigh: float
     shin: float
     foot: float
-    knee_axis: list[float]  # unit, knee space
-    ankle_from_foot: list[float]  # wxyz
-    contacts: int  # number of stances
-    contact_share: float  # 0..1, of the frames
-    contacts_from: str  # file or motion
+    knee_axis: list[float]
+    """Unit, knee space."""
+    ankle_from_foot: list[float]
+    """Unit quaternions, wxyz."""
+    contacts: int
+    """Number of stances."""
+    contact_share: float
+    """0..1, of the frames."""
+    contacts_from: str
+    """File or motion."""
 
 
 class ClipSummary(TypedDict):
@@ -32,14 +38,18 @@ class ClipSummary(TypedDict):
     frames: int
     seconds: float
     fps: float
-    raw_frame_time: float  # s
+    raw_frame_time: float
+    """Seconds."""
     raw_fps: float
-    scale: float  # metres per unit of the file
+    scale: float
+    """Metres per unit of the file."""
     up_axis: str
     body_height: float
     joints: list[str]
-    dialect: str | None  # joint naming convention
-    joint_map: dict[str, str]  # role to joint name
+    dialect: str | None
+    """Joint naming convention."""
+    joint_map: dict[str, str]
+    """Role to joint name."""
     legs: dict[str, LegSummary]
     warnings: list[str]
 

@@ -29,10 +29,14 @@ BallCurve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class FootMotion:
     """One foot over the frames."""
 
-    ball: Float64[np.ndarray, "frames 3"]  # m
-    ankle: Float64[np.ndarray, "frames 3"]  # m
-    rot: Float64[np.ndarray, "frames 4"]  # wxyz
-    stance: Bool[np.ndarray, " frames"]  # True while its ball is placed
+    ball: Float64[np.ndarray, "frames 3"]
+    """Metres."""
+    ankle: Float64[np.ndarray, "frames 3"]
+    """Metres."""
+    rot: Float64[np.ndarray, "frames 4"]
+    """Unit quaternions, wxyz."""
+    stance: Bool[np.ndarray, " frames"]
+    """True while its ball is placed."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +46,19 @@ class Footsteps:
     Arrays begin with the foothold before the first frame, so stance i is at index i + 1.
     """
 
-    phase_offset: float  # of this foot
-    side: float  # 1 left, -1 right
+    phase_offset: float
+    """Of this foot."""
+    side: float
+    """1 left, -1 right."""
     path: GroundPath
-    along: Float64[np.ndarray, " strides"]  # m, position of the ball along the path
-    aside: Float64[np.ndarray, " strides"]  # m, to the left of the path
-    lift: Float64[np.ndarray, " strides"]  # m, added to the height of the following swing
-    pitch: Float64[np.ndarray, " strides"]  # rad, added to its pitch
+    along: Float64[np.ndarray, " strides"]
+    """m, position of the ball along the path."""
+    aside: Float64[np.ndarray, " strides"]
+    """m, to the left of the path."""
+    lift: Float64[np.ndarray, " strides"]
+    """m, added to the height of the following swing."""
+    pitch: Float64[np.ndarray, " strides"]
+    """rad, added to its pitch."""
 
     def motion(self, phase: np.ndarray, still: np.ndarray) -> FootMotion:
         """The foot over the frames.

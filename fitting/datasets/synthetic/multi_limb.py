@@ -32,11 +32,16 @@ class Limb:
     """A two-bone limb with a foot or hand; points are relative to the floor below the trunk."""
 
     name: str
-    root: Point  # m, of the hip or shoulder
-    home: tuple[float, float]  # m, left and ahead: the ball of the foot in the middle of its stance
-    pole: Point  # where the knee or elbow points
-    bones: tuple[float, float]  # m, upper and lower
-    phase_offset: float  # of a stride, after the first limb
+    root: Point
+    """m, of the hip or shoulder."""
+    home: tuple[float, float]
+    """m, left and ahead: the ball of the foot in the middle of its stance."""
+    pole: Point
+    """Where the knee or elbow points."""
+    bones: tuple[float, float]
+    """m, upper and lower."""
+    phase_offset: float
+    """Of a stride, after the first limb."""
 
 
 @dataclass(frozen=True)
@@ -45,24 +50,36 @@ class Body:
 
     name: str
     limbs: tuple[Limb, ...]
-    height: float  # m, of the trunk above the floor
-    stride: float  # m
-    period: float  # s, of a stride
-    stance_fraction: float  # of a stride, in which a limb stands
-    lift: float  # m, of the ball in the middle of a swing
-    toe_drop: float  # rad, by which toes point down there
-    bob: float  # m, by which the trunk rises and falls, twice per stride
-    ankle_to_ball: tuple[float, float]  # m, down and ahead
-    ball_height: float  # m, above the sole
+    height: float
+    """m, of the trunk above the floor."""
+    stride: float
+    """Metres."""
+    period: float
+    """s, of a stride."""
+    stance_fraction: float
+    """Of a stride, in which a limb stands."""
+    lift: float
+    """m, of the ball in the middle of a swing."""
+    toe_drop: float
+    """rad, by which toes point down there."""
+    bob: float
+    """m, by which the trunk rises and falls, twice per stride."""
+    ankle_to_ball: tuple[float, float]
+    """m, down and ahead."""
+    ball_height: float
+    """m, above the sole."""
 
 
 @dataclass(frozen=True)
 class Route:
     """Where a body goes, and how regular its footholds are."""
 
-    start: float = 0.0  # m, position along the path at the start
-    bend: float = 0.09  # rad, about how far the path turns away from +z to either side
-    jitter: float = 0.015  # m, standard deviation of footholds, along the path and across
+    start: float = 0.0
+    """m, position along the path at the start."""
+    bend: float = 0.09
+    """rad, about how far the path turns away from +z to either side."""
+    jitter: float = 0.015
+    """m, standard deviation of footholds, along the path and across."""
 
 
 class _Travel(NamedTuple):

@@ -19,17 +19,22 @@ SETTLING = 0.25  # fraction of the normal cadence below which feet settle flat; 
 class Slip:
     """Seconds in which the root moves faster or slower than the feet step, as game roots do."""
 
-    start: float  # s
-    end: float  # s
-    speed_change: float  # fraction of the walking speed, added; negative if the root lags behind
+    start: float
+    """Seconds."""
+    end: float
+    """Seconds."""
+    speed_change: float
+    """Fraction of the walking speed, added; negative if the root lags behind."""
 
 
 @dataclass(frozen=True)
 class Slide:
     """Seconds in which the walk freezes and the whole body glides on at walking speed."""
 
-    start: float  # s
-    end: float  # s
+    start: float
+    """Seconds."""
+    end: float
+    """Seconds."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +45,10 @@ class Stop:
     exactly still until `end`.
     """
 
-    start: float  # s
-    end: float  # s
+    start: float
+    """Seconds."""
+    end: float
+    """Seconds."""
 
 
 Event = Slip | Slide | Stop
@@ -50,10 +57,14 @@ Event = Slip | Slide | Stop
 class SpeedProfile(NamedTuple):
     """How fast a walk goes in each frame."""
 
-    cadence: Float64[np.ndarray, " frames"]  # fraction of the normal cadence
-    drift: Float64[np.ndarray, " frames"]  # m/s, speed of the whole body beyond what the feet step
-    slide: Float64[np.ndarray, " frames"]  # 1 in a slide, else 0
-    still: Float64[np.ndarray, " frames"]  # 0..1, 1 while the character stands
+    cadence: Float64[np.ndarray, " frames"]
+    """Fraction of the normal cadence."""
+    drift: Float64[np.ndarray, " frames"]
+    """m/s, speed of the whole body beyond what the feet step."""
+    slide: Float64[np.ndarray, " frames"]
+    """1 in a slide, else 0."""
+    still: Float64[np.ndarray, " frames"]
+    """0..1, 1 while the character stands."""
 
 
 def speed_profile(

@@ -28,9 +28,12 @@ WALL_FROM_FLOOR = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 
 class Point(NamedTuple):
     """A corner of a height profile."""
 
-    z: float  # m
-    height: float  # m, at x = 0
-    tilt: float = 0.0  # m per metre of x, to the character's left
+    z: float
+    """Metres."""
+    height: float
+    """m, at x = 0."""
+    tilt: float = 0.0
+    """m per metre of x, to the character's left."""
 
 
 def strip(profile: Sequence[Point]) -> Mesh:

@@ -32,8 +32,10 @@ def heading_vectors(yaw: np.ndarray) -> np.ndarray:
 class GroundPath:
     """A gently bending line over the floor, through x = 0 at z = 0, as a function of z, m."""
 
-    bend: float  # rad, about how far the path turns away from +z to either side
-    phase: float  # rad, of the bends at z = 0
+    bend: float
+    """rad, about how far the path turns away from +z to either side."""
+    phase: float
+    """rad, of the bends at z = 0."""
 
     def yaw(self, z: np.ndarray) -> np.ndarray:
         """Heading, rad; 0 faces +z."""

@@ -33,8 +33,10 @@ PARENTS = (-1, 0, 1, 2, 3, 0, 5, 6, 7)
 class WalkStyle:
     """How straight and how regular a walk is."""
 
-    bend: float = 0.09  # rad, about how far the path turns away from +z to either side
-    variation: float = 1.0  # of strides, 1 as measured; 0 makes all alike
+    bend: float = 0.09
+    """rad, about how far the path turns away from +z to either side."""
+    variation: float = 1.0
+    """Of strides, 1 as measured; 0 makes all alike."""
 
 
 def walk(

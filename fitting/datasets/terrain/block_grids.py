@@ -41,9 +41,12 @@ class Grid:
     u = cos(heading) x + sin(heading) z and v = -sin(heading) x + cos(heading) z.
     """
 
-    pitch: float  # m
-    heading: float  # rad, -pi/4 to pi/4, as a quarter turn gives the same grid
-    origin: tuple[float, float]  # m, (u0, v0), each from 0 to pitch
+    pitch: float
+    """Metres."""
+    heading: float
+    """rad, -pi/4 to pi/4, as a quarter turn gives the same grid."""
+    origin: tuple[float, float]
+    """m, (u0, v0), each from 0 to pitch."""
 
     def cells(self, points: Float64[np.ndarray, "points 2"]) -> Int64[np.ndarray, "points 2"]:
         """The cell of each point (x, z), m."""
@@ -64,9 +67,12 @@ class Grid:
 class Footprints:
     """Where flat feet stood, which is what grids and surfaces are fitted to."""
 
-    balls: Float64[np.ndarray, "stances 2"]  # m, (x, z)
-    heights: Float64[np.ndarray, " stances"]  # m, of the ground below the balls
-    ankles: Float64[np.ndarray, "stances 2"]  # m, (x, z); the ground below is not higher
+    balls: Float64[np.ndarray, "stances 2"]
+    """m, (x, z)."""
+    heights: Float64[np.ndarray, " stances"]
+    """m, of the ground below the balls."""
+    ankles: Float64[np.ndarray, "stances 2"]
+    """m, (x, z); the ground below is not higher."""
 
     def without(self, index: int) -> "Footprints":
         """All footprints except one."""
@@ -79,9 +85,12 @@ class RankedGrids:
     """Candidate grids that partition the stances differently, the most probable first."""
 
     grids: tuple[Grid, ...]
-    extra_evidence: Float64[np.ndarray, " grids"]  # nats, from other grids with the same partition
-    pitches: tuple[float, float]  # m, range of grids nearly as probable as the best
-    headings: tuple[float, float]  # rad, likewise
+    extra_evidence: Float64[np.ndarray, " grids"]
+    """Nats, from other grids with the same partition."""
+    pitches: tuple[float, float]
+    """m, range of grids nearly as probable as the best."""
+    headings: tuple[float, float]
+    """rad, likewise."""
 
 
 def search(feet: Footprints) -> RankedGrids:

@@ -9,8 +9,10 @@ from jaxtyping import Float64, Int64
 class Mesh(NamedTuple):
     """Triangles over vertices in world space, y up."""
 
-    vertices: Float64[np.ndarray, "vertices 3"]  # m
-    faces: Int64[np.ndarray, "faces 3"]  # vertex indices, counterclockwise seen from above
+    vertices: Float64[np.ndarray, "vertices 3"]
+    """Metres."""
+    faces: Int64[np.ndarray, "faces 3"]
+    """Vertex indices, counterclockwise seen from above."""
 
 
 def join(*meshes: Mesh) -> Mesh:

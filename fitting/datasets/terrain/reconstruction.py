@@ -34,14 +34,22 @@ SurfaceFit = Callable[[Footprints], Surface]
 class Stances:
     """Where feet stood, in order of time."""
 
-    leg: Int64[np.ndarray, " stances"]  # index
-    first: Int64[np.ndarray, " stances"]  # frame
-    last: Int64[np.ndarray, " stances"]  # frame, included
-    points: Float64[np.ndarray, "stances 2"]  # m, (x, z) of the ball
-    ankles: Float64[np.ndarray, "stances 2"]  # m, (x, z)
-    heights: Float64[np.ndarray, " stances"]  # m, of the ground below the ball
-    toes: Bool[np.ndarray, " stances"]  # True where the heel is in the air
-    used: Bool[np.ndarray, " stances"]  # True where the surfaces are fitted to it
+    leg: Int64[np.ndarray, " stances"]
+    """Index."""
+    first: Int64[np.ndarray, " stances"]
+    """Frame."""
+    last: Int64[np.ndarray, " stances"]
+    """Frame, included."""
+    points: Float64[np.ndarray, "stances 2"]
+    """m, (x, z) of the ball."""
+    ankles: Float64[np.ndarray, "stances 2"]
+    """m, (x, z)."""
+    heights: Float64[np.ndarray, " stances"]
+    """m, of the ground below the ball."""
+    toes: Bool[np.ndarray, " stances"]
+    """True where the heel is in the air."""
+    used: Bool[np.ndarray, " stances"]
+    """True where the surfaces are fitted to it."""
 
     @property
     def footprints(self) -> Footprints:
@@ -54,8 +62,10 @@ class Stances:
 class Prediction:
     """How well a kind of surface predicts each used stance from the others."""
 
-    errors: Float64[np.ndarray, " stances"]  # m, predicted minus measured
-    alone: Bool[np.ndarray, " stances"]  # no other stance on its block: predicted from neighbours
+    errors: Float64[np.ndarray, " stances"]
+    """m, predicted minus measured."""
+    alone: Bool[np.ndarray, " stances"]
+    """No other stance on its block: predicted from neighbours."""
 
     @property
     def rms(self) -> float:
@@ -73,10 +83,13 @@ class Reconstruction:
     """The surfaces fitted to a clip's stances, and which of them was chosen."""
 
     stances: Stances
-    surfaces: Mapping[str, Surface]  # by kind
-    predictions: Mapping[str, Prediction]  # by kind
+    surfaces: Mapping[str, Surface]
+    """By kind."""
+    predictions: Mapping[str, Prediction]
+    """By kind."""
     grids: RankedGrids
-    chosen: str  # kind
+    chosen: str
+    """Kind."""
 
     @property
     def surface(self) -> Surface:

@@ -40,8 +40,10 @@ class Surface(ABC):
 class Plane(Surface):
     """The plane y = level + slope · (x, z)."""
 
-    level: float  # m, at the origin
-    slope: tuple[float, float]  # m per m along x and z
+    level: float
+    """m, at the origin."""
+    slope: tuple[float, float]
+    """m per m along x and z."""
 
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
         return self.level + points @ np.array(self.slope)
@@ -58,9 +60,12 @@ class ThinPlate(Surface):
     """A thin-plate smoothing spline (Duchon 1977; Wahba, "Spline models", 1990)."""
 
     plate: RBFInterpolator
-    smoothing: float  # m²; 0 interpolates every footprint
-    lowest: float  # m; heights are clipped to those of the footprints
-    highest: float  # m
+    smoothing: float
+    """m²; 0 interpolates every footprint."""
+    lowest: float
+    """m; heights are clipped to those of the footprints."""
+    highest: float
+    """Metres."""
 
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
         return np.clip(self.plate(points), self.lowest, self.highest)
@@ -80,9 +85,12 @@ class LevelBlocks(Surface):
     """Level blocks. One without footprints has the mean height of the nearest that have any."""
 
     grid: Grid
-    cells: Int64[np.ndarray, "blocks 2"]  # with footprints
-    tops: Float64[np.ndarray, " blocks"]  # m
-    stances: Int64[np.ndarray, " blocks"]  # number of footprints
+    cells: Int64[np.ndarray, "blocks 2"]
+    """With footprints."""
+    tops: Float64[np.ndarray, " blocks"]
+    """Metres."""
+    stances: Int64[np.ndarray, " blocks"]
+    """Number of footprints."""
 
     def heights(self, points: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, " points"]:
         return self._heights_of(self.grid.cells(points))

@@ -82,7 +82,8 @@ def _point(lm: LMState) -> Point:
 class Streaks:
     """Steps in a row without progress."""
 
-    small: int = 0  # accepted, but with next to no gain
+    small: int = 0
+    """Accepted, but with next to no gain."""
     rejected: int = 0
 
     def after(self, before: LMState, after: LMState, settings: SearchSettings) -> "Streaks":

@@ -23,9 +23,12 @@ class LMState(eqx.Module):
     """Where a descent stands; all of it arrays."""
 
     u: Float[Array, " free"]
-    cost: Float[Array, ""]  # infinite before the first evaluation
-    accepted: Bool[Array, ""]  # whether the last step lowered the cost
-    solver: PyTree  # optimistix's own state: Jacobian, step size, the point to evaluate next
+    cost: Float[Array, ""]
+    """Infinite before the first evaluation."""
+    accepted: Bool[Array, ""]
+    """Whether the last step lowered the cost."""
+    solver: PyTree
+    """Optimistix's own state: Jacobian, step size, the point to evaluate next."""
 
     @property
     def jacobian(self) -> Float[Array, "residuals free"]:

@@ -21,9 +21,12 @@ BATCH = 64  # candidates in one call of a vmapped program, which is compiled for
 class Evaluation(NamedTuple):
     """Candidates and their costs."""
 
-    cost: Float[np.ndarray, " candidates"]  # of the hard program; infinite where not finite
-    stepped: Float[np.ndarray, "candidates free"]  # after a Gauss-Newton step
-    predicted: Float[np.ndarray, " candidates"]  # cost there if the Jacobian held
+    cost: Float[np.ndarray, " candidates"]
+    """Of the hard program; infinite where not finite."""
+    stepped: Float[np.ndarray, "candidates free"]
+    """After a Gauss-Newton step."""
+    predicted: Float[np.ndarray, " candidates"]
+    """Cost there if the Jacobian held."""
 
 
 def from_values(

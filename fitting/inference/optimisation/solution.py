@@ -10,12 +10,18 @@ from jaxtyping import Float
 class Progress:
     """One report of a running search."""
 
-    stage: str  # start, blocks, ensemble, sweep, slopes or polish
-    start: int  # index of the starting point
-    step: int  # Levenberg–Marquardt steps so far, from this start
-    cost: float  # of the point that the stage has reached
-    best: float  # minimum cost of the hard program so far, over all starts
-    seconds: float  # since the search began
+    stage: str
+    """Start, blocks, ensemble, sweep, slopes or polish."""
+    start: int
+    """Index of the starting point."""
+    step: int
+    """Levenberg–Marquardt steps so far, from this start."""
+    cost: float
+    """Of the point that the stage has reached."""
+    best: float
+    """Minimum cost of the hard program so far, over all starts."""
+    seconds: float
+    """Since the search began."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,13 +30,18 @@ class Solution:
 
     names: tuple[str, ...]
     u: Float[np.ndarray, " free"]
-    values: Float[np.ndarray, " free"]  # in the parameters' units
-    cost_before: float  # of the system's values before the fit
+    values: Float[np.ndarray, " free"]
+    """In the parameters' units."""
+    cost_before: float
+    """Of the system's values before the fit."""
     cost: float
     converged: bool
-    message: str  # one sentence
-    jacobian: Float[np.ndarray, "residuals free"]  # of `Problem.residuals`; 0 for thresholds
+    message: str
+    """One sentence."""
+    jacobian: Float[np.ndarray, "residuals free"]
+    """Of `Problem.residuals`; 0 for thresholds."""
     history: tuple[Progress, ...]
-    steps: int  # of Levenberg–Marquardt, all starts together
+    steps: int
+    """Of Levenberg–Marquardt, all starts together."""
     seconds: float
     interrupted: bool = False

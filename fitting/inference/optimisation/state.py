@@ -28,23 +28,34 @@ class Point:
     """A point of the search space."""
 
     u: Float[np.ndarray, " free"]
-    cost: float = np.inf  # of the hard program; infinite where not finite, or not evaluated
-    jacobian: Float[np.ndarray, "residuals free"] | None = None  # of `Problem.residuals`
+    cost: float = np.inf
+    """Of the hard program; infinite where not finite, or not evaluated."""
+    jacobian: Float[np.ndarray, "residuals free"] | None = None
+    """Of `Problem.residuals`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchState:
     """Where a search stands."""
 
-    point: Point  # where the next stage begins
-    best: Point  # of the whole search
-    random: np.random.Generator  # use `generator`, never this one itself
-    converged: bool = False  # the best point is the end of a finished polish
-    start: int = 0  # index of the starting point
-    start_steps: int = 0  # Levenberg–Marquardt steps from this start
-    steps: int = 0  # and from all starts
-    sweeps: int = 0  # so far; the next one looks between the values of these
-    evaluated: LMState | None = None  # first starting point, evaluated while programs compiled
+    point: Point
+    """Where the next stage begins."""
+    best: Point
+    """Of the whole search."""
+    random: np.random.Generator
+    """Use `generator`, never this one itself."""
+    converged: bool = False
+    """The best point is the end of a finished polish."""
+    start: int = 0
+    """Index of the starting point."""
+    start_steps: int = 0
+    """Levenberg–Marquardt steps from this start."""
+    steps: int = 0
+    """And from all starts."""
+    sweeps: int = 0
+    """So far; the next one looks between the values of these."""
+    evaluated: LMState | None = None
+    """First starting point, evaluated while programs compiled."""
     history: tuple[Progress, ...] = ()
 
     @classmethod
@@ -73,8 +84,10 @@ class Search:
 
     problem: Problem
     settings: SearchSettings = DEFAULTS
-    observe: Callable[[SearchState], None] = lambda state: None  # called with every report
-    began: float = dataclasses.field(default_factory=time.perf_counter)  # s
+    observe: Callable[[SearchState], None] = lambda state: None
+    """Called with every report."""
+    began: float = dataclasses.field(default_factory=time.perf_counter)
+    """Seconds."""
 
     @property
     def thresholds(self) -> np.ndarray:

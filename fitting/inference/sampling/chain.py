@@ -34,8 +34,10 @@ class Identity:
     parameters: tuple[str, ...]
     walkers: int
     seed: int
-    thin_by: int  # sampler steps per stored step
-    problem: str  # digest of the data and the parameter space
+    thin_by: int
+    """Sampler steps per stored step."""
+    problem: str
+    """Digest of the data and the parameter space."""
 
     @property
     def token(self) -> bytes:

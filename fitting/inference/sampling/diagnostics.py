@@ -89,11 +89,13 @@ class ParameterSummary(TypedDict):
     mean: float
     sd: float
     median: float
-    low68: float  # central intervals
+    low68: float
+    """Central intervals."""
     high68: float
     low95: float
     high95: float
-    ess: float  # effective sample size
+    ess: float
+    """Effective sample size."""
     r_hat: float
 
 
@@ -137,7 +139,8 @@ class Check:
     """What the first `length` steps of a chain look like."""
 
     length: int
-    times: Float[np.ndarray, " free"]  # autocorrelation times, without isolated walkers
+    times: Float[np.ndarray, " free"]
+    """Autocorrelation times, without isolated walkers."""
     isolated: Bool[np.ndarray, " walkers"]
 
     @property

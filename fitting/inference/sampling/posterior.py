@@ -26,10 +26,14 @@ class SamplingProgress:
 
     step: int
     max_steps: int
-    elapsed: float  # s, of this call
-    acceptance: float  # fraction of the proposals, mean over the walkers
-    log_probability: float  # of the median walker now
-    autocorrelation_time: float  # steps, of the slowest parameter at the last check; NaN before
+    elapsed: float
+    """s, of this call."""
+    acceptance: float
+    """Fraction of the proposals, mean over the walkers."""
+    log_probability: float
+    """Of the median walker now."""
+    autocorrelation_time: float
+    """Steps, of the slowest parameter at the last check; NaN before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +44,10 @@ class WalkerStart:
     that far away get stuck.
     """
 
-    u: Float[Array | np.ndarray, " _"]  # as many as there are free parameters
-    sd: Float[Array | np.ndarray, " _"]  # of u
+    u: Float[Array | np.ndarray, " _"]
+    """As many as there are free parameters."""
+    sd: Float[Array | np.ndarray, " _"]
+    """Of u."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,16 +57,24 @@ class Posterior:
     names: tuple[str, ...]
     u: Float[np.ndarray, "steps walkers free"]
     log_probability: Float[np.ndarray, "steps walkers"]
-    values: Float[np.ndarray, "steps walkers free"]  # in the parameters' units
+    values: Float[np.ndarray, "steps walkers free"]
+    """In the parameters' units."""
     thin_by: int
-    burn_in: int  # stored steps to leave out
-    autocorrelation_time: Float[np.ndarray, " free"]  # steps of the sampler
-    acceptance: Float[np.ndarray, " walkers"]  # fraction of the stored steps' proposals
-    isolated: list[int]  # walkers on an island of negligible weight; left out of the summary
-    stuck: list[int]  # those, and walkers that hardly ever move
+    burn_in: int
+    """Stored steps to leave out."""
+    autocorrelation_time: Float[np.ndarray, " free"]
+    """Steps of the sampler."""
+    acceptance: Float[np.ndarray, " walkers"]
+    """Fraction of the stored steps' proposals."""
+    isolated: list[int]
+    """Walkers on an island of negligible weight; left out of the summary."""
+    stuck: list[int]
+    """Those, and walkers that hardly ever move."""
     converged: bool
-    message: str  # one sentence
-    seconds: float  # of this call
+    message: str
+    """One sentence."""
+    seconds: float
+    """Of this call."""
     interrupted: bool = False
 
     @property
