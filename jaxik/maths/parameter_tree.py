@@ -8,6 +8,7 @@ presets, fits, reports and error messages read it from there.
 # pyright: reportInvalidTypeVarUse=false
 
 import dataclasses
+import inspect
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -43,6 +44,18 @@ else:
 class Rule(eqx.Module):
     """One implementation of a stage. Printed, it lists its parameters with their units."""
 
+    def __init_subclass__(cls, **options: object) -> None:
+        """Lists the declared fields in the docstring, for `help` and the API reference."""
+        super().__init_subclass__(**options)
+        lines = [
+            f"    {name}: {_meaning(field)}"
+            for name, field in vars(cls).items()
+            if isinstance(field, dataclasses.Field) and "doc" in field.metadata
+        ]
+        if lines:
+            summary = inspect.cleandoc(cls.__doc__ or "")
+            cls.__doc__ = "\n".join([summary, "", "Attributes:", *lines])
+
     def __repr__(self) -> str:
         return outline(self)
 
@@ -52,12 +65,26 @@ class Declaration:
     """What is known of a parameter before any data."""
 
     unit: str
-    low: float  # a fit stays between low and high
+    low: float
+    """a fit stays between low and high."""
     high: float
-    kind: ParameterKind  # a threshold moves a hard decision: its derivative there is zero
-    scale: Scale  # a gain is fitted as its half-life
-    above: str | None  # name of the field of the same rule that this one stays above
-    doc: str  # one sentence: what the parameter does
+    kind: ParameterKind
+    """a threshold moves a hard decision: its derivative there is zero."""
+    scale: Scale
+    """a gain is fitted as its half-life."""
+    above: str | None
+    """Name of the field of the same rule that this one stays above."""
+    doc: str
+    """One sentence: what the parameter does."""
+
+
+def _meaning(field: dataclasses.Field) -> str:
+    """What a field is for, with its unit and range."""
+    unit = field.metadata.get("unit", "1")
+    parts = [field.metadata["doc"], *([] if unit == "1" else [f"Unit {unit}."])]
+    if (declaration := field.metadata.get("declaration")) is not None:
+        parts.append(f"Range {declaration.low:g} to {declaration.high:g}.")
+    return " ".join(parts)
 
 
 def as_float_array(x: ArrayLike | Sequence) -> Array:

@@ -97,6 +97,12 @@ def test_everything_declared_has_a_sentence_of_meaning():
     assert list(docs) == [*(f"lift.{field.name}" for field in fields(Lift)), "max_angle", "speed"]
 
 
+def test_help_on_a_rule_lists_its_parameters_with_unit_range_and_meaning():
+    doc = str(Lift.__doc__)
+    assert "height: Height of the foot. Unit m. Range 0 to 0.5." in doc
+    assert "Attributes:" in doc and doc.index("Attributes:") < doc.index("height:")
+
+
 def test_a_parameter_needs_a_sentence_of_meaning():
     with pytest.raises(TypeError, match="doc"):
         parameter(0.1, unit="m", low=0.0, high=0.5)  # pyright: ignore[reportCallIssue]
