@@ -28,10 +28,14 @@ PLAUSIBLE_RATIO = 1.5  # to an adult's leg; beyond it the guessed unit is called
 class Overrides:
     """What the caller knows better than the file; None leaves it to be read or guessed."""
 
-    scale: float | None = None  # metres per unit of the file
-    fps: float | None = None  # frames per second
-    up: str | None = None  # "y" or "z"
-    joints: Mapping[str, str] | None = None  # role to joint name, see `joint_roles.find_roles`
+    scale: float | None = None
+    """Metres per unit of the file."""
+    fps: float | None = None
+    """Frames per second."""
+    up: str | None = None
+    """Either "y" or "z"."""
+    joints: Mapping[str, str] | None = None
+    """Role to joint name, see `joint_roles.find_roles`."""
 
     def __post_init__(self) -> None:
         if self.up not in (None, "y", "z"):
@@ -68,7 +72,7 @@ def clip_from_recording(
     if scale is None:
         scale = recording.metres_per_unit or _guess_scale(recording, roles, remarks)
     recording = recording.scaled(scale)
-    up = overrides.up or _guess_up(recording, roles, remarks)
+    up = overrides.up or recording.up_axis or _guess_up(recording, roles, remarks)
     if up == "z":
         recording = recording.rotated(Y_UP_FROM_Z_UP)
     rate = overrides.fps or _common_rate(recording.frame_time, remarks)
@@ -95,10 +99,14 @@ class JointMotion:
     """Joints in world space, metres, y up, with contact labels."""
 
     names: tuple[str, ...]
-    parents: tuple[int, ...]  # -1 at the root; parents before children
-    positions_ws: Float64[np.ndarray, "frames joints 3"]  # m
-    rotations_ws: Float64[np.ndarray, "frames joints 4"]  # wxyz
-    stance: Bool[np.ndarray, "frames legs"]  # when each foot stands
+    parents: tuple[int, ...]
+    """-1 at the root; parents before children."""
+    positions_ws: Float64[np.ndarray, "frames joints 3"]
+    """Metres."""
+    rotations_ws: Float64[np.ndarray, "frames joints 4"]
+    """Unit quaternions, wxyz."""
+    stance: Bool[np.ndarray, "frames legs"]
+    """When each foot stands."""
     fps: float
 
 

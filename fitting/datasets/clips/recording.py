@@ -1,6 +1,7 @@
 """`Recording`: what every motion file reader returns, in the file's own units and axes."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,7 +16,8 @@ class Recording:
     """A skeleton and its motion as a file states them, before anything is guessed or converted.
 
     A reader fills this in and decides nothing: lengths stay in the file's unit and vectors in the
-    file's axes. `assemble.clip_from_recording` finds scale, up axis, frame rate and legs later.
+    file's axes. `assemble.clip_from_recording` finds the legs later, and what the file
+    leaves open: scale and up axis.
     Only two things are converted: angles become quaternions, and the end of a bone without child
     (BVH's `End Site`) becomes a joint of its own, named `<parent>_end`.
 
@@ -37,6 +39,8 @@ class Recording:
     """Seconds per frame, as written in the file."""
     metres_per_unit: float | None = None
     """Scale, where the file states it; None lets the loader guess it from the legs' length."""
+    up_axis: Literal["y", "z"] | None = None
+    """Axis that points up, where the file states it; None lets the loader guess it."""
     remarks: tuple[str, ...] = ()
     """Sentences for the user about anything missing or odd in the file."""
 
