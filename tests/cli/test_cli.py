@@ -18,7 +18,7 @@ import pytest
 from fitting import jobs
 from fitting.cli import main, progress
 from fitting.cli.parser import make_parser
-from fitting.datasets.clips import load_clip
+from fitting.datasets.clips import formats, load_clip
 from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.chain import journal_path
@@ -34,6 +34,7 @@ COMMANDS = [
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
+WANTED_CLIP = f"wanted a {', '.join(formats.READERS)} or .npz file"
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
 
@@ -367,7 +368,7 @@ MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
     ("clip", "ground", "out", "more", "message"),
     [
         ("no.bvh", GROUND, "a.npz", [], "no.bvh: no such file"),
-        (str(DATA), GROUND, "a.npz", [], "data: wanted a .bvh, .amc or .npz file"),
+        (str(DATA), GROUND, "a.npz", [], f"data: {WANTED_CLIP}"),
         ("bad.bvh", GROUND, "a.npz", [], "bad.bvh:1: wanted HIERARCHY"),
         ("bad.npz", GROUND, "a.npz", [], "bad.npz: wanted a NumPy archive"),
         ("legless.bvh", GROUND, "a.npz", [], "legless.bvh: no pair of legs recognised"),
@@ -413,7 +414,7 @@ def test_inspect_describes_a_clip_in_words_and_as_json(capsys):
     ("words", "message"),
     [
         (["no.bvh"], "no.bvh: no such file"),
-        ([str(DATA)], "wanted a .bvh, .amc or .npz file"),
+        ([str(DATA)], WANTED_CLIP),
         (["step.bvh", "--scale", "nan"], "scale is nan; wanted a number above 0"),
         (["step.amc", "--asf", "no.asf"], "no.asf: No such file"),
     ],

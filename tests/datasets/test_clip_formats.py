@@ -51,8 +51,9 @@ def test_a_reader_in_the_table_makes_its_suffix_a_clip_format(points_file, monke
 
 
 def test_the_error_for_an_unknown_suffix_lists_the_formats(points_file, monkeypatch):
-    with pytest.raises(ValueError, match=r"wanted a \.bvh, \.amc or \.npz file"):
+    suffixes = ", ".join(formats.READERS)
+    with pytest.raises(ValueError, match=f"wanted a {suffixes} or .npz file"):
         load_clip(points_file)
     monkeypatch.setattr(formats, "READERS", {**formats.READERS, ".points": read_points})
-    with pytest.raises(ValueError, match=r"wanted a \.bvh, \.amc, \.points or \.npz file"):
+    with pytest.raises(ValueError, match=f"wanted a {suffixes}, .points or .npz file"):
         load_clip(points_file.with_suffix(".fbx"))
