@@ -1,19 +1,13 @@
 """Readers of motion files, one module per format, and the table that maps suffixes to them.
 
-To add a format:
+A reader takes a `pathlib.Path` and returns a `clips.recording.Recording`, in the file's own unit
+and axes. The strings below the fields of `Recording` (in the source, or in the API reference) state
+what each field holds. A reader raises `ValueError` with the path, and for a text format the line
+number, where the file is not what its suffix promises. `bvh.read_bvh` is a complete example.
 
-1. Write a module here with a function that takes a `pathlib.Path` and returns a
-   `clips.recording.Recording`: joint names, parents, rest offsets, local positions and local
-   rotations, in the file's own unit and axes. The docstring of `Recording` states each field. Do
-   not guess scale, up axis, frame rate or legs; `clips.assemble` does that for all formats.
-2. Raise `ValueError` with the path, and for a text format the line number, where the file is not
-   what its suffix promises. `bvh.read_bvh` is a complete example.
-3. Add the suffix and the function to `READERS` below. `load_clip`, its messages and every command
-   that takes a clip then accept the format.
-4. If a joint naming convention is new, add a line to `clips.joint_roles.DIALECTS`.
-
-`tests/datasets/test_clip_formats.py` adds a format of a few lines and loads a clip with it;
-`tests/datasets/test_clips_bvh.py` shows what a reader should be tested for.
+The suffix and the function go into `READERS` below; `load_clip`, its messages and every command
+that takes a clip then accept the format. "How to add a clip format" in fitting/README.md has all
+steps, with an example.
 
 `npz` differs: an archive holds a complete clip, so its reader returns a `Clip`, not a `Recording`.
 """
