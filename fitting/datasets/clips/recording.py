@@ -1,7 +1,6 @@
 """`Recording`: what every motion file reader returns, in the file's own units and axes."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -39,10 +38,14 @@ class Recording:
     """Seconds per frame, as written in the file."""
     metres_per_unit: float | None = None
     """Scale, where the file states it; None lets the loader guess it from the legs' length."""
-    up_axis: Literal["y", "z"] | None = None
-    """Axis that points up, where the file states it; None lets the loader guess it."""
+    up_axis: str | None = None
+    """Axis that points up, "y" or "z", where the file states it; None lets the loader guess it."""
     remarks: tuple[str, ...] = ()
     """Sentences for the user about anything missing or odd in the file."""
+
+    def __post_init__(self) -> None:
+        if self.up_axis not in (None, "y", "z"):
+            raise ValueError(f"up_axis is {self.up_axis!r}; wanted 'y', 'z' or None")
 
     def scaled(self, factor: float) -> "Recording":
         """The same motion with every length multiplied by `factor`."""
