@@ -270,7 +270,7 @@ class PlantState:
     locked: Float[Array, " legs"]
     """0 or 1."""
     weight: Float[Array, " legs"]
-    """0..1, how much planting planting."""
+    """0..1, how much of the planting is applied."""
     foothold: Float[Array, "legs 3"]
     """m, platform space."""
     clearance: Float[Array, " legs"]
