@@ -4,9 +4,12 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 import house
 
 
+@pytest.mark.slow
 def test_the_reference_has_a_page_for_every_module(tmp_path):
     command = [sys.executable, "-W", "error", "-m", "pdoc", "--docformat", "google"]
     # pdoc warns of a value that is also in the environment, where the tests put the flags.

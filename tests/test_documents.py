@@ -115,6 +115,7 @@ def run_examples(document: Document) -> None:
             example.evaluate()
 
 
+@pytest.mark.slow
 @each_file(PAGES)
 def test_the_snippets_of_a_page_run(path, scratch):
     run_examples(Sybil(PAGE_PARSERS).parse(path))

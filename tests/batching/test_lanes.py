@@ -197,6 +197,7 @@ def test_blocks_keep_shared_results():
     assert first.shape == (BATCH,) and shared.tolist() == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_reverse_mode_stores_one_block_at_a_time():
     def waves(x):
         for _ in range(40):  # reverse mode stores each of them

@@ -112,6 +112,7 @@ def sample(
 # Known posteriors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "stop_at"), [(10, 50.0), (20, 25.0)])
 def test_a_known_normal_is_sampled_with_its_variances(size, stop_at):
     problem, mean, covariance = normal(size)
@@ -139,6 +140,7 @@ def test_the_moves_are_differential_evolution_only():
     assert moves == [("DEMove", None, 0.9), ("DEMove", 1.0, 0.1)]
 
 
+@pytest.mark.slow
 def test_intervals_have_their_nominal_coverage():
     size, runs = 3, 20
     problem, _, covariance = normal(size)

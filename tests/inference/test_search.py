@@ -101,6 +101,7 @@ def test_thresholds_and_smooth_parameters_are_recovered(seed):
     assert solution.cost_before == pytest.approx(cost_of(problem, np.asarray(problem.space.u0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", CLIPS)
 def test_the_jacobian_agrees_with_finite_differences(seed):
     problem, solution = toy.solved(seed)

@@ -14,6 +14,7 @@ FRAMES = 600
 ADULT: dict = {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "values", "legs"),
     [

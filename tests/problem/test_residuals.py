@@ -143,6 +143,7 @@ def rotation_vector(a: Rotation, b: Rotation) -> np.ndarray:
     return vector * np.sinc(angle / 2 / np.pi)
 
 
+@pytest.mark.slow
 def test_residuals_agree_with_numpy(scene, scene_residuals):
     expected = expected_residuals(scene)
     flat = np.concatenate([part.ravel() for part in expected.values()])
@@ -248,6 +249,7 @@ def around(embedded, truth) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_at_the_truth_residuals_are_one_standard_deviation(embedded, around):
     at_truth = around[0, : -embedded.space.size]
     active = at_truth[at_truth != 0.0]
@@ -256,6 +258,7 @@ def test_at_the_truth_residuals_are_one_standard_deviation(embedded, around):
     assert abs(np.mean(active)) < 0.05
 
 
+@pytest.mark.slow
 def test_the_jacobian_agrees_with_finite_differences_column_by_column(embedded, jacobian, around):
     space = embedded.space
     ahead, behind = around[1:].reshape(2, space.size, -1)

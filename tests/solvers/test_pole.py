@@ -236,6 +236,7 @@ SINGULAR = {
 
 # Ozz's angle between the normals has a kink where a hinge begins to tilt in a plane that needs no
 # rotation, or one by pi: gradients are compared away from there, and only have to be finite there.
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0.0, 0.3], ids=["square", "tilted"])
 @pytest.mark.parametrize("seed", range(4))
 def test_gradients_match_finite_differences(seed, tilt):

@@ -277,6 +277,7 @@ def test_the_derivative_of_a_parameter_is_its_difference_quotient(case: Case, ga
     assert_slope(case, "record", gate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
 @pytest.mark.parametrize("name", ["limps", "limps on its toes"])
 def test_gradients_of_animation_and_terrain_are_difference_quotients(name, gate):

@@ -300,6 +300,7 @@ def test_gradients_in_the_vertices_match_finite_differences():
     assert np.all(terrain.cast(ground, origins, jnp.inf).found == 1.0)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_on_edges_corners_walls_and_misses():
     vertices, triangles = degenerate()
     steps, _ = stepped()
