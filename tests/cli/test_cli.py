@@ -45,6 +45,7 @@ def cache(tmp_path_factory):
     Programs are compiled without optimisations, as each runs once or twice, on short clips.
     """
     folder = tmp_path_factory.mktemp("compiled")
+    jax.clear_caches()  # optimised programs of other tests round differently from a child process
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_disable_most_optimizations", True)
     yield folder
@@ -132,6 +133,7 @@ def test_wrong_words_are_rejected(words, message, capsys):
 # Fit and sample
 
 
+@pytest.mark.slow
 def test_a_fit_writes_numbers_tables_and_plots(run):
     names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
     assert names <= tree(run) and {"motion.png", "cost.png"} <= tree(run)
@@ -141,6 +143,7 @@ def test_a_fit_writes_numbers_tables_and_plots(run):
         assert row["value"] == pytest.approx(quick.TARGETS[row["name"]], abs=0.003)
 
 
+@pytest.mark.slow
 def test_sampling_continues_its_chain(quick_residuals, run, tmp_path, capsys):
     once, twice = (Path(shutil.copytree(run, tmp_path / name)) for name in ("once", "twice"))
     assert main.main(["sample", str(once)]) == 0
@@ -159,6 +162,7 @@ def chain_of(run: Path) -> np.ndarray:
         return np.asarray(file["mcmc/chain"])
 
 
+@pytest.mark.slow
 def test_a_sampling_that_was_killed_ends_with_the_chain_of_an_unbroken_one(
     quick_residuals, run, tmp_path, cache
 ):
@@ -189,6 +193,7 @@ def test_a_sampling_that_was_killed_ends_with_the_chain_of_an_unbroken_one(
     np.testing.assert_array_equal(chain_of(killed), chain_of(whole))
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_writes_its_best_point(
     quick_residuals, experiment_file, tmp_path, monkeypatch, capsys
 ):
@@ -222,6 +227,7 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_at_the_next_report(capsys):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.slow
 def test_an_interrupted_sampling_keeps_its_chain(
     quick_residuals, run, tmp_path, monkeypatch, capsys
 ):
@@ -237,6 +243,7 @@ def test_an_interrupted_sampling_keeps_its_chain(
     assert len(chain_of(copy)) == 100
 
 
+@pytest.mark.slow
 def test_an_interrupt_before_the_search_writes_nothing(
     quick_residuals, experiment_file, tmp_path, monkeypatch, capsys
 ):
@@ -248,6 +255,7 @@ def test_an_interrupt_before_the_search_writes_nothing(
     assert capsys.readouterr().err == "\njaxik fit: interrupted\n" and not tree(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_parameters_are_written_before_anything_can_fail_after_the_search(
     quick_residuals, experiment_file, tmp_path, monkeypatch, capsys
 ):
@@ -300,6 +308,7 @@ def test_a_folder_without_a_fit_is_rejected(words, tmp_path, capsys, monkeypatch
     assert not tree(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_fit_with_other_parameters_than_its_experiment_is_rejected(run, tmp_path, capsys):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     numbers = json.loads((copy / run_folder.FIT).read_text())
@@ -309,6 +318,7 @@ def test_a_fit_with_other_parameters_than_its_experiment_is_rejected(run, tmp_pa
     assert run_folder.CHAIN not in tree(copy)
 
 
+@pytest.mark.slow
 def test_a_limit_of_no_steps_is_rejected(run, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "run")
     assert "max-steps is 0" in error_of(capsys, "sample", copy, "--max-steps", "0")
@@ -317,6 +327,7 @@ def test_a_limit_of_no_steps_is_rejected(run, tmp_path, capsys):
 # Run and apply
 
 
+@pytest.mark.slow
 def test_apply_writes_a_clip_that_the_benchmark_can_score(run, mocap, tmp_path, capsys):
     whole = dict(np.load(mocap / "blocks" / "03_03.npz"))
     frames = len(whole["pelvis"])
@@ -340,6 +351,7 @@ def test_apply_writes_a_clip_that_the_benchmark_can_score(run, mocap, tmp_path, 
         np.testing.assert_array_equal(archive["pelvis"], clip.positions_ws[:, 0])
 
 
+@pytest.mark.slow
 def test_run_accepts_a_bvh_and_a_parameter_file(tmp_path, capsys):
     (tmp_path / "step.bvh").write_text(BVH)
     (tmp_path / "still.toml").write_text("lock.enabled = false\n[leg]\nweight = 0.0\n")
@@ -426,6 +438,7 @@ def test_inspect_rejects_a_file_that_it_cannot_read(words, message, tmp_path, ca
     assert message in error_of(capsys, "inspect", *words)
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_error(tmp_path):
     script = f"import sys; from fitting.cli import main; sys.exit(main.main(['inspect', {BASE!r}]))"
     reader, writer = os.pipe()
