@@ -99,6 +99,7 @@ def test_files_are_small():
         assert path.stat().st_size < MAX_MESH_SIZE, path
 
 
+@pytest.mark.slow
 def test_a_reference_is_the_true_motion_plus_the_stated_noise(make, reference):
     truth = tomllib.loads((DATA / "clips" / f"{reference.name}_truth.toml").read_text("utf-8"))
     noise = truth.pop("noise")

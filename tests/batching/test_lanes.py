@@ -141,6 +141,7 @@ def test_the_results_are_those_of_vmap(name):
     assert_same(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), batch_last), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(CASES) - {"a while loop", "integers"}))
 def test_the_derivatives_are_those_of_vmap(name):
     x, tangent = numbers(BATCH, 3), numbers(BATCH, 3, seed=1)

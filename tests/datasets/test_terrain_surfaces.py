@@ -35,6 +35,7 @@ def test_a_grid_rotated_by_quarter_turns_has_one_canonical_form(quarters):
     np.testing.assert_array_equal(grid.cells(points), TILTED.cells(points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", [TILTED, WIDE], ids=["45 cm", "80 cm"])
 def test_an_unknown_grid_is_found(grid, narrow_search):
     feet = block_footprints(grid)
@@ -49,6 +50,7 @@ def test_an_unknown_grid_is_found(grid, narrow_search):
     assert np.median(np.abs(error)) < 0.003 and np.mean(np.abs(error) < 0.01) > 0.9
 
 
+@pytest.mark.slow
 def test_rotating_and_shifting_the_feet_rotates_and_shifts_the_grid(narrow_search):
     feet, angle, shift = block_footprints(TILTED), np.radians(-13.0), np.array([4.0, -7.0])
     rot = block_grids._uv_from_xz(angle)

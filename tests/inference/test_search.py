@@ -120,6 +120,7 @@ def test_the_jacobian_agrees_with_finite_differences(seed):
             )
 
 
+@pytest.mark.slow
 def test_the_column_of_a_threshold_holds_only_its_prior():
     problem, solution = toy.solved(CLIPS[0])
     jacobian = eqx.filter_jit(lambda u: problem.jacobian(u))(jnp.asarray(solution.u))

@@ -444,6 +444,7 @@ def test_a_three_legged_character_in_a_batch_equals_itself_alone():
     assert_close(at(crowd_result(), 2), jaxik.run(ik, rig, ground, frames), EXACT)
 
 
+@pytest.mark.slow
 def test_padded_legs_give_finite_numbers():
     for leaf in jax.tree.leaves(crowd_result()):
         assert np.isfinite(leaf).all()

@@ -18,6 +18,8 @@ from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 from support.experiments import CLIP, UNEVEN_WALK, write
 
+pytestmark = pytest.mark.slow
+
 BESIDE = 0.1  # in u, away from where the clip was made
 STEP = 1e-6  # of u, to either side
 TOLERANCE = 1e-5  # of a column's largest derivative
@@ -143,7 +145,6 @@ def rotation_vector(a: Rotation, b: Rotation) -> np.ndarray:
     return vector * np.sinc(angle / 2 / np.pi)
 
 
-@pytest.mark.slow
 def test_residuals_agree_with_numpy(scene, scene_residuals):
     expected = expected_residuals(scene)
     flat = np.concatenate([part.ravel() for part in expected.values()])
@@ -249,7 +250,6 @@ def around(embedded, truth) -> np.ndarray:
     )
 
 
-@pytest.mark.slow
 def test_at_the_truth_residuals_are_one_standard_deviation(embedded, around):
     at_truth = around[0, : -embedded.space.size]
     active = at_truth[at_truth != 0.0]
@@ -258,7 +258,6 @@ def test_at_the_truth_residuals_are_one_standard_deviation(embedded, around):
     assert abs(np.mean(active)) < 0.05
 
 
-@pytest.mark.slow
 def test_the_jacobian_agrees_with_finite_differences_column_by_column(embedded, jacobian, around):
     space = embedded.space
     ahead, behind = around[1:].reshape(2, space.size, -1)
@@ -273,7 +272,6 @@ def test_the_jacobian_agrees_with_finite_differences_column_by_column(embedded, 
     assert above_prior >= 0.8 * sum(space.smooth), "the clip outweighs the prior in most columns"
 
 
-@pytest.mark.slow
 def test_reverse_mode_agrees_with_forward_mode(embedded, truth, jacobian):
     weights = np.random.default_rng(0).normal(size=len(jacobian))
     gradient = reverse_mode(embedded, truth + BESIDE, jnp.asarray(weights))

@@ -242,6 +242,7 @@ def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
     np.testing.assert_allclose(np.cos(captured.knee_angle), cosine, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitted):
     scene = fitted.problem.data[0]
     values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}

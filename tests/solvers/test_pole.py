@@ -250,6 +250,7 @@ def test_gradients_match_finite_differences(seed, tilt):
     assert_gradients_match(joints, *task, rng.uniform(0.5, 0.9), rng.uniform(-3, 3))
 
 
+@pytest.mark.slow
 def test_a_straight_knee_ends_at_one_place_wherever_it_starts():
     jacobian = finite_jacobian(joints, *STRAIGHT, -0.8 * X, Y, ONE, 0.0)
     # Knee and ankle do not depend on where the ankle was sideways.

@@ -43,6 +43,7 @@ def result_of(frames: jaxik.Frame, **values: float) -> jaxik.Result:
     return resume(ik, to_rig(RIG), to_terrain(FLAT), jaxik.init(ik, to_rig(RIG)), frames)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["speed", "height"])
 def test_a_foot_between_the_thresholds_stays_as_it_was(by: str):
     still, low = np.zeros(FRAMES), np.full(FRAMES, 0.02)

@@ -120,6 +120,7 @@ def heels() -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 def test_on_a_walk_a_heel_rises_as_far_as_a_search_finds_within_its_limit():
     walk, max_lift = heels(), VALUES["effector.max_lift"]
     assert 0.02 < (walk["expected"] > 0.0).mean() < 0.9 and (walk["expected"] > max_lift).any()

@@ -272,6 +272,7 @@ def test_a_leaf_has_the_expected_effect(preset: str, case: Case):
     assert_effect(case, preset)
 
 
+@pytest.mark.slow
 @listed(INERT)
 def test_a_leaf_that_no_rule_reads_changes_nothing(preset: str, case: Case):
     before, after = (run_case(case, value, preset)[0] for value in case.values)

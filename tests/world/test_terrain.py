@@ -136,6 +136,7 @@ def test_random_rays_agree_with_embree(name, up):
     np.testing.assert_allclose(hit.point, origins - np.outer(hit.distance, up), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, up, dtype",
     [
