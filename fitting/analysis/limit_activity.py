@@ -130,12 +130,7 @@ def flipped_decisions(
 def _decisions(result: jaxik.Result) -> Bool[np.ndarray, " decisions"]:
     trace = stage_outputs(result)
     sensed, held = trace.sensed, trace.advanced.hold
-    weights = (
-        sensed.contact.planted,
-        sensed.contact.lifted,
-        held.locked,
-        sensed.foothold.found,
-    )
+    weights = (sensed.contact.planted, sensed.contact.lifted, held.locked, sensed.foothold.found)
     return np.stack([np.asarray(weight) > 0.5 for weight in weights], axis=-1).ravel()
 
 

@@ -293,9 +293,7 @@ RULES: dict[str, Callable[[BatchEvaluator, JaxprEqn, list[Value]], list[Value]]]
 # Primitives whose parameters state shapes, to which the batch axis is added.
 SHAPED: dict[str, Callable[[list[Array], dict[str, PyTree], int], Array]] = {
     "broadcast_in_dim": lambda xs, params, size: lax.broadcast_in_dim(
-        xs[0],
-        (*params["shape"], size),
-        (*params["broadcast_dimensions"], len(params["shape"])),
+        xs[0], (*params["shape"], size), (*params["broadcast_dimensions"], len(params["shape"]))
     ),
     "concatenate": lambda xs, params, size: lax.concatenate(xs, params["dimension"]),
     "reduce_sum": lambda xs, params, size: _sum(xs[0], params["axes"]),

@@ -139,7 +139,4 @@ class Rig:
 
 def bone_lengths(pose: LegPose) -> tuple[Array, Array]:
     """Thigh and shin lengths of a pose, m, each of shape `legs`."""
-    return (
-        vec.length(pose.knee.pos - pose.hip.pos),
-        vec.length(pose.ankle.pos - pose.knee.pos),
-    )
+    return (vec.length(pose.knee.pos - pose.hip.pos), vec.length(pose.ankle.pos - pose.knee.pos))

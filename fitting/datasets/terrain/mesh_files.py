@@ -74,9 +74,7 @@ def check_mesh_name(path: str | Path) -> None:
 
 
 def save_mesh(
-    path: str | Path,
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    path: str | Path, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> None:
     """Writes a mesh that `load_terrain` reads. The same mesh always gives the same bytes.
 
@@ -129,9 +127,7 @@ def embree_tracer(
     return trimesh.ray.ray_pyembree.RayMeshIntersector(mesh)  # pyright: ignore
 
 
-def _read(
-    path: Path,
-) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
+def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
     """Vertices and triangles of all geometries of a file, in its own unit and axes."""
     if not path.is_file():
         raise ValueError(f"{path}: there is no such file")

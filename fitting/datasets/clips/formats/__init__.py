@@ -20,7 +20,4 @@ from fitting.datasets.clips.recording import Recording
 from .asfamc import read_asfamc
 from .bvh import read_bvh
 
-READERS: Mapping[str, Callable[[Path], Recording]] = {
-    ".bvh": read_bvh,
-    ".amc": read_asfamc,
-}
+READERS: Mapping[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_asfamc}
