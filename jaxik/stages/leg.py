@@ -1,5 +1,7 @@
 """Stage 9: two-bone legs that bring the ankles to their targets."""
 
+# pyright: reportInvalidTypeVarUse=false
+
 import dataclasses
 from abc import abstractmethod
 
@@ -9,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
+from jaxik.maths.parameter_tree import Declared, Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.solvers.pole import PoleTarget, bend_to_pole
 from jaxik.solvers.reach import LENGTH_BAND, soft_limit, third_side
@@ -58,6 +60,21 @@ class AbstractLeg(Rule):
         """The legs with their ankles at their targets."""
 
 
+def _soften_parameter(default: float, low: float) -> Declared:
+    doc = "Part of its reach beyond which a leg slows down instead of snapping straight."
+    return parameter(default, unit="1", low=low, high=1.0, doc=doc)
+
+
+def _twist_parameter() -> Declared:
+    doc = "Turn of the leg about the line from hip to target."
+    return parameter(0.0, unit="rad", low=-1.0, high=1.0, doc=doc)
+
+
+def _weight_parameter() -> Declared:
+    doc = "How much of foot IK each leg takes, 0 to 1."
+    return parameter(1.0, unit="1", low=0.0, high=1.0, doc=doc)
+
+
 class TwoBone(AbstractLeg):
     """Turns the knee about its hinge until the ankle is as far as the target, then swings the hip.
 
@@ -82,26 +99,12 @@ class TwoBone(AbstractLeg):
     min_knee_angle: Leaf = parameter(
         0.6982008392, unit="rad", low=0.0, high=1.8, doc="Smallest interior angle of the knee."
     )
-    soften: Leaf = parameter(
-        0.98,
-        unit="1",
-        low=0.8,
-        high=1.0,
-        doc="Part of its reach beyond which a leg slows down instead of snapping straight.",
-    )
+    soften: Leaf = _soften_parameter(0.98, low=0.8)
     as_animated: Leaf = switch(
         False, doc="Whether a leg may stay as straight or bent as animated, beyond the limits."
     )
-    twist: Leaf = parameter(
-        0.0,
-        unit="rad",
-        low=-1.0,
-        high=1.0,
-        doc="Turn of the leg about the line from hip to target.",
-    )
-    weight: Leaf = parameter(
-        1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
-    )
+    twist: Leaf = _twist_parameter()
+    weight: Leaf = _weight_parameter()
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         return self.solve(inputs.rig, goal, inputs.gate)
@@ -150,23 +153,9 @@ class PoleLeg(AbstractLeg):
     """
 
     enabled: Leaf = switch(True, doc="Whether legs are solved.")
-    soften: Leaf = parameter(
-        1.0,
-        unit="1",
-        low=0.1,
-        high=1.0,
-        doc="Part of its reach beyond which a leg slows down instead of snapping straight.",
-    )
-    twist: Leaf = parameter(
-        0.0,
-        unit="rad",
-        low=-1.0,
-        high=1.0,
-        doc="Turn of the leg about the line from hip to target.",
-    )
-    weight: Leaf = parameter(
-        1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
-    )
+    soften: Leaf = _soften_parameter(1.0, low=0.1)
+    twist: Leaf = _twist_parameter()
+    weight: Leaf = _weight_parameter()
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         limb = limb_of(inputs.rig, goal.pose)
@@ -189,23 +178,9 @@ class HintLeg(AbstractLeg):
         high=0.5,
         doc="Offset of the knee's aim in character axes (x left, y up, z forward).",
     )
-    soften: Leaf = parameter(
-        1.0,
-        unit="1",
-        low=0.1,
-        high=1.0,
-        doc="Part of its reach beyond which a leg slows down instead of snapping straight.",
-    )
-    twist: Leaf = parameter(
-        0.0,
-        unit="rad",
-        low=-1.0,
-        high=1.0,
-        doc="Turn of the leg about the line from hip to target.",
-    )
-    weight: Leaf = parameter(
-        1.0, unit="1", low=0.0, high=1.0, doc="How much of foot IK each leg takes, 0 to 1."
-    )
+    soften: Leaf = _soften_parameter(1.0, low=0.1)
+    twist: Leaf = _twist_parameter()
+    weight: Leaf = _weight_parameter()
 
     def pose(self, inputs: Inputs, sensed: Sensed, goal: LegGoal) -> SolvedLeg:
         frame = inputs.frame
