@@ -217,7 +217,7 @@ def _read(path: Path) -> Program | None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether nobody but this user can have written the file, as far as the system knows owners."""
+    """Whether the file is this user's own, and not everybody may write to it."""
     status = path.stat()
     return not hasattr(os, "getuid") or (
         status.st_uid == os.getuid() and not status.st_mode & 0o002
