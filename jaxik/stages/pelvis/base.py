@@ -1,0 +1,93 @@
+"""What pelvis rules share: their memory, what they are given, and how high feet want the body."""
+
+from abc import abstractmethod
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import vec
+from jaxik.maths.parameter_tree import Rule
+from jaxik.maths.struct import struct
+from jaxik.stages.inputs import SensedMoment
+from jaxik.stages.lean import Lean
+from jaxik.world.frame import Sensed
+from jaxik.world.skeleton import Rig, Transform
+
+HEIGHT_BAND = 0.01  # m
+FAR = 1e6  # m, beyond any leg
+
+
+@struct
+class PelvisState:
+    """The offset of the body from its animation."""
+
+    height: Float[Array, ""]
+    """Metres."""
+    velocity: Float[Array, ""]
+    """m/s; 0 unless it follows as a spring."""
+    goal: Float[Array, ""]
+    """m, where the height is going."""
+    offset_ws: Float[Array, "3"]
+    """Metres."""
+    half_height: Float[Array, ""]
+    """m, of the capsule; 0 where a rule has none."""
+
+    @classmethod
+    def level(cls, rig: Rig) -> "PelvisState":
+        """No offset."""
+        zero = jnp.zeros((), rig.side.dtype)
+        return cls(zero, zero, zero, jnp.zeros(3, rig.side.dtype), zero)
+
+    @classmethod
+    def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
+        """An offset of `height`, m, along `up_ws`, at rest."""
+        zero = jnp.zeros_like(height)
+        return cls(height, zero, goal, vec.scale(up_ws, height), zero)
+
+
+@struct
+class PelvisMoment(SensedMoment):
+    """A moment, with what only the pelvis reads."""
+
+    lean: Lean
+    awake: Float[Array, ""]
+    """0 while the body is to stay where it is, else 1."""
+
+
+class AbstractPelvis(Rule):
+    """Moves the body up and down."""
+
+    def init(self, rig: Rig) -> PelvisState:
+        """Memory before the first frame."""
+        return PelvisState.level(rig)
+
+    @abstractmethod
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        """Memory after this frame, which holds the offset.
+
+        Args:
+            now: the sensed frame. With `now.awake` 0 the body is to stay where it is.
+            target: where the ankles are to go (legs), world space.
+            state: memory after the frame before.
+        """
+
+
+def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
+    """Mean of requested heights, m, weighted by foot IK of each leg; 0 if all weights are 0."""
+    return vec.safe_divide(vec.sum_last(sensed.weight * requested), vec.sum_last(sensed.weight))
+
+
+def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:
+    """How far the body has to rise until each hip is `length` from its ankle, m.
+
+    For an ankle further aside than that, the height at which it is nearest.
+    """
+    leg = ankle_ws - sensed.hip_ws
+    height = vec.dot(leg, sensed.up_ws)
+    aside2 = vec.dot(leg, leg) - height**2
+    return height + vec.safe_sqrt(length**2 - aside2)
+
+
+def requested_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+    """Height from each animated ankle to its target along the leg's up, m."""
+    return vec.dot(target_ws - sensed.ankle_ws, sensed.leg_up_ws)

@@ -1,0 +1,164 @@
+"""Pelvis rules of games: the lowest foot, a capsule that shrinks, limits on leg length."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxik.maths import smoothing
+from jaxik.maths.parameter_tree import (
+    Leaf,
+    constant,
+    gain_parameter,
+    parameter,
+    switch,
+)
+from jaxik.world.skeleton import Transform
+
+from .base import (
+    FAR,
+    HEIGHT_BAND,
+    AbstractPelvis,
+    PelvisMoment,
+    PelvisState,
+    requested_heights,
+    rise_to_length,
+)
+
+
+class LowestPelvis(AbstractPelvis):
+    """Follows the standing foot that requests the lowest body (the record's "height offset").
+
+    Each foot requests the height from its animated ankle to its target. A foot that does not stand
+    is blended, by its contact weight, into the highest request of all. With no foot standing the
+    goal is 0. Without a limit and with gains of 1 this is ozz's pelvis correction.
+    """
+
+    enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
+    limit: Leaf = parameter(
+        0.30, unit="m", low=0.0, high=0.6, doc="Furthest that the pelvis moves up or down."
+    )
+    on_gain: Leaf = gain_parameter(
+        0.225, doc="Part of the gap that the pelvis closes in each tick while a foot stands."
+    )
+    off_gain: Leaf = gain_parameter(
+        0.116, doc="Part of the gap that the pelvis closes in each tick while no foot stands."
+    )
+    vertical_only: Leaf = switch(
+        True, doc="Whether the pelvis moves along up, or along the ground's normal."
+    )
+    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        requested = requested_heights(sensed, target.pos)
+        weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
+        active = sensed.weight > 0
+        highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)
+        requested = jnp.where(active, smoothing.lerp(highest, requested, weight), highest)
+        lowest = gate.minimum(requested, band=HEIGHT_BAND)
+        standing = gate.maximum(weight, band=0.1)
+        goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, goal, 0.0)
+        fraction = smoothing.lerp(
+            smoothing.fraction_of_gain(self.off_gain, now.dt, self.tick_hz),
+            smoothing.fraction_of_gain(self.on_gain, now.dt, self.tick_hz),
+            standing,
+        )
+        fraction = now.awake * now.progress(fraction)
+        height = smoothing.lerp(state.height, goal, fraction)
+        direction_ws = jnp.where(self.vertical_only, sensed.up_ws, now.lean.normal_ws)
+        return PelvisState.at(height, goal, direction_ws)
+
+
+class CapsulePelvis(AbstractPelvis):
+    """Sinks to the lowest foot and never rises, and shrinks the capsule (Unreal).
+
+    The goal is the lowest height that a foot requests, or 0 if that is above 0. The capsule's
+    half-height goes to its full value less half of that depth. Both follow by the clamped-speed law
+    of Unreal's interp-to. With `enabled` off both go back.
+    """
+
+    enabled: Leaf = switch(True, doc="Whether the pelvis sinks.")
+    speed: Leaf = parameter(
+        15.0,
+        unit="1/s",
+        low=0.5,
+        high=30.0,
+        scale="log",
+        doc="Rate at which pelvis and capsule follow their goals.",
+    )
+    half_height: Leaf = parameter(
+        0.90, unit="m", low=0.3, high=2.0, doc="Half the height of the character's capsule at rest."
+    )
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        requested = jnp.where(sensed.weight > 0, requested_heights(sensed, target.pos), 0.0)
+        lowest = gate.minimum(requested, band=HEIGHT_BAND)
+        zero = jnp.zeros_like(lowest)
+        sunk = gate.clip(lowest, zero - jnp.inf, zero, band=HEIGHT_BAND)
+        goal = jnp.where(self.enabled, sunk, 0.0)
+
+        def follow(value: Array, goal: Array) -> Array:
+            fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - value)
+            return smoothing.lerp(value, goal, now.awake * now.progress(fraction))
+
+        height = follow(state.height, goal)
+        half_height = follow(state.half_height, self.half_height - 0.5 * jnp.abs(goal))
+        after = PelvisState.at(height, goal, sensed.up_ws)
+        return dataclasses.replace(after, half_height=half_height)
+
+
+class LegLengthPelvis(AbstractPelvis):
+    """Keeps the distance from each hip to its foot within the leg's limits (Mec).
+
+    Of all heights that do, it takes the one nearest to the animation. Where one leg needs the body
+    higher and another needs it lower, it takes the lower, so that no leg is over-stretched. A foot
+    too far aside to be reached requests the height that comes nearest. With `damp` on the offset
+    follows by the clamped-speed law of Unreal's interp-to.
+    """
+
+    enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
+    min_length: Leaf = parameter(
+        0.50,
+        unit="m",
+        low=0.0,
+        high=1.0,
+        doc="Shortest distance from hip to ankle that the pelvis allows.",
+    )
+    max_length: Leaf = parameter(
+        0.88,
+        unit="m",
+        low=0.2,
+        high=1.5,
+        above="min_length",
+        doc="Longest distance from hip to ankle that the pelvis allows.",
+    )
+    damp: Leaf = switch(
+        True, doc="Whether the pelvis follows its goal smoothly; if not, it jumps there."
+    )
+    speed: Leaf = parameter(
+        10.0,
+        unit="1/s",
+        low=0.5,
+        high=30.0,
+        scale="log",
+        doc="Rate at which the pelvis follows its goal.",
+    )
+
+    def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
+        sensed, gate = now.sensed, now.gate
+        lowest = rise_to_length(sensed, target.pos, self.min_length)
+        highest = rise_to_length(sensed, target.pos, self.max_length)
+        active = (sensed.foothold.found > 0) & (sensed.weight > 0)
+        zero = jnp.zeros_like(lowest[:1])
+        floors = jnp.concatenate([jnp.where(active, lowest, -FAR), zero])
+        floor = gate.maximum(floors, band=HEIGHT_BAND)
+        ceilings = jnp.concatenate([jnp.where(active, highest, FAR), floor[None]])
+        goal = jnp.where(self.enabled, gate.minimum(ceilings, band=HEIGHT_BAND), 0.0)
+
+        fraction = smoothing.fraction_of_speed(self.speed, now.dt, goal - state.height)
+        fraction = now.awake * jnp.where(now.started & self.damp, fraction, 1.0)
+        height = smoothing.lerp(state.height, goal, fraction)
+        return PelvisState.at(height, goal, sensed.up_ws)
