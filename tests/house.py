@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxik", "fitting")
 MANY_ARGUMENTS = 6
-MODULE_LINES = (21, 399)
+MODULE_LINES = (21, 350)
 NO_LIMITS = (-math.inf, math.inf)
 HELP = "from fitting.cli.main import main; main(['--help'])"
 

@@ -1,0 +1,177 @@
+"""What a record means: the parameters of the record preset, in our names and units."""
+
+import dataclasses
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxik import presets
+from jaxik.maths import parameter_tree
+from jaxik.pipeline import FootIK
+from jaxik.world.skeleton import Rig
+
+from .layout import FLAGS, FLOATS, Record, knee_axis, pack_float
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How to understand the fields whose unit or sign the record does not state.
+
+    Attributes:
+        length_unit: unit of planted and raised heights and of ray lengths: "m", "cm", or "auto",
+            which warns and takes centimetres if a planted height is over 1 or a ray over 5, more
+            than any body of 1.8 m has in metres.
+        knee_convention: "interior" (pi is a straight leg) or "flexion" (0 is a straight leg).
+        lean_sign: 1 if a positive rate aligns the body with the ground's normal, -1 if it leans
+            into the hill.
+        tick_hz: the game's rate, to which all gains refer.
+    """
+
+    length_unit: str = "auto"
+    knee_convention: str = "interior"
+    lean_sign: int = 1
+    tick_hz: float = 30.0  # Hz
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("length_unit", ("auto", "m", "cm")),
+            ("knee_convention", ("interior", "flexion")),
+            ("lean_sign", (1, -1)),
+        ):
+            if (value := getattr(self, name)) not in allowed:
+                raise ValueError(f"{name} is {value!r}; it is one of {allowed}")
+        if not self.tick_hz > 0:
+            raise ValueError(f"tick_hz is {self.tick_hz}; it is the game's rate, above 0")
+
+
+def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
+    """The record preset with a record's parameters; those that it lacks keep their defaults.
+
+    Raises:
+        ValueError: if a number is not finite or the knee axis is unknown.
+    """
+    reading = reading or Reading()
+    knee_axis(record)
+    values: dict[str, float] = {}
+    for name, ours, unit in _fields(reading):
+        if not np.isfinite(stored := record.value(name)):
+            raise ValueError(f"{name} is {stored}; the record's floats are finite numbers")
+        values[ours] = _from_stored(name, stored, unit, record, reading)
+    toe = [values.pop(f"probe.toe_ls[{axis}]") for axis in range(3)]
+    switches = {ours: record.flag(name) for _, name, ours in FLAGS}
+    ticks = {name: reading.tick_hz for name in ("lean.tick_hz", "pelvis.tick_hz")}
+    return parameter_tree.replace(
+        presets.record(), values | {"probe.toe_ls": toe} | switches | ticks
+    )
+
+
+def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = None) -> Record:
+    """The record with a system's parameters.
+
+    Args:
+        ik: a system with the rules of the record preset.
+        base: where knee axis, padding and tail come from. A float whose value is the same in `base`
+            and `ik` keeps its bytes.
+        reading: units and signs to write. With `length_unit` "auto" lengths get the unit of `base`,
+            or metres.
+
+    Raises:
+        ValueError: if a parameter differs between legs, does not fit a 32-bit float, or would be
+            read back in another unit.
+    """
+    reading = reading or Reading()
+    template = base or Record()
+    flags = template.flags & ~0b111
+    for bit, _, ours in FLAGS:
+        flags |= int(_shared_value(ik, ours)) << bit
+    automatic_unit = reading.length_unit == "auto"
+    if automatic_unit:
+        length_unit = "cm" if base is not None and _in_centimetres(base) else "m"
+        reading = dataclasses.replace(reading, length_unit=length_unit)
+    floats = []
+    for index, (name, ours, unit) in enumerate(_fields(reading)):
+        value = _shared_value(ik, ours)
+        stored = pack_float(_to_stored(value, unit, reading))
+        if base is not None and np.isfinite(base.value(name)):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                before = _from_stored(name, base.value(name), unit, base, reading)
+            if np.isclose(before, value, rtol=1e-6, atol=1e-7):
+                stored = base.floats[index]
+        floats.append(stored)
+    record = dataclasses.replace(template, flags=flags, floats=tuple(floats))
+    if automatic_unit and _in_centimetres(record) != (reading.length_unit == "cm"):
+        raise ValueError(
+            f"lengths written in {reading.length_unit} would be read in the other unit, because a "
+            'planted height over 1 or a ray over 5 counts as cm; set length_unit to "m" or "cm"'
+        )
+    return record
+
+
+def with_knee_axis(rig: Rig, record: Record) -> Rig:
+    """The rig with the record's knee axis, for a game skeleton.
+
+    Not for rigs that were measured from a captured clip: these have their own axes.
+    """
+    axis = jnp.asarray(knee_axis(record), rig.knee_axis_ls.dtype)
+    return dataclasses.replace(rig, knee_axis_ls=jnp.broadcast_to(axis, rig.knee_axis_ls.shape))
+
+
+def _fields(reading: Reading) -> list[tuple[str, str, str]]:
+    """`FLOATS` for a reading: the largest flexion is the smallest interior angle."""
+    if reading.knee_convention == "interior":
+        return list(FLOATS)
+    other = {"leg.max_knee_angle": "leg.min_knee_angle", "leg.min_knee_angle": "leg.max_knee_angle"}
+    return [(name, other.get(ours, ours), unit) for name, ours, unit in FLOATS]
+
+
+def _shared_value(ik: FootIK, name: str) -> float:
+    """The value of a parameter, which must be the same for all legs."""
+    leaf, _, index = name.rstrip("]").partition("[")
+    values = np.asarray(parameter_tree.get(ik, leaf))
+    values = np.unique(values[..., int(index)] if index else values)
+    if len(values) > 1:
+        raise ValueError(f"{name} is {values.tolist()}; the record has one value for all legs")
+    return float(values[0])
+
+
+def _in_centimetres(record: Record) -> bool:
+    """Whether lengths can only be in centimetres, for a body of 1.8 m."""
+    rays = max(record.value("raycastDistanceUp"), record.value("raycastDistanceDown"))
+    return record.value("footPlantedAnkleHeightMS") > 1.0 or rays > 5.0
+
+
+def _from_stored(name: str, value: float, unit: str, record: Record, reading: Reading) -> float:
+    """A stored number in our units: metres, radians, gains per tick."""
+    if unit == "length":
+        if reading.length_unit == "cm":
+            return value / 100.0
+        if reading.length_unit == "auto" and _in_centimetres(record):
+            warnings.warn(f"{name} = {value} is read as centimetres", stacklevel=3)
+            return value / 100.0
+    if unit == "cosine":
+        if abs(value) > 1.0:
+            warnings.warn(f"{name} = {value} is no cosine; it is read as degrees", stacklevel=3)
+            angle = np.radians(value)
+        else:
+            angle = np.arccos(value)
+        return float(angle if reading.knee_convention == "interior" else np.pi - angle)
+    if unit == "deg":
+        return float(np.radians(value))
+    if unit == "lean":
+        return reading.lean_sign * value
+    return value
+
+
+def _to_stored(value: float, unit: str, reading: Reading) -> float:
+    """A number in our units as the record stores it."""
+    if unit == "length" and reading.length_unit == "cm":
+        return value * 100.0
+    if unit == "cosine":
+        return float(np.cos(value if reading.knee_convention == "interior" else np.pi - value))
+    if unit == "deg":
+        return float(np.degrees(value))
+    if unit == "lean":
+        return reading.lean_sign * value
+    return value
