@@ -13,7 +13,7 @@ from jaxtyping import Float
 import jaxik
 from fitting.analysis import playback
 from fitting.experiments.experiment import Experiment
-from fitting.inference.identifiability import Identifiability, assess_identifiability
+from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.search import Starts, find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
@@ -139,18 +139,6 @@ def search(
         starts=experiment.fit.starts if starts is None else starts,
         seed=experiment.seed,
         progress=progress,
-    )
-
-
-def assess(
-    experiment: Experiment,
-    problem: Problem[jaxik.FootIK],
-    solution: Solution,
-    known_values: Mapping[str, float] | None = None,
-) -> Fit:
-    """The fit with what its clips determine of it."""
-    return Fit(
-        experiment, problem, solution, assess_identifiability(problem, solution), known_values
     )
 
 
