@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TypedDict
 
 import jax
+import jaxlib
 
 from fitting.runtime.threads import usable_cores
 
@@ -24,6 +25,7 @@ class Hardware(TypedDict):
     memory_gb: float | None
     device: str
     jax: str
+    jaxlib: str
     python: str
     xla_flags: str
 
@@ -38,6 +40,7 @@ def hardware() -> Hardware:
         "memory_gb": _memory_gb(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
+        "jaxlib": jaxlib.__version__,
         "python": platform.python_version(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }

@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 from fitting.report import formatting
 from fitting.report.plots import style
-from fitting.runtime import files
+from fitting.runtime import files, xla
 
 from . import scaling_plot
 from .host import hardware, load_average
@@ -78,6 +78,7 @@ def text(report: Report) -> str:
         f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, {memory}"
         f"{machine['device']}; JAX {machine['jax']}, Python {machine['python']}; "
         f"load average {min(loads):.1f} to {max(loads):.1f}",
+        f"XLA flags: {xla.describe_flags(machine['jaxlib'])}",
         "Medians of several runs. CPU: by CPU time, divided by the number of threads that work. "
         "Limit: what memory, arithmetic or dispatch alone would allow, and the fraction reached.",
     ]

@@ -2,34 +2,69 @@
 
 import os
 
+VARIABLE = "XLA_FLAGS"
+ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
+
 # Fusion emitters: two to three times longer to compile a pipeline, and the code is no faster.
-# Vector width: XLA's default is 256 bits, with which legs, feet and crowds take a third longer on
-# a core that has 512.
+EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+# XLA's default is 256 bits, with which legs, feet and crowds take a third longer on a core that
+# has 512.
+VECTORS = "--xla_cpu_prefer_vector_width=512"
 # Reductions stay XLA's own. A library call keeps the surrounding loop from becoming one function,
 # and the gradient of a crowd, which has four of them, takes 1190 ns per leg and frame instead of
 # 720.
+REDUCTIONS = "--xla_cpu_experimental_ynn_fusion_type=-LIBRARY_FUSION_TYPE_REDUCE"
 # A loop that moves fewer bytes per iteration than this threshold becomes one function, which saves
 # the calls of its hundred small kernels: the residuals of a clip take a third of the time. Nearly
 # every loop here is below it; a mesh counts in full each time it is read. One function runs on one
 # core, so large work must be spread over threads (half a million rays each: 220 ns per ray on two
 # cores, 430 as one call; as kernels, which XLA spreads itself, 190 and 320).
-FLAGS = (
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_prefer_vector_width=512"
-    " --xla_cpu_experimental_ynn_fusion_type=-LIBRARY_FUSION_TYPE_REDUCE"
-    " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
-)
-ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
+LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+
+# Each version of jaxlib that was tried, and the flags it knows. XLA ends the process at a flag that
+# it does not know, and patch releases remove flags, so an untried version gets none.
+FLAGS = {
+    **dict.fromkeys(
+        ("0.10.0", "0.10.1", "0.10.2", "0.11.0"), (EMITTERS, VECTORS, REDUCTIONS, LOOPS)
+    ),
+    **dict.fromkeys(("0.11.1", "0.11.2", "0.12.0", "0.12.0.1"), (VECTORS, REDUCTIONS, LOOPS)),
+}
 
 
 def configure_xla() -> None:
-    """Sets XLA flags that suit a CPU; call it before JAX computes anything.
+    """Sets XLA flags that suit a CPU; call it before JAX computes anything, or nothing changes.
 
-    Environment variables that are already set stay as they are. Programs also run in the thread
-    that calls them: waking another thread, as JAX does by default, takes as long as computing one
-    frame of one character.
+    Only flags that the installed jaxlib is known to accept are set; with a version that is newer
+    than this package there may be none, and everything works, slower. Flags in the environment
+    variable `XLA_FLAGS` are kept and take precedence; where it is empty or names a file, no flags
+    are added.
+
+    Programs also run in the thread that calls them, unless `JAX_CPU_ENABLE_ASYNC_DISPATCH` says
+    otherwise: waking another thread, as JAX does by default, takes as long as computing one frame
+    of one character.
     """
-    os.environ.setdefault("XLA_FLAGS", FLAGS)
-    if ASYNC_DISPATCH not in os.environ:
-        import jax  # takes half a second, which `jaxik --help` should not spend
+    import jax  # takes half a second, which `jaxik --help` should not spend
+    import jaxlib
 
+    if flags := combine_flags(FLAGS.get(jaxlib.__version__, ()), os.environ.get(VARIABLE)):
+        os.environ[VARIABLE] = flags
+    if ASYNC_DISPATCH not in os.environ:
         jax.config.update(ASYNC_DISPATCH.lower(), False)
+
+
+def combine_flags(flags: tuple[str, ...], of_user: str | None) -> str:
+    """The value of `XLA_FLAGS` that adds flags to the user's; None where the user set none."""
+    if of_user is None:
+        return " ".join(flags)
+    if not of_user.lstrip().startswith("-"):  # empty, or the name of a file with flags
+        return of_user
+    # The user's come last: of two values for one flag XLA takes the later.
+    return " ".join([*(flag for flag in flags if flag not in of_user.split()), of_user])
+
+
+def describe_flags(jaxlib_version: str) -> str:
+    """The flags of this process in one line, and whether a version of jaxlib gets none."""
+    flags = os.environ.get(VARIABLE) or "none"
+    if jaxlib_version in FLAGS:
+        return flags
+    return f"{flags}; which flags jaxlib {jaxlib_version} knows has not been tried"

@@ -183,7 +183,7 @@ def test_the_command_prints_a_table_with_the_hardware(trivial_suite, capsys):
     assert main.main(["bench", "--quick", "--only", "quick"]) == 0
     output = capsys.readouterr()
     assert f"JAX {jax.__version__}" in output.out and "threads used" in output.out
-    assert "load average" in output.out
+    assert "load average" in output.out and "XLA flags: " in output.out
     assert "Quick: smaller sizes" in output.out
     ours, ratio = (line for line in output.out.splitlines() if line.startswith("quick "))
     assert ours.endswith("yes") and "≤ 1" in ours and " to " in ours
@@ -198,7 +198,8 @@ def test_the_json_is_complete(trivial_suite, tmp_path, capsys):
     content = json.loads(numbers.read_text())
     assert not content["quick"] and not content["interrupted"]
     assert set(content["machine"]) == {
-        "cpu", "cores", "threads", "memory_gb", "device", "jax", "python", "xla_flags", "load",
+        "cpu", "cores", "threads", "memory_gb", "device", "jax", "jaxlib", "python",
+        "xla_flags", "load",
     }  # fmt: skip
     assert len(content["machine"]["load"]) == 2  # at the start and at the end
     (row,) = content["rows"]
