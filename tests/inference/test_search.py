@@ -222,28 +222,77 @@ def test_a_robust_loss_limits_the_pull_of_outliers(loss):
     assert error_with_outliers(loss) < error_with_outliers("squares") / 3
 
 
-@pytest.mark.slow
+class Valley(eqx.Module):
+    """Rosenbrock's curved valley, in which a descent turns and has steps rejected."""
+
+    def residuals(self, u: jax.Array) -> jax.Array:
+        return jnp.stack([1 - u[0], 10 * (u[1] - u[0] ** 2)])
+
+    def residuals_and_jacobian(self, u, max_cost):
+        del max_cost
+        return self.residuals(u), jax.jacfwd(self.residuals)(u)
+
+
+VALLEY_START = (-1.2, 1.0)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 20])
+def test_steps_are_those_of_optimistix_in_a_valley(steps):
+    states = march(Valley(), jnp.asarray(VALLEY_START), steps)
+    expected = optimum(Valley().residuals, jnp.asarray(VALLEY_START), steps)
+    np.testing.assert_allclose(states[-1].u, expected, rtol=1e-9)
+    rejected = [not state.accepted for state in states]
+    assert rejected[0] is False and any(rejected) == (steps > 2)
+
+
 def test_steps_on_the_compressed_rows_are_those_of_optimistix_on_all_rows():
-    """Fails when a new optimistix keeps its state in other fields, or steps differently."""
     problem = curve_problem()
     u = problem.space.u0
-    model = models.HardModel(problem, u)
-    state = levenberg_marquardt.begin(model, u)
-    solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
-    expected, residuals = u, lambda u, _: (problem.residuals(u), None)
-    shape = jax.eval_shape(residuals, u, None)[0]
-    options = {"options": {"jac": "fwd"}, "tags": frozenset()}
-    solver_state = solver.init(residuals, u, None, f_struct=shape, aux_struct=None, **options)
-    for _ in range(20):
-        state = levenberg_marquardt.step(model, state)
-        expected, solver_state, _ = solver.step(
-            residuals, expected, None, state=solver_state, **options
-        )
-        np.testing.assert_allclose(state.u, expected, rtol=1e-9)
+    state = march(models.HardModel(problem, u), u, 20)[-1]
+    np.testing.assert_allclose(state.u, optimum(problem.residuals, u, 20), rtol=1e-9)
     assert float(state.cost) < 1e-2 * float(problem.cost(u))
     np.testing.assert_allclose(state.cost, problem.cost(state.u), rtol=1e-12)
     jacobian = models.problem_jacobian(state.jacobian)
     np.testing.assert_allclose(jacobian, problem.jacobian(state.u), rtol=1e-12)
+
+
+def march(model: models.Model, u: jax.Array, steps: int) -> list[levenberg_marquardt.LMState]:
+    """The states after each of our steps."""
+    states = [levenberg_marquardt.begin(model, u)]
+    for _ in range(steps):
+        states.append(levenberg_marquardt.step(model, states[-1]))
+    return states[1:]
+
+
+def optimum(residuals, u: jax.Array, steps: int) -> jax.Array:
+    """Where optimistix is after as many steps by itself."""
+    solver = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
+    return optx.least_squares(
+        lambda u, _: residuals(u), solver, u, max_steps=steps, throw=False
+    ).value
+
+
+class Reticent(optx.AbstractSearch):
+    """Optimistix's search, which keeps its state in a form of its own."""
+
+    def init(self, y, f_info_struct):
+        return {"kept": optx.ClassicalTrustRegion().init(y, f_info_struct)}
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        before = (first_step, y, y_eval, f_info, f_eval_info, state["kept"])
+        *outputs, after = optx.ClassicalTrustRegion().step(*before)
+        return *outputs, {"kept": after}
+
+
+def test_a_search_may_keep_its_state_in_any_form(monkeypatch):
+    expected = march(Valley(), jnp.asarray(VALLEY_START), 3)[-1]
+    monkeypatch.setattr(levenberg_marquardt, "SEARCH", Reticent())
+    for name in ("begin", "step"):  # untraced, or the programs from above would run
+        function = getattr(levenberg_marquardt, name).__wrapped__
+        monkeypatch.setattr(levenberg_marquardt, name, function)
+    state = march(Valley(), jnp.asarray(VALLEY_START), 3)[-1]
+    assert set(state.search) == {"kept"}
+    np.testing.assert_allclose(state.u, expected.u, rtol=1e-12)
 
 
 def test_all_steps_of_a_descent_are_one_program():

@@ -85,29 +85,6 @@ class Compressed(eqx.Module):
     jacobian: Float[Array, "rotated free"]
     full_jacobian: Float[Array, "residuals free"]
 
-    def as_function(self, u: Array, _: None) -> tuple[Array, Array]:
-        """The rotated residuals, and the full Jacobian as auxiliary output, for this one point.
-
-        As a function with a derivative, which optimistix asks for. The derivative is the stored
-        Jacobian, so that the pipeline is not traced and differentiated once more.
-        """
-        return _with_derivative(u, self.residuals, self.jacobian, self.full_jacobian)
-
-
-@jax.custom_jvp
-def _with_derivative(
-    u: Array, residuals: Array, jacobian: Array, full_jacobian: Array
-) -> tuple[Array, Array]:
-    return residuals, full_jacobian
-
-
-@_with_derivative.defjvp
-def _(
-    primals: tuple[Array, ...], tangents: tuple[Array, ...]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    _, residuals, jacobian, full_jacobian = primals
-    return (residuals, full_jacobian), (jacobian @ tangents[0], jnp.zeros_like(full_jacobian))
-
 
 @eqx.filter_jit  # traced once for all programs around it
 def compress(model: Model, u: Float[Array, " free"], max_cost: Float[Array, ""]) -> Compressed:
