@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TypedDict
 
 import jax
-import jaxlib
 
+from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
 
 STATUS = Path("/proc/self/status")
@@ -40,7 +40,7 @@ def hardware() -> Hardware:
         "memory_gb": _memory_gb(),
         "device": f"{device.platform}: {device.device_kind}",
         "jax": jax.__version__,
-        "jaxlib": jaxlib.__version__,
+        "jaxlib": xla.jaxlib_version(),
         "python": platform.python_version(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }

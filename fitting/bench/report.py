@@ -78,7 +78,7 @@ def text(report: Report) -> str:
         f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, {memory}"
         f"{machine['device']}; JAX {machine['jax']}, Python {machine['python']}; "
         f"load average {min(loads):.1f} to {max(loads):.1f}",
-        f"XLA flags: {xla.describe_flags(machine['jaxlib'])}",
+        f"XLA flags: {xla.describe_flags()}",
         "Medians of several runs. CPU: by CPU time, divided by the number of threads that work. "
         "Limit: what memory, arithmetic or dispatch alone would allow, and the fraction reached.",
     ]

@@ -1,6 +1,7 @@
 """XLA and JAX settings that make these programs fast on a CPU; they have no effect on a GPU."""
 
 import os
+from importlib import metadata
 
 VARIABLE = "XLA_FLAGS"
 ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
@@ -44,12 +45,16 @@ def configure_xla() -> None:
     of one character.
     """
     import jax  # takes half a second, which `jaxik --help` should not spend
-    import jaxlib
 
-    if flags := combine_flags(FLAGS.get(jaxlib.__version__, ()), os.environ.get(VARIABLE)):
+    if flags := combine_flags(FLAGS.get(jaxlib_version(), ()), os.environ.get(VARIABLE)):
         os.environ[VARIABLE] = flags
     if ASYNC_DISPATCH not in os.environ:
         jax.config.update(ASYNC_DISPATCH.lower(), False)
+
+
+def jaxlib_version() -> str:
+    """The installed version of the library that holds XLA."""
+    return metadata.version("jaxlib")
 
 
 def combine_flags(flags: tuple[str, ...], of_user: str | None) -> str:
@@ -62,9 +67,9 @@ def combine_flags(flags: tuple[str, ...], of_user: str | None) -> str:
     return " ".join([*(flag for flag in flags if flag not in of_user.split()), of_user])
 
 
-def describe_flags(jaxlib_version: str) -> str:
-    """The flags of this process in one line, and whether a version of jaxlib gets none."""
+def describe_flags() -> str:
+    """The flags of this process in one line, and whether this version of jaxlib gets none."""
     flags = os.environ.get(VARIABLE) or "none"
-    if jaxlib_version in FLAGS:
+    if (version := jaxlib_version()) in FLAGS:
         return flags
-    return f"{flags}; which flags jaxlib {jaxlib_version} knows has not been tried"
+    return f"{flags}; which flags jaxlib {version} knows has not been tried"
