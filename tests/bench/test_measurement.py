@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.bench import host, measurement, report, roofline, runner, sizes, suite
+from fitting.bench import host, measurement, operations, report, roofline, runner, sizes, suite
 from fitting.bench.measurement import Figure, FigureSpec, Measurement, Series
 from fitting.bench.roofline import Work
 from fitting.bench.runner import Benchmark
@@ -134,20 +134,34 @@ def test_operations_count_in_loops_and_branches_unless_no_result_depends_on_them
     assert counted(jax.vmap(jnp.sum), matrix).operations == 12
 
 
-def test_jax_still_removes_dead_code_as_this_benchmark_uses_it():
-    """The internals of JAX behind `live_code`: a failure names what a new version changed."""
-    program = jax.make_jaxpr(lambda x, unused: (jnp.sin(unused), x + 1.0)[1])(1.0, 2.0).jaxpr
-    assert hasattr(roofline.partial_eval, "dce_jaxpr"), "jax.interpreters.partial_eval.dce_jaxpr"
-    live, needed = roofline.live_code(program)
-    assert [equation.primitive.name for equation in live.eqns] == ["add"]
-    assert list(needed) == [True, False], "which arguments are needed"
+def test_the_names_that_jax_does_not_promise_are_still_these():
+    """All of JAX that `operations` reads: a failure names what a new version changed."""
+
+    def names(function, *arguments) -> dict:
+        program = jax.make_jaxpr(function)(*arguments).jaxpr
+        return {equation.primitive.name: equation.params for equation in program.eqns}
+
+    x = jnp.ones((3, 3))
+    scan = names(lambda x: jax.lax.scan(lambda c, _: (c + c, None), x, None, length=7)[0], x)
+    assert scan["scan"]["length"] == 7
+    assert "cond" in names(lambda x: jax.lax.cond(x[0, 0] > 0, jnp.sin, jnp.cos, x), x)
+    assert "jit" in names(jax.jit(jnp.sin), x)
+    assert names(jnp.matmul, x, x)["dot_general"]["dimension_numbers"][0] == ((1,), (0,))
+    assert operations.REDUCTIONS & names(lambda x: x.sum(), x).keys()
+    for function in (jnp.add, jnp.arctan2, jnp.maximum):
+        assert operations.ARITHMETIC & names(function, x, x).keys(), function
+    for function in (jnp.sqrt, jnp.sin, jnp.arccos, jnp.square, jnp.exp):
+        assert operations.ARITHMETIC & names(function, x).keys(), function
 
 
-def test_jax_still_lists_the_programs_inside_an_equation():
-    program = jax.make_jaxpr(jax.jit(jnp.sin))(1.0).jaxpr
-    (call,) = program.eqns
-    (inner,) = roofline.jaxprs_in_params(call.params)
-    assert [equation.primitive.name for equation in inner.eqns] == ["sin"]
+def test_a_called_program_counts_as_far_as_its_results_are_used():
+    @jax.jit
+    def called(x, y):
+        return jnp.sin(x), jnp.exp(y) * y
+
+    work = counted(lambda x, y: called(x, y)[0], jnp.ones(10), jnp.ones(1000))
+    assert work.operations == 10
+    assert work.moved == 2 * jnp.ones(10).nbytes
 
 
 def test_bytes_are_those_that_a_run_has_to_read_and_write():
