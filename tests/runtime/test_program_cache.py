@@ -2,11 +2,9 @@
 
 import functools
 import os
-import pickle
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.runtime import files, program_cache
+from fitting.runtime import cache_folder, files, program_cache, program_key
 from jaxik.maths import vec
 
 TRACED = []
@@ -30,20 +28,46 @@ def stretch(scale, points, *, by=1.0):
     }
 
 
+def by_function(change, points):
+    """A stand-in for a function of the project that takes another function."""
+    TRACED.append(points.shape)
+    return change(points)
+
+
+def stretch_known(points):
+    """A stand-in for a function of the project that calls a cached one with constants."""
+    return points + STRETCH_KNOWN(2.0, KNOWN)["longer"]
+
+
+def as_set(points):
+    """A stand-in for a function of the project whose output holds more than can be kept."""
+    TRACED.append(points.shape)
+    return points, frozenset({"one"})
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A JAX cache for this test alone; `stretch` passes for one of the project's functions."""
-    config: Any = jax.config
-    before = config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    monkeypatch.setattr(stretch, "__module__", "fitting.somewhere")
+    """A JAX cache for this test alone; the functions above pass for the project's."""
+    before = cache_folder.setting(cache_folder.FOLDER)
+    jax.config.update(cache_folder.FOLDER, str(tmp_path))
+    for function in (stretch, by_function, stretch_known, as_set):
+        monkeypatch.setattr(function, "__module__", "fitting.somewhere")
+    cache_folder.warn_once.cache_clear()
     TRACED.clear()
-    yield tmp_path / program_cache.FOLDER
-    jax.config.update("jax_compilation_cache_dir", before)
+    yield tmp_path / cache_folder.TRACED
+    jax.config.update(cache_folder.FOLDER, before)
 
 
 def points(count=4, dtype=float):
     return jnp.asarray(np.random.default_rng(0).normal(size=(count, 3)), dtype)
+
+
+def mine(points):
+    """A function of a user's module."""
+    return 2 * points
+
+
+KNOWN, STRETCH_KNOWN = points(), program_cache.cached(stretch)
 
 
 def assert_same(output, expected):
@@ -58,12 +82,19 @@ def fresh():
     return program_cache.cached(stretch)
 
 
+def kept(folder):
+    return list(folder.iterdir()) if folder.exists() else []
+
+
+# What is kept
+
+
 def test_a_cached_function_gives_the_same_output_and_is_traced_once(folder):
     expected = eqx.filter_jit(stretch)(2.0, points(), by=3.0)
     TRACED.clear()
     for _ in range(2):
         assert_same(fresh()(2.0, points(), by=3.0), expected)
-    assert TRACED == [(4, 3)] and len(list(folder.iterdir())) == 1
+    assert TRACED == [(4, 3)] and len(kept(folder)) == 1
 
 
 def test_each_shape_type_and_constant_gets_its_own_program(folder):
@@ -84,56 +115,22 @@ def test_each_shape_type_and_constant_gets_its_own_program(folder):
                 rtol=1e-6,
             )
             assert output["longer"].dtype == args[1].dtype
-        assert len(TRACED) == len(list(folder.iterdir())) == len(calls), times
+        assert len(TRACED) == len(kept(folder)) == len(calls), times
 
 
 def test_a_change_of_the_source_makes_a_new_program(folder, monkeypatch):
     fresh()(2.0, points())
-    sources = program_cache._sources()
-    monkeypatch.setattr(program_cache, "_sources", lambda: sources + b"changed")
+    monkeypatch.setattr(program_key, "_sources", lambda: "changed")
     fresh()(2.0, points())
-    assert len(TRACED) == 2
+    assert len(TRACED) == len(kept(folder)) == 2
 
 
-def test_the_source_of_both_packages_counts(tmp_path, monkeypatch):
-    monkeypatch.setattr(program_cache, "PROJECT", ("jaxik",))
-    program_cache._sources.cache_clear()
-    alone = program_cache._sources()
-    monkeypatch.undo()
-    program_cache._sources.cache_clear()
-    assert program_cache._sources() != alone
-
-
-def by_function(change, at):
-    """A stand-in for a function of the project that takes another function."""
-    TRACED.append(at.shape)
-    return change(at)
-
-
-def test_static_arguments_from_the_project_are_identified_by_name(folder, monkeypatch):
-    monkeypatch.setattr(by_function, "__module__", "fitting.somewhere")
-    for _ in range(2):
-        output = program_cache.cached(by_function)(vec.sum_last, points())
-        np.testing.assert_array_equal(output, vec.sum_last(points()))
-    assert len(TRACED) == len(list(folder.iterdir())) == 1
-
-
-@pytest.mark.parametrize("change", [lambda at: at + 1, stretch], ids=["lambda", "user's module"])
-def test_a_user_function_as_an_argument_is_called_but_not_kept(folder, monkeypatch, change):
-    monkeypatch.setattr(by_function, "__module__", "fitting.somewhere")
-    if change is stretch:
-        monkeypatch.setattr(stretch, "__module__", "mine")
-        change = functools.partial(stretch, 1.0)
+@pytest.mark.parametrize("change", [vec.sum_last, jnp.sort])
+def test_functions_of_the_project_and_its_libraries_are_identified_by_name(folder, change):
     for _ in range(2):
         output = program_cache.cached(by_function)(change, points())
-    assert jax.tree.leaves(output)[0].shape == (4, 3)
-    assert len(TRACED) >= 2 and not folder.exists()
-
-
-def test_a_program_of_a_user_function_is_not_kept(folder, monkeypatch):
-    monkeypatch.setattr(stretch, "__module__", "mine")
-    np.testing.assert_allclose(fresh()(2.0, points())["half"][0], points() / 2)
-    assert not folder.exists()
+        np.testing.assert_array_equal(output, change(points()))
+    assert len(TRACED) == len(kept(folder)) == 1
 
 
 def test_inside_another_program_it_becomes_part_of_it(folder):
@@ -145,99 +142,121 @@ def test_inside_another_program_it_becomes_part_of_it(folder):
     gradient = jax.jit(jax.grad(whole))(points())
     assert gradient.shape == (4, 3)
     assert np.isfinite(gradient).all() and np.any(gradient != 0)
-    assert not folder.exists()
+    assert not kept(folder)
 
 
-def test_a_cached_call_with_constant_arguments_inside_a_trace_does_not_deadlock(
-    folder, monkeypatch
-):
-    inner, known = fresh(), points()
-
-    def outer(p):
-        return p + inner(2.0, known)["longer"]  # the arguments of the inner call are not traced
-
-    monkeypatch.setattr(outer, "__module__", "fitting.somewhere")
-    output = program_cache.cached(outer)(points())
+def test_a_cached_call_with_constant_arguments_inside_a_trace_does_not_deadlock(folder):
+    output = program_cache.cached(stretch_known)(points())
     np.testing.assert_allclose(output, points() + stretch(2.0, points())["longer"])
+    assert len(kept(folder)) == 2
+
+
+# What is not kept
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"damaged", pickle.dumps(None), pickle.dumps((b"no program", 0, None))]
+    "change",
+    [lambda points: points + 1, functools.partial(vec.sum_last), mine],
+    ids=["lambda", "partial", "user's module"],
 )
-def test_a_damaged_file_is_replaced(folder, content):
-    expected = fresh()(2.0, points())
-    (file,) = folder.iterdir()
-    intact = file.read_bytes()
-    file.write_bytes(content)
-    assert_same(fresh()(2.0, points()), expected)
-    assert len(TRACED) == 2 and file.read_bytes() == intact
+def test_a_user_function_as_an_argument_is_called_but_not_kept(folder, change):
+    for _ in range(2):
+        output = program_cache.cached(by_function)(change, points())
+        np.testing.assert_array_equal(output, change(points()))
+    assert len(TRACED) == 2 and not kept(folder)
 
 
-class Hostile:
-    """Runs code when it is unpickled."""
-
-    def __init__(self, mark: Path):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.mark),)
+def test_a_program_of_a_user_function_is_not_kept(folder, monkeypatch):
+    monkeypatch.setattr(stretch, "__module__", "mine")
+    np.testing.assert_allclose(fresh()(2.0, points())["half"][0], points() / 2)
+    assert not kept(folder)
 
 
-class Deferred:
-    """Calls a function of the project that writes files, when it is unpickled."""
-
-    def __init__(self, mark: Path):
-        self.mark = mark
-
-    def __reduce__(self):
-        return files.write_text, (self.mark, "")
-
-
-@pytest.mark.parametrize("payload", [Hostile, Deferred])
-def test_a_hostile_file_runs_no_code(folder, payload):
-    expected = fresh()(2.0, points())
-    (file,) = folder.iterdir()
-    mark = folder.parent / "mark"
-    file.write_bytes(pickle.dumps((payload(mark), 0, None)))
-    assert_same(fresh()(2.0, points()), expected)
-    assert not mark.exists() and len(TRACED) == 2
-
-
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
-def test_a_file_that_others_may_write_is_not_read(folder):
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [(cache_folder.ENABLED, False), (cache_folder.FOLDER, ""), (cache_folder.FOLDER, None)],
+)
+def test_nothing_is_kept_where_jax_keeps_nothing(folder, setting, value):
+    before = cache_folder.setting(setting)
+    jax.config.update(setting, value)
     fresh()(2.0, points())
-    (file,) = folder.iterdir()
-    file.chmod(0o666)
-    fresh()(2.0, points())
-    assert len(TRACED) == 2
-    assert not file.stat().st_mode & 0o002, "the file was replaced by a new one"
-
-
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
-def test_a_file_of_another_user_is_not_read(folder, monkeypatch):
-    fresh()(2.0, points())
-    monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
-    fresh()(2.0, points())
-    assert len(TRACED) == 2
-
-
-def test_a_folder_that_cannot_be_written_to_does_no_harm(folder):
-    folder.write_text("a file in its place")
-    assert_same(fresh()(2.0, points()), fresh()(2.0, points()))
-    assert folder.read_text() == "a file in its place"
-
-
-def test_nothing_is_kept_where_jax_keeps_nothing(folder, monkeypatch):
-    jax.config.update("jax_enable_compilation_cache", False)
-    fresh()(2.0, points())
-    jax.config.update("jax_enable_compilation_cache", True)
+    jax.config.update(setting, before)
     assert not folder.exists()
 
 
 def test_a_mistake_in_a_call_raises_the_usual_error(folder):
     with pytest.raises(ValueError, match="Incompatible shapes"):
         fresh()(jnp.zeros(2), points())
-    assert not folder.exists()
+    assert not kept(folder)
+
+
+# Failures are said once, and the call goes on
+
+
+def test_a_damaged_file_is_replaced(folder):
+    expected = fresh()(2.0, points())
+    (file,) = kept(folder)
+    intact = file.read_bytes()
+    file.write_bytes(intact[:-1])
+    with pytest.warns(RuntimeWarning, match=f"traced anew: {file} is damaged: its sha256"):
+        assert_same(fresh()(2.0, points()), expected)
+    assert len(TRACED) == 2 and file.read_bytes() == intact
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_file_that_others_may_write_is_replaced(folder):
+    fresh()(2.0, points())
+    (file,) = kept(folder)
+    file.chmod(0o666)
+    with pytest.warns(RuntimeWarning, match=f"traced anew: everybody may write to {file}"):
+        fresh()(2.0, points())
+    assert len(TRACED) == 2 and not file.stat().st_mode & 0o002
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_folder_of_another_user_is_neither_read_nor_written(folder, monkeypatch):
+    fresh()(2.0, points())
+    monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
+    with pytest.warns(RuntimeWarning, match="not kept: .*traced belongs to another user") as said:
+        for count in (4, 5):
+            fresh()(2.0, points(count))
+    assert len(said) == 1, "once, not for each program"
+    assert len(TRACED) == 3 and len(kept(folder)) == 1
+
+
+def test_a_file_in_the_place_of_the_folder_stays(folder):
+    folder.write_text("a file in its place")
+    with pytest.warns(RuntimeWarning, match="traced programs are not kept: .*File exists"):
+        assert_same(fresh()(2.0, points()), fresh()(2.0, points()))
+    assert folder.read_text() == "a file in its place"
+
+
+def test_a_full_disk_is_said_once(folder, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    expected = eqx.filter_jit(stretch)(2.0, points())
+    monkeypatch.setattr(files, "write", fail)
+    with pytest.warns(RuntimeWarning, match="not kept: .*No space left on device") as said:
+        assert_same(fresh()(2.0, points()), expected)
+        fresh()(2.0, points(5))
+    assert len(said) == 1 and not kept(folder)
+
+
+def test_an_output_that_cannot_be_kept_is_returned_all_the_same(folder):
+    with pytest.warns(RuntimeWarning, match="not kept: frozenset is neither"):
+        output = program_cache.cached(as_set)(points())
+    assert output[1] == {"one"} and TRACED == [(4, 3)] and not kept(folder)
+
+
+def test_a_program_that_jax_does_not_export_is_run_all_the_same(folder, monkeypatch):
+    def refuse(*_, **__):
+        raise ValueError("Cannot serialize\nthis call")
+
+    monkeypatch.setattr(program_cache.export, "export", refuse)
+    with pytest.warns(RuntimeWarning, match="of stretch is not kept: Cannot serialize$"):
+        output = fresh()(2.0, points())
+    np.testing.assert_allclose(output["half"][0], points() / 2)
 
 
 @pytest.mark.slow
@@ -260,7 +279,7 @@ print(float(at.cost), *traced)
 """
     outputs = [
         subprocess.run(
-            [sys.executable, "-c", code, str(tmp_path)],
+            [sys.executable, "-W", "error::RuntimeWarning", "-c", code, str(tmp_path)],
             env=os.environ | {"PYTHONHASHSEED": seed},
             cwd=Path(__file__).parents[2],
             check=True,

@@ -1,0 +1,133 @@
+"""The folder in which programs are kept between processes: where it is, and what lies in it.
+
+It is JAX's folder for compiled programs. The traced ones lie in a folder inside it.
+"""
+
+import functools
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"  # settings of JAX
+MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"
+TRACED = "traced"  # inside JAX's folder
+# Names of complete and of half-written files: of ours, and of JAX's.
+TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*")
+COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)")
+
+
+class KeptPrograms(NamedTuple):
+    """The files of kept programs."""
+
+    traced: list[Path]
+    compiled: list[Path]
+
+
+def use_default() -> None:
+    """Has JAX keep compiled programs in the user's cache folder, unless it was told where.
+
+    Warns, and has nothing kept, where that folder belongs to somebody else or cannot be made:
+    JAX would run what it finds there.
+    """
+    if setting(FOLDER) is not None:
+        return
+    try:
+        folder = default()
+        _make_own(folder)
+    except (OSError, RuntimeError) as error:
+        warn_once(f"programs are not kept between calls: {error}")
+        return
+    jax.config.update(FOLDER, str(folder))
+    if MIN_SECONDS.upper() not in os.environ:
+        jax.config.update(MIN_SECONDS, 0.0)
+
+
+def default() -> Path:
+    """`jaxik` in the folder where this platform keeps caches, or in `XDG_CACHE_HOME`."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    if os.path.isabs(given):  # others are to be ignored, says the specification
+        return Path(given, "jaxik")
+    if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local, "jaxik", "Cache")
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "jaxik"
+
+
+def why_unused() -> str:
+    """Why traced programs are not kept, in words that name JAX's setting; "" if they are."""
+    folder = setting(FOLDER)
+    if not folder:
+        return f"{FOLDER} names no folder"
+    if "://" in str(folder):
+        return f"{FOLDER} is {folder}, and traced programs are kept on this machine only"
+    if not setting(ENABLED):
+        return f"{ENABLED} is off"
+    if jax.device_count() > 1:
+        return f"there are {jax.device_count()} devices, and programs are kept for one"
+    return ""
+
+
+def traced() -> Path | None:
+    """The user's own folder for traced programs, made if missing; None if none are to be kept."""
+    if why_unused():
+        return None
+    folder = Path(str(setting(FOLDER)), TRACED)
+    try:
+        _make_own(folder)
+    except OSError as error:
+        warn_once(f"traced programs are not kept: {error}")
+        return None
+    return folder
+
+
+def check_own(path: Path, status: os.stat_result) -> None:
+    """Checks that a file or folder is this user's own, and that not everybody may write to it.
+
+    Raises:
+        PermissionError: it is not, or everybody may.
+    """
+    if not _is_own(status):
+        raise PermissionError(f"{path} belongs to another user")
+    if os.name == "posix" and status.st_mode & 0o002:
+        raise PermissionError(f"everybody may write to {path}")
+
+
+def kept_programs(folder: Path) -> KeptPrograms:
+    """The user's own files of programs in a folder, and no others."""
+    traced, compiled = _files(folder / TRACED, TRACED_NAMES), _files(folder, COMPILED_NAMES)
+    return KeptPrograms(list(traced), list(compiled))
+
+
+def setting(name: str) -> object:
+    """The value of one of JAX's settings."""
+    return getattr(jax.config, name)
+
+
+@functools.cache
+def warn_once(problem: str) -> None:
+    """Warns of a problem the first time that it arises in this process."""
+    warnings.warn(problem, RuntimeWarning, stacklevel=2)
+
+
+def _make_own(folder: Path) -> None:
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    check_own(folder, folder.stat())
+
+
+def _is_own(status: os.stat_result) -> bool:
+    """Whether it belongs to this user; on Windows everything in a user's folders does."""
+    return not hasattr(os, "getuid") or status.st_uid == os.getuid()
+
+
+def _files(folder: Path, names: re.Pattern[str]) -> Iterator[Path]:
+    if not folder.is_dir():
+        return
+    for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+        if names.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+            if _is_own(entry.stat(follow_symlinks=False)):
+                yield Path(entry)
