@@ -22,6 +22,10 @@ TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*")
 COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)")
 
 
+class SwitchedOffError(Exception):
+    """Traced programs are not to be kept, by JAX's settings; the message names one."""
+
+
 class KeptPrograms(NamedTuple):
     """The files of kept programs."""
 
@@ -58,31 +62,25 @@ def default() -> Path:
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "jaxik"
 
 
-def why_unused() -> str:
-    """Why traced programs are not kept, in words that name JAX's setting; "" if they are."""
+def traced() -> Path:
+    """The user's own folder for traced programs, made if missing.
+
+    Raises:
+        SwitchedOffError: none are to be kept, by JAX's settings.
+        OSError: the folder cannot be made, or is not safe from others.
+    """
     folder = setting(FOLDER)
     if not folder:
-        return f"{FOLDER} names no folder"
-    if "://" in str(folder):
-        return f"{FOLDER} is {folder}, and traced programs are kept on this machine only"
+        raise SwitchedOffError(f"{FOLDER} names no folder")
     if not setting(ENABLED):
-        return f"{ENABLED} is off"
+        raise SwitchedOffError(f"{ENABLED} is off")
+    if "://" in str(folder):
+        raise SwitchedOffError(f"traced programs are kept on this machine only, not in {folder}")
     if jax.device_count() > 1:
-        return f"there are {jax.device_count()} devices, and programs are kept for one"
-    return ""
-
-
-def traced() -> Path | None:
-    """The user's own folder for traced programs, made if missing; None if none are to be kept."""
-    if why_unused():
-        return None
-    folder = Path(str(setting(FOLDER)), TRACED)
-    try:
-        _make_own(folder)
-    except OSError as error:
-        warn_once(f"traced programs are not kept: {error}")
-        return None
-    return folder
+        raise SwitchedOffError(f"there are {jax.device_count()} devices; one's programs are kept")
+    path = Path(str(folder), TRACED)
+    _make_own(path)
+    return path
 
 
 def check_own(path: Path, status: os.stat_result) -> None:

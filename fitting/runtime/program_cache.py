@@ -87,11 +87,13 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
 
 def _place(function: Callable, arguments: Arguments) -> _Place | None:
     """Where the program for arguments of these types is kept; None if it must not be."""
-    if (folder := cache_folder.traced()) is None:
-        return None
     try:
+        folder = cache_folder.traced()
         key = program_key(function, arguments)
-    except NotPlainError:
+    except (cache_folder.SwitchedOffError, NotPlainError):
+        return None
+    except OSError as error:
+        warn_once(f"traced programs are not kept: {error}")
         return None
     return _Place(folder / f"{function.__name__}-{key}", key)
 

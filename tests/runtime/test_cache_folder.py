@@ -8,7 +8,14 @@ import jax
 import pytest
 
 from fitting.runtime import cache_folder
-from fitting.runtime.cache_folder import ENABLED, FOLDER, MIN_SECONDS, TRACED, setting
+from fitting.runtime.cache_folder import (
+    ENABLED,
+    FOLDER,
+    MIN_SECONDS,
+    TRACED,
+    SwitchedOffError,
+    setting,
+)
 
 DIGEST = "0123456789abcdef" * 4
 
@@ -136,14 +143,16 @@ def test_the_reason_for_keeping_nothing_names_the_setting(
     monkeypatch.chdir(tmp_path)
     jax.config.update(FOLDER, str(tmp_path / "cache"))
     jax.config.update(name, value)
-    assert reason in cache_folder.why_unused()
-    assert cache_folder.traced() is None and not list(tmp_path.iterdir())
+    with pytest.raises(SwitchedOffError, match=reason):
+        cache_folder.traced()
+    assert not list(tmp_path.iterdir())
 
 
 def test_with_several_devices_nothing_is_kept(tmp_path, monkeypatch):
     jax.config.update(FOLDER, str(tmp_path))
     monkeypatch.setattr(jax, "device_count", lambda: 2)
-    assert cache_folder.why_unused() == "there are 2 devices, and programs are kept for one"
+    with pytest.raises(SwitchedOffError, match="there are 2 devices"):
+        cache_folder.traced()
 
 
 # What
