@@ -24,7 +24,6 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -35,6 +34,7 @@ from fitting.datasets.synthetic import multi_limb, terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip, Stop
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import systems
+from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain
 
@@ -213,6 +213,7 @@ def _toml(value: float | bool) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
+@in_float64
 def make(folder: Path) -> None:
     """Writes all files to `folder`."""
     terrains, clips = folder / "terrains", folder / "clips"
@@ -234,5 +235,4 @@ def make(folder: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Generates the terrain and clips of this folder.")
     parser.add_argument("-o", "--output", type=Path, default=HERE, help="folder to write to")
-    jax.config.update("jax_enable_x64", True)
     make(parser.parse_args().output)

@@ -4,6 +4,9 @@ Each job checks everything the user gave before it computes anything, writes its
 they exist, and draws its report last. Without an `output` nothing is written. `progress` is called
 with reports of a running search or sampling; `log` with lines and tables as the command line prints
 them, so `log=print` shows the same.
+
+Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
+bits; a system that was made in 32 bits is taken with the values it has there.
 """
 
 import time
@@ -39,6 +42,7 @@ from fitting.report import (
 )
 from fitting.report.formatting import aligned
 from fitting.runtime import files
+from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import ablation, comparison, run_folder, translation
 from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.comparison import Comparison
@@ -53,6 +57,7 @@ def _silent(text: str) -> None:
     """Drops a line of the log."""
 
 
+@in_float64
 def fit(
     experiment: Experiment | str | Path,
     output: str | Path | None = None,
@@ -91,6 +96,7 @@ def fit(
     return fitted
 
 
+@in_float64
 def sample(
     fitted: Fit | str | Path,
     *,
@@ -132,6 +138,7 @@ def sample(
     return posterior
 
 
+@in_float64
 def ablate(
     experiment: Experiment | str | Path,
     output: str | Path | None = None,
@@ -170,6 +177,7 @@ def ablate(
     return rows
 
 
+@in_float64
 def compare(
     systems: Mapping[str, jaxik.FootIK],
     animation: AnimationFiles,
@@ -192,6 +200,7 @@ def compare(
             not finite, or the folder cannot be made.
     """
     folder = _checked(output)
+    systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
     title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
     compared = comparison.compare(systems, load_animation(animation), title=title, during=during)
     if folder is not None:
@@ -201,6 +210,7 @@ def compare(
     return compared
 
 
+@in_float64
 def translate(
     request: TranslationRequest,
     output: str | Path | None = None,
@@ -246,6 +256,7 @@ def translate(
     return fitted
 
 
+@in_float64
 def apply(
     run: str | Path,
     animation: AnimationFiles,
@@ -263,6 +274,7 @@ def apply(
     return solve(ik, animation, output, log=log)
 
 
+@in_float64
 def solve(
     ik: jaxik.FootIK,
     animation: AnimationFiles,
@@ -287,7 +299,7 @@ def solve(
         if path.suffix.lower() != ".npz":
             raise ValueError(f"{path}: wanted a name that ends in .npz")
         files.check_output_file(path)
-    loaded = load_animation(animation)
+    ik, loaded = with_floats(ik, np.float64), load_animation(animation)
     loaded.check_shapes(ik)
     began = time.perf_counter()
     result, solved = loaded.solve(ik)

@@ -14,6 +14,7 @@ import jaxik
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene, legs_ws, pelvis_ws
 from fitting.runtime import program_cache
+from fitting.runtime.precision import in_float64, with_floats
 from jaxik.maths import vec
 from jaxik.pipeline import Trace
 from jaxik.world import frame
@@ -118,8 +119,10 @@ class Playback(eqx.Module):
         return self.travelled[per_frame] + np.sum(offset * self.forward_ws[per_frame], axis=-1)
 
 
+@in_float64
 def run(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
-    """The result of a system on the scene's clip."""
+    """The result of a system on the scene's clip, in the scene's precision."""
+    ik = with_floats(ik, scene.frames.dt.dtype)
     return program_cache.run(ik, scene.rig, scene.terrain, scene.frames)
 
 
@@ -130,6 +133,7 @@ def stage_outputs(result: jaxik.Result) -> Trace:
     return result.trace
 
 
+@in_float64
 def play(scene: Scene, result: jaxik.Result) -> Playback:
     """The scene's clip with this result, as NumPy arrays."""
     return jax.tree.map(np.asarray, _play(scene, result))

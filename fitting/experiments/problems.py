@@ -21,6 +21,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Reference, Scene, Sigmas
 from fitting.problem.space import make_space
+from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
@@ -37,6 +38,7 @@ class ClipData(NamedTuple):
     terrain: Terrain
 
 
+@in_float64
 def make_problem(experiment: Experiment) -> Problem[jaxik.FootIK]:
     """Loads the clips of an experiment and builds its problem.
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
 
 from .optimisation.solution import Solution
 from .threshold_profile import Profile, profile
@@ -57,6 +58,7 @@ class Identifiability:
         return tuple(name for name, contraction in pairs if contraction < UNDETERMINED)
 
 
+@in_float64
 def assess_identifiability(problem: Problem, solution: Solution) -> Identifiability:
     """What the data of a problem determine around its solution.
 

@@ -12,6 +12,7 @@ from fitting.problem.free_parameters import PRIOR_SD, free_parameter
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
 from fitting.problem.space import Space, make_space
+from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
@@ -36,6 +37,7 @@ def all_parameters(ik: jaxik.FootIK) -> dict[str, dict[str, float]]:
     return table
 
 
+@in_float64
 def measure_sensitivity(
     ik: jaxik.FootIK, free: FreeTable, scenes: tuple[Scene, ...], seed: int = 0
 ) -> dict[str, float]:

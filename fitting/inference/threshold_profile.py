@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
 
 from .optimisation import population
 from .optimisation.solution import Solution
@@ -33,6 +34,7 @@ class Profile:
     """Rise if it alone moves down or up by a tenth of its range."""
 
 
+@in_float64
 def profile(problem: Problem, solution: Solution, name: str) -> Profile:
     """Cost over the range of one threshold, the other thresholds keeping their values.
 

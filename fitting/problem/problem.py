@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from fitting.runtime.precision import in_float64
 from jaxik import lanes
 
 from .loss import Loss, apply_loss
-from .space import Space, System
+from .space import Space, System, Vector
 
 
 class Problem(eqx.Module, Generic[System]):
@@ -33,8 +34,9 @@ class Problem(eqx.Module, Generic[System]):
     loss: Loss = eqx.field(static=True, default="squares")
     independent_fraction: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
 
+    @in_float64
     @eqx.filter_jit  # traced once for all programs around it
-    def residuals(self, u: Float[Array, " free"]) -> Float[Array, " residuals"]:
+    def residuals(self, u: Vector) -> Float[Array, " residuals"]:
         """Residuals after the loss, then those of the prior; half their squares' sum is the cost.
 
         The last `space.size` of them belong to the prior.
@@ -43,11 +45,13 @@ class Problem(eqx.Module, Generic[System]):
         residuals *= jnp.sqrt(self.independent_fraction.astype(residuals.dtype))
         return jnp.concatenate([residuals, self.space.prior_residuals(u)])
 
-    def cost(self, u: Float[Array, " free"]) -> Float[Array, ""]:
+    @in_float64
+    def cost(self, u: Vector) -> Float[Array, ""]:
         """Minus the log-probability, up to a constant; not finite where a residual is not."""
         return 0.5 * jnp.sum(self.residuals(u) ** 2)
 
-    def jacobian(self, u: Float[Array, " free"]) -> Float[Array, "residuals free"]:
+    @in_float64
+    def jacobian(self, u: Vector) -> Float[Array, "residuals free"]:
         """Derivatives of the residuals, by forward mode.
 
         The column of a threshold holds only its prior: the residuals jump with it, and between two
@@ -56,8 +60,9 @@ class Problem(eqx.Module, Generic[System]):
         """
         return self.residuals_and_jacobian(u)[1]
 
+    @in_float64
     def residuals_and_jacobian(
-        self, u: Float[Array, " free"], max_cost: Float[Array, ""] | float = jnp.inf
+        self, u: Vector, max_cost: Float[Array, ""] | float = jnp.inf
     ) -> tuple[Float[Array, " residuals"], Float[Array, "residuals free"]]:
         """Both from one linearisation; the Jacobian is all 0 where the cost exceeds `max_cost`."""
         residuals, tangent = jax.linearize(lambda u: self.residuals(u), u)
@@ -69,7 +74,8 @@ class Problem(eqx.Module, Generic[System]):
             lambda: jnp.zeros((residuals.size, u.size), residuals.dtype),
         )
 
-    def log_probability(self, u: Float[Array, " free"]) -> Float[Array, ""]:
+    @in_float64
+    def log_probability(self, u: Vector) -> Float[Array, ""]:
         """Unnormalised log-density of the posterior in `u`; -inf where a residual is not finite."""
         cost = self.cost(u)
         return jnp.where(jnp.isfinite(cost), -cost, -jnp.inf)

@@ -16,7 +16,7 @@ default width and centre it is nearly flat over the range (within a factor of tw
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
@@ -33,6 +34,7 @@ CENTRE_LIMIT = 3.0  # of u: a prior centred at a bound would hide the rest of th
 EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
 
 System = TypeVar("System", bound=eqx.Module)
+Vector: TypeAlias = Float[Array | np.ndarray, " free"]
 
 
 class Space(eqx.Module, Generic[System]):
@@ -71,15 +73,18 @@ class Space(eqx.Module, Generic[System]):
         """Which parameters only move hard decisions, so that their derivative is zero."""
         return tuple(parameter.kind == "threshold" for parameter in self.parameters)
 
-    def unpack(self, u: Float[Array, " free"]) -> System:
+    @in_float64
+    def unpack(self, u: Vector) -> System:
         """The system with the parameters that `u` stands for."""
-        return parameter_tree.replace(self.system, self._leaves_and_values(u)[0])
+        return parameter_tree.replace(self.system, self._leaves_and_values(jnp.asarray(u))[0])
 
+    @in_float64
     @eqx.filter_jit
-    def values(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
+    def values(self, u: Vector) -> Float[Array, " free"]:
         """The free parameters in their own units."""
-        return self._leaves_and_values(u)[1]
+        return self._leaves_and_values(jnp.asarray(u))[1]
 
+    @in_float64
     def pack(self, source: System | Mapping[str, ArrayLike]) -> Float[Array, " free"]:
         """`u` of a system, or of values by name; names left out keep this system's values.
 
@@ -112,9 +117,10 @@ class Space(eqx.Module, Generic[System]):
             leaves[parameter.leaf] = _with_value(leaf, parameter.leg, value)
         return jnp.stack(u)
 
-    def prior_residuals(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
+    @in_float64
+    def prior_residuals(self, u: Vector) -> Float[Array, " free"]:
         """Distance from the prior's centre in prior standard deviations."""
-        return (u - self.u0) / self.prior_sd
+        return (jnp.asarray(u) - self.u0) / self.prior_sd
 
     def _leaves(self, system: eqx.Module) -> dict[str, Array]:
         """The leaves that are free, and those that a free one stays above."""

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from fitting.analysis import limit_activity, playback, worst_window
 from fitting.analysis.playback import Playback
 from fitting.runtime import files
+from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
@@ -33,6 +34,7 @@ def fit_text(fitted: Fit) -> str:
     return "\n".join(parts)
 
 
+@in_float64
 def write_fit(
     run: Path, fitted: Fit, opening: Sequence[str] = (), details: Sequence[str] = ()
 ) -> None:

@@ -12,6 +12,7 @@ from fitting.analysis.difference import Difference
 from fitting.experiments import parameter_files, systems
 from fitting.inference import sensitivity
 from fitting.runtime import files
+from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit
 from fitting.studies.translation import Translation
 from jaxik.maths import parameter_tree
@@ -23,6 +24,7 @@ from .plots import difference_plots, style
 NUMBERS = "translation.json"
 
 
+@in_float64
 def differences(fitted: Fit) -> list[Difference]:
     """What remains of the source's correction, for each clip."""
     return [
@@ -42,6 +44,7 @@ def translation_text(translation: Translation, clips: Sequence[Difference]) -> s
     return "\n".join([*parts, "", *difference_report.shortcomings(clips, source, target)])
 
 
+@in_float64
 def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Difference]) -> None:
     """Writes parameters, numbers, plots and summary of a translation into the folder of its run."""
     source, target = translation.source, translation.target

@@ -9,6 +9,8 @@ from typing import TypeVar
 
 import jax
 
+from .precision import for_other_thread
+
 Output = TypeVar("Output")
 
 
@@ -42,7 +44,7 @@ def on_all_cores(calls: Sequence[Callable[[], Output]]) -> list[Output]:
             pending.clear()
 
     helpers = usable_cores() - 1
-    futures = [_thread_pool(helpers).submit(work) for _ in range(helpers)]
+    futures = [_thread_pool(helpers).submit(for_other_thread(work)) for _ in range(helpers)]
     work()
     for future in futures:
         future.result()

@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxik
@@ -208,7 +207,7 @@ def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] 
         solution = search(problem, variant, progress)
         if solution.interrupted:
             raise KeyboardInterrupt
-        ik = problem.space.unpack(jnp.asarray(solution.u))
+        ik = problem.space.unpack(solution.u)
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
         converged, message, seconds = solution.converged, solution.message, solution.seconds
     accuracy = summarise([_errors(ik, clip, frames) for clip, frames in data.measured])

@@ -17,6 +17,7 @@ from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
 from fitting.experiments.parameter_files import load_system
 from fitting.experiments.systems import leaf_names, preset_system
+from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree, vec
 from jaxik.world.terrain import Terrain, cast
@@ -41,6 +42,7 @@ class Comparison:
     measures: Mapping[str, Measures]
 
 
+@in_float64
 def named_systems(
     options: Iterable[tuple[str, str]], *, on_ground: bool = True
 ) -> dict[str, jaxik.FootIK]:

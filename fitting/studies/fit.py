@@ -17,6 +17,7 @@ from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.search import Starts, find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
@@ -87,7 +88,7 @@ class Fit:
     @cached_property
     def ik(self) -> jaxik.FootIK:
         """The fitted system."""
-        return self.problem.space.unpack(jnp.asarray(self.solution.u))
+        return self.problem.space.unpack(self.solution.u)
 
     @cached_property
     def results(self) -> tuple[jaxik.Result, ...]:
@@ -101,6 +102,7 @@ class Fit:
         return np.clip(sd, MIN_START_SD, MAX_START_SD)
 
     @cached_property
+    @in_float64
     def summary(self) -> FitSummary:
         """The numbers of the fit as JSON holds them."""
         solution = self.solution

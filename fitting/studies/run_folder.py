@@ -11,8 +11,6 @@ import json
 import os
 from pathlib import Path
 
-import jax.numpy as jnp
-
 import jaxik
 from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
@@ -62,7 +60,7 @@ def save_solution(
     """
     run.mkdir(parents=True, exist_ok=True)
     (run / FIT).unlink(missing_ok=True)
-    ik = problem.space.unpack(jnp.asarray(solution.u))
+    ik = problem.space.unpack(solution.u)
     write_text(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
     write_text(run / PARAMETERS, parameter_files.system_to_toml(ik, experiment.preset))
 

@@ -32,6 +32,7 @@ from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.runtime import files, validation
+from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 
@@ -96,6 +97,7 @@ class Translation:
         return f"`{self.source.name}`{' (source)' if same else ''}", f"`{self.target.name}`"
 
 
+@in_float64
 def load_named_system(text: str, option: str = "system") -> NamedSystem:
     """The system with the name of a preset, or in a parameter file (.toml).
 
@@ -149,7 +151,11 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
     """
     if not request.animations:
         raise ValueError("no clip; wanted at least one, with a terrain for each")
-    source, target, run = request.source, request.target, run.resolve()
+    source, target = (
+        replace(named, ik=with_floats(named.ik, np.float64))
+        for named in (request.source, request.target)
+    )
+    run = run.resolve()
     data = [_source_motion(source, files, request.fps) for files in request.animations]
     preset = systems.preset_system(target.preset)
     rules = systems.changed_rules(target.ik, preset)

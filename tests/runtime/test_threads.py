@@ -2,7 +2,9 @@
 
 import threading
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from fitting.runtime import threads
@@ -24,6 +26,21 @@ def test_two_calls_run_at_the_same_time(monkeypatch):
     use_cores(monkeypatch, 2)
     meeting = threading.Barrier(2, timeout=30)  # breaks unless two threads wait at it together
     threads.on_all_cores([lambda: jnp.asarray(meeting.wait())] * 2)
+
+
+@pytest.mark.parametrize("enabled", [False, True])
+def test_calls_in_all_threads_have_the_callers_types(monkeypatch, enabled):
+    use_cores(monkeypatch, 2)
+    meeting = threading.Barrier(2, timeout=30)
+
+    def new_floats() -> jax.Array:
+        meeting.wait()
+        return jnp.ones(())
+
+    with jax.enable_x64(enabled):
+        outputs = threads.on_all_cores([new_floats] * 2)
+    expected = np.float64 if enabled else np.float32
+    assert [output.dtype for output in outputs] == [expected] * 2
 
 
 @pytest.mark.parametrize("cores", [1, 2])

@@ -18,15 +18,14 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from fitting.problem.problem import Problem
+from fitting.runtime.precision import for_other_thread, in_float64
 
 from . import levenberg_marquardt
 from .descent import descend, polish
-from .levenberg_marquardt import LMState
 from .models import HardModel, problem_jacobian
 from .population import evaluate
 from .settings import DEFAULTS, SearchSettings
@@ -38,6 +37,7 @@ from .thresholds import search_thresholds
 Starts = int | Float[np.ndarray, "starts free"]
 
 
+@in_float64
 def find_best_fit(
     problem: Problem,
     settings: SearchSettings = DEFAULTS,
@@ -136,14 +136,9 @@ def starting_points(
     else:
         count, candidates = len(starts), starts
     first = search.array(candidates[0])
-    x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-
-    def evaluate_first() -> LMState:
-        with jax.enable_x64(x64):  # a thread does not inherit what is set around its caller
-            return levenberg_marquardt.evaluate(HardModel(search.problem, first), first)
-
+    evaluate_first = for_other_thread(levenberg_marquardt.evaluate)
     with ThreadPoolExecutor(1) as thread:  # the two programs compile side by side
-        evaluated = thread.submit(evaluate_first)
+        evaluated = thread.submit(evaluate_first, HardModel(search.problem, first), first)
         present = np.asarray(space.pack({}))[None]
         before, *costs = evaluate(search.problem, np.concatenate([present, candidates])).cost
     state = dataclasses.replace(state, random=random, evaluated=evaluated.result())

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
 
 from . import diagnostics
 from .chain import Chain, Identity
@@ -92,6 +93,7 @@ class Posterior:
         )
 
 
+@in_float64
 def sample_posterior(
     problem: Problem,
     start: WalkerStart,
