@@ -6,9 +6,11 @@ import warnings
 from collections.abc import Sequence
 
 from fitting.runtime import xla
+from fitting.runtime.validation import in_one_line
 
 from .parser import make_parser
 
+JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
 MISTAKE, INTERRUPTED = 2, 130  # exit statuses
 RENAMED = {"contribution": "ablate"}  # old commands, which still work in this release
 
@@ -30,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, OSError) as error:
-        print(f"jaxik {options.command}: {_sentence(error)}", file=sys.stderr)
+        print(f"jaxik {options.command}: {in_one_line(error)}", file=sys.stderr)
         return MISTAKE
     except KeyboardInterrupt:
         print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
@@ -50,15 +52,10 @@ def _with_new_command(words: list[str]) -> list[str]:
     return words
 
 
-def _sentence(error: Exception) -> str:
-    """An error in one line."""
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split("\n"))
-
-
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     print(f"jaxik: {message}", file=sys.stderr)
+    if JAX_CACHE in str(message):  # JAX would repeat it for each program
+        warnings.filterwarnings("ignore", message=f".*{JAX_CACHE}")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import jax
 
+from .validation import in_one_line
+
 FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"  # settings of JAX
 MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"
 TRACED = "traced"  # inside JAX's folder
@@ -45,7 +47,7 @@ def use_default() -> None:
         folder = default()
         _make_own(folder)
     except (OSError, RuntimeError) as error:
-        warn_once(f"programs are not kept between calls: {error}")
+        warn_once(f"programs are not kept between calls: {in_one_line(error)}")
         return
     jax.config.update(FOLDER, str(folder))
     if MIN_SECONDS.upper() not in os.environ:

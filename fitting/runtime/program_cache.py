@@ -26,6 +26,7 @@ from .cache_folder import warn_once
 from .plain_tree import NotPlainError
 from .program_file import Program, Slot
 from .program_key import Arguments, array_type, program_key, versions
+from .validation import in_one_line
 
 # JAX refuses to export these calls because their names may change with jaxlib, whose version is
 # part of the key here. They belong to the least-squares solves of a fit.
@@ -93,7 +94,7 @@ def _place(function: Callable, arguments: Arguments) -> _Place | None:
     except (cache_folder.SwitchedOffError, NotPlainError):
         return None
     except OSError as error:
-        warn_once(f"traced programs are not kept: {error}")
+        warn_once(f"traced programs are not kept: {in_one_line(error)}")
         return None
     return _Place(folder / f"{function.__name__}-{key}", key)
 
@@ -102,7 +103,7 @@ def _read(place: _Place) -> Program | None:
     try:
         return program_file.read(place.path, place.key, versions())
     except (OSError, ValueError) as error:
-        warn_once(f"a kept program is traced anew: {error}")
+        warn_once(f"a kept program is traced anew: {in_one_line(error)}")
         return None
 
 
@@ -110,7 +111,7 @@ def _write(place: _Place, program: Program) -> None:
     try:
         program_file.write(place.path, program, place.key, versions())
     except (OSError, ValueError, NotPlainError) as error:
-        warn_once(f"traced programs are not kept: {error}")
+        warn_once(f"traced programs are not kept: {in_one_line(error)}")
 
 
 def _trace(function: Callable, arguments: Arguments) -> Program:

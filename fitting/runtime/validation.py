@@ -92,6 +92,13 @@ def error_context(where: Path | str) -> Iterator[None]:
         raise ValueError(f"{where}: {error}") from None
 
 
+def in_one_line(error: Exception) -> str:
+    """An error in one line, for a message."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split("\n"))
+
+
 def check_keys(table: Table, known: Sequence[str], where: str) -> None:
     """Checks that all keys are known ones.
 

@@ -114,7 +114,7 @@ def test_a_default_folder_that_everybody_may_write_to_is_not_used(tmp_path, monk
 def test_a_default_folder_that_cannot_be_made_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "jaxik").write_text("a file in its place")
-    with pytest.warns(RuntimeWarning, match="not kept between calls: .*File exists"):
+    with pytest.warns(RuntimeWarning, match="not kept between calls: .*: File exists"):
         cache_folder.use_default()
     assert setting(FOLDER) is None
 
