@@ -3,7 +3,6 @@
 It is JAX's folder for compiled programs. The traced ones lie in a folder inside it.
 """
 
-import functools
 import os
 import re
 import sys
@@ -22,6 +21,7 @@ TRACED = "traced"  # inside JAX's folder
 # Names of complete and of half-written files: of ours, and of JAX's.
 TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*")
 COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)")
+WARNED: set[str] = set()  # problems that this process has warned of
 
 
 class SwitchedOffError(Exception):
@@ -47,7 +47,7 @@ def use_default() -> None:
         folder = default()
         _make_own(folder)
     except (OSError, RuntimeError) as error:
-        warn_once(f"programs are not kept between calls: {in_one_line(error)}")
+        warn_once("programs are not kept between calls", in_one_line(error))
         return
     jax.config.update(FOLDER, str(folder))
     if MIN_SECONDS.upper() not in os.environ:
@@ -108,10 +108,11 @@ def setting(name: str) -> object:
     return getattr(jax.config, name)
 
 
-@functools.cache
-def warn_once(problem: str) -> None:
-    """Warns of a problem the first time that it arises in this process."""
-    warnings.warn(problem, RuntimeWarning, stacklevel=2)
+def warn_once(problem: str, reason: str) -> None:
+    """Warns of a problem the first time that it arises in this process, for whatever reason."""
+    if problem not in WARNED:
+        WARNED.add(problem)
+        warnings.warn(f"{problem}: {reason}", RuntimeWarning, stacklevel=2)
 
 
 def _make_own(folder: Path) -> None:

@@ -70,7 +70,7 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
                 _write(place, program)
         if program is None:
             output = function(*args, **named)  # raises the error if the call itself is wrong
-            warn_once(f"the program of {function.__name__} is not kept: {failure}")
+            warn_once(f"the program of {function.__name__} is not kept", failure)
             return output
         return program.call(jax.tree.leaves(eqx.filter(arguments, eqx.is_array)))
 
@@ -94,7 +94,7 @@ def _place(function: Callable, arguments: Arguments) -> _Place | None:
     except (cache_folder.SwitchedOffError, NotPlainError):
         return None
     except OSError as error:
-        warn_once(f"traced programs are not kept: {in_one_line(error)}")
+        warn_once("traced programs are not kept", in_one_line(error))
         return None
     return _Place(folder / f"{function.__name__}-{key}", key)
 
@@ -103,7 +103,7 @@ def _read(place: _Place) -> Program | None:
     try:
         return program_file.read(place.path, place.key, versions())
     except (OSError, ValueError) as error:
-        warn_once(f"a kept program is traced anew: {in_one_line(error)}")
+        warn_once("a kept program is traced anew", in_one_line(error))
         return None
 
 
@@ -111,7 +111,7 @@ def _write(place: _Place, program: Program) -> None:
     try:
         program_file.write(place.path, program, place.key, versions())
     except (OSError, ValueError, NotPlainError) as error:
-        warn_once(f"traced programs are not kept: {in_one_line(error)}")
+        warn_once("traced programs are not kept", in_one_line(error))
 
 
 def _trace(function: Callable, arguments: Arguments) -> Program:

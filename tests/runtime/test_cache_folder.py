@@ -25,7 +25,7 @@ def untouched(monkeypatch):
     """JAX as it is without settings of its own, which come back after the test."""
     before = {name: setting(name) for name in (FOLDER, ENABLED, MIN_SECONDS)}
     jax.config.update(FOLDER, None)
-    cache_folder.warn_once.cache_clear()
+    cache_folder.WARNED.clear()
     for variable in ("XDG_CACHE_HOME", FOLDER.upper(), MIN_SECONDS.upper()):
         monkeypatch.delenv(variable, raising=False)
     yield
@@ -188,7 +188,15 @@ def test_programs_of_others_do_not_count(tmp_path, monkeypatch):
 
 
 def test_a_problem_is_said_once():
+    problems = [
+        ("nothing is kept", "no space"),
+        ("nothing is kept", "no folder"),
+        ("read anew", ""),
+    ]
     with pytest.warns(RuntimeWarning) as said:
-        for problem in ("the disk is full", "the disk is full", "the file is damaged"):
-            cache_folder.warn_once(problem)
-    assert [str(warning.message) for warning in said] == ["the disk is full", "the file is damaged"]
+        for problem, reason in problems:
+            cache_folder.warn_once(problem, reason)
+    assert [str(warning.message) for warning in said] == [
+        "nothing is kept: no space",
+        "read anew: ",
+    ]

@@ -52,7 +52,7 @@ def folder(tmp_path, monkeypatch):
     jax.config.update(cache_folder.FOLDER, str(tmp_path))
     for function in (stretch, by_function, stretch_known, as_set):
         monkeypatch.setattr(function, "__module__", "fitting.somewhere")
-    cache_folder.warn_once.cache_clear()
+    cache_folder.WARNED.clear()
     TRACED.clear()
     yield tmp_path / cache_folder.TRACED
     jax.config.update(cache_folder.FOLDER, before)
@@ -232,11 +232,11 @@ def test_a_file_in_the_place_of_the_folder_stays(folder):
 
 
 def test_a_full_disk_is_said_once(folder, monkeypatch):
-    def fail(*_):
+    def fail(**_):
         raise OSError(28, "No space left on device")
 
     expected = eqx.filter_jit(stretch)(2.0, points())
-    monkeypatch.setattr(files, "write", fail)
+    monkeypatch.setattr(files.tempfile, "mkstemp", fail)
     with pytest.warns(RuntimeWarning, match="not kept: .*No space left on device") as said:
         assert_same(fresh()(2.0, points()), expected)
         fresh()(2.0, points(5))
