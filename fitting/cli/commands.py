@@ -1,11 +1,8 @@
 """One function per command: reads the options, calls the job, prints."""
 
 import argparse
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-
-import jax
 
 from fitting import jobs
 from fitting.bench import report as bench_report
@@ -16,8 +13,9 @@ from fitting.datasets.terrain.reconstruction import reconstruct
 from fitting.experiments import parameter_files, record_files, systems
 from fitting.report import terrain_report
 from fitting.report.formatting import aligned
-from fitting.runtime import files
-from fitting.runtime.validation import error_context
+from fitting.runtime import cache_folder, files
+from fitting.runtime.precision import in_float64
+from fitting.runtime.validation import error_context, in_one_line
 from fitting.studies import comparison, translation
 from fitting.studies.animations import AnimationFiles
 from fitting.studies.translation import TranslationRequest
@@ -59,6 +57,7 @@ def apply(options: argparse.Namespace) -> int:
     return 0
 
 
+@in_float64
 def run(options: argparse.Namespace) -> int:
     """Runs a preset or a parameter file on a clip."""
     _prepare_jax()
@@ -70,6 +69,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+@in_float64
 def compare(options: argparse.Namespace) -> int:
     """Runs several systems on a clip and measures them."""
     _prepare_jax()
@@ -79,6 +79,7 @@ def compare(options: argparse.Namespace) -> int:
     return 0
 
 
+@in_float64
 def translate(options: argparse.Namespace) -> int:
     """Fits one system to the motion of another."""
     _prepare_jax()
@@ -108,9 +109,9 @@ def inspect(options: argparse.Namespace) -> int:
     return 0
 
 
+@in_float64
 def terrain(options: argparse.Namespace) -> int:
     """Reconstructs the ground of a clip; writes a mesh, its numbers and a plot."""
-    jax.config.update("jax_enable_x64", True)
     for name in ("sole", "margin"):
         if getattr(options, name) < 0:
             raise ValueError(f"--{name} is {getattr(options, name):g}; wanted 0 or more metres")
@@ -139,9 +140,9 @@ def bench(options: argparse.Namespace) -> int:
     return _status(interrupted=report.interrupted)
 
 
+@in_float64
 def convert_record(options: argparse.Namespace) -> int:
     """Shows the game's record, or converts it from or to our parameters."""
-    jax.config.update("jax_enable_x64", True)
     reading = record.Reading(options.length_unit, options.knee, options.lean_sign, options.tick_hz)
     base_path = getattr(options, "base", None)  # an option of to-bytes only
     base = None if base_path is None else record_files.read_binary(base_path)
@@ -166,6 +167,28 @@ def convert_record(options: argparse.Namespace) -> int:
     return 0
 
 
+def cache(options: argparse.Namespace) -> int:
+    """Shows where programs are kept between calls, or removes them."""
+    cache_folder.use_default()
+    folder = Path(str(cache_folder.setting(cache_folder.FOLDER) or cache_folder.default()))
+    traced, compiled = cache_folder.kept_programs(folder)
+    if options.clear:
+        size = _megabytes([*traced, *compiled])
+        for path in (*traced, *compiled):
+            path.unlink(missing_ok=True)
+        print(f"removed {len(traced)} traced and {len(compiled)} compiled, {size}, from {folder}")
+        return 0
+    print(f"place              {folder}")
+    print(f"traced programs    {len(traced)} ({_megabytes(traced)})")
+    print(f"compiled programs  {len(compiled)} ({_megabytes(compiled)})")
+    try:
+        cache_folder.traced()
+        print("used               yes")
+    except (cache_folder.SwitchedOffError, OSError) as error:
+        print(f"used               no: {in_one_line(error)}")
+    return 0
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "fit": fit,
     "ablate": ablate,
@@ -178,21 +201,21 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "terrain": terrain,
     "bench": bench,
     "record": convert_record,
+    "cache": cache,
 }
 
 
 def _prepare_jax() -> None:
-    """Switches to float64, and keeps compiled programs between calls."""
-    jax.config.update("jax_enable_x64", True)
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        cache = Path.home() / ".cache" / "jaxik"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    warnings.filterwarnings("ignore", message=".*persistent compilation cache.*")
+    """Keeps programs between calls."""
+    cache_folder.use_default()
 
 
 def _animation(options: argparse.Namespace) -> AnimationFiles:
     return AnimationFiles(options.clip, options.terrain, options.file_up, options.floor)
+
+
+def _megabytes(paths: Sequence[Path]) -> str:
+    return f"{sum(path.stat().st_size for path in paths) / 1e6:.1f} MB"
 
 
 def _status(*, interrupted: bool) -> int:

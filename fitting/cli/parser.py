@@ -18,6 +18,7 @@ EXAMPLES = """examples:
   jaxik terrain walk.bvh -o ground.ply
   jaxik record to-toml footik.bin -o footik.toml
   jaxik bench --quick
+  jaxik cache                                                  where compiled programs are kept
 
 exit status: 0 when done, 2 for a mistake in the input (one line says which), 130 when
 interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` its chain, and
@@ -39,7 +40,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
         _add_fit, _add_ablate, _add_sample, _add_apply, _add_run, _add_compare, _add_translate,
-        _add_inspect, _add_terrain, _add_bench, _add_record,
+        _add_inspect, _add_terrain, _add_bench, _add_record, _add_cache,
     ):  # fmt: skip
         add(commands)
     return top
@@ -240,6 +241,17 @@ def _add_bench(commands: Commands) -> None:
     bench.add_argument("--only", metavar="NAME,...", help="these rows (default: all of them)")
     bench.add_argument("--json", type=Path, metavar="FILE", help="all numbers, of every run")
     bench.add_argument("--plot", type=Path, metavar="FILE.png", help="curves of time against size")
+
+
+def _add_cache(commands: Commands) -> None:
+    cache = _add(
+        commands, "cache", "show where compiled programs are kept between calls, or remove them",
+        """
+        jaxik cache
+        jaxik cache --clear     other files in that folder stay
+        """,
+    )  # fmt: skip
+    cache.add_argument("--clear", action="store_true", help="remove the programs")
 
 
 def _add_record(commands: Commands) -> None:

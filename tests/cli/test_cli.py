@@ -30,7 +30,7 @@ from support.sample_clips import BVH
 DATA = ROOT / "data"
 COMMANDS = [
     "fit", "ablate", "sample", "apply", "run", "compare", "translate", "inspect", "terrain",
-    "bench", "record", "record show", "record to-toml", "record to-bytes",
+    "bench", "cache", "record", "record show", "record to-toml", "record to-bytes",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
