@@ -20,6 +20,7 @@ from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.space import make_space
+from fitting.runtime.precision import with_floats
 from jaxik.maths import parameter_tree, quat
 from jaxik.world import terrain
 from jaxik.world.frame import Sensed
@@ -57,14 +58,7 @@ DRAWN = {
 
 def single(tree: Tree) -> Tree:
     """The tree with its floats in 32 bits."""
-    return jax.tree.map(
-        lambda leaf: (
-            jnp.asarray(leaf, jnp.float32)
-            if eqx.is_array_like(leaf) and jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
-            else leaf
-        ),
-        tree,
-    )
+    return with_floats(tree, jnp.float32)
 
 
 def walk(frame_count: int, *, uneven_pace: bool = False) -> Clip:
