@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 
 import jax
 
+from fitting.runtime import cache_folder
+
 from . import host
 from .measurement import Measurement
 from .sizes import Sizes
@@ -55,9 +57,9 @@ def run_benchmarks(
         progress: called with what is being done within a benchmark.
     """
     report, ceilings = Report(quick), {}
-    cached = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    cached = cache_folder.setting(cache_folder.ENABLED)
     # With a cache, the second run of a benchmark would not compile.
-    jax.config.update("jax_enable_compilation_cache", False)
+    jax.config.update(cache_folder.ENABLED, False)
     try:
         for number, (name, benchmark) in enumerate(benchmarks.items()):
             announce(f"[{number + 1}/{len(benchmarks)}] {name}: {benchmark.title}")
@@ -73,7 +75,7 @@ def run_benchmarks(
             if report.interrupted:
                 break
     finally:
-        jax.config.update("jax_enable_compilation_cache", cached)
+        jax.config.update(cache_folder.ENABLED, cached)
     return report
 
 
