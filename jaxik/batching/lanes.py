@@ -76,7 +76,7 @@ def lanes(
 def _in_blocks(traced: ClosedJaxpr, values: list[Value], size: int, block: int) -> list[Value]:
     """The results of a trace, block by block. The last block overlaps the one before."""
     call, results_batched = BatchEvaluator(block).as_function(
-        traced.jaxpr, traced.consts, [value.batched for value in values]
+        traced, [value.batched for value in values]
     )
     arrays = [value.array for value in values]
     if block == size:
@@ -106,14 +106,8 @@ def _in_blocks(traced: ClosedJaxpr, values: list[Value], size: int, block: int) 
 
 def _leaf_axes(axes: PyTree[int], tree: PyTree) -> list[int | None]:
     """The axis of each leaf of a tree, from axes of leaves or of whole subtrees."""
-    subtrees = jax.tree.map(
-        lambda axis, subtree: [axis] * len(jax.tree.leaves(subtree)),
-        axes,
-        tree,
-        is_leaf=lambda axis: axis is None,
-    )
-    lists = jax.tree.leaves(subtrees, is_leaf=lambda part: isinstance(part, list))
-    return [axis for part in lists for axis in part]
+    broadcast = jax.tree.broadcast(axes, tree, is_leaf=lambda axis: axis is None)
+    return jax.tree.structure(tree).flatten_up_to(broadcast)
 
 
 def _batch_size(arrays: Sequence[ArrayLike], axes: list[int | None]) -> int:

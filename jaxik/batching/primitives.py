@@ -1,7 +1,11 @@
-"""Evaluates a function traced for one example on a whole batch (the engine of `lanes`).
+"""Evaluates a trace for a whole batch (the engine of `lanes`); all that reads JAX's traces is here.
 
-Batched values have the batch axis last. Values that all examples share keep their shape. A
-primitive without a rule here goes through JAX's own batching rule.
+Batched values have the batch axis last. Values that all examples share keep their shape.
+
+JAX promises neither the names of the primitives in a trace nor their parameters. So a rule here
+states which parameters it reads, and takes whatever it can from shapes. An equation without a rule,
+or whose parameters are others than its rule reads, goes through `jax.vmap`: the result is the same,
+only slower. `tests/batching/test_primitives.py` says which equations of the pipeline do.
 """
 
 import functools
@@ -14,7 +18,7 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from jax.typing import ArrayLike
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 UNROLLED_SUM = 8  # a sum of at most this many entries is written out
 
@@ -29,7 +33,7 @@ ELEMENTWISE = frozenset(
 # difference to them.
 ALONG_AXES = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum optimization_barrier reduce_and"
-    " reduce_max reduce_min reduce_or reduce_prod rev split stack unstack".split()
+    " reduce_max reduce_min reduce_or reduce_prod rev split squeeze stack unstack".split()
 )
 
 
@@ -52,20 +56,6 @@ class Value(NamedTuple):
 Function: TypeAlias = Callable[..., list]  # of arrays, to a list of arrays
 
 
-def _is_bool(x: ArrayLike) -> bool:
-    return jax.typeof(x).dtype == bool
-
-
-def _example(atom: Var | Literal) -> jax.ShapeDtypeStruct:
-    """Shape and dtype that a value has for one example."""
-    aval = cast(ShapedArray, atom.aval)
-    return jax.ShapeDtypeStruct(aval.shape, aval.dtype)
-
-
-def _is_value(x: object) -> bool:
-    return isinstance(x, Value)
-
-
 def _arrays(values: Sequence[Value]) -> list:
     return [value.array for value in values]
 
@@ -76,6 +66,10 @@ def _batched(values: Sequence[Value]) -> list[bool]:
 
 def _values(arrays: Sequence[ArrayLike], batched: Sequence[bool]) -> list[Value]:
     return [Value(*pair) for pair in zip(arrays, batched, strict=True)]
+
+
+def _aval(atom: Var | Literal) -> ShapedArray:
+    return cast(ShapedArray, atom.aval)
 
 
 def _unbatched(equation: JaxprEqn) -> Function:
@@ -94,17 +88,16 @@ class BatchEvaluator:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        # By identity of the jaxpr and what is batched: a jitted function called often is traced
-        # once. The jaxpr is kept so that its identity stays taken.
-        self.jitted: dict[tuple, tuple[Function, list[bool], ClosedJaxpr]] = {}
+        # A jitted function called often is traced once. The trace is kept with it, so that its
+        # identity stays taken.
+        self.jitted: dict[tuple, tuple[Function, list[bool], Jaxpr]] = {}
 
-    def evaluate(
-        self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], values: Sequence[Value]
-    ) -> list[Value]:
-        """The results of a jaxpr for these arguments."""
-        known: dict[Var, Value] = {}
-        known |= zip(jaxpr.constvars, [Value(const, False) for const in consts], strict=True)
-        known |= zip(jaxpr.invars, values, strict=True)
+    def evaluate(self, traced: ClosedJaxpr | Jaxpr, values: Sequence[Value]) -> list[Value]:
+        """The results of a trace for these arguments."""
+        # A `Jaxpr` has no constants up to JAX 0.10, and its own from 0.12 on.
+        jaxpr, consts = getattr(traced, "jaxpr", traced), getattr(traced, "consts", ())
+        values = [*(Value(const, False) for const in consts), *values]
+        known = dict(zip((*jaxpr.constvars, *jaxpr.invars), values, strict=True))
 
         def read(atom: Var | Literal) -> Value:
             return Value(atom.val, False) if isinstance(atom, Literal) else known[atom]
@@ -115,16 +108,16 @@ class BatchEvaluator:
         return [read(atom) for atom in jaxpr.outvars]
 
     def as_function(
-        self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], batched: Sequence[bool]
+        self, traced: ClosedJaxpr | Jaxpr, batched: Sequence[bool]
     ) -> tuple[Function, list[bool]]:
-        """A jaxpr as a function of arrays, and which of its results are batched.
+        """A trace as a function of arrays, and which of its results are batched.
 
         The list is filled in when the function is first traced.
         """
         results_batched: list[bool] = []
 
         def call(*xs: ArrayLike) -> list:
-            results = self.evaluate(jaxpr, consts, _values(xs, batched))
+            results = self.evaluate(traced, _values(xs, batched))
             results_batched[:] = _batched(results)
             return _arrays(results)
 
@@ -134,56 +127,105 @@ class BatchEvaluator:
         name = equation.primitive.name
         if not any(_batched(values)):
             return [Value(x, False) for x in _unbatched(equation)(*_arrays(values))]
-        if name in RULES:
-            return RULES[name](self, equation, values)
-        xs = self._broadcast(values)
-        if name in SHAPED:
-            return [Value(SHAPED[name](xs, equation.params, self.size), True)]
-        if name in ELEMENTWISE | ALONG_AXES:
-            if name in ELEMENTWISE:  # a scalar operand may stand beside arrays
-                shape = (*_example(equation.outvars[0]).shape, self.size)
-                xs = [jnp.broadcast_to(x, shape) for x in xs]
-            return [Value(x, True) for x in _unbatched(equation)(*xs)]
-        return self._vmap(equation, values)
-
-    def _broadcast(self, values: Sequence[Value]) -> list[Array]:
-        return [value.broadcast(self.size) for value in values]
+        reads, rule = RULES.get(name, ("", BatchEvaluator._vmap))
+        known = set(reads.split()) <= equation.params.keys()
+        return rule(self, equation, values) if known else self._vmap(equation, values)
 
     def _vmap(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        """JAX's rule for primitives without one here: while loops, dot products, sorting."""
+        """JAX's own rule: while loops, dot products, sorting, and what is not known here."""
         axes = tuple(-1 if value.batched else None for value in values)
         results = jax.vmap(_unbatched(equation), in_axes=axes, out_axes=-1)(*_arrays(values))
         return [Value(x, True) for x in results]
 
-    def _jit(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        closed, batched = equation.params["jaxpr"], tuple(_batched(values))
-        if (id(closed), batched) not in self.jitted:
-            call, results_batched = self.as_function(closed.jaxpr, closed.consts, batched)
-            call.__name__ = equation.params["name"]
-            self.jitted[id(closed), batched] = jax.jit(call), results_batched, closed
-        call, results_batched, _ = self.jitted[id(closed), batched]
-        return _values(call(*_arrays(values)), results_batched)
+    def _broadcast(self, values: Sequence[Value]) -> list[Array]:
+        return [value.broadcast(self.size) for value in values]
+
+    def _widen(self, values: Sequence[Value], chosen: Sequence[bool]) -> list[Value]:
+        """The values, of which the chosen have a batch axis for certain."""
+        return [
+            Value(value.broadcast(self.size), True) if batch else value
+            for value, batch in zip(values, chosen, strict=True)
+        ]
+
+    def _elementwise(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        shape = (*_aval(equation.outvars[0]).shape, self.size)
+        # A scalar operand may stand beside arrays.
+        xs = [jnp.broadcast_to(x, shape) for x in self._broadcast(values)]
+        return [Value(x, True) for x in _unbatched(equation)(*xs)]
+
+    def _along_axes(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        return [Value(x, True) for x in _unbatched(equation)(*self._broadcast(values))]
+
+    def _broadcast_in_dim(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        shape = _aval(equation.outvars[0]).shape
+        axes = (*equation.params["broadcast_dimensions"], len(shape))
+        return [Value(lax.broadcast_in_dim(values[0].array, (*shape, self.size), axes), True)]
+
+    def _concatenate(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        axis = equation.params["dimension"]
+        return [Value(lax.concatenate(self._broadcast(values), axis), True)]
+
+    def _reshape(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        shape = _aval(equation.outvars[0]).shape
+        return [Value(lax.reshape(values[0].array, (*shape, self.size)), True)]
+
+    def _transpose(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        axes = equation.params["permutation"]
+        return [Value(lax.transpose(values[0].array, (*axes, len(axes))), True)]
+
+    def _sum(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        """The sum over some axes; short axes are added entry by entry.
+
+        A CPU loop that computes its summands on the fly would take the batch one example at a time.
+        """
+        x = values[0].array
+        for axis in sorted(equation.params["axes"], reverse=True):
+            count = x.shape[axis]
+            if 0 < count <= UNROLLED_SUM:
+                parts = lax.split(x, (1,) * count, axis)
+                x = lax.squeeze(functools.reduce(lax.add, parts), (axis,))
+            else:
+                x = lax.reduce_sum(x, (axis,))
+        return [Value(x, True)]
+
+    def _gather(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        """Reads from an array that all examples share, at indices of their own."""
+        operand, indices = values
+        if operand.batched:
+            return self._vmap(equation, values)
+        params = {**equation.params, "indices_are_sorted": False, "unique_indices": False}
+        # The last axis of the indices holds the coordinates of one place.
+        result = lax.gather(operand.array, jnp.moveaxis(indices.array, -1, -2), **params)
+        return [Value(result, True)]
 
     def _inline(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        closed = equation.params["call_jaxpr"]
-        return self.evaluate(closed.jaxpr, closed.consts, values)
+        return self.evaluate(equation.params["call_jaxpr"], values)
+
+    def _jit(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        traced, batched = equation.params["jaxpr"], tuple(_batched(values))
+        if (id(traced), batched) not in self.jitted:
+            call, results_batched = self.as_function(traced, batched)
+            call.__name__ = equation.params["name"]
+            self.jitted[id(traced), batched] = jax.jit(call), results_batched, traced
+        call, results_batched, _ = self.jitted[id(traced), batched]
+        return _values(call(*_arrays(values)), results_batched)
 
     def _checkpoint(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
         params = equation.params
-        call, results_batched = self.as_function(params["jaxpr"], (), _batched(values))
+        call, results_batched = self.as_function(params["jaxpr"], _batched(values))
         remat = jax.checkpoint(call, prevent_cse=params["prevent_cse"], policy=params["policy"])
         return _values(remat(*_arrays(values)), results_batched)
 
     def _custom_jvp(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
         """Keeps the function's own derivative rule, evaluated for the batch as well."""
-        examples = [_example(atom) for atom in equation.invars]
-        if not all(jnp.issubdtype(example.dtype, jnp.inexact) for example in examples):
+        avals = [_aval(atom) for atom in equation.invars]
+        if not all(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in avals):
             return self._vmap(equation, values)
+        examples = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
         primal = equation.params["call_jaxpr"]
 
-        def evaluate(closed: ClosedJaxpr, xs: Sequence[Array]) -> list[Array]:
-            batch = [Value(x, True) for x in xs]
-            return self._broadcast(self.evaluate(closed.jaxpr, closed.consts, batch))
+        def evaluate(traced: ClosedJaxpr, xs: Sequence[Array]) -> list[Array]:
+            return self._broadcast(self.evaluate(traced, [Value(x, True) for x in xs]))
 
         @jax.custom_jvp
         def function(*xs: Array) -> list[Array]:
@@ -203,50 +245,36 @@ class BatchEvaluator:
         A rule may have an attribute `elementwise`: a function of an unbatched first argument and
         of numbers of any shape, treated one by one, which needs no axis moved.
         """
-        params = equation.params
-        elementwise = getattr(params["rule"], "elementwise", None)
-        _, (first, *numbers) = jax.tree.unflatten(params["in_tree"], values)
-        first_values = jax.tree.leaves(first, is_leaf=_is_value)
-        if elementwise is None or any(_batched(first_values)):
+        elementwise = getattr(equation.params["rule"], "elementwise", None)
+        _, (first, *numbers) = jax.tree.unflatten(equation.params["in_tree"], values)
+        shared, structure = jax.tree.flatten(first, is_leaf=lambda x: isinstance(x, Value))
+        if elementwise is None or any(_batched(shared)):
             return self._vmap(equation, values)
         results = elementwise(
-            jax.tree.map(lambda value: value.array, first, is_leaf=_is_value),
+            jax.tree.unflatten(structure, _arrays(shared)),
             *(x if batched else lax.expand_dims(x, (jnp.ndim(x),)) for x, batched in numbers),
         )
         return [Value(x, True) for x in jax.tree.leaves(results)]
 
-    def _gather(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        """Reads from an array that all examples share, at indices of their own."""
-        operand, indices = values
-        if operand.batched:
-            return self._vmap(equation, values)
-        params = {**equation.params, "indices_are_sorted": False, "unique_indices": False}
-        # The last axis of the indices holds the coordinates of one place.
-        result = lax.gather(operand.array, jnp.moveaxis(indices.array, -1, -2), **params)
-        return [Value(result, True)]
-
     def _scan(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        params = equation.params
-        closed, consts, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
+        traced = equation.params["jaxpr"]
+        # What is carried has the same rank inside the body; inputs and outputs have one axis less.
+        inputs_count = _count_sliced(equation.invars, traced.in_avals)
+        carried = len(equation.outvars) - _count_sliced(equation.outvars, traced.out_avals)
+        consts = len(values) - inputs_count - carried
         # A shared boolean would become a branch taken per number; a batched one becomes a mask.
-        values = [
-            Value(value.broadcast(self.size), True) if _is_bool(value.array) else value
-            for value in values
-        ]
+        is_bool = [jax.typeof(value.array).dtype == bool for value in values]
+        values = self._widen(values, is_bool)
         shared, inputs = values[:consts], values[consts + carried :]
         carry = values[consts : consts + carried]
         results_batched: list[bool] = []
 
         def body(before: list, xs: list) -> tuple[list, list]:
             old = _values(before, _batched(carry))
-            new = _values(xs, _batched(inputs))
-            results = self.evaluate(closed.jaxpr, closed.consts, [*shared, *old, *new])
+            results = self.evaluate(traced, [*shared, *old, *_values(xs, _batched(inputs))])
             results_batched[:] = _batched(results)
-            after = [
-                value.broadcast(self.size) if wide else value.array
-                for value, wide in zip(results[:carried], _batched(carry), strict=True)
-            ]
-            return after, _arrays(results[carried:])
+            after = self._widen(results[:carried], _batched(carry))
+            return _arrays(after), _arrays(results[carried:])
 
         while True:  # a carry that the body makes batched has to start batched
             slices = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in _arrays(inputs)]
@@ -257,55 +285,34 @@ class BatchEvaluator:
             ]
             if not any(grown):
                 break
-            carry = [
-                Value(value.broadcast(self.size), True) if grows else value
-                for value, grows in zip(carry, grown, strict=True)
-            ]
-        options = {name: params[name] for name in ("length", "reverse", "unroll")}
+            carry = self._widen(carry, grown)
+        options = {name: equation.params[name] for name in ("length", "reverse", "unroll")}
         last, outputs = lax.scan(body, _arrays(carry), _arrays(inputs), **options)
         return [*_values(last, _batched(carry)), *_values(outputs, results_batched[carried:])]
 
 
-def _sum(x: Array, axes: Sequence[int]) -> Array:
-    """The sum over some axes; short axes are added entry by entry.
-
-    A CPU loop that computes its summands on the fly would take the batch one example at a time.
-    """
-    for axis in sorted(axes, reverse=True):
-        count = x.shape[axis]
-        if 0 < count <= UNROLLED_SUM:
-            parts = lax.split(x, (1,) * count, axis)
-            x = lax.squeeze(functools.reduce(lax.add, parts), (axis,))
-        else:
-            x = lax.reduce_sum(x, (axis,))
-    return x
+def _count_sliced(outer: Sequence[Var | Literal], inner: Sequence[ShapedArray]) -> int:
+    """How many values of a scan its body sees one slice of."""
+    pairs = zip(outer, inner, strict=True)
+    return sum(len(_aval(whole).shape) > len(part.shape) for whole, part in pairs)
 
 
-RULES: dict[str, Callable[[BatchEvaluator, JaxprEqn, list[Value]], list[Value]]] = {
-    "jit": BatchEvaluator._jit,
-    "closed_call": BatchEvaluator._inline,  # a step of a scan that reverse mode recomputes
-    "remat2": BatchEvaluator._checkpoint,
-    "custom_jvp_call": BatchEvaluator._custom_jvp,
-    "custom_vmap_call": BatchEvaluator._custom_vmap,
-    "gather": BatchEvaluator._gather,
-    "scan": BatchEvaluator._scan,
-}
-# Primitives whose parameters state shapes, to which the batch axis is added.
-SHAPED: dict[str, Callable[[list[Array], dict[str, PyTree], int], Array]] = {
-    "broadcast_in_dim": lambda xs, params, size: lax.broadcast_in_dim(
-        xs[0], (*params["shape"], size), (*params["broadcast_dimensions"], len(params["shape"]))
-    ),
-    "concatenate": lambda xs, params, size: lax.concatenate(xs, params["dimension"]),
-    "reduce_sum": lambda xs, params, size: _sum(xs[0], params["axes"]),
-    "reshape": lambda xs, params, size: lax.reshape(xs[0], (*params["new_sizes"], size)),
-    "slice": lambda xs, params, size: lax.slice(
-        xs[0],
-        (*params["start_indices"], 0),
-        (*params["limit_indices"], size),
-        params["strides"] and (*params["strides"], 1),
-    ),
-    "squeeze": lambda xs, params, size: lax.squeeze(xs[0], params["dimensions"]),
-    "transpose": lambda xs, params, size: lax.transpose(
-        xs[0], (*params["permutation"], len(params["permutation"]))
-    ),
+Rule: TypeAlias = Callable[[BatchEvaluator, JaxprEqn, list[Value]], list[Value]]
+# By the name of the primitive: the parameters that the rule reads, and the rule.
+RULES: dict[str, tuple[str, Rule]] = {
+    **dict.fromkeys(ELEMENTWISE, ("", BatchEvaluator._elementwise)),
+    **dict.fromkeys(ALONG_AXES, ("", BatchEvaluator._along_axes)),
+    "broadcast_in_dim": ("broadcast_dimensions", BatchEvaluator._broadcast_in_dim),
+    "closed_call": ("call_jaxpr", BatchEvaluator._inline),  # what reverse mode recomputes
+    "concatenate": ("dimension", BatchEvaluator._concatenate),
+    "custom_jvp_call": ("call_jaxpr", BatchEvaluator._custom_jvp),
+    "custom_vmap_call": ("rule in_tree", BatchEvaluator._custom_vmap),
+    "eval_jaxpr": ("call_jaxpr", BatchEvaluator._inline),  # the same from JAX 0.12 on
+    "gather": ("indices_are_sorted unique_indices", BatchEvaluator._gather),
+    "jit": ("jaxpr name", BatchEvaluator._jit),
+    "reduce_sum": ("axes", BatchEvaluator._sum),
+    "remat2": ("jaxpr prevent_cse policy", BatchEvaluator._checkpoint),
+    "reshape": ("", BatchEvaluator._reshape),
+    "scan": ("jaxpr length reverse unroll", BatchEvaluator._scan),
+    "transpose": ("permutation", BatchEvaluator._transpose),
 }

@@ -1,0 +1,88 @@
+"""What `lanes` depends on in JAX's traces, which JAX may change; this file says where it did.
+
+A primitive or a parameter that JAX renames makes `lanes` slower, not wrong: its equations go
+through `jax.vmap`. Here the programs of the pipeline are traced, and primitives that do are named.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from batching.test_lanes import CASES, assert_same, numbers
+from fitting.bench import workloads
+from fitting.bench.benchmarks import crowd
+from jaxik import lanes
+from jaxik.batching import primitives
+
+# JAX's own rules leave the batch axis where it is, or an example reads a place of its own.
+MAPPED_BY_JAX = {"dynamic_slice", "pad", "slice"}
+
+
+@pytest.fixture
+def mapped_by_jax(monkeypatch):
+    """Names of the primitives that went through `jax.vmap`."""
+    names = set()
+    vmap = primitives.BatchEvaluator._vmap
+
+    def recorded(evaluator, equation, values):
+        names.add(equation.primitive.name)
+        return vmap(evaluator, equation, values)
+
+    monkeypatch.setattr(primitives.BatchEvaluator, "_vmap", recorded)
+    return names
+
+
+def crowd_program(function):
+    def program():
+        people = workloads.crowd(2, 6)
+        ground = workloads.ground(workloads.mesh_field(10))
+        jax.make_jaxpr(lanes(lambda member: function(people, ground, member)))(people.members)
+
+    return program
+
+
+def fit_program(function):
+    def program():
+        problem = workloads.problem(30, workloads.parameter_names(20))
+        jax.make_jaxpr(lambda u: function(problem, u))(problem.space.u0)
+
+    return program
+
+
+PROGRAMS = {
+    "a crowd": crowd_program(crowd.forward),
+    "its gradient": crowd_program(crowd.reverse),
+    "a Jacobian": fit_program(lambda problem, u: problem.residuals_and_jacobian(u)),
+    "a posterior": fit_program(
+        lambda problem, u: lanes(problem.log_probability)(jnp.stack([u, u]))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_pipeline_has_rules_for_its_primitives_in_the_installed_jax(name, mapped_by_jax):
+    PROGRAMS[name]()
+    assert mapped_by_jax <= MAPPED_BY_JAX, f"JAX {jax.__version__} changed {mapped_by_jax}"
+
+
+@pytest.mark.parametrize("primitive", ["scan", "jit", "custom_jvp_call", "broadcast_in_dim"])
+@pytest.mark.parametrize("change", ["renamed", "another parameter"])
+def test_results_stay_when_jax_changes_a_primitive(primitive, change, monkeypatch, mapped_by_jax):
+    rules = dict(primitives.RULES)
+    _, rule = rules.pop(primitive)
+    if change == "another parameter":
+        rules[primitive] = ("of_tomorrow", rule)
+    monkeypatch.setattr(primitives, "RULES", rules)
+    x = numbers(5, 3)
+    for name in ("rotations", "a scan", "a custom derivative"):
+        assert_same(lanes(CASES[name])(x), jax.vmap(CASES[name])(x))
+    assert primitive in mapped_by_jax
+
+
+def test_a_rule_reads_parameters_that_its_primitive_has():
+    x = np.ones((3, 2), np.float32)
+    trace = jax.make_jaxpr(lambda x: jax.lax.scan(lambda c, y: (c + y, y), x[0], x))(x)
+    scans = [equation for equation in trace.eqns if equation.primitive.name == "scan"]
+    reads, _ = primitives.RULES["scan"]
+    assert set(reads.split()) <= scans[0].params.keys()
