@@ -60,7 +60,10 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+SLOW = pytest.param("its gradient", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name", [SLOW if name == "its gradient" else name for name in PROGRAMS])
 def test_the_pipeline_has_rules_for_its_primitives_in_the_installed_jax(name, mapped_by_jax):
     PROGRAMS[name]()
     assert mapped_by_jax <= MAPPED_BY_JAX, f"JAX {jax.__version__} changed {mapped_by_jax}"
