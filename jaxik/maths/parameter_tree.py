@@ -11,7 +11,7 @@ import dataclasses
 import inspect
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -43,6 +43,9 @@ else:
 
 class Rule(eqx.Module):
     """One implementation of a stage. Printed, it lists its parameters with their units."""
+
+    per_leg: ClassVar[bool] = True
+    """Whether parameters and switches may be one per leg where they do not say themselves."""
 
     def __init_subclass__(cls, **options: object) -> None:
         """Lists the declared fields in the docstring, for `help` and the API reference."""
@@ -112,6 +115,7 @@ def parameter(
     kind: ParameterKind = "smooth",
     scale: Scale = "linear",
     above: str | None = None,
+    per_leg: bool | None = None,
 ) -> Declared:
     """Declares a float field of a rule: one number for all legs, or one a leg.
 
@@ -124,9 +128,11 @@ def parameter(
         kind: "threshold" if it moves a hard decision, so that its derivative there is zero.
         scale: how a fit steps: "linear", by factors ("log"), or as the half-life of a "gain".
         above: the field of the same rule that it stays above, if any.
+        per_leg: whether it may be one number a leg; None leaves that to the rule's `per_leg`, which
+            is False in stages that move the whole body.
     """
     declaration = Declaration(unit, low, high, kind, scale, above, doc)
-    metadata = {"declaration": declaration, "unit": unit, "doc": doc}
+    metadata = {"declaration": declaration, "unit": unit, "doc": doc, "per_leg": per_leg}
     return _field(default, as_float_array, metadata)
 
 
@@ -145,9 +151,9 @@ def constant(default: float, *, unit: str, doc: str) -> Declared:
     return _field(default, as_float_array, {"unit": unit, "doc": doc})
 
 
-def switch(default: bool, *, doc: str) -> Declared:
-    """Declares a boolean field of a rule."""
-    return _field(default, as_switch, {"doc": doc})
+def switch(default: bool, *, doc: str, per_leg: bool | None = None) -> Declared:
+    """Declares a boolean field of a rule; for `per_leg` see `parameter`."""
+    return _field(default, as_switch, {"doc": doc, "per_leg": per_leg})
 
 
 def layers(default: int = ALL_LAYERS) -> Declared:
@@ -158,7 +164,9 @@ def layers(default: int = ALL_LAYERS) -> Declared:
 
 def _field(default, converter, metadata: dict):
     return eqx.field(
-        default_factory=lambda: converter(default), converter=converter, metadata=metadata
+        default_factory=lambda: converter(default),
+        converter=converter,
+        metadata=metadata | {"shape": np.shape(default)},
     )
 
 
@@ -166,7 +174,7 @@ def declarations(module: eqx.Module) -> dict[str, Declaration]:
     """Every declared parameter of a rule or of a tree of rules, by dotted name."""
     return {
         name: field.metadata["declaration"]
-        for name, field in _fields(module)
+        for name, _, field in _fields(module)
         if "declaration" in field.metadata
     }
 
@@ -174,18 +182,42 @@ def declarations(module: eqx.Module) -> dict[str, Declaration]:
 def docs(module: eqx.Module) -> dict[str, str]:
     """The sentence of meaning of each parameter, constant and switch, by dotted name."""
     return {
-        name: field.metadata["doc"] for name, field in _fields(module) if "doc" in field.metadata
+        name: field.metadata["doc"] for name, _, field in _fields(module) if "doc" in field.metadata
     }
 
 
-def _fields(module: eqx.Module, path: str = "") -> Iterator[tuple[str, dataclasses.Field]]:
-    """The fields of a tree that are not modules themselves, by dotted name."""
+def check_shapes(module: eqx.Module, legs: int) -> None:
+    """Refuses a declared field that is neither one value nor, where it may be, one per leg.
+
+    Raises:
+        ValueError: naming the field, its shape, and the shapes that it may have.
+    """
+    for name, owner, field in _fields(module):
+        if "shape" not in field.metadata:  # a field that was not declared by the functions above
+            continue
+        single: tuple[int, ...] = field.metadata["shape"]
+        per_leg = field.metadata.get("per_leg")
+        if per_leg is None:
+            per_leg = getattr(owner, "per_leg", True)
+        shape = np.shape(getattr(owner, field.name))
+        if shape == single or (per_leg and shape == (legs, *single)):
+            continue
+        wanted = f"{single}, the same for all legs"
+        if per_leg:
+            wanted += f", or {(legs, *single)}, one per leg"
+        raise ValueError(f"{name} has shape {shape}, wanted {wanted}")
+
+
+def _fields(
+    module: eqx.Module, path: str = ""
+) -> Iterator[tuple[str, eqx.Module, dataclasses.Field]]:
+    """The fields of a tree that are not modules themselves, with their owners, by dotted name."""
     for field in dataclasses.fields(module):
         name = f"{path}{field.name}"
         if isinstance(child := getattr(module, field.name), eqx.Module):
             yield from _fields(child, f"{name}.")
         else:
-            yield name, field
+            yield name, module, field
 
 
 def get(module: eqx.Module, name: str) -> Array:
@@ -208,6 +240,12 @@ def replace(module: Tree, values: Mapping[str, ArrayLike | Sequence]) -> Tree:
             known = list(declarations(module))
             raise ValueError(f"no parameter named {name!r}; there are {known}") from None
     return eqx.tree_at(lambda tree: [getter(tree) for getter in getters], module, leaves)
+
+
+def shown(module: eqx.Module, name: str) -> str:
+    """The leaf with this dotted name as `outline` prints it: value and unit."""
+    units = {path: field.metadata.get("unit", "") for path, _, field in _fields(module)}
+    return _shown(get(module, name), units[name])
 
 
 def outline(module: eqx.Module) -> str:

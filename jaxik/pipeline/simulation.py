@@ -16,6 +16,7 @@ from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import LegTerrains, Terrain
 
 from .phases import advance, pose, sense, sense_contacts
+from .shapes import check_inputs, check_state
 from .system import Advanced, FootIK, Result, State, init
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -51,8 +52,14 @@ def step(
 
     Returns:
         Memory after the frame, for the next step, and the result.
+
+    Raises:
+        ValueError: if an array has a shape that does not fit the legs of the rig, or is that of
+            several characters, or the memory is that of another system; it says which.
     """
     inputs = Inputs(rig, terrain, frame, gate)
+    check_inputs(ik, inputs, clip=False)
+    check_state(state, jax.eval_shape(init, ik, rig))
     with jax.named_scope("contact"):
         now = Moment(frame.dt, state.started, gate)
         memory, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
@@ -79,8 +86,13 @@ def resume(
 
     Returns:
         Memory after the last frame, so that the rest can follow, and the result.
+
+    Raises:
+        ValueError: as `step`.
     """
     inputs = Inputs(rig, terrain, frames, gate)
+    check_inputs(ik, inputs, clip=True)
+    check_state(state, jax.eval_shape(init, ik, rig))
 
     def at(frame: Frame) -> Inputs:
         return dataclasses.replace(inputs, frame=frame)
@@ -120,12 +132,13 @@ def run(
             memory, in reverse mode one block and the state before each.
 
     Raises:
-        ValueError: if `block` is less than 1.
+        ValueError: if `block` is less than 1, or an array has a wrong shape, as in `step`.
     """
     if block is not None and block < 1:
         raise ValueError(
             f"block must be at least 1 frame, or None for all frames at once; got {block}"
         )
+    check_inputs(ik, Inputs(rig, terrain, frames, gate), clip=True)
     start, count = init(ik, rig), frames.dt.shape[0]
     if block is None or block >= count:
         return resume(ik, rig, terrain, start, frames, gate)[1]

@@ -18,6 +18,8 @@ from jaxik.stages.target import AbstractTarget
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 
+from .shapes import check_system
+
 
 class FootIK(Rule):
     """A foot-IK system: one rule for each of ten stages, in the order in which they run.
@@ -30,7 +32,8 @@ class FootIK(Rule):
 
     Printing a system lists its rules and parameters with their units. It is a pytree whose float
     leaves are the parameters (`equinox.filter_grad` differentiates by them). A parameter is one
-    number for all legs or an array with one number a leg.
+    number for all legs or an array with one number a leg; those of root, lean and pelvis, which
+    move the whole body, are mostly one number only, and another shape is refused by name.
     """
 
     contact: AbstractContact
@@ -107,7 +110,13 @@ class Result:
 
 
 def init(ik: FootIK, rig: Rig) -> State:
-    """Memory before the first frame, which then starts settled, with nothing to catch up on."""
+    """Memory before the first frame, which then starts settled, with nothing to catch up on.
+
+    Raises:
+        ValueError: if a parameter is neither one for all legs nor, where it may be, one per leg of
+            the rig, or the rig is not that of one character.
+    """
+    check_system(ik, rig)
     return State(
         jnp.zeros((), bool),
         ik.contact.init(rig),

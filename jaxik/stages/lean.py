@@ -1,6 +1,7 @@
 """Stage 5: how the body leans on slopes."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -26,6 +27,8 @@ class Lean:
 
 class AbstractLean(Rule):
     """Leans the body on slopes."""
+
+    per_leg: ClassVar[bool] = False
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:

@@ -107,7 +107,7 @@ class OffsetLock(AbstractLock):
 
     enabled: Leaf = switch(True, doc="Whether planted feet are locked in place.")
     hold_ball: Leaf = switch(
-        False, doc="Whether a lock holds the ball only, so that the heel can rise."
+        False, doc="Whether a lock holds the ball only, so that the heel can rise.", per_leg=False
     )
     release_min_angle: Leaf = parameter(
         0.8726646260,

@@ -1,6 +1,7 @@
 """Stage 2: the height of the whole character."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,6 +15,8 @@ from .inputs import Inputs
 
 class AbstractRoot(Rule):
     """Moves the whole character before its legs look for ground."""
+
+    per_leg: ClassVar[bool] = False
 
     @abstractmethod
     def sense(self, inputs: Inputs) -> Float[Array, ""]:

@@ -1,6 +1,7 @@
 """What pelvis rules share: their memory, what they are given, and how high feet want the body."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -56,6 +57,8 @@ class PelvisMoment(SensedMoment):
 
 class AbstractPelvis(Rule):
     """Moves the body up and down."""
+
+    per_leg: ClassVar[bool] = False
 
     def init(self, rig: Rig) -> PelvisState:
         """Memory before the first frame."""

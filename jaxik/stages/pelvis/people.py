@@ -120,6 +120,7 @@ class ReachPelvis(AbstractFollowingPelvis):
         unit="1",
         low=0.85,
         high=1.0,
+        per_leg=True,
         doc="Part of its length to which a leg may be stretched.",
     )
     softness: Leaf = parameter(
