@@ -111,12 +111,16 @@ class CapsulePelvis(AbstractPelvis):
 
 
 class LegLengthPelvis(AbstractPelvis):
-    """Keeps the distance from each hip to its foot within the leg's limits (Mec).
+    """Keeps the distance from each hip to its ankle's target within the leg's limits (Mec).
 
     Of all heights that do, it takes the one nearest to the animation. Where one leg needs the body
     higher and another needs it lower, it takes the lower, so that no leg is over-stretched. A foot
     too far aside to be reached requests the height that comes nearest. With `damp` on the offset
     follows by the clamped-speed law of Unreal's interp-to.
+
+    Mec measures to the position that it found for the foot, which is its height above the contact
+    with the ground, not to the contact itself: a leg that is as long as from hip to ankle then
+    leaves a body alone that stands on flat ground.
     """
 
     enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
@@ -125,6 +129,7 @@ class LegLengthPelvis(AbstractPelvis):
         unit="m",
         low=0.0,
         high=1.0,
+        per_leg=True,
         doc="Shortest distance from hip to ankle that the pelvis allows.",
     )
     max_length: Leaf = parameter(
@@ -133,6 +138,7 @@ class LegLengthPelvis(AbstractPelvis):
         low=0.2,
         high=1.5,
         above="min_length",
+        per_leg=True,
         doc="Longest distance from hip to ankle that the pelvis allows.",
     )
     damp: Leaf = switch(
