@@ -55,7 +55,7 @@ def describe(entry: record.Record, reading: record.Reading) -> str:
     """A record with its own names and ours, a line for each field."""
     ik = record.to_ik(entry, reading)
     declared = parameter_tree.declarations(ik)
-    axis = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")[entry.knee_axis_type]
+    axis = record.KNEE_AXIS_NAMES[entry.knee_axis_type]
     lines = [f"{'kneeAxisType':30} {entry.knee_axis_type} ({axis})"]
     for _, name, ours in record.FLAGS:
         lines.append(f"{name:30} {'on' if entry.flag(name) else 'off':>12}   {ours}")

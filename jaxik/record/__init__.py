@@ -12,12 +12,15 @@ from .layout import FLAG_NAMES as FLAG_NAMES
 from .layout import FLAGS as FLAGS
 from .layout import FLOAT_NAMES as FLOAT_NAMES
 from .layout import FLOATS as FLOATS
+from .layout import KNEE_AXIS_NAMES as KNEE_AXIS_NAMES
 from .layout import SIZE as SIZE
 from .layout import Record as Record
+from .layout import besides_parameters as besides_parameters
 from .layout import from_bytes as from_bytes
 from .layout import knee_axis as knee_axis
 from .layout import to_bytes as to_bytes
 from .parameters import Reading as Reading
+from .parameters import dropped as dropped
 from .parameters import from_ik as from_ik
 from .parameters import to_ik as to_ik
 from .parameters import with_knee_axis as with_knee_axis

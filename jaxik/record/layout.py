@@ -48,6 +48,7 @@ FLOATS = (  # name in the record, in the order of the offsets; our name; unit at
 FLOAT_NAMES = tuple(name for name, _, _ in FLOATS)
 FLAG_NAMES = tuple(name for _, name, _ in FLAGS)
 KNEE_AXES = np.concatenate([np.eye(3), -np.eye(3)])  # by kneeAxisType
+KNEE_AXIS_NAMES = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")  # likewise
 QUIET_NAN = b"\0\0\xc0\x7f"  # what "nan" reads as
 
 
@@ -103,8 +104,23 @@ def to_bytes(record: Record) -> bytes:
 def knee_axis(record: Record) -> np.ndarray:
     """The hinge of the knee in knee space, unit (3,)."""
     if record.knee_axis_type >= len(KNEE_AXES):
-        raise ValueError(f"kneeAxisType is {record.knee_axis_type}; 0 to 5 are +X +Y +Z -X -Y -Z")
+        known = " ".join(KNEE_AXIS_NAMES)
+        raise ValueError(f"kneeAxisType is {record.knee_axis_type}; 0 to 5 are {known}")
     return KNEE_AXES[record.knee_axis_type]
+
+
+def besides_parameters(record: Record) -> list[str]:
+    """What a record holds that is no parameter of a system: knee axis, padding and tail, in words.
+
+    Padding of zeros and an empty tail are left out.
+    """
+    axis, padding_bits = record.knee_axis_type, record.flags >> len(FLAGS)
+    parts = [f"kneeAxisType {axis} ({dict(enumerate(KNEE_AXIS_NAMES)).get(axis, 'unknown')})"]
+    if padding_bits or any(record.padding):
+        parts.append(f"padding (bits {padding_bits:#x}, bytes {record.padding.hex()})")
+    if record.tail:
+        parts.append(f"a tail of {len(record.tail)} bytes")
+    return parts
 
 
 def pack_float(value: float | str) -> bytes:

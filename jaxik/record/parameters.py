@@ -11,7 +11,7 @@ from jaxik.maths import parameter_tree
 from jaxik.pipeline import FootIK
 from jaxik.world.skeleton import Rig
 
-from .layout import FLAGS, FLOATS, Record, knee_axis, pack_float
+from .layout import FLAGS, FLOATS, Record, besides_parameters, knee_axis, pack_float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +69,9 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
 def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = None) -> Record:
     """The record with a system's parameters.
 
+    Warns of parameters that the record cannot hold (`dropped`) and, without a base, of what is
+    written for knee axis, padding and tail.
+
     Args:
         ik: a system with the rules of the record preset.
         base: where knee axis, padding and tail come from. A float whose value is the same in `base`
@@ -77,11 +80,24 @@ def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = No
             or metres.
 
     Raises:
-        ValueError: if a parameter differs between legs, does not fit a 32-bit float, or would be
-            read back in another unit.
+        ValueError: if the system has other rules, or a parameter differs between legs, does not fit
+            a 32-bit float, or would be read back in another unit.
     """
     reading = reading or Reading()
     template = base or Record()
+    if lost := dropped(ik, reading):
+        listed = ", ".join(f"{name} = {ours} ({theirs})" for name, (ours, theirs) in lost.items())
+        warnings.warn(
+            f"the record cannot hold {listed}; its reader takes the values in brackets",
+            stacklevel=2,
+        )
+    if base is None:
+        (knee,) = besides_parameters(template)
+        warnings.warn(
+            f"parameters do not tell the knee's axis: {knee}, zero padding and no tail are "
+            "written, as no base record was given",
+            stacklevel=2,
+        )
     flags = template.flags & ~0b111
     for bit, _, ours in FLAGS:
         flags |= int(_shared_value(ik, ours)) << bit
@@ -107,6 +123,33 @@ def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = No
             'planted height over 1 or a ray over 5 counts as cm; set length_unit to "m" or "cm"'
         )
     return record
+
+
+def dropped(ik: FootIK, reading: Reading | None = None) -> dict[str, tuple[str, str]]:
+    """The parameters and switches that bytes cannot hold and whose reader would assume otherwise.
+
+    Returns:
+        By dotted name the value in `ik` and the one that `to_ik` gives, both with their units.
+
+    Raises:
+        ValueError: if the system has other rules than those of the record preset.
+    """
+    assumed = to_ik(Record(), reading)
+    for stage, rule in vars(assumed).items():
+        if type(other := getattr(ik, stage)) is not type(rule):
+            raise ValueError(
+                f"{stage} is a {type(other).__name__}; a record holds parameters of a system with "
+                f"the record's rules, there a {type(rule).__name__}"
+            )
+    slots = {ours for _, _, ours in FLAGS} | {ours.partition("[")[0] for _, ours, _ in FLOATS}
+    return {
+        name: (parameter_tree.shown(ik, name), parameter_tree.shown(assumed, name))
+        for name in parameter_tree.docs(ik)
+        if name not in slots
+        and not np.allclose(
+            parameter_tree.get(ik, name), parameter_tree.get(assumed, name), rtol=1e-6, atol=0.0
+        )
+    }
 
 
 def with_knee_axis(rig: Rig, record: Record) -> Rig:

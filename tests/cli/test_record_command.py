@@ -23,15 +23,52 @@ def binary(tmp_path) -> Path:
     return path
 
 
+@pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize(
     "more", [[], ["--knee", "flexion", "--lean-sign", "-1", "--tick-hz", "60"]]
 )
 def test_a_record_converted_to_toml_and_back_is_the_same_to_the_byte(binary, more, capsys):
     toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
     assert main.main(["record", "to-toml", str(binary), "-o", str(toml), *more]) == 0
+    assert capsys.readouterr().err == (
+        "jaxik: kneeAxisType 4 (-Y), padding (bits 0x15, bytes 1234), a tail of 4 bytes: no "
+        f"parameters, so not in {toml}; `record to-bytes` takes them from --base {binary}\n"
+    )
     words = ["record", "to-bytes", str(toml), "--base", str(binary), "-o", str(back), *more]
     assert main.main(words) == 0
+    assert capsys.readouterr().err == ""
     assert back.read_bytes() == binary.read_bytes()
+
+
+@pytest.mark.filterwarnings("default")
+def test_bytes_without_a_base_say_what_they_put_in_its_place(binary, capsys):
+    toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
+    assert main.main(["record", "to-toml", str(binary), "-o", str(toml)]) == 0
+    capsys.readouterr()
+    assert main.main(["record", "to-bytes", str(toml), "-o", str(back)]) == 0
+    assert capsys.readouterr().err == (
+        "jaxik: parameters do not tell the knee's axis: kneeAxisType 2 (+Z), zero padding and no "
+        "tail are written, as no base record was given\n"
+    )
+    expected = bytearray(binary.read_bytes())[: record.SIZE]
+    expected[0], expected[1], expected[2:4] = 2, expected[1] & 0b111, b"\0\0"
+    written = back.read_bytes()
+    floats = np.frombuffer(written[4:], "<f4"), np.frombuffer(bytes(expected[4:]), "<f4")
+    assert written[:4] == expected[:4]
+    np.testing.assert_allclose(*floats, rtol=1e-5)
+
+
+@pytest.mark.filterwarnings("default")
+def test_parameters_without_a_slot_in_the_record_are_named_when_written(binary, capsys):
+    toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
+    toml.write_text("[target]\nrise_half_life = 0.1\n[lock]\nmax_speed = 0.9\nrelease_cone = 0.3\n")
+    words = ["record", "to-bytes", str(toml), "--base", str(binary), "-o", str(back)]
+    assert main.main(words) == 0
+    assert capsys.readouterr().err == (
+        "jaxik: the record cannot hold target.rise_half_life = 0.1 s (0 s), lock.max_speed = 0.9 "
+        "m/s (inf m/s); its reader takes the values in brackets\n"
+    )
+    assert back.stat().st_size == record.SIZE + len(b"tail")
 
 
 def test_show_prints_both_names_and_both_units(binary, capsys):
@@ -79,7 +116,7 @@ def test_lengths_in_centimetres_are_mentioned_in_one_line(tmp_path, capsys):
         (["to-toml", "nan.bin", "-o", "a.toml"], "nan.bin: originalGroundHeightMS is nan"),
         (["to-toml", "two.csv", "-o", "a.toml"], "two.csv has 2 rows"),
         (["to-toml", "footik.bin", "-o", "no/a.toml"], "there is no folder no"),
-        (["to-bytes", "one.toml", "-o", "."], "cannot be written: it is a folder"),
+        (["to-bytes", "one.toml", "--base", "footik.bin", "-o", "."], "cannot be written: it is a"),
         (["to-bytes", "one.toml", "--base", "no.bin", "-o", "a.bin"], "no.bin: no such file"),
         (["to-bytes", "two.csv", "--base", "footik.bin", "-o", "a.bin"], "a base completes"),
     ],

@@ -241,7 +241,7 @@ def test_a_record_round_trips_through_parameters(single, length_unit, knee_conve
 def test_parameters_round_trip_through_a_record():
     changes = {"lean.gain": 0.3, "leg.max_knee_angle": 2.8, "lock.enabled": False}
     ik = parameter_tree.replace(jaxik.presets.record(), changes)
-    meant = record.to_ik(record.from_ik(ik))
+    meant = record.to_ik(record.from_ik(ik, Record()))
     for name, expected in leaves_of(ik).items():
         np.testing.assert_allclose(leaves_of(meant)[name], expected, atol=2e-6, err_msg=name)
     assert not parameter_tree.get(meant, "lock.enabled")
@@ -272,20 +272,64 @@ def test_a_record_in_centimetres_stays_in_centimetres():
 def test_lengths_that_would_be_read_in_another_unit_are_not_written():
     ik = parameter_tree.replace(jaxik.presets.record(), {"probe.ray_up": 6.0})
     with pytest.raises(ValueError, match='written in m .* set length_unit to "m" or "cm"'):
-        record.from_ik(ik)
-    assert record.from_ik(ik, reading=Reading(length_unit="m")).value("raycastDistanceUp") == 6.0
+        record.from_ik(ik, Record())
+    written = record.from_ik(ik, Record(), Reading(length_unit="m"))
+    assert written.value("raycastDistanceUp") == 6.0
 
 
 def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
     ik = jaxik.presets.record()
-    same = parameter_tree.replace(
-        ik, {"probe.toe_ls": [[0.01, -0.07, 0.2]] * 2, "leg.soften": [0.9, 0.8]}
-    )
-    assert record.from_ik(same).value("footEndLS_X") == np.float32(0.01)
+    same = parameter_tree.replace(ik, {"probe.toe_ls": [[0.01, -0.07, 0.2]] * 2})
+    assert record.from_ik(same, Record()).value("footEndLS_X") == np.float32(0.01)
     with pytest.raises(ValueError, match=r"foot.max_pitch is \[0.4, 0.5\].*one value"):
-        record.from_ik(parameter_tree.replace(ik, {"foot.max_pitch": [0.5, 0.4]}))
+        record.from_ik(parameter_tree.replace(ik, {"foot.max_pitch": [0.5, 0.4]}), Record())
     with pytest.raises(ValueError, match="beyond a 32-bit float"):
-        record.from_ik(parameter_tree.replace(ik, {"pelvis.limit": 1e39}))
+        record.from_ik(parameter_tree.replace(ik, {"pelvis.limit": 1e39}), Record())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("target.rise_half_life", 0.1, "target.rise_half_life = 0.1 s (0 s)"),
+        ("lock.max_speed", 0.9, "lock.max_speed = 0.9 m/s (inf m/s)"),
+        ("lock.release_distance", math.inf, "lock.release_distance = inf m (0.2 m)"),
+        ("target.max_slope", 0.3, "target.max_slope = 0.3 rad (17.19°) (1.047 rad (60°))"),
+        ("leg.soften", [0.9, 0.8], "leg.soften = [0.9, 0.8] (0.98)"),
+        ("lean.spring", True, "lean.spring = on (off)"),
+        ("probe.layers", 0b101, "probe.layers = 0x5 (all)"),
+        ("pelvis.tick_hz", 60.0, "pelvis.tick_hz = 60 Hz (30 Hz)"),
+    ],
+)
+def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, value, message):
+    ik = parameter_tree.replace(jaxik.presets.record(), {name: value})
+    with pytest.warns(UserWarning) as caught:
+        written = record.from_ik(ik, Record())
+    assert [str(warning.message) for warning in caught] == [
+        f"the record cannot hold {message}; its reader takes the values in brackets"
+    ]
+    assert list(record.dropped(ik)) == [name] and record.dropped(record.to_ik(written)) == {}
+
+
+def test_exactly_the_parameters_without_a_slot_are_dropped():
+    ik = jaxik.presets.record()
+    leaves = {name: parameter_tree.get(ik, name) for name in parameter_tree.docs(ik)}
+    other = {n: ~x if x.dtype == bool else x // 2 if x.dtype == jnp.uint32 else x * 0.8 + 0.1
+             for n, x in leaves.items()}  # fmt: skip
+    other |= {name: 1.0 for name, leaf in leaves.items() if np.isinf(leaf).any()}
+    slots = {ours for _, _, ours in record.FLAGS}
+    slots |= {ours.partition("[")[0] for _, ours, _ in record.FLOATS}
+    assert set(record.dropped(parameter_tree.replace(ik, other))) == set(leaves) - slots
+
+
+def test_a_record_without_a_base_says_what_it_takes_for_the_knee():
+    with pytest.warns(UserWarning, match=r"2 \(\+Z\), zero padding and no tail") as caught:
+        assert record.from_ik(jaxik.presets.record()).knee_axis_type == 2
+    assert len(caught) == 1
+
+
+def test_a_system_of_other_rules_is_no_record():
+    with pytest.raises(ValueError, match="contact is a LabelContact; .* there a HeightContact"):
+        record.from_ik(jaxik.presets.stride())
 
 
 def test_records_round_trip_through_csv_byte_for_byte():
