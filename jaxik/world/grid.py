@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
 
 from jaxik.maths import vec
 
@@ -191,7 +191,7 @@ def build(
     """
     used = np.asarray(vertices_ws)[np.asarray(triangles).reshape(-1)]
     centre_ws = jnp.asarray((used.min(axis=0) + used.max(axis=0)) / 2, used.dtype)
-    axes_ws = _axes(up_ws)
+    axes_ws = frame_axes(up_ws)
     corners, wall = _corners(vertices_ws, triangles, centre_ws, axes_ws)
     plan = np.asarray(corners).reshape(-1, 3, 3)[..., :2]
     # Entering the frame, rays and corners are rounded in proportion to their size.
@@ -241,10 +241,14 @@ def _corners(
     return rotated.reshape(-1, 9), jnp.abs(left - right) <= noise
 
 
-def _axes(up: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Right-handed axes, the second of which is up; the world's axes where up is its y."""
+def frame_axes(up: ArrayLike) -> Float[Array, "3 3"]:
+    """Right-handed axes, the second of which is up; the world's axes where up is its y.
+
+    Args:
+        up: unit; not traced.
+    """
     second = np.asarray(up, np.float64)
     forward = np.eye(3)[2] if abs(second[2]) < 0.9 else np.eye(3)[0]
     side = np.cross(second, forward)
     side /= np.linalg.norm(side)
-    return jnp.asarray(np.stack([side, second, np.cross(side, second)]), up.dtype)
+    return jnp.asarray(np.stack([side, second, np.cross(side, second)]), np.asarray(up).dtype)
