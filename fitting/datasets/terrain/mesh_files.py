@@ -1,4 +1,4 @@
-"""Terrain files: reads what trimesh reads as `jaxik.world.terrain.Terrain`, and writes meshes."""
+"""Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +10,10 @@ import trimesh
 from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
 
+from fitting.runtime.validation import error_context
 from jaxik.world import terrain
+
+from . import heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
 # A file with z up is rotated about x, as glTF exporters do: (x, y, z) becomes (x, z, -y).
@@ -30,41 +33,55 @@ def load_terrain(
     slack: float = 0.0,
     dtype: DTypeLike | None = None,
 ) -> terrain.Terrain:
-    """The triangles of a file as terrain, in metres with y up.
+    """The mesh or heightfield of a file as terrain, in metres with y up.
 
     A scene of several geometries becomes one mesh, with each geometry's transform applied. Vertices
     of a single geometry keep the file's order.
 
     Args:
-        path: PLY, OBJ, STL, GLB, OFF or whatever else trimesh reads.
-        up: direction opposite to the rays that probe the ground, world space; any length.
+        path: PLY, OBJ, STL, GLB, OFF or whatever else trimesh reads; or a heightfield as NPZ, whose
+            arrays `heightfield_files` lists.
+        up: direction opposite to the rays that probe the ground, and of a heightfield's heights;
+            world space, any length.
         layer: 0 to 31, of all triangles.
-        file_up: the file's up axis, "y" or "z"; with "z", (x, y, z) becomes (x, z, -y).
+        file_up: the file's up axis, "y" or "z"; with "z", (x, y, z) becomes (x, z, -y). A
+            heightfield has y up.
         scale: metres per unit of the file; 0.01 for centimetres.
-        slack: m, see `jaxik.world.terrain.mesh`.
+        slack: m, of a mesh; see `jaxik.world.terrain.mesh`.
         dtype: of the floats; None takes JAX's default.
 
     Raises:
-        ValueError: no such file, a file that trimesh cannot read or that has no triangles, vertices
-            that are not finite, an `up` of zero length, or another argument out of range.
+        ValueError: no such file, a file that cannot be read or that has no triangles, vertices that
+            are not finite, arrays that are no heightfield, an `up` of zero length, or another
+            argument out of range.
     """
     if file_up not in _WORLD_FROM_FILE:
         known = " or ".join(repr(axis) for axis in _WORLD_FROM_FILE)
         raise ValueError(f"file_up is the file's up axis, {known}; got {file_up!r}")
     if not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"scale is metres per unit, above 0; got {scale}")
-    vertices, triangles = _read(Path(path))
-    vertices_ws = scale * vertices @ _WORLD_FROM_FILE[file_up].T
-    try:
-        return terrain.mesh(
-            vertices_ws if dtype is None else vertices_ws.astype(dtype),
-            triangles,
-            up=up,
-            layer=layer,
-            slack=slack,
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    path = Path(path)
+    if path.suffix.lower() == heightfield_files.SUFFIX:
+        if file_up != "y":
+            raise ValueError(f"{path}: a heightfield has y up; got file_up {file_up!r}")
+        field = heightfield_files.read_heightfield(path)
+        with error_context(path):
+            return terrain.heightfield(
+                _as_dtype(scale * field.heights, dtype),
+                scale * field.spacing,
+                scale * field.origin,
+                up=up,
+                layer=layer,
+                interpolation=field.interpolation,
+            )
+    vertices, triangles = _read(path)
+    vertices_ws = _as_dtype(scale * vertices @ _WORLD_FROM_FILE[file_up].T, dtype)
+    with error_context(path):
+        return terrain.mesh(vertices_ws, triangles, up=up, layer=layer, slack=slack)
+
+
+def _as_dtype(array: Float[np.ndarray, "..."], dtype: DTypeLike | None) -> np.ndarray:
+    return array if dtype is None else array.astype(dtype)
 
 
 def check_mesh_name(path: str | Path) -> None:
@@ -133,7 +150,10 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
         raise ValueError(f"{path}: there is no such file")
     formats = sorted(trimesh.available_formats())
     if not path.name.lower().endswith(tuple(f".{name}" for name in formats)):
-        raise ValueError(f"{path}: trimesh reads {', '.join(formats)}; not {path.suffix!r}")
+        raise ValueError(
+            f"{path}: wanted a heightfield (.npz) or a mesh that trimesh reads "
+            f"({', '.join(formats)}); not {path.suffix!r}"
+        )
     try:
         # Unprocessed, as trimesh would otherwise merge and drop vertices.
         scene = trimesh.load_scene(path, process=False)
