@@ -1,4 +1,5 @@
 from . import phases as phases
+from . import shapes as shapes
 from . import simulation as simulation
 from . import system as system
 from .simulation import resume as resume
