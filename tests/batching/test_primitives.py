@@ -83,6 +83,13 @@ def test_results_stay_when_jax_changes_a_primitive(primitive, change, monkeypatc
     assert primitive in mapped_by_jax
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_results_stay_without_any_rule(name, monkeypatch):
+    monkeypatch.setattr(primitives, "RULES", {})
+    x = numbers(5, 3)
+    assert_same(lanes(CASES[name])(x), jax.vmap(CASES[name])(x))
+
+
 def test_a_rule_reads_parameters_that_its_primitive_has():
     x = np.ones((3, 2), np.float32)
     trace = jax.make_jaxpr(lambda x: jax.lax.scan(lambda c, y: (c + y, y), x[0], x))(x)
