@@ -102,7 +102,8 @@ def height_function(height: HeightOf, dtype) -> HeightOf:
     for leaf in jax.tree.leaves(height) if is_tree else ():
         if not eqx.is_array_like(leaf):
             raise ValueError(f"all leaves of height must be arrays; one is a {type(leaf).__name__}")
-    tree = height if is_tree else Partial(height)
+    # A Python number would be static in `equinox.filter_jit`, and every new one a new program.
+    tree = jax.tree.map(jnp.asarray, height) if is_tree else Partial(height)
     scalar = jax.ShapeDtypeStruct((), dtype)
     result = jax.eval_shape(lambda x, z: jnp.asarray(tree(x, z)), scalar, scalar)
     if result.shape != () or jnp.issubdtype(result.dtype, jnp.complexfloating):

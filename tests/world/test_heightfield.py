@@ -379,6 +379,19 @@ def test_numbers_of_a_function_change_without_a_new_trace(make):
     assert len(traces) == 2  # another function
 
 
+def test_python_numbers_of_a_function_are_traced_too():
+    traces = []
+
+    @eqx.filter_jit
+    def cast(ground):
+        traces.append(ground)
+        return terrain.cast(ground, jnp.array([0.5, 9.0, 0.0]), jnp.inf).point[1]
+
+    heights = [cast(terrain.function(Partial(wave_height, (size, 1.0)))) for size in (1.0, 2.0)]
+    assert float(heights[1]) == pytest.approx(2 * float(heights[0]))
+    assert len(traces) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["record", "stride"])
 def test_a_walk_over_a_heightfield_is_that_over_the_same_mesh(preset):
