@@ -133,7 +133,6 @@ UNREAL_TRUTH = {
     "target.adjust": 0.03,
     "pelvis.speed": 6.0,
     "effector.speed": 9.0,
-    "effector.mesh_scale": 1.15,
     "leg.twist": 0.12,
     "leg.weight": 0.9,
 }

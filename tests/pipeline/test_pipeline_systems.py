@@ -56,7 +56,6 @@ CASES: list[tuple[str, str, dict[str, Any], int]] = [
             "pelvis.half_height": 0.8,
             "effector.speed": 9.0,
             "effector.latch_distance": 0.003,
-            "effector.mesh_scale": 1.25,
             "leg.weight": 0.9,
         },
         2,

@@ -271,9 +271,9 @@ def test_unreal_measures_from_the_origin_and_finds_no_ground_beyond_its_ray(
     assert output["hip"] == pytest.approx(height if changes and height < 0 else 0.0)
 
 
-def test_unreal_divides_effectors_by_the_scale_of_the_mesh_and_idles_below_a_speed():
-    _, output = step(unreal, LEFT_LOW, stand(), {"effector.mesh_scale": 2.0})
-    assert np.allclose(output["target_ws"][:, 1], [ANKLE - 0.1, ANKLE - 0.05], atol=EXACT)
+def test_unreal_brings_each_foot_to_its_own_ground_and_idles_below_a_speed():
+    _, output = step(unreal, LEFT_LOW, stand())
+    assert np.allclose(output["target_ws"][:, 1], [ANKLE - 0.1, ANKLE], atol=EXACT)
     _, output = step(unreal, LEFT_LOW, stand(speed=0.5))
     assert output["hip"] == 0.0 and not output["idle"]
     _, output = step(unreal, LEFT_LOW, stand(speed=0.5), {"contact.idle_speed": 0.5})

@@ -125,7 +125,6 @@ SINGULAR: dict[str, tuple[jaxik.Frame, Any, dict[str, Any], dict[str, dict[str, 
         {},
         {
             "ozz": BAREFOOT["ozz"] | {"foot.weight": 0.0},
-            "unreal": {"effector.mesh_scale": np.inf},
             "mec": {"probe.foot_length": 0.0, "probe.half_width": 0.0, "foot.max_tilt": 0.0},
         },
     ),

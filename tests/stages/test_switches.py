@@ -132,7 +132,6 @@ CASES: dict[str, tuple[Case, ...]] = {
             -1,
             {"contact.idle_speed": 0.1},
         ),
-        Case("effector.mesh_scale", "standing", RAISED, (0.8, 1.25), "target height", -1),
         Case("leg.max_knee_angle", "standing", LOWERED, (2.6, 2.8), "knee angle", 1, STIFF),
         Case("leg.min_knee_angle", "standing", planes((0, 0, 0.5)), (0.9, 1.2), "knee angle", 1),
         Case(

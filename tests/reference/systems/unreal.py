@@ -28,7 +28,6 @@ DEFAULTS: dict[str, Any] = {
     "effector.speed": 15.0,
     "effector.latch": True,
     "effector.latch_distance": 0.01,
-    "effector.mesh_scale": 1.0,
     "leg.min_knee_angle": 0.0,
     "leg.max_knee_angle": math.pi,
     "leg.soften": 1.0,
@@ -72,9 +71,9 @@ def step(
     body = limb.body(frame, terrain.up * state.hip, maths.IDENTITY)
     solved, reached, targets = [], [], []
     for leg in legs:
-        raised = state.effector[leg] / parameters.of_leg("effector.mesh_scale", leg)
+        raised = characters.under(terrain, leg).up * state.effector[leg]
         target_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
-        target_ws = target_ws + terrain.up * state.hip + characters.under(terrain, leg).up * raised
+        target_ws = target_ws + terrain.up * state.hip + raised
         target_ms = maths.unapply(frame.world_from_model, target_ws)
         hip, knee, ankle, arrived = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
         # The body does not rotate, so the animated model-space rotation is the world's as well.
