@@ -160,9 +160,10 @@ def test_equal_values_per_leg_act_like_a_shared_value(preset: str):
         return jnp.broadcast_to(leaf, (2, *leaf.shape))
 
     def may_be_per_leg(name: str) -> bool:
-        if name in ("pelvis.min_length", "pelvis.max_length"):
+        if name in ("pelvis.min_length", "pelvis.max_length", "pelvis.extension"):
             return True
-        return not name.startswith(("root.", "lean.", "pelvis.")) and name != "effector.latch"
+        one_for_all = name in ("effector.latch", "lock.hold_ball")
+        return not one_for_all and not name.startswith(("root.", "lean.", "pelvis."))
 
     values = {name: widened(name) for name in filter(may_be_per_leg, parameter_tree.docs(ik))}
     result = run(parameter_tree.replace(ik, values), rig, ground, frames)
