@@ -5,6 +5,7 @@
 - `synthetic`: walks, animals and terrain made from parameters.
 - `flat_animation`: the animation on flat ground that belongs to a clip captured on uneven ground.
 - `clip_frames`: clips to frames of the foot IK pipeline, and its results back to clips.
+- `ground_path`: the ground along a clip's path, and a root that follows it.
 
 Nothing here knows what is fitted or how; that begins in `fitting.problem`.
 

@@ -1,10 +1,11 @@
 """Conversion between clips and the foot IK pipeline: `Clip` to `Frame`, and `Result` to `Clip`."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float64
 from scipy.spatial.transform import Rotation
 
 import jaxik
@@ -17,7 +18,13 @@ from .clips.kinematics import local_from_world
 Direction = Sequence[float] | np.ndarray
 
 
-def frames_from_clip(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -> jaxik.Frame:
+def frames_from_clip(
+    clip: Clip,
+    *,
+    floor: float = 0.0,
+    up_ws: Direction = UP,
+    rise: Float64[np.ndarray, " frames"] | None = None,
+) -> jaxik.Frame:
     """The clip as the pipeline's input: one `Frame` whose leaves have a leading frames axis.
 
     Foot IK is at full weight, the ground does not move, and the character slides where the clip
@@ -27,6 +34,8 @@ def frames_from_clip(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -
         clip: with legs.
         floor: height of the floor on which the clip was animated, m; the origin of model space.
         up_ws: unit normal of that floor; for a climber, the wall's.
+        rise: how far the character is raised along it in each frame, m; see `ground_path`. Speeds
+            stay those of the animation on its floor.
 
     Raises:
         ValueError: the clip has no legs.
@@ -45,7 +54,7 @@ def frames_from_clip(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -
         return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
 
     upright = np.tile([1.0, 0.0, 0.0, 0.0], (clip.frame_count, 1))
-    return jaxik.Frame(
+    frames = jaxik.Frame(
         world_from_model=world,
         pose=pose,
         weight=array(np.ones((clip.frame_count, legs))),
@@ -57,6 +66,22 @@ def frames_from_clip(clip: Clip, *, floor: float = 0.0, up_ws: Direction = UP) -
         dt=array(np.full(clip.frame_count, 1.0 / clip.fps)),
         platform=jaxik.Transform(array(np.zeros(world.pos.shape)), array(upright)),
     )
+    return frames if rise is None else frames.translated(array(_along(up_ws, rise)))
+
+
+def raised(clip: Clip, rise: Float64[np.ndarray, " frames"] | None, up_ws: Direction = UP) -> Clip:
+    """The clip with the whole character moved along `up_ws` by `rise`, m, in each frame.
+
+    It keeps the contact labels that it has on its floor. None returns the same clip.
+    """
+    if rise is None:
+        return clip
+    moved = clip.with_motion(clip.positions_ws + _along(up_ws, rise)[:, None], clip.rotations_ws)
+    return replace(moved, stance=clip.stance_labels())
+
+
+def _along(up_ws: Direction, distance: np.ndarray) -> Float64[np.ndarray, "frames 3"]:
+    return distance[:, None] * np.asarray(up_ws, np.float64)
 
 
 @jax.jit  # as one program; without it thirty operations are compiled
@@ -96,7 +121,12 @@ def _stride(clip: Clip) -> tuple[np.ndarray, ...]:
 
 
 def clip_from_result(
-    clip: Clip, result: jaxik.Result, *, floor: float = 0.0, up_ws: Direction = UP
+    clip: Clip,
+    result: jaxik.Result,
+    *,
+    floor: float = 0.0,
+    up_ws: Direction = UP,
+    rise: Float64[np.ndarray, " frames"] | None = None,
 ) -> Clip:
     """The clip with the motion that the pipeline returned.
 
@@ -108,8 +138,12 @@ def clip_from_result(
         result: of all its frames.
         floor: as passed to `frames_from_clip`.
         up_ws: as passed to `frames_from_clip`.
+        rise: as passed to `frames_from_clip`.
     """
     world = clip.world_from_model(floor, up_ws)
+    if rise is not None:
+        world = jaxik.Transform(world.pos + _along(up_ws, rise), world.rot)
+        clip = raised(clip, rise, up_ws)
     body, solved = _world_from_model(world, result.body, result.pose)
     body_rot, body_pos = _rotation(body.rot), np.asarray(body.pos)
 

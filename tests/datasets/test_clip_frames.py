@@ -145,3 +145,31 @@ def test_toe_speed_is_that_of_the_toes(clip):
     frames = clip_frames.frames_from_clip(clip)
     steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
     np.testing.assert_allclose(frames.toe_speed[1:], steps, rtol=1e-9)
+
+
+def test_a_raised_character_has_the_pose_and_the_speeds_of_its_floor(clip):
+    rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
+    frames, flat = (clip_frames.frames_from_clip(clip, rise=height) for height in (rise, None))
+    moved = np.asarray(frames.world_from_model.pos - flat.world_from_model.pos)
+    np.testing.assert_allclose(moved, rise[:, None] * [0.0, 1.0, 0.0], atol=1e-12)
+    same = dataclasses.replace(frames, world_from_model=flat.world_from_model)
+    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(flat), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_foot_ik_that_changes_nothing_returns_the_raised_clip(clip):
+    rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
+    quiet = {"lock.enabled": jnp.array(False), "leg.weight": jnp.array(0.0)}
+    ik = parameter_tree.replace(jaxik.presets.record(), quiet)
+    far = terrain.plane((0.0, -9.0, 0.0))
+    result = jaxik.run(ik, clip.rig, far, clip_frames.frames_from_clip(clip, rise=rise))
+    solved = clip_frames.clip_from_result(clip, result, rise=rise)
+    raised = clip_frames.raised(clip, rise)
+    np.testing.assert_allclose(solved.positions_ws, raised.positions_ws, rtol=0, atol=1e-9)
+
+
+def test_a_raised_clip_keeps_its_contact_labels(clip):
+    unlabelled = dataclasses.replace(clip, stance=None)
+    raised = clip_frames.raised(unlabelled, np.linspace(0.0, 2.0, clip.frame_count))
+    np.testing.assert_array_equal(raised.stance_labels(), unlabelled.stance_labels())
+    assert clip_frames.raised(clip, None) is clip
