@@ -5,6 +5,7 @@ fractions. Sentences, tables and pictures of them are in `fitting.report`.
 
 Start with `playback`, which puts the animation, the solved and the captured motion of a clip side
 by side; `worst_window` reads it. `accuracy` holds the figures of the blocks benchmark, `measures`
-says how well a motion stands on its ground, `difference` compares two systems, and
-`limit_activity` says which limits and decisions a clip exercises.
+says how well a motion stands on its ground, `placement` where its feet are, `misplacement` why
+they are not where they should be, `difference` compares two systems, and `limit_activity` says
+which limits and decisions a clip exercises.
 """
