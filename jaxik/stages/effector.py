@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
+from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform
 
 from .inputs import SensedMoment
@@ -86,9 +87,9 @@ class FoundEffector(AbstractInstantEffector):
 class HeelEffector(AbstractInstantEffector):
     """Lifts the heel of a leg that would be over-stretched, as the trailing foot of a walker.
 
-    The foot turns about its ball, toes down, until the distance from hip to ankle is `extension`
-    times the length of the leg, or the animated distance if that is longer. It turns by at most
-    `max_lift`. Locomotion systems after Johansen (2009) lift heels in the same way.
+    The foot, tilted as the ground, turns about its ball, toes down, until the distance from hip to
+    ankle is `extension` times the length of the leg, or the animated distance if that is longer. It
+    turns by at most `max_lift`. Locomotion systems after Johansen (2009) lift heels in this way.
     """
 
     extension: Leaf = parameter(
@@ -107,19 +108,30 @@ class HeelEffector(AbstractInstantEffector):
     ) -> tuple[None, Effector]:
         sensed = now.sensed
         from_animated = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
+        tilt = foot_tilt(sensed)
         arm = quat.rotate(from_animated, sensed.ankle_ws - sensed.ball_ws)
+        arm = quat.rotate(tilt, arm)
         ball = target.pos - arm
         axis = vec.cross(sensed.ahead_ws, sensed.leg_up_ws)
+        tilted_axis = quat.rotate(tilt, axis)
         animated = vec.length(sensed.ankle_ws - sensed.hip_ws)
         longest = self.extension * (sensed.thigh + sensed.shin)
         longest = jnp.where(animated > longest, animated, longest)
         hip = sensed.hip_ws + pelvis.offset_ws
-        angle = heel_angle(ball - hip, arm, axis, longest)
+        angle = heel_angle(ball - hip, arm, tilted_axis, longest)
         zero = jnp.zeros_like(angle)
         angle = now.gate.clip(angle, zero, zero + self.max_lift, band=ANGLE_BAND)
-        lift = quat.from_axis_angle(axis, -angle)
-        rot_ws = quat.multiply(lift, target.rot)
-        return None, Effector(ball + quat.rotate(lift, arm), rot_ws, sensed.weight)
+        raised = quat.rotate(quat.from_axis_angle(tilted_axis, -angle), arm)
+        # The foot rule tilts the foot once it is raised.
+        rot_ws = quat.multiply(quat.from_axis_angle(axis, -angle), target.rot)
+        return None, Effector(ball + raised, rot_ws, sensed.weight)
+
+
+def foot_tilt(sensed: Sensed) -> Float[Array, "legs 4"]:
+    """Rotation of a level foot onto the ground under it, as far as it turns."""
+    up = jnp.broadcast_to(sensed.leg_up_ws, sensed.ahead_ws.shape)
+    tilt = quat.shortest_arc(up, sensed.ground.ankle.normal, sensed.ahead_ws)
+    return quat.nlerp(quat.identity(tilt.dtype), tilt, sensed.turned)
 
 
 def heel_angle(to_ball: Array, arm: Array, axis: Array, length: Array) -> Float[Array, " legs"]:
@@ -170,6 +182,10 @@ class BodyEffector(AbstractEffector):
     Unreal's interp-to, and the foot moves with the pelvis. With `latch` on, as in the original,
     everything stops once all feet are within `latch_distance` of their goals, until the character
     moves. A pelvis slower than the feet then freezes short of its goal, so better leave it off.
+
+    The original divides these heights by the vertical scale of the mesh, because they go into the
+    space of the mesh, from which the engine brings them back by the same factor. Here poses and
+    heights are in metres of the world, whatever the scale of the mesh, so there is none.
     """
 
     speed: Leaf = parameter(
@@ -181,7 +197,9 @@ class BodyEffector(AbstractEffector):
         doc="Rate at which feet follow their heights relative to the body.",
     )
     latch: Leaf = switch(
-        False, doc="Whether everything stops once the feet have arrived, until the character moves."
+        False,
+        doc="Whether everything stops once the feet have arrived, until the character moves.",
+        per_leg=False,
     )
     latch_distance: Leaf = parameter(
         0.01,
@@ -190,13 +208,6 @@ class BodyEffector(AbstractEffector):
         high=0.05,
         kind="threshold",
         doc="Distance from its goal within which a foot counts as arrived.",
-    )
-    mesh_scale: Leaf = parameter(
-        1.0,
-        unit="1",
-        low=0.5,
-        high=2.0,
-        doc="Scale of the character's mesh, by which heights of feet are divided.",
     )
 
     def init(self, rig: Rig) -> BodyState:
@@ -221,9 +232,7 @@ class BodyEffector(AbstractEffector):
         may_sleep = jnp.where(self.latch, self._stands(now), 0.0)
         asleep = may_sleep * (1.0 - awake * (1.0 - arrived))
 
-        offset_ws = (
-            vec.scale(sensed.leg_up_ws, height / self.mesh_scale - requested) + pelvis.offset_ws
-        )
+        offset_ws = vec.scale(sensed.leg_up_ws, height - requested) + pelvis.offset_ws
         effector = Effector(target.pos + offset_ws, target.rot, sensed.weight)
         return BodyState(height, asleep), effector
 

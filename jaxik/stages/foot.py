@@ -66,8 +66,8 @@ class PitchRollFoot(AbstractAnimatedFoot):
     """Pitches and rolls the animated foot onto the ground and keeps its heading (the record).
 
     The pitch comes from the hits of ankle and toe, or from the normal if there is no toe ray; the
-    roll comes from the normal. Both are scaled by contact. Pitch, then roll, aligns the sole with
-    the normal exactly.
+    roll comes from the normal. Both are scaled by contact, unless the probe says that swinging feet
+    turn too. Pitch, then roll, aligns the sole with the normal exactly.
 
     Limits are joint angles against the shin: 0 is a foot perpendicular to it, a positive pitch
     lifts the toes and a positive roll the outer edge, so that one pair of roll limits serves both
@@ -265,7 +265,7 @@ def limit_angle(rot: Array, limit: Array, gate: AbstractGate) -> Array:
 
 
 def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tuple[Array, Array]:
-    """Pitch and roll that align a level sole with the ground, rad, scaled by contact."""
+    """Pitch and roll that align a level sole with the ground, rad, by how far it is turned."""
     up, ankle, toe = sensed.leg_up_ws, sensed.ground.ankle, sensed.ground.toe
     across = toe.point - ankle.point
     run = vec.dot(across, ahead)
@@ -277,8 +277,7 @@ def ground_angles(sensed: Sensed, ahead: Array, right: Array, side: Array) -> tu
     # The part of the normal along the up axis of the pitched foot.
     upward = vec.safe_divide(run * facing + rise * rising, vec.safe_sqrt(run * run + rise * rise))
     roll = vec.safe_arctan2(side * vec.dot(ankle.normal, right), upward)
-    standing = sensed.contact.weight * ankle.found
-    return pitch * standing, roll * standing
+    return pitch * sensed.turned, roll * sensed.turned
 
 
 def joint_angle(axis: Array, shin: Array) -> Array:

@@ -70,7 +70,7 @@ class FootProbe(AbstractProbe):
         ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
         toe = with_weight(toe, jnp.where(self.use_toe, toe.found, 0.0))
         rays = make_rays(ankle, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(ankle, toe, no_hit(ankle), rays)
+        return GroundHits(ankle, toe, no_hit(ankle), jnp.zeros_like(ankle.found), rays)
 
 
 class RootProbe(AbstractProbe):
@@ -105,7 +105,7 @@ class RootProbe(AbstractProbe):
         start = ankle_ws + vec.scale(up, self.ray_up - over_root)
         hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(hit, no_hit(hit), no_hit(hit), rays)
+        return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.zeros_like(hit.found), rays)
 
 
 class CornerProbe(AbstractProbe):
@@ -214,7 +214,7 @@ class CornerProbe(AbstractProbe):
             )
         )
         rays = make_rays(ankle, self.ray_up + foot_height, below - foot_height, self.layers)
-        return GroundHits(ankle, toe, corner, rays)
+        return GroundHits(ankle, toe, corner, jnp.zeros_like(ankle.found), rays)
 
     def _extra(self, inputs: Inputs, foot_ws: Array, up_ws: Array) -> Array:
         """How far below a standing sole the rays of each foot end, m."""

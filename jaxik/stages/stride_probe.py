@@ -1,5 +1,7 @@
 """Stage 3 with lookahead: the ground between the last and the next foothold of each foot."""
 
+import functools
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -29,13 +31,18 @@ class StrideProbe(AbstractProbe):
     gives the middle slope of the minimum-jerk quintic (Flash and Hogan 1985). The foot thus starts
     to rise before the obstacle is under it.
 
+    Only a step is curved in this way. The slope that both footholds and the line between them share
+    is followed as the foot goes. The ground is sensed below the ball of the foot and continued to
+    below the ankle along the plane of the hits, so that on a slope the whole sole is on the ground.
+    Feet keep the slope of the ground in their swing, so that they neither leave nor meet it level.
+
     The animation may provide the footholds (`Frame.stride`). If not, they are predicted from the
     character's velocity: feet stand for `stance_time` and swing for `swing_time`, from as far ahead
     of the hip to as far behind it (Raibert 1986).
 
-    A next foothold more than `max_step` above or below the last, or on ground steeper than
-    `max_slope`, counts less and less, so that a foot neither drops off a ledge nor snaps onto a
-    wall. Rays along the path lift the foot over edges up to `max_step` high, on slopes of
+    A next foothold more than `max_step` above or below the slope of the last, or on ground steeper
+    than `max_slope`, counts less and less, so that a foot neither drops off a ledge nor snaps onto
+    a wall. Rays along the path lift the foot over edges up to `max_step` high, on slopes of
     `way_slope` before and after each edge. Where the ground is above the curve, heel and ball clear
     it by as much as the animation lifts them, less `clearance`.
     """
@@ -84,7 +91,7 @@ class StrideProbe(AbstractProbe):
         unit="m",
         low=0.1,
         high=1.0,
-        doc="Height of a step up or down above which the next foothold is ignored.",
+        doc="Height of a step, not of a slope, above which the next foothold is ignored.",
     )
     max_slope: Leaf = parameter(
         1.05,
@@ -138,24 +145,33 @@ class StrideProbe(AbstractProbe):
         found = jnp.where(last.found > next_.found, last.found, next_.found)
         low = jnp.where(last.found > 0, low, jnp.where(next_.found > 0, high, 0.0))
         normal = jnp.where(last.found[..., None] > 0, last.normal, next_.normal)
-        trust = next_.found * self._trust(next_.normal, high - low, level)
-        rise = trust * (high - low)
-        normal_rise = vec.scale(next_.normal - normal, trust)
+
+        way = vec.reject(stride.next_ws - stride.last_ws, level.up_ws)
+        climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
+        slope = least_rise(high - low, *climbs)
+        step = high - low - slope
+        trust = next_.found * self._trust(next_.normal, step, level)
 
         since_start = stride.fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
         fraction = s_curve(fraction, self.steepness)
-        height = low + rise * fraction
+        ankle, ball = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.toe.pos)
+        covered = vec.safe_divide(vec.dot(ball - stride.last_ws, way), vec.dot(way, way))
+        height = low + trust * (slope * clip_to_one(covered) + step * fraction)
+        rise = trust * (high - low)
         top = low + jnp.where(rise > 0, rise, 0.0)
-        soles = self._soles(inputs, level, foot_height)
-        height += self._clearance_over_edges(inputs, stride, soles, height, top)
-        height = jnp.where(found > 0, height, 0.0)
+        normal += vec.scale(next_.normal - normal, trust * fraction)
+        normal = vec.normalize(normal, level.up_ws)
 
-        ankle_ws = level.project(animated_ankles(frame).pos) + vec.scale(level.up_ws, height)
-        tilted = normal + vec.scale(normal_rise, fraction)
-        hit = Hit(ankle_ws, vec.normalize(tilted, level.up_ws), self.ray_up - height, found)
+        soles = self._soles(inputs, level, foot_height)
+        under_soles = height + self._climb(normal, soles - ball, level)
+        height += self._clearance_over_edges(inputs, stride, soles, under_soles, top)
+        height += self._climb(normal, ankle - ball, level)
+        height = jnp.where(found > 0, height, 0.0)
+        ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
+        hit = Hit(ankle_ws, normal, self.ray_up - height, found)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(hit, no_hit(hit), no_hit(hit), rays)
+        return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.ones_like(found), rays)
 
     def _stride(self, inputs: Inputs, contact: Contact, level: "Level") -> Stride:
         """The stride of the animation where it is known, else one predicted from velocity."""
@@ -191,11 +207,24 @@ class StrideProbe(AbstractProbe):
         return hit, level.height(hit.point)
 
     def _trust(self, normal: Array, step: Array, level: "Level") -> Array:
-        """0..1, how much a step of this height to ground with this normal counts."""
+        """0..1, how much a step of this height, m, to ground with this normal counts."""
+        low_enough = 1.0 - smoothstep((jnp.abs(step) - self.max_step) / STEP_FADE)
+        return low_enough * self._gentleness(normal, level)
+
+    def _climb(self, normal: Array, way: Array, level: "Level") -> Array:
+        """How much higher ground with this normal is at the end of a way than at its start, m.
+
+        Ground that is too steep counts as level: a foot is not to follow a wall.
+        """
+        against = vec.dot(vec.reject(way, level.up_ws), normal)
+        climb = -vec.safe_divide(against, vec.dot(normal, level.up_ws))
+        return climb * self._gentleness(normal, level)
+
+    def _gentleness(self, normal: Array, level: "Level") -> Array:
+        """0..1, how much ground with this normal counts: less if it is too steep."""
         cosine = vec.dot(normal, level.up_ws)
         slope = vec.safe_arctan2(vec.length(vec.cross(normal, level.up_ws)), cosine)
-        low_enough = 1.0 - smoothstep((jnp.abs(step) - self.max_step) / STEP_FADE)
-        return low_enough * (1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE))
+        return 1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE)
 
     def _soles(self, inputs: Inputs, level: "Level", foot_height: Array) -> Array:
         """Animated heels and balls at sole height, (2 legs 3), m, world space."""
@@ -208,25 +237,28 @@ class StrideProbe(AbstractProbe):
         return jnp.stack([heel, ball - vec.scale(level.up_ws, self.ball_height)])
 
     def _clearance_over_edges(
-        self, inputs: Inputs, stride: Stride, soles: Array, height: Array, top: Array
+        self, inputs: Inputs, stride: Stride, soles: Array, under_soles: Array, top: Array
     ) -> Float[Array, " legs"]:
-        """How much higher each foot goes to clear what lies between its footholds, m."""
+        """How much higher each foot goes to clear what lies between its footholds, m.
+
+        `under_soles` is the height of the ground that each sole was lifted from, m.
+        """
         terrain, gate = inputs.terrain, inputs.gate
         level = Level(inputs.frame.world_from_model.pos, terrain.leg_up_ws)
-        fractions = (jnp.arange(PATH_RAYS, dtype=height.dtype) + 0.5) / PATH_RAYS
+        fractions = (jnp.arange(PATH_RAYS, dtype=top.dtype) + 0.5) / PATH_RAYS
         path_ws = stride.last_ws + vec.scale(
             stride.next_ws - stride.last_ws, fractions[:, None]
         )  # (rays legs 3)
         hit, ground = self._ground_at(terrain, level, path_ws)
         fade = 1.0 - smoothstep((ground - top - self.max_step) / STEP_FADE)
         away = vec.length(vec.reject(path_ws[:, None] - soles, level.up_ws))  # (rays 2 legs)
-        excess = fade[:, None] * (ground[:, None] - self.way_slope * away - height)
+        excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
         # A sole that the animation sinks into its own floor needs no correction.
         lift = level.height(soles) - self.clearance
         lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
         rise = excess - lift
         rise = jnp.where(hit.found[:, None] > 0, rise, FAR_BELOW)
-        most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *height.shape), 0, -1), band=HEIGHT_BAND)
+        most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *top.shape), 0, -1), band=HEIGHT_BAND)
         zero = jnp.zeros_like(most)
         most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)
         fade_in = smoothstep(stride.fraction / ENDS)
@@ -258,7 +290,20 @@ def s_curve(fraction: Array, steepness: Array) -> Array:
     return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(fraction < 0.5, 0.0, 1.0))
 
 
+def least_rise(*rises: Array) -> Array:
+    """The rise nearest to 0, or 0 if some go up and others down, m."""
+    # Not `jnp.minimum`: on a plane all are equal, and its derivative would add up several of them.
+    lowest = functools.reduce(lambda a, b: jnp.where(a < b, a, b), rises)
+    highest = functools.reduce(lambda a, b: jnp.where(a > b, a, b), rises)
+    return jnp.where(lowest > 0, lowest, jnp.where(highest < 0, highest, 0.0))
+
+
 def smoothstep(x: Array) -> Array:
     """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
-    x = jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
+    x = clip_to_one(x)
     return x * x * (3.0 - 2.0 * x)
+
+
+def clip_to_one(x: Array) -> Array:
+    """`x` limited to 0..1, with zero gradient outside."""
+    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))

@@ -96,6 +96,8 @@ class GroundHits:
     """Legs; `found` is 0 where no toe ray was cast."""
     corner: Hit
     """Legs, beside the ankle; `found` is 0 where no such ray was cast."""
+    swing: Float[Array, " legs"]
+    """0..1, how far swinging feet turn to the ground; standing feet do by their contact."""
     rays: Rays
     """For stages that cast further rays."""
 
@@ -182,6 +184,12 @@ class Sensed:
     contact: Contact
     foothold: Foothold
     slope: Slope
+
+    @property
+    def turned(self) -> Float[Array, " legs"]:
+        """0..1, how far each foot turns to the ground under it."""
+        standing = self.contact.weight
+        return self.ground.ankle.found * (standing + self.ground.swing * (1.0 - standing))
 
 
 def animated_ankles(frame: Frame) -> Transform:

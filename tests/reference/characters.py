@@ -225,6 +225,12 @@ class Foot:
     hit: Hit
     toe_hit: Hit
     foothold_ws: Array
+    turns_in_swing: bool = False
+
+    @property
+    def turned(self) -> float:
+        """0..1, how far the foot turns to the ground under it."""
+        return float(self.hit.found) if self.turns_in_swing else self.grounded
 
     @property
     def grounded(self) -> float:

@@ -87,6 +87,13 @@ def walked() -> tuple[jaxik.Frame, jaxik.Result]:
     return frames, run(to_ik(VALUES, "stride"), to_rig(RIG), ground, frames)
 
 
+def tilt_of(sensed: jaxik.world.frame.Sensed) -> jax.Array:
+    """Rotations that lay level soles on the ground."""
+    normal = sensed.ground.ankle.normal
+    up = jnp.broadcast_to(jnp.asarray(maths.Y), normal.shape)
+    return quat.shortest_arc(up, normal, sensed.ahead_ws)
+
+
 @functools.cache
 def heels() -> dict[str, np.ndarray]:
     """Each heel's lift and expected lift, rad; its leg's length before, after and at most, m."""
@@ -101,14 +108,14 @@ def heels() -> dict[str, np.ndarray]:
         VALUES["effector.extension"] * (sample_poses.THIGH + sample_poses.SHIN), animated
     )
 
-    arm = sensed.ankle_ws - sensed.ball_ws
-    axis = -np.asarray(quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X)))
+    tilt = tilt_of(sensed)
+    arm = quat.rotate(tilt, sensed.ankle_ws - sensed.ball_ws)
+    level_axis = -quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X))
+    axis = quat.rotate(tilt, jnp.broadcast_to(level_axis[:, None], arm.shape))
     expected = [
-        search_angle(ball, arm, axis[index], length)
-        for index, legs in enumerate(
-            zip(*map(np.asarray, (before - arm, arm, longest)), strict=True)
-        )
-        for ball, arm, length in zip(*legs, strict=True)
+        search_angle(*leg)
+        for legs in zip(*map(np.asarray, (before - arm, arm, axis, longest)), strict=True)
+        for leg in zip(*legs, strict=True)
     ]
     cosine = np.abs(np.sum(advanced.effector.rot_ws * sensed.ankle_rot_ws, axis=-1))
     return {
@@ -150,9 +157,11 @@ def test_the_ball_stays_in_place_while_the_heel_rises():
     to_world = jax.vmap(lambda root, ball: root.apply(ball))
     ball = to_world(frames.world_from_model, result.pose.toe.pos)
     lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
-    requested = advanced.foothold_ws + lift + (sensed.ball_ws - sensed.ankle_ws)
-    # The foot is then rotated onto the slope about its ankle: the ball stays on level ground only.
-    level = np.asarray(sensed.ground.ankle.normal)[..., 1] * np.asarray(sensed.contact.weight)
-    arrived = (np.asarray(result.reached) > 0) & ((level == 0) | (level > 1 - 1e-12))
+    normal = sensed.ground.ankle.normal
+    to_ball = quat.rotate(tilt_of(sensed), sensed.ball_ws - sensed.ankle_ws)
+    moved = np.asarray(ball - (advanced.foothold_ws + lift + to_ball))
+    arrived = (np.asarray(result.reached) > 0) & (np.asarray(result.aimed) > 0)
     assert (heels()["lift"][arrived] > 0.02).any()
-    np.testing.assert_allclose(ball[arrived], requested[arrived], rtol=0, atol=1e-8)
+    assert np.abs(np.sum(moved * normal, axis=-1))[arrived].max() < 1e-8
+    # Pitch and roll turn the foot a little about the normal, and so the ball along the ground.
+    assert np.abs(moved)[arrived].max() < 0.002

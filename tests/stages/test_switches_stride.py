@@ -34,8 +34,9 @@ EAGER = {
     "contact.planted_speed": 1.0,
     "contact.raised_speed": 1.5,
 }  # a root that stands while the feet walk
-UPHILL, DOWNHILL = planes((0.4, 0, 0)), planes((-0.4, 0, 0))
-GENTLE = planes((0.15, 0, 0))
+UPHILL = planes((0.4, 0, 0))
+STEP_UP = planes((0, 0, 0), (1.0, 0, -0.25))  # rises 0.2 m ahead of the ankles
+STEP_DOWN = planes((0, 0, 0), (-1.0, 0, 0.15))  # falls until 0.1 m ahead of the ankles
 TILTED, STEEP, WALL = (planes((0, left, 0)) for left in (0.4, 0.9, 4.0))  # the left foot higher
 LOWERED, RAISED = planes((0, 0, -0.5)), planes((0, 0, 0.1))
 
@@ -65,15 +66,15 @@ CASES: dict[str, tuple[Case, ...]] = {
         ),
         Case("probe.ray_down", "standing", LOWERED, (0.3, 0.8), "target height", -1, slope=False),
         Case("probe.layers", "standing", RAISED, (NONE, ALL), "target height", 1),
-        Case("probe.rise_start", "comes down", UPHILL, (0.0, 0.3), "target height", -1),
-        Case("probe.rise_end", "comes down", UPHILL, (0.8, 1.0), "target height", -1),
-        Case("probe.steepness", "comes down", UPHILL, (1.0, 2.0), "target height", 1),
-        Case("probe.max_step", "comes down", UPHILL, (0.25, 0.3), "target height", 1),
+        Case("probe.rise_start", "comes down", STEP_UP, (0.0, 0.3), "target height", -1),
+        Case("probe.rise_end", "comes down", STEP_UP, (0.8, 1.0), "target height", -1),
+        Case("probe.steepness", "comes down", STEP_UP, (1.0, 2.0), "target height", 1),
+        Case("probe.max_step", "comes down", STEP_UP, (0.25, 0.3), "target height", 1),
         Case("probe.max_slope", "comes down", UPHILL, (0.3, 0.36), "target height", 1),
-        Case("probe.clearance", "lifts off", UPHILL, (0.0, 0.05), "target height", 1, WIDE),
-        Case("probe.way_slope", "lifts off", UPHILL, (0.5, 1.0), "target height", -1),
-        Case("probe.heel_length", "comes down", DOWNHILL, (0.05, 0.09), "target height", 1),
-        Case("probe.ball_height", "lifts off", UPHILL, (0.03, 0.06), "target height", 1, WIDE),
+        Case("probe.clearance", "lifts off", STEP_UP, (0.0, 0.05), "target height", 1, WIDE),
+        Case("probe.way_slope", "lifts off", STEP_UP, (0.5, 1.0), "target height", -1),
+        Case("probe.heel_length", "comes down", STEP_DOWN, (0.05, 0.09), "target height", 1),
+        Case("probe.ball_height", "lifts off", STEP_UP, (0.03, 0.06), "target height", 1, WIDE),
         Case(
             "probe.stance_time", "swings, footholds unknown", KINK, (0.5, 0.7), "target height", 1
         ),
@@ -171,11 +172,13 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
     "by speed": (
         Case("contact.ground_height", "standing", FLAT, (0.0, 0.01), "target height", -1),
-        Case("contact.planted_height", "hovering", GENTLE, (0.05, 0.08), "pitch", 1),
-        Case("contact.raised_height", "lifts its feet slowly", GENTLE, (0.08, 0.11), "pitch", 1),
-        Case("contact.planted_speed", "drifts", GENTLE, (0.2, 0.45), "pitch", 1),
-        Case("contact.raised_speed", "speeds up", GENTLE, (0.3, 0.6), "pitch", 1),
-        Case("contact.half_life", "speeds up", GENTLE, (0.05, 0.2), "pitch", 1),
+        Case("contact.planted_height", "hovering", FLAT, (0.05, 0.08), "locked", 1, LOOSE),
+        Case(
+            "contact.raised_height", "lifts its feet slowly", FLAT, (0.08, 0.11), "locked", 1, LOOSE
+        ),
+        Case("contact.planted_speed", "drifts", FLAT, (0.2, 0.45), "locked", 1, LOOSE),
+        Case("contact.raised_speed", "speeds up", FLAT, (0.3, 0.6), "locked", 1, LOOSE),
+        Case("contact.half_life", "speeds up", FLAT, (0.05, 0.2), "contact", 1),
         Case("pelvis.lowest_share", "standing", TILTED, (0.2, 0.8), "pelvis height", -1),
         *followed(**EAGER),
     ),

@@ -56,6 +56,7 @@ def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
         "left roll": edge[:, 0],
         "lean forward": body[..., 2],
         "lean right": -body[..., 0],
+        "contact": result.trace.sensed.contact.weight,
         "weight": effector.weight,
         "slip": vec.length(ankle_ws[1:] - ankle_ws[:-1]),
         "miss": vec.length(ankle_ws - effector.target_ws),

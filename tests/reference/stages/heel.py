@@ -24,14 +24,16 @@ def raised(
 ) -> tuple[Array, Array, float]:
     """Ankle target, ankle rotation, and the angle by which the heel rises about the ball, rad."""
     rot_ws = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
-    from_ball = foot.ankle_ws - foot.ball_ws
+    tilt = onto_ground(foot, up)
+    from_ball = rotate(tilt, foot.ankle_ws - foot.ball_ws)
     ball = target - from_ball
     hip = foot.hip_ws + offset_ws
     longest = max(
         parameters.of_leg("effector.extension", leg) * leg_length(frame, leg),
         length(foot.ankle_ws - foot.hip_ws),
     )
-    axis = cross(foot.heading_ws, up)
+    level_axis = cross(foot.heading_ws, up)
+    axis = rotate(tilt, level_axis)
     square = across(from_ball, axis)
     to_ball = ball - hip
     fixed = to_ball + (from_ball - square)
@@ -44,5 +46,12 @@ def raised(
         angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
         angle += math.atan2(by_sine, by_cosine)
         lift = clip(angle, 0.0, parameters.of_leg("effector.max_lift", leg))
-    rise = maths.from_axis_angle(axis, -lift)
-    return ball + rotate(rise, from_ball), maths.multiply(rise, rot_ws), lift
+    ankle = ball + rotate(maths.from_axis_angle(axis, -lift), from_ball)
+    # The foot stage tilts the foot after its heel has risen.
+    return ankle, maths.multiply(maths.from_axis_angle(level_axis, -lift), rot_ws), lift
+
+
+def onto_ground(foot: Foot, up: Array) -> Array:
+    """The rotation by which a level sole comes to lie on the ground, as far as the foot turns."""
+    whole = maths.shortest_arc(up, foot.hit.normal, foot.heading_ws)
+    return maths.nlerp(maths.IDENTITY, whole, foot.turned)

@@ -164,7 +164,7 @@ def foot(
     lateral = -side * right
 
     pitch, roll = _ground_angles(foot, heading, right, lateral, up)
-    pitch, roll = pitch * foot.grounded, roll * foot.grounded
+    pitch, roll = pitch * foot.turned, roll * foot.turned
 
     shin = unit(rotate(world_from_model, ankle.pos - knee.pos), -up)
     joint_pitch = _joint_angle(foot_forward, shin)

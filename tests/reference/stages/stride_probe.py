@@ -4,6 +4,7 @@ One leg, one frame at a time. World space; heights are above the root along the 
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -84,11 +85,14 @@ def ground_of_stride(
     following = following if following.found else last
 
     low, high = height(frame, up, last.point), height(frame, up, following.point)
+    # What the two footholds rise by is a slope, as far as both planes rise so far, and a step.
+    across_ws = across(stride.next - stride.last, up)
+    climbs = [climb(parameters, leg, up, hit.normal, across_ws) for hit in (last, following)]
+    slope = shared_rise(high - low, *climbs)
+    step = high - low - slope
     max_step = parameters.of_leg("probe.max_step", leg)
-    steepness = math.acos(clip(float(following.normal @ up), -1.0, 1.0))
-    too_high = smooth01((abs(high - low) - max_step) / FADE)
-    too_steep = smooth01((steepness - parameters.of_leg("probe.max_slope", leg)) / FADE)
-    sure = (1.0 - too_high) * (1.0 - too_steep)
+    too_high = smooth01((abs(step) - max_step) / FADE)
+    sure = (1.0 - too_high) * gentle(parameters, leg, up, following.normal)
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
 
@@ -97,13 +101,47 @@ def ground_of_stride(
     x = clip((stride.fraction - start) / (end - start), 0.0, 1.0)
     k = parameters.of_leg("probe.steepness", leg)
     risen = x**k / (x**k + (1.0 - x) ** k)
-    ground = lerp(low, high, risen)
+    ball = apply(frame.world_from_model, frame.toe.pos[leg])
+    squared = float(across_ws @ across_ws)
+    on_its_way = float((ball - stride.last) @ across_ws) / squared if squared > 0.0 else 0.0
+    ground = low + sure * (slope * clip(on_its_way, 0.0, 1.0) + step * risen)
     normal = unit(last.normal + risen * (next_normal - last.normal), up)
 
-    need = lift_over_edges(parameters, rig, terrain, frame, leg, stride, ground, max(low, high))
+    def beside_ball(point: Array) -> float:
+        """Height of the ground under a point of the foot, on the plane under its ball, m."""
+        return ground + climb(parameters, leg, up, normal, point - ball)
+
+    need = lift_over_edges(
+        parameters, rig, terrain, frame, leg, stride, beside_ball, max(low, high)
+    )
     passed, left = stride.fraction, 1.0 - stride.fraction
     window = smooth01(passed / EDGE_FRACTION) * smooth01(left / EDGE_FRACTION)
-    return Hit(True, here + up * (ground + window * need), normal), stride
+    ankle = apply(frame.world_from_model, frame.ankle.pos[leg])
+    return Hit(True, here + up * (beside_ball(ankle) + window * need), normal), stride
+
+
+def climb(parameters: Parameters, leg: int, up: Array, normal: Array, moved: Array) -> float:
+    """What a plane with this normal rises by along the horizontal part of a move, m."""
+    facing = float(normal @ up)
+    if facing <= 0.0:
+        return 0.0
+    rise = -float(across(moved, up) @ normal) / facing
+    return rise * gentle(parameters, leg, up, normal)
+
+
+def gentle(parameters: Parameters, leg: int, up: Array, normal: Array) -> float:
+    """1 for a slope that counts, 0 for one that is too steep."""
+    steepness = math.acos(clip(float(normal @ up), -1.0, 1.0))
+    return 1.0 - smooth01((steepness - parameters.of_leg("probe.max_slope", leg)) / FADE)
+
+
+def shared_rise(*rises: float) -> float:
+    """The smallest of rises that are all up or all down, m; else 0."""
+    if all(rise > 0.0 for rise in rises):
+        return min(rises)
+    if all(rise < 0.0 for rise in rises):
+        return max(rises)
+    return 0.0
 
 
 def lift_over_edges(
@@ -113,7 +151,7 @@ def lift_over_edges(
     frame: Frame,
     leg: int,
     stride: Swing,
-    ground: float,
+    ground_under: Callable[[Array], float],
     top: float,
 ) -> float:
     """How far the ground must be raised for the animated sole to clear obstacles on its path, m."""
@@ -141,7 +179,7 @@ def lift_over_edges(
         counts = 1.0 - smooth01(beyond / FADE)
         for point in (heel, ball):
             away = length(across(point - pos, up))
-            over = edge - parameters.of_leg("probe.way_slope", leg) * away - ground
+            over = edge - parameters.of_leg("probe.way_slope", leg) * away - ground_under(point)
             # The clearance that the animation has over its own floor is subtracted.
             lift = height(frame, up, point) - parameters.of_leg("probe.clearance", leg)
             need = max(need, counts * over - max(lift, 0.0))

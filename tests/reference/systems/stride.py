@@ -79,6 +79,10 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         "leg.max_knee_angle": math.pi,
         "leg.soften": 0.985,
         "leg.as_animated": True,
+        "foot.max_pitch": 0.8,
+        "foot.min_pitch": -1.0,
+        "foot.max_roll": 0.45,
+        "foot.min_roll": -0.6,
     }
 
 
@@ -248,6 +252,7 @@ def sense(
         hit=hit,
         toe_hit=hit._replace(found=False),
         foothold_ws=ground.foothold(parameters, leg, hit, ankle_ws, lift, terrain.up),
+        turns_in_swing=True,
     )
     return foot, swing
 
