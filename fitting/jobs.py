@@ -19,10 +19,8 @@ import numpy as np
 
 import jaxik
 from fitting.analysis import accuracy
-from fitting.analysis.playback import stage_outputs
-from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip, load_clip, save_clip
-from fitting.datasets.clips.formats.npz import is_blocks_file
+from fitting.datasets.clips.formats.npz import check_clip_file, is_blocks_file
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
@@ -37,11 +35,11 @@ from fitting.report import (
     comparison_report,
     fit_report,
     fit_tables,
+    placement_report,
     posterior_report,
     translation_report,
 )
 from fitting.report.formatting import aligned
-from fitting.runtime import files
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import ablation, comparison, run_folder, translation
 from fitting.studies.animations import AnimationFiles, load_animation
@@ -84,9 +82,10 @@ def fit(
         experiment = load_experiment(experiment)
     known_values = load_known_values(experiment)
     run = _checked(output)
-    problem = make_problem(experiment)
-    clips = len(experiment.clips)
-    log(f"fitting {len(experiment.free)} parameters of {experiment.preset} to {clips} clip(s)")
+    roots: list[str] = []
+    problem = make_problem(experiment, roots.append)
+    free, preset = len(experiment.free), experiment.preset
+    log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
     solution = search(problem, experiment, progress)
     fitted = _assess_and_save(run, experiment, problem, solution, known_values)
     if run is not None:
@@ -186,11 +185,11 @@ def compare(
     during: Callable[[str], AbstractContextManager] = nullcontext,
     log: Log = _silent,
 ) -> Comparison:
-    """Runs several systems on a flat animation and measures them side by side.
+    """Runs several systems on a flat animation and measures them side by side; warns as `solve`.
 
     Args:
         systems: by name.
-        animation: the clip and the terrain.
+        animation: the clip, the terrain, and where the root is put for all systems.
         output: folder for the table, the numbers and the figure.
         during: makes a context for the run of each system, from its name.
         log: called with what the command line prints.
@@ -202,11 +201,15 @@ def compare(
     folder = _checked(output)
     systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
     title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
-    compared = comparison.compare(systems, load_animation(animation), title=title, during=during)
+    loaded = load_animation(animation)
+    compared = comparison.compare(systems, loaded, title=title, during=during)
     if folder is not None:
         comparison_report.write(folder, compared)
-    log(aligned(comparison_report.transposed(comparison_report.table(compared))))
+    table = aligned(comparison_report.transposed(comparison_report.table(compared)))
+    log(f"{table}\n\nroot: {loaded.root.reason}")
     _log_output(log, folder, comparison_report.TABLE)
+    for name, (placement, cause) in compared.placements.items():
+        placement_report.warn(placement, cause, name)
     return compared
 
 
@@ -282,11 +285,14 @@ def solve(
     *,
     log: Log = _silent,
 ) -> Clip:
-    """Solves a flat animation; where a captured motion is known, the log shows the difference.
+    """Solves a flat animation, and measures how its feet are placed on the ground.
+
+    Where a captured motion is known, the log also shows the difference. Feet that are visibly off
+    the ground, slide or pop are a warning, with the most likely cause.
 
     Args:
         ik: the system.
-        animation: the clip and the terrain.
+        animation: the clip, the terrain, and where the root is put.
         output: .npz file for the solved clip.
         log: called with what the command line prints.
 
@@ -296,25 +302,21 @@ def solve(
     """
     path = None if output is None else Path(output)
     if path is not None:
-        if path.suffix.lower() != ".npz":
-            raise ValueError(f"{path}: wanted a name that ends in .npz")
-        files.check_output_file(path)
+        check_clip_file(path)
     ik, loaded = with_floats(ik, np.float64), load_animation(animation)
     loaded.check_shapes(ik)
     began = time.perf_counter()
     result, solved = loaded.solve(ik)
+    seconds = time.perf_counter() - began
+    placement, cause = loaded.assess(solved)
     if path is not None:
-        save_clip(path, solved, joints=positions_by_role(solved))
-    grounded = float(np.mean(stage_outputs(result).sensed.foothold.found))
-    log(
-        f"{solved.frame_count} frames in {time.perf_counter() - began:.1f} s: ground under "
-        f"{grounded:.1%} of the feet, {float(np.mean(result.reached)):.1%} of the targets reached"
-        + ("" if path is None else f"; written to {path}")
-    )
+        save_clip(path, solved, joints=placement_report.arrays(solved, placement))
+    log(placement_report.solved_text(result, seconds, path))
+    log(f"root: {loaded.root.reason}\n\n{placement_report.text(placement)}")
     if is_blocks_file(animation.clip):
-        captured = load_clip(animation.clip)
-        errors = accuracy.clip_errors(solved, captured, loaded.clip)
+        errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)
         log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")
+    placement_report.warn(placement, cause)
     return solved
 
 

@@ -1,6 +1,7 @@
 """One function per command: reads the options, calls the job, prints."""
 
 import argparse
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
 def compare(options: argparse.Namespace) -> int:
     """Runs several systems on a clip and measures them."""
     _prepare_jax()
-    requested = comparison.named_systems(options.systems, on_ground=options.roots == "ground")
+    requested = comparison.named_systems(options.systems, on_ground=options.root == "auto")
     animation = _animation(options)
     jobs.compare(requested, animation, options.output, during=progress.timed, log=print)
     return 0
@@ -161,6 +162,12 @@ def convert_record(options: argparse.Namespace) -> int:
         with error_context(options.file):
             text = parameter_files.system_to_toml(record.to_ik(only, reading))
         files.write_text(options.output, text)
+        if (rest := record.besides_parameters(only)) != record.besides_parameters(record.Record()):
+            warnings.warn(
+                f"{', '.join(rest)}: no parameters, so not in {options.output}; `record to-bytes` "
+                f"takes them from --base {options.file}",
+                stacklevel=2,
+            )
     else:
         files.write(options.output, lambda path: path.write_bytes(record.to_bytes(only)))
     print(f"written to {options.output}")
@@ -211,7 +218,9 @@ def _prepare_jax() -> None:
 
 
 def _animation(options: argparse.Namespace) -> AnimationFiles:
-    return AnimationFiles(options.clip, options.terrain, options.file_up, options.floor)
+    return AnimationFiles(
+        options.clip, options.terrain, options.file_up, options.floor, options.root
+    )
 
 
 def _megabytes(paths: Sequence[Path]) -> str:

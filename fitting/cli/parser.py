@@ -138,10 +138,6 @@ def _add_compare(commands: Commands) -> None:
             option, dest="systems", action="append", default=[], metavar="NAME,...",
             type=lambda text, option=option: (option, text), help=f"{description}, in this order",
         )  # fmt: skip
-    compare.add_argument(
-        "--roots", choices=("ground", "animated"), default="ground",
-        help="where to put the root in unreal and mec, whose games put characters on the ground",
-    )  # fmt: skip
 
 
 def _add_translate(commands: Commands) -> None:
@@ -336,6 +332,11 @@ def _add_animation(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--floor", type=_finite, default=0.0, metavar="M", help="height of the clip's floor, m"
     )
+    command.add_argument(
+        "--root", choices=("auto", "animation", "ground"), default="auto",
+        help="keep the root of the clip, or let it follow the ground below it; auto keeps it where "
+        "foot IK reaches the ground from there, or where the feet follow this terrain already",
+    )  # fmt: skip
 
 
 def _finite(text: str) -> float:

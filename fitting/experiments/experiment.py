@@ -48,6 +48,8 @@ class ClipEntry:
     """What plots call the reference."""
     mask_pops: bool = True
     """Ignores frames in which a captured marker jumps."""
+    root: str = "auto"
+    """Where the base's root is put: one of `ground_path.ROOTS`."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,15 @@ class Experiment:
     def starting_system(self) -> jaxik.FootIK:
         """The preset with the experiment's rules and fixed parameters."""
         return with_parameters(self.preset_system(), self.parameters, f"{self.path} [parameters]")
+
+    def placed_clips(self) -> tuple[ClipEntry, ...]:
+        """The clips, with the root as animated where the system is told to place it itself."""
+        if not self.parameters.get("root.enabled", False):
+            return self.clips
+        return tuple(
+            replace(entry, root="animation") if entry.root == "auto" else entry
+            for entry in self.clips
+        )
 
     def free_parameters(self, ik: jaxik.FootIK) -> list[FreeParameter]:
         """The free parameters, as the rules declare them and the experiment overrides them.

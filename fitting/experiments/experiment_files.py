@@ -27,6 +27,7 @@ from typing import Any, get_args
 
 import tomli_w
 
+from fitting.datasets.ground_path import ROOTS
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
@@ -45,6 +46,7 @@ CLIP_KEYS: dict[str, Constraint] = {
     **dict.fromkeys(("start", "end"), validation.SECONDS),
     "file_up": validation.one_of(("y", "z")),
     "mask_pops": validation.BOOLEAN,
+    "root": validation.one_of(ROOTS),
 }
 SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
 SIGMA_KEYS |= {"correlation": validation.FRACTION}

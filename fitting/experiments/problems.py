@@ -4,7 +4,7 @@ A clip's reference, flat animation and terrain are cut and resampled alike, so t
 they belong together.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
@@ -13,9 +13,10 @@ import jax
 import numpy as np
 
 import jaxik
-from fitting.datasets.clip_frames import frames_from_clip
+from fitting.datasets.clip_frames import frames_from_clip, raised
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.flat_animation import flatten_clip, load_flat_animation
+from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain import mesh_files
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
@@ -27,6 +28,7 @@ from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment
+from .systems import without_own_root
 
 
 class ClipData(NamedTuple):
@@ -36,16 +38,29 @@ class ClipData(NamedTuple):
     base: Clip
     """The flat animation."""
     terrain: Terrain
+    root: RootChoice = AS_ANIMATED
+
+
+def _silent(text: str) -> None:
+    """Drops a line of the log."""
 
 
 @in_float64
-def make_problem(experiment: Experiment) -> Problem[jaxik.FootIK]:
+def make_problem(
+    experiment: Experiment, log: Callable[[str], object] = _silent
+) -> Problem[jaxik.FootIK]:
     """Loads the clips of an experiment and builds its problem.
+
+    Args:
+        experiment: what is fitted to what.
+        log: called with a line for each clip, which says where its root is.
 
     Raises:
         ValueError: something in the experiment does not fit its clips or its preset.
     """
-    data = (load_clip_data(entry, experiment.fps) for entry in experiment.clips)
+    data = [load_clip_data(entry, experiment.fps) for entry in experiment.placed_clips()]
+    for clip in data:
+        log(f"root of {clip.base.source}: {clip.root.reason}")
     return problem_from_clips(experiment, data)
 
 
@@ -55,13 +70,16 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     Raises:
         ValueError: as `make_problem`.
     """
+    data = list(clips)
     ik = experiment.starting_system()
+    if any(clip.root.rise is not None for clip in data):
+        ik = without_own_root(ik)
     parameters = experiment.free_parameters(ik)
     with error_context(f"{experiment.path} [free]"):
         space = make_space(ik, parameters)
     scenes = []
-    for entry, data in zip(experiment.clips, clips, strict=True):
-        scene = make_scene(data, experiment.sigmas, entry.label)
+    for entry, clip in zip(experiment.clips, data, strict=True):
+        scene = make_scene(clip, experiment.sigmas, entry.label)
         with error_context(f"{experiment.path} [parameters]"):
             check_shapes(ik, scene.rig, scene.terrain, scene.frames)
         scenes.append(scene)
@@ -80,13 +98,15 @@ def load_clip_data(entry: ClipEntry, fps: float | None) -> ClipData:
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
         base = flatten_clip(reference, mesh_files.height_function(terrain))
-        return ClipData(reference, base, terrain)
+        base, root = place_root(base, terrain, entry.root)
+        return ClipData(reference, base, terrain, root)
     base = _cut(load_flat_animation(entry.base), entry.base, entry, fps)
     if _outline(base) != _outline(reference):
         raise ValueError(
             f"{entry.base}: the base has {_outline(base)}; the reference has {_outline(reference)}"
         )
-    return ClipData(reference, base, terrain)
+    base, root = place_root(base, terrain, entry.root)
+    return ClipData(reference, base, terrain, root)
 
 
 def _outline(clip: Clip) -> str:
@@ -101,8 +121,9 @@ def _cut(clip: Clip, path: Path, entry: ClipEntry, fps: float | None) -> Clip:
 
 def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captured") -> Scene:
     """One clip as residuals need it; `sigmas` override the defaults, plots show the label."""
-    reference, base, terrain = data
-    frames = frames_from_clip(base)
+    reference, base, terrain, root = data
+    frames = frames_from_clip(base, rise=root.rise)
+    placed = raised(base, root.rise)
     legs = reference.leg_pose_ws()
     stance = reference.stance
     labels = np.zeros(legs.ankle.pos.shape[:2]) if stance is None else stance.astype(float)
@@ -114,7 +135,7 @@ def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captur
         rig=base.rig,
         terrain=terrain,
         frames=frames,
-        pelvis=_into(frames.world_from_model, _joint_ws(base, base.rig.pelvis)),
+        pelvis=_into(frames.world_from_model, _joint_ws(placed, base.rig.pelvis)),
         reference=Reference(
             pelvis=_joint_ws(reference, reference.rig.pelvis),
             knee_ws=legs.knee.pos,

@@ -125,6 +125,12 @@ def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK
     return parameter_tree.replace(ik, dict(values))
 
 
+def without_own_root(ik: jaxik.FootIK) -> jaxik.FootIK:
+    """The system without a root rule of its own, for characters whose root is placed already."""
+    own = "root.enabled" in leaf_names(ik)
+    return parameter_tree.replace(ik, {"root.enabled": False}) if own else ik
+
+
 def leaf_names(ik: jaxik.FootIK) -> list[str]:
     """Dotted names of all parameters, conventions and switches of a system."""
     return [f"{stage}.{leaf.name}" for stage, rule in vars(ik).items() for leaf in fields(rule)]

@@ -64,7 +64,7 @@ def _summary(comparison: Comparison) -> str:
         "## What the columns mean",
         explanations(MEASURES),
         "Presets that leave the character's height to their game (`unreal`, `mec`) have the root "
-        "on the ground below it, unless `--roots animated` was given.",
+        "on the ground below it, unless `--root animation` was given.",
         "A foot stands where the animation says so: by its contact labels or, without them, by its "
         "motion. The ground under a point is what a ray from above meets first.",
     ]

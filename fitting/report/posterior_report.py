@@ -4,14 +4,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
+from fitting.inference.sampling.diagnostics import ParameterSummary
 from fitting.inference.sampling.posterior import Posterior
 from fitting.runtime import files
 from fitting.studies.fit import FittedParameter
 from fitting.studies.run_folder import SUMMARY
 
-from . import posterior_tables
 from .fit_report import gallery, save_plot
-from .formatting import aligned, bullets, markdown, percent
+from .fit_tables import Truth
+from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .plots import posterior_plots
 
 HEADING = "## Posterior"  # what follows it in summary.md is replaced
@@ -19,11 +20,11 @@ HEADING = "## Posterior"  # what follows it in summary.md is replaced
 
 def posterior_text(posterior: Posterior, known_values: Mapping[str, float] | None) -> str:
     """The result of a sampling, for the terminal."""
-    table = aligned(posterior_tables.posterior_table(posterior, known_values, {}))
+    table = aligned(posterior_table(posterior, known_values, {}))
     parts = [*_health(posterior), "", table]
     if known_values:
-        covered = posterior_tables.covered(posterior, known_values, posterior.names)
-        parts += ["", f"The 95 % intervals contain the true values of {covered} parameters."]
+        count = covered(posterior, known_values, posterior.names)
+        parts += ["", f"The 95 % intervals contain the true values of {count} parameters."]
     return "\n".join(parts)
 
 
@@ -55,14 +56,14 @@ def write_posterior(
     plots |= save_plot(run, "chain.png", title, figure)
 
     parts = [HEADING, bullets(_health(posterior))]
-    parts.append(markdown(posterior_tables.posterior_table(posterior, known_values, units)))
+    parts.append(markdown(posterior_table(posterior, known_values, units)))
     if known_values:
         determined = [name for name, row in rows.items() if row["determined"]]
-        covered = posterior_tables.covered(posterior, known_values, posterior.names)
-        covered_determined = posterior_tables.covered(posterior, known_values, determined)
+        all_count = covered(posterior, known_values, posterior.names)
+        determined_count = covered(posterior, known_values, determined)
         parts.append(
-            f"The 95 % intervals contain the true values of {covered} parameters; among those that "
-            f"the fit calls determined, of {covered_determined}."
+            f"The 95 % intervals contain the true values of {all_count} parameters; among those "
+            f"that the fit calls determined, of {determined_count}."
         )
     parts.append(gallery(plots))
     summary = run / SUMMARY
@@ -84,3 +85,40 @@ def _health(posterior: Posterior) -> list[str]:
         f"Stuck walkers: {stuck}; left out of the summary: "
         f"{', '.join(map(str, posterior.isolated)) or 'none'}.",
     ]
+
+
+def posterior_table(posterior: Posterior, truth: Truth, units: Mapping[str, str]) -> Table:
+    """Parameters of a posterior: moments, intervals, how well they are sampled.
+
+    Args:
+        posterior: after sampling.
+        truth: known values by name; where there are any, the last column says whether the 95 %
+            interval contains them.
+        units: of the parameters, by name; empty to leave the column out.
+    """
+    heading = ["parameter", *(["unit"] if units else []), "mean", "sd", "median", "68 % interval"]
+    heading += ["95 % interval", "ESS", "R-hat", "autocorrelation"]
+    table = [heading + (["truth", "covered"] if truth else [])]
+    for row, steps in zip(posterior.summary, posterior.autocorrelation_time, strict=True):
+        cells = [row["name"], *([units[row["name"]]] if units else [])]
+        cells += [number(row[key]) for key in ("mean", "sd", "median")]
+        cells += [interval(row["low68"], row["high68"]), interval(row["low95"], row["high95"])]
+        cells += [f"{row['ess']:.0f}", f"{row['r_hat']:.3f}", f"{steps:.0f} steps"]
+        if truth:
+            true = truth.get(row["name"])
+            cells.append("unknown" if true is None else number(true))
+            cells.append("" if true is None else "yes" if covers(row, true) else "no")
+        table.append(cells)
+    return table
+
+
+def covered(posterior: Posterior, truth: Mapping[str, float], names: Sequence[str]) -> str:
+    """How many of these parameters have their true value within their 95 % interval."""
+    known = [row for row in posterior.summary if row["name"] in names and row["name"] in truth]
+    inside = sum(covers(row, truth[row["name"]]) for row in known)
+    return f"{inside} of {len(known)}"
+
+
+def covers(row: ParameterSummary, true: float) -> bool:
+    """Whether the 95 % interval of a posterior's row contains this value."""
+    return row["low95"] <= true <= row["high95"]

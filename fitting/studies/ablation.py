@@ -20,6 +20,7 @@ import numpy as np
 import jaxik
 from fitting.analysis.accuracy import Accuracy, Errors, clip_errors, summarise
 from fitting.datasets.clips import Clip, edit
+from fitting.datasets.ground_path import place_root
 from fitting.experiments.ablations import COMPLETE, Ablation
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.experiment_files import experiment_to_toml
@@ -98,7 +99,7 @@ def ablate(
         with error_context(name):
             _check(variant)
     finished = {} if folder is None else {row.key: row for row in read(folder)}
-    data = [load_clip_data(entry, None) for entry in experiment.clips]
+    data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
     splits = list(split(experiment.clips, data, folds))
     content = _digest(experiment.clips)
     rows: list[Row] = []
@@ -217,17 +218,18 @@ def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] 
 def _at_rate(data: ClipData, fps: float | None) -> ClipData:
     if fps is None:
         return data
-    return data._replace(
-        reference=edit.resample(data.reference, fps), base=edit.resample(data.base, fps)
-    )
+    reference, base = edit.resample(data.reference, fps), edit.resample(data.base, fps)
+    base, root = place_root(base, data.terrain, data.root.root)
+    return ClipData(reference, base, data.terrain, root)
 
 
 def _errors(ik: jaxik.FootIK, data: ClipData, frames: slice) -> Errors:
     """Errors of the system in these frames, at the clip's own rate."""
-    animation = Animation(data.base, data.terrain)
+    animation = Animation(data.base, data.terrain, root=data.root)
     animation.check_shapes(ik)
     _, solved = animation.solve(ik)
-    return clip_errors(*(clip.select(frames) for clip in (solved, data.reference, data.base)))
+    compared = (solved, data.reference, animation.placed_clip)
+    return clip_errors(*(clip.select(frames) for clip in compared))
 
 
 def _labelled(

@@ -1,5 +1,6 @@
 """A flat animation on a terrain, and what a system makes of it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -7,11 +8,15 @@ from pathlib import Path
 import numpy as np
 
 import jaxik
-from fitting.datasets.clip_frames import clip_from_result, frames_from_clip
+from fitting.analysis import placement
+from fitting.analysis.misplacement import Cause, likely_cause
+from fitting.analysis.placement import Placement
+from fitting.datasets.clip_frames import clip_from_result, frames_from_clip, raised
 from fitting.datasets.clips import Clip
 from fitting.datasets.flat_animation import load_flat_animation
+from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.experiments import problems
+from fitting.experiments import problems, systems
 from fitting.runtime import program_cache
 from jaxik.world.terrain import Terrain
 
@@ -26,6 +31,16 @@ class AnimationFiles:
     """Up axis of the terrain's file."""
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
+    root: str = "auto"
+    """Where the root is put; see `place_root`."""
+
+    def load_terrain(self) -> Terrain:
+        """The terrain of the mesh."""
+        return load_terrain(self.terrain, file_up=self.file_up)
+
+    def load_turned_terrain(self) -> Terrain:
+        """The terrain of the mesh with its other axis up."""
+        return load_terrain(self.terrain, file_up="z" if self.file_up == "y" else "y")
 
 
 @dataclass(frozen=True)
@@ -33,15 +48,23 @@ class Animation:
     """A flat animation on a terrain."""
 
     clip: Clip
-    """With bones of the rig's lengths, as `load_flat_animation` gives it."""
+    """On its floor, with bones of the rig's lengths, as `load_flat_animation` gives it."""
     terrain: Terrain
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
+    root: RootChoice = AS_ANIMATED
+    turned: Callable[[], Terrain] | None = None
+    """Loads the terrain with the other axis of its file up."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
         """The clip as the pipeline's input."""
-        return frames_from_clip(self.clip, floor=self.floor)
+        return frames_from_clip(self.clip, floor=self.floor, rise=self.root.rise)
+
+    @cached_property
+    def placed_clip(self) -> Clip:
+        """The clip with its root where foot IK gets it."""
+        return raised(self.clip, self.root.rise)
 
     def check_shapes(self, ik: jaxik.FootIK) -> None:
         """Raises ValueError if a parameter of the system has too many values for the rig."""
@@ -50,24 +73,35 @@ class Animation:
     def solve(self, ik: jaxik.FootIK) -> tuple[jaxik.Result, Clip]:
         """The result of a system, and the clip as the system leaves it.
 
+        Where the clip's root follows the ground, a root rule of the system is off.
+
         Raises:
             ValueError: the poses are not finite.
         """
+        if self.root.rise is not None:
+            ik = systems.without_own_root(ik)
         result = program_cache.run(ik, self.clip.rig, self.terrain, self.frames)
-        solved = clip_from_result(self.clip, result, floor=self.floor)
+        solved = clip_from_result(self.clip, result, floor=self.floor, rise=self.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite; nothing was written")
         return result, solved
 
+    def assess(self, solved: Clip) -> tuple[Placement, Cause | None]:
+        """How the feet of a solved clip are placed; why, if they are off the ground."""
+        floor = self.clip, self.terrain, self.floor
+        placed = placement.assess(placement.soles(solved, *floor), solved, self.placed_clip)
+        if not placed.misplaced:
+            return placed, None
+        animated = placement.soles(self.placed_clip, *floor)
+        return placed, likely_cause(animated, self.placed_clip, self.terrain, self.turned)
+
 
 def load_animation(files: AnimationFiles) -> Animation:
-    """Reads a flat animation and its terrain.
+    """Reads a flat animation and its terrain, and chooses where to put the root.
 
     Raises:
-        ValueError: a file does not exist or cannot be read.
+        ValueError: a file does not exist or cannot be read, or the root cannot be put there.
     """
-    return Animation(
-        load_flat_animation(files.clip),
-        load_terrain(files.terrain, file_up=files.file_up),
-        files.floor,
-    )
+    terrain = files.load_terrain()
+    clip, root = place_root(load_flat_animation(files.clip), terrain, files.root, files.floor)
+    return Animation(clip, terrain, files.floor, root, files.load_turned_terrain)

@@ -12,6 +12,8 @@ from jaxtyping import Float64
 import jaxik
 from fitting.analysis import measures
 from fitting.analysis.measures import FootStates, Measures
+from fitting.analysis.misplacement import Cause
+from fitting.analysis.placement import Placement
 from fitting.analysis.playback import RAY_START, Motion, stage_outputs
 from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
@@ -40,6 +42,8 @@ class Comparison:
     """Fraction of all points of soles that have no ground under them."""
     motions: Mapping[str, Motion]
     measures: Mapping[str, Measures]
+    placements: Mapping[str, tuple[Placement, Cause | None]]
+    """Of the systems, without the animation; see `Animation.assess`."""
 
 
 @in_float64
@@ -96,7 +100,7 @@ def compare(
     Raises:
         ValueError: parameters do not fit the legs, or give poses that are not finite.
     """
-    clip = animation.clip
+    clip = animation.placed_clip
     for name, ik in systems.items():
         with error_context(name):
             animation.check_shapes(ik)
@@ -108,7 +112,7 @@ def compare(
         grounded = np.asarray(stage_outputs(result).sensed.foothold.found) > 0
         reached[name] = np.where(grounded, np.asarray(result.reached, np.float64), np.nan)
 
-    depths = measures.sole_depths(clip, animation.floor)
+    depths = measures.sole_depths(animation.clip, animation.floor)
     soles_ws = np.stack([measures.soles(solved, depths) for solved in clips.values()])
     ground = ground_heights(animation.terrain, soles_ws)
     motions = {name: _motion(solved) for name, solved in clips.items()}
@@ -125,6 +129,7 @@ def compare(
         groundless=float(np.mean(np.isnan(ground))),
         motions=motions,
         measures=measured,
+        placements={name: animation.assess(clips[name]) for name in systems},
     )
 
 

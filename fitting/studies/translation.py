@@ -20,6 +20,7 @@ import jaxik
 from fitting.analysis import difference
 from fitting.datasets import clip_frames, clips
 from fitting.datasets.clips import Clip, edit
+from fitting.datasets.ground_path import place_root
 from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, problem_from_clips
@@ -194,6 +195,7 @@ def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ..
             file_up=animation.file_up,
             label=f"source: {source.name}",
             mask_pops=False,
+            root=animation.root,
         )
         for number, animation in enumerate(request.animations, 1)
     )
@@ -203,12 +205,14 @@ def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None
     """What the source makes of a clip, as the reference."""
     animation = load_animation(files)
     if fps is not None:
-        animation = replace(animation, clip=edit.resample(animation.clip, fps))
+        clip = edit.resample(animation.clip, fps)
+        clip, root = place_root(clip, animation.terrain, animation.root.root, animation.floor)
+        animation = replace(animation, clip=clip, root=root)
     with error_context(source.name):
         animation.check_shapes(source.ik)
         _, solved = animation.solve(source.ik)
     solved = replace(solved, source=f"{source.name} on {animation.clip.source}")
-    return ClipData(solved, animation.clip, animation.terrain)
+    return ClipData(solved, animation.clip, animation.terrain, animation.root)
 
 
 def _changed_values(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, object]:

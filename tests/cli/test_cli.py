@@ -18,12 +18,14 @@ import pytest
 from fitting import jobs
 from fitting.cli import main, progress
 from fitting.cli.parser import make_parser
-from fitting.datasets.clips import formats, load_clip
+from fitting.datasets.clips import formats, load_clip, save_clip
+from fitting.datasets.synthetic import walker
+from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.chain import journal_path
 from fitting.studies import run_folder
-from support import quick
+from support import grounds, quick
 from support.experiments import CLIP, ROOT, write
 from support.sample_clips import BVH
 
@@ -35,6 +37,7 @@ COMMANDS = [
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
 WANTED_CLIP = f"wanted a {', '.join(formats.READERS)} or .npz file"
+SHOWN = "always::fitting.report.placement_report.PlacementWarning"
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
 
@@ -121,6 +124,7 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
         (["fit"], "required: EXPERIMENT.toml, -o/--output"),
         (["run", BASE, "-o", "a.npz"], "required: --terrain"),
         (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--floor", "nan"], "finite number"),
+        (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--root", "x"], "invalid choice: 'x'"),
         (["record", "show", "a", "--tick-hz", "x"], "'x'; wanted a finite number"),
     ],
 )
@@ -328,6 +332,7 @@ def test_a_limit_of_no_steps_is_rejected(run, tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings(SHOWN)
 def test_apply_writes_a_clip_that_the_benchmark_can_score(run, mocap, tmp_path, capsys):
     whole = dict(np.load(mocap / "blocks" / "03_03.npz"))
     frames = len(whole["pelvis"])
@@ -352,6 +357,7 @@ def test_apply_writes_a_clip_that_the_benchmark_can_score(run, mocap, tmp_path, 
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings(SHOWN)
 def test_run_accepts_a_bvh_and_a_parameter_file(tmp_path, capsys):
     (tmp_path / "step.bvh").write_text(BVH)
     (tmp_path / "still.toml").write_text("lock.enabled = false\n[leg]\nweight = 0.0\n")
@@ -373,6 +379,64 @@ def test_poses_that_are_not_finite_are_not_written(tmp_path, capsys):
     assert not (tmp_path / "out.npz").exists()
 
 
+@pytest.fixture(scope="module")
+def hill_files(tmp_path_factory) -> Path:
+    """A flat walk and a hill of 2 m."""
+    folder = tmp_path_factory.mktemp("hill")
+    save_clip(folder / "walk.npz", walker.walk(6.0, 30.0))
+    save_mesh(folder / "hill.ply", *grounds.hill())
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(SHOWN)
+def test_run_puts_the_root_on_a_hill_and_shows_where_the_feet_are(hill_files, tmp_path, capsys):
+    words = ["run", hill_files / "walk.npz", "--terrain", hill_files / "hill.ply"]
+    words += ["-o", tmp_path / "out.npz"]
+    assert main.main([*map(str, words)]) == 0
+    output = capsys.readouterr()
+    assert re.search(r"^root: on the ground below it, 0 to \d+ cm above its", output.out, re.M)
+    assert re.search(r"^standing feet in the ground +0\.\d % ", output.out, re.MULTILINE)
+    assert "--root ground" not in output.err
+    with np.load(tmp_path / "out.npz") as archive:
+        placement = json.loads(str(archive["placement"]))
+    assert placement["sunk"] < 0.01 and placement["groundless"] == 0.0
+    assert load_clip(tmp_path / "out.npz").positions_ws[..., 1].max() > 2.5
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(SHOWN)
+def test_run_warns_of_a_root_that_stays_below_a_hill_and_names_frames(hill_files, tmp_path, capsys):
+    words = ["run", hill_files / "walk.npz", "--terrain", hill_files / "hill.ply"]
+    words += ["-o", tmp_path / "out.npz", "--root", "animation"]
+    assert main.main([*map(str, words)]) == 0
+    output = capsys.readouterr()
+    assert "\nroot: as animated\n" in output.out
+    warning = output.err.splitlines()[0]
+    assert warning.startswith("jaxik: standing feet are 2 cm or more in the ground in ")
+    assert re.search(r"deepest: 1\d\d\.\d cm, (left|right), frame \d+", warning)
+    assert warning.endswith("likely cause: the root stays on the animation's floor where the "
+                            "ground rises (use --root ground)")  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(SHOWN)
+def test_run_names_the_other_up_axis(hill_files, tmp_path, capsys):
+    words = ["run", hill_files / "walk.npz", "--terrain", hill_files / "hill.ply"]
+    words += ["-o", tmp_path / "out.npz", "--file-up", "z"]
+    assert main.main([*map(str, words)]) == 0
+    output = capsys.readouterr()
+    assert "root: as animated: there is no ground below most of its path" in output.out
+    assert "the other axis of the terrain's file is up (--file-up)" in output.err
+
+
+def test_run_rejects_a_root_without_ground(hill_files, tmp_path, capsys):
+    words = ["run", hill_files / "walk.npz", "--terrain", hill_files / "hill.ply"]
+    words += ["-o", tmp_path / "out.npz", "--file-up", "z", "--root", "ground"]
+    assert "there is no ground below most of its path, on which to put" in error_of(capsys, *words)
+    assert not tree(tmp_path)
+
+
 MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
 
 
@@ -388,7 +452,7 @@ MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
         (BASE, str(DATA), "a.npz", [], "data: there is no such file"),
         (BASE, "m.ply", "a.npz", [], "m.ply: trimesh cannot read it"),
         (BASE, "p.obj", "a.npz", [], "p.obj: terrain needs triangles"),
-        (BASE, "t.toml", "a.npz", [], "t.toml: trimesh reads"),
+        (BASE, "t.toml", "a.npz", [], "trimesh reads"),
         (BASE, GROUND, "a", [], "a: wanted a name that ends in .npz"),
         (BASE, GROUND, "d.npz", [], "d.npz: cannot be written: it is a folder"),
         (BASE, GROUND, "no/a.npz", [], "there is no folder no"),

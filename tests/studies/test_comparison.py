@@ -26,7 +26,8 @@ from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support.experiments import ROOT
 
-pytestmark = pytest.mark.slow
+SHOWN = "always::fitting.report.placement_report.PlacementWarning"
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings(SHOWN)]
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
@@ -202,8 +203,11 @@ def test_the_terminal_shows_the_table_and_how_long_each_system_took(folder, comp
     output = capsys.readouterr()
     assert output.out.splitlines()[0].split() == ["system", "as", "animated", "record"]
     assert f"read {folder / 'again' / comparison_report.TABLE}" in output.out
-    name, dots, seconds, unit = output.err.split()
+    assert "\nroot: as animated: the ground is " in output.out
+    timing, *warned = output.err.splitlines()
+    name, dots, seconds, unit = timing.split()
     assert (name, dots, unit) == ("record", "...", "s") and float(seconds) >= 0.0
+    assert all(line.startswith("jaxik: record: ") for line in warned)
     assert numbers(folder / "again")["record"] == numbers(compared)["record"]
 
 
@@ -234,7 +238,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
     compared = comparison.Comparison(
         "title", tuple(f"leg {leg}" for leg in range(legs)), 30.0,
         np.full((300, legs), np.nan), 0.0,
-        {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero},
+        {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero}, {},
     )  # fmt: skip
     figure = comparison_plots.overview(compared)
     upper, lower = figure.subfigs

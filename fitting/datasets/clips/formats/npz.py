@@ -13,7 +13,7 @@ import numpy as np
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
-from fitting.runtime.files import write
+from fitting.runtime import files
 from jaxik.world.skeleton import Rig
 
 Arrays = dict[str, np.ndarray]
@@ -64,7 +64,14 @@ def save_clip(
         with temporary.open("wb") as file:  # given a name, NumPy would append a suffix
             np.savez_compressed(file, **content)  # pyright: ignore[reportArgumentType]
 
-    write(path, fill)
+    files.write(path, fill)
+
+
+def check_clip_file(path: Path) -> None:
+    """ValueError unless `save_clip` can write here."""
+    if path.suffix.lower() != ".npz":
+        raise ValueError(f"{path}: wanted a name that ends in .npz")
+    files.check_output_file(path)
 
 
 def read_npz(path: Path, variant: str) -> Clip:
