@@ -157,7 +157,7 @@ def test_an_ablation_drops_parameters_that_its_rules_do_not_have_but_no_mistakes
 def test_the_held_out_part_is_not_fitted_and_everything_else_is(tmp_path, folds):
     experiment = load(tmp_path)
     (data,) = load_clips(experiment)
-    captured, base, _ = data
+    captured, base, *_ = data
     splits = list(ablation.split(experiment.clips, [data], folds))
     assert [split.name for split in splits[:-1]] == [
         f"part {i + 1} of {folds}" for i in range(folds)
@@ -170,7 +170,7 @@ def test_the_held_out_part_is_not_fitted_and_everything_else_is(tmp_path, folds)
         held_out = np.zeros(captured.frame_count, bool)
         held_out[part] = True
         times_held_out += held_out
-        ((entry, (fitted, animation, _)),) = split.fitted
+        ((entry, (fitted, animation, *_)),) = split.fitted
         assert entry is experiment.clips[0]
         assert animation is base, "the animation is played as a whole"
         np.testing.assert_array_equal(fitted.mask, observed & ~held_out)
@@ -220,7 +220,7 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
     assert not observed[0][:45].any() and not observed[1][46:].any()
     assert observed[0][46:].mean() > 0.9 and observed[1][:45].mean() > 0.9
     assert observed[2].mean() > 0.9
-    (captured, base, _) = load_clips(experiment)[0]
+    (captured, base, *_) = load_clips(experiment)[0]
     difference = (base.positions_ws - captured.positions_ws)[:, captured.rig.pelvis, 1]
     gains = [float(frames.sum()) / 1000 for frames in observed] + [0.6] * 3
     for row, gain in zip(rows, gains, strict=True):
