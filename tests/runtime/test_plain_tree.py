@@ -99,7 +99,6 @@ def local():
         local, local(), functools.partial(files.write), {1, 2}, b"bytes", 1j, object(),
         Slot(0).__eq__, [{"deep": local}],
     ],
-    ids=str,
 )  # fmt: skip
 def test_what_no_name_or_value_identifies_is_refused(tree):
     with pytest.raises(NotPlainError):
