@@ -326,7 +326,7 @@ def _add_animation(command: argparse.ArgumentParser) -> None:
         help=".bvh, .amc or .npz over flat ground; for a blocks .npz its flat animation",
     )  # fmt: skip
     command.add_argument(
-        "--terrain", type=Path, required=True, metavar="MESH", help=".ply, .obj, .stl, .glb, ..."
+        "--terrain", type=Path, required=True, metavar="MESH", help=".ply, .obj, .npz, .glb, ..."
     )
     command.add_argument("--file-up", choices=("y", "z"), default="y", help="up axis of the mesh")
     command.add_argument(
