@@ -5,7 +5,6 @@ they belong together.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +23,7 @@ from fitting.problem.scene import Reference, Scene, Sigmas
 from fitting.problem.space import make_space
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
+from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
@@ -81,7 +81,7 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     for entry, clip in zip(experiment.clips, data, strict=True):
         scene = make_scene(clip, experiment.sigmas, entry.label)
         with error_context(f"{experiment.path} [parameters]"):
-            check_shapes(ik, scene.rig, scene.terrain, scene.frames)
+            parameter_tree.check_shapes(ik, len(scene.rig.side))
         scenes.append(scene)
     dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
     independent = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
@@ -155,29 +155,3 @@ def _joint_ws(clip: Clip, joint: int) -> Transform:
 @jax.jit  # without jit this compiles twelve programs instead of one
 def _into(space: Transform, joint: Transform) -> Transform:
     return space.inverse() @ joint
-
-
-def check_shapes(ik: jaxik.FootIK, rig: jaxik.Rig, terrain: Terrain, frames: jaxik.Frame) -> None:
-    """Checks that parameters with several values have one for each leg of the rig.
-
-    Raises:
-        ValueError: a parameter has another number of values than the rig has legs.
-    """
-    changed_shapes = {
-        f"{stage}.{leaf.name}": getattr(rule, leaf.name).shape
-        for stage, rule in vars(ik).items()
-        for leaf in fields(rule)
-        if getattr(rule, leaf.name).shape != getattr(type(rule)(), leaf.name).shape
-    }
-    if not changed_shapes:
-        return  # the usual case, which need not wait for a trace
-    try:
-        jax.eval_shape(jaxik.run, ik, rig, terrain, frames)
-    except (TypeError, ValueError):
-        counts = ", ".join(
-            f"{name} has {shape[0]} values" for name, shape in changed_shapes.items()
-        )
-        raise ValueError(
-            f"{counts}; wanted one for all legs or, where legs may differ, {len(rig.side)} for the "
-            f"legs {list(rig.names)}"
-        ) from None

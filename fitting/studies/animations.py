@@ -16,8 +16,9 @@ from fitting.datasets.clips import Clip
 from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.experiments import problems, systems
+from fitting.experiments import systems
 from fitting.runtime import program_cache
+from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain
 
 
@@ -68,7 +69,7 @@ class Animation:
 
     def check_shapes(self, ik: jaxik.FootIK) -> None:
         """Raises ValueError if a parameter of the system has too many values for the rig."""
-        problems.check_shapes(ik, self.clip.rig, self.terrain, self.frames)
+        parameter_tree.check_shapes(ik, len(self.clip.rig.side))
 
     def solve(self, ik: jaxik.FootIK) -> tuple[jaxik.Result, Clip]:
         """The result of a system, and the clip as the system leaves it.

@@ -458,7 +458,7 @@ MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
         (BASE, GROUND, "no/a.npz", [], "there is no folder no"),
         (BASE, GROUND, "a.npz", ["--preset", "recrod"], "no preset named 'recrod'"),
         (BASE, GROUND, "a.npz", ["--parameters", "no.toml"], "no.toml: no such file"),
-        (BASE, GROUND, "a.npz", ["--parameters", "legs.toml"], "foot.max_roll has 3 values"),
+        (BASE, GROUND, "a.npz", ["--parameters", "legs.toml"], "foot.max_roll has shape (3,)"),
     ],
 )
 def test_wrong_input_to_run_is_reported_and_nothing_written(

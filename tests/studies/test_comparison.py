@@ -263,7 +263,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
         (BASE, GROUND, "d", [], "nothing to compare"),
         (BASE, GROUND, "d", ["--presets", "record,none"], "no preset named 'none'; there are"),
         (BASE, GROUND, "d", ["--presets", "record,record"], "already is a system named 'record'"),
-        (BASE, GROUND, "d", ["--parameters", "legs.toml"], "legs: foot.max_roll has 3 values"),
+        (BASE, GROUND, "d", ["--parameters", "legs.toml"], "legs: foot.max_roll has shape (3,)"),
     ],
 )
 def test_wrong_input_is_reported_in_one_line_and_nothing_written(
