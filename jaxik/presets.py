@@ -20,9 +20,8 @@ from jaxik.stages.lean import NoLean, SlopeLean
 from jaxik.stages.leg import HintLeg, PoleLeg, TwoBone
 from jaxik.stages.lock import NoLock, OffsetLock, PlantLock
 from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
-from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe
+from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe, StrideProbe
 from jaxik.stages.root import GroundRoot, KeepRoot
-from jaxik.stages.stride_probe import StrideProbe
 from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
 
 

@@ -8,5 +8,4 @@ from . import lock as lock
 from . import pelvis as pelvis
 from . import probe as probe
 from . import root as root
-from . import stride_probe as stride_probe
 from . import target as target

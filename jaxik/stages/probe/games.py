@@ -1,33 +1,28 @@
-"""Stage 3: rays that find the ground under each foot."""
+"""The probes of the games: ozz and the record, Unreal, Mec."""
 
-import dataclasses
-from abc import abstractmethod
-from collections.abc import Sequence
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxik.maths import parameter_tree, quat, vec
-from jaxik.maths.gate import AbstractGate
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
-from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
-from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
+from jaxik.maths import parameter_tree, vec
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.stages.inputs import Inputs
+from jaxik.world.frame import Contact, GroundHits, animated_ankles
+from jaxik.world.terrain import Hit, cast
 
-from .inputs import Inputs
+from .base import (
+    AbstractProbe,
+    cast_each,
+    foot_heading,
+    make_rays,
+    no_hit,
+    or_level,
+    toe_point,
+    with_weight,
+)
 
 HEIGHT_BAND = 0.01  # m
 SPEED_BAND = 0.05  # m/s
 MARGIN = 0.1  # m that rays are cast too far, so that a softened reach has ground on both sides
-
-
-class AbstractProbe(Rule):
-    """Finds the ground under the feet."""
-
-    @abstractmethod
-    def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
-        """The ground under each leg in this frame; `foot_height` is from sole to ankle, m."""
 
 
 class FootProbe(AbstractProbe):
@@ -225,56 +220,3 @@ class CornerProbe(AbstractProbe):
         stable = jnp.where(self.by_height, low, 1.0) * jnp.where(self.by_speed, slow, 1.0)
         chosen = gate.choose(stable, self.extra_max, self.extra_min)
         return jnp.where(self.by_height | self.by_speed, chosen, self.extra)
-
-
-def cast_each(
-    terrain: Terrain | LegTerrains, starts_ws: Sequence[Array], reach: Array, mask: Array
-) -> list[Hit]:
-    """The hits of several rays per leg, by one search: each search adds much to a program."""
-    hits = cast(terrain, jnp.stack(starts_ws), reach, mask)
-    return [jax.tree.map(lambda x: x[i], hits) for i in range(len(starts_ws))]  # noqa: B023
-
-
-def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
-    """Toe of each leg, m, model space.
-
-    `toe_ls` is the toe of a left foot relative to its ankle, in foot axes; right feet mirror it.
-    """
-    x, y, z = vec.components(toe_ls)
-    foot = quat.multiply(frame.pose.ankle.rot, rig.ankle_from_foot)
-    return frame.pose.ankle.pos + quat.rotate(foot, vec.stack(rig.side * x, y, z))
-
-
-def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
-    """Forward and right of each animated foot, unit, perpendicular to up, world space.
-
-    A foot that points along up gets those of the character.
-    """
-    frame = inputs.frame
-    foot = quat.multiply(animated_ankles(frame).rot, inputs.rig.ankle_from_foot)
-    sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
-    ahead = vec.normalize(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
-    return ahead, vec.cross(ahead, up_ws)
-
-
-def with_weight(hit: Hit, found: Array) -> Hit:
-    """The hit with another weight `found`."""
-    return dataclasses.replace(hit, found=found)
-
-
-def no_hit(like: Hit) -> Hit:
-    """Misses, for rays that were not cast."""
-    return with_weight(like, jnp.zeros_like(like.found))
-
-
-def or_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit:
-    """The hit where its foot was `found` too; else a miss at `level_ws`, level with the foot."""
-    weight = hit.found * found
-    point = gate.choose(weight[..., None], hit.point, level_ws)
-    return Hit(point, hit.normal, hit.distance, weight)
-
-
-def make_rays(like: Hit, above: Array, below: Array, layers: Array) -> Rays:
-    """One ray per hit in `like`, all of the same reach, m."""
-    shape = like.found.shape
-    return Rays(jnp.broadcast_to(above, shape), jnp.broadcast_to(below, shape), layers)

@@ -1,4 +1,4 @@
-"""Stage 3 with lookahead: the ground between the last and the next foothold of each foot."""
+"""A probe that looks ahead: the ground between the last and the next foothold of each foot."""
 
 import functools
 
@@ -8,11 +8,11 @@ from jaxtyping import Array, Float
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.maths.struct import struct
+from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
 from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
 
-from .inputs import Inputs
-from .probe import AbstractProbe, make_rays, no_hit
+from .base import AbstractProbe, make_rays, no_hit
 
 HEIGHT_BAND = 0.01  # m
 STEP_FADE = 0.10  # m, over which a step becomes too high
