@@ -1,69 +1,20 @@
-"""Stage 6: locks that keep standing feet in place in the world."""
-
-from abc import abstractmethod
+"""The lock of the record: an offset that cancels the motion of a standing foot."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
 from jaxik.maths.struct import struct
+from jaxik.stages.inputs import SensedMoment
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import cast
 
-from .inputs import SensedMoment
+from .base import AbstractLock, Hold
 
 DISTANCE_BAND = 0.01  # m
 COSINE_BAND = 0.03  # about 2 degrees at a right angle
 SPEED_BAND = 0.05  # m/s
 FACTOR_BAND = 0.05
-
-
-@struct
-class Hold:
-    """How locks change the footholds."""
-
-    offset_ws: Float[Array, "legs 3"]
-    """m, from the foothold."""
-    rot_ws: Float[Array, "legs 4"]
-    """Of the ankles."""
-    locked: Float[Array, " legs"]
-    """1 where the foot keeps its place."""
-
-
-class AbstractLock(Rule):
-    """Keeps standing feet in place."""
-
-    @abstractmethod
-    def init(self, rig: Rig) -> PyTree:
-        """Memory before the first frame."""
-
-    @abstractmethod
-    def advance(
-        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PyTree
-    ) -> tuple[PyTree, Hold]:
-        """Memory after this frame, and how locks change the footholds.
-
-        Args:
-            now: the sensed frame.
-            foothold_ws: where each foot would stand without a lock, m.
-            hip_ws: the hips on the body as last placed, m.
-            state: memory after the frame before.
-        """
-
-
-class NoLock(AbstractLock):
-    """No locks: feet follow their footholds."""
-
-    def init(self, rig: Rig) -> None:
-        return None
-
-    def advance(
-        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: None
-    ) -> tuple[None, Hold]:
-        free = jnp.zeros_like(foothold_ws)
-        sensed = now.sensed
-        return None, Hold(free, sensed.rot_ws, jnp.zeros_like(sensed.foothold.found))
 
 
 @struct
@@ -261,82 +212,3 @@ class OffsetLock(AbstractLock):
         aligned = jnp.where(self.release_heading < jnp.pi, aligned, 1.0)
         speed = vec.safe_divide(vec.length(moved), now.dt)
         return aligned * gate.below(speed, self.release_speed, band=SPEED_BAND)
-
-
-@struct
-class PlantState:
-    """Where planted feet stand."""
-
-    locked: Float[Array, " legs"]
-    """0 or 1."""
-    weight: Float[Array, " legs"]
-    """0..1, how much of the planting is applied."""
-    foothold: Float[Array, "legs 3"]
-    """m, platform space."""
-    clearance: Float[Array, " legs"]
-    """m, of that foothold above the ground below it."""
-    rot: Float[Array, "legs 4"]
-    """Of the ankles, platform axes."""
-
-
-class PlantLock(AbstractLock):
-    """Keeps a foot where and how it first found ground until its ray finds none (Mec).
-
-    The kept foothold follows the ground below it, which is probed again in every frame, and a
-    moving platform. The weight of planting moves to `plant_weight` at `plant_speed`: set it to 0
-    or 1 between steps to turn planting off or on over time, at once if the speed is infinite.
-    """
-
-    plant: Leaf = switch(True, doc="Whether a foot stays where it first found ground.")
-    plant_weight: Leaf = parameter(
-        1.0, unit="1", low=0.0, high=1.0, doc="How much a planted foot keeps its place, 0 to 1."
-    )
-    plant_speed: Leaf = parameter(
-        float("inf"),
-        unit="1/s",
-        low=0.1,
-        high=20.0,
-        scale="log",
-        doc="Rate at which planting moves to its weight; infinite sets it at once.",
-    )
-
-    def init(self, rig: Rig) -> PlantState:
-        zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)
-        identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
-        return PlantState(zero, zero, zeros, zero, identity)
-
-    def advance(
-        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
-    ) -> tuple[PlantState, Hold]:
-        sensed, gate = now.sensed, now.gate
-        up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
-        before = state.locked
-        kept_ws = gate.choose(before[..., None], platform.apply(state.foothold), foothold_ws)
-        kept_rot = quat.nlerp(sensed.rot_ws, platform.apply_rot(state.rot), before)
-
-        hit = cast(
-            now.terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
-        )
-        height = vec.dot(kept_ws - hit.point, up)
-        clearance = gate.choose(before, state.clearance, height * hit.found)
-        on_ground = hit.point + vec.scale(up, clearance)
-        planted_ws = gate.choose(hit.found[..., None], on_ground, kept_ws)
-
-        locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
-        step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
-        weight = smoothing.move_towards(state.weight, self.plant_weight, step)
-        planting = locked * weight
-        hold = Hold(
-            vec.scale(planted_ws - foothold_ws, planting),
-            quat.nlerp(sensed.rot_ws, kept_rot, planting),
-            locked,
-        )
-        platform_from_world = platform.inverse()
-        after = PlantState(
-            locked,
-            weight,
-            platform_from_world.apply(planted_ws),
-            clearance,
-            platform_from_world.apply_rot(kept_rot),
-        )
-        return after, hold

@@ -1,0 +1,92 @@
+"""The lock of Mec: a foot stays where it first found ground."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.stages.inputs import SensedMoment
+from jaxik.world.skeleton import Rig
+from jaxik.world.terrain import cast
+
+from .base import AbstractLock, Hold
+
+
+@struct
+class PlantState:
+    """Where planted feet stand."""
+
+    locked: Float[Array, " legs"]
+    """0 or 1."""
+    weight: Float[Array, " legs"]
+    """0..1, how much of the planting is applied."""
+    foothold: Float[Array, "legs 3"]
+    """m, platform space."""
+    clearance: Float[Array, " legs"]
+    """m, of that foothold above the ground below it."""
+    rot: Float[Array, "legs 4"]
+    """Of the ankles, platform axes."""
+
+
+class PlantLock(AbstractLock):
+    """Keeps a foot where and how it first found ground until its ray finds none (Mec).
+
+    The kept foothold follows the ground below it, which is probed again in every frame, and a
+    moving platform. The weight of planting moves to `plant_weight` at `plant_speed`: set it to 0
+    or 1 between steps to turn planting off or on over time, at once if the speed is infinite.
+    """
+
+    plant: Leaf = switch(True, doc="Whether a foot stays where it first found ground.")
+    plant_weight: Leaf = parameter(
+        1.0, unit="1", low=0.0, high=1.0, doc="How much a planted foot keeps its place, 0 to 1."
+    )
+    plant_speed: Leaf = parameter(
+        float("inf"),
+        unit="1/s",
+        low=0.1,
+        high=20.0,
+        scale="log",
+        doc="Rate at which planting moves to its weight; infinite sets it at once.",
+    )
+
+    def init(self, rig: Rig) -> PlantState:
+        zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)
+        identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))
+        return PlantState(zero, zero, zeros, zero, identity)
+
+    def advance(
+        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
+    ) -> tuple[PlantState, Hold]:
+        sensed, gate = now.sensed, now.gate
+        up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
+        before = state.locked
+        kept_ws = gate.choose(before[..., None], platform.apply(state.foothold), foothold_ws)
+        kept_rot = quat.nlerp(sensed.rot_ws, platform.apply_rot(state.rot), before)
+
+        hit = cast(
+            now.terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
+        )
+        height = vec.dot(kept_ws - hit.point, up)
+        clearance = gate.choose(before, state.clearance, height * hit.found)
+        on_ground = hit.point + vec.scale(up, clearance)
+        planted_ws = gate.choose(hit.found[..., None], on_ground, kept_ws)
+
+        locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
+        step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
+        weight = smoothing.move_towards(state.weight, self.plant_weight, step)
+        planting = locked * weight
+        hold = Hold(
+            vec.scale(planted_ws - foothold_ws, planting),
+            quat.nlerp(sensed.rot_ws, kept_rot, planting),
+            locked,
+        )
+        platform_from_world = platform.inverse()
+        after = PlantState(
+            locked,
+            weight,
+            platform_from_world.apply(planted_ws),
+            clearance,
+            platform_from_world.apply_rot(kept_rot),
+        )
+        return after, hold
