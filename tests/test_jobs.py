@@ -17,6 +17,7 @@ from fitting import jobs
 from fitting.analysis import playback
 from fitting.experiments import problems
 from fitting.inference.identifiability import assess_identifiability
+from fitting.jobs import fits
 from fitting.report import fit_report
 from fitting.runtime.precision import with_floats
 from fitting.studies import run_folder
@@ -73,7 +74,7 @@ def test_a_solution_is_on_disk_before_anything_else_is_computed(experiment_file,
         assert (run / run_folder.PARAMETERS).is_file()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(jobs, "assess_identifiability", interrupt)
+    monkeypatch.setattr(fits, "assess_identifiability", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fitting.fit(experiment_file, run)
     assert not (run / run_folder.FIT).exists()

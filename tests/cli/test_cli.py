@@ -15,7 +15,6 @@ import jax
 import numpy as np
 import pytest
 
-from fitting import jobs
 from fitting.cli import main, progress
 from fitting.cli.parser import make_parser
 from fitting.datasets.clips import formats, load_clip, save_clip
@@ -24,6 +23,7 @@ from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.chain import journal_path
+from fitting.jobs import fits
 from fitting.studies import run_folder
 from support import grounds, quick
 from support.experiments import CLIP, ROOT, write
@@ -254,7 +254,7 @@ def test_an_interrupt_before_the_search_writes_nothing(
     def interrupt(*_):
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(jobs, "make_problem", interrupt)
+    monkeypatch.setattr(fits, "make_problem", interrupt)
     assert main.main(["fit", str(experiment_file), "-o", str(tmp_path / "run")]) == main.INTERRUPTED
     assert capsys.readouterr().err == "\njaxik fit: interrupted\n" and not tree(tmp_path)
 
@@ -266,7 +266,7 @@ def test_the_parameters_are_written_before_anything_can_fail_after_the_search(
     def fail(*_):
         raise ValueError("no slopes")
 
-    monkeypatch.setattr(jobs, "assess_identifiability", fail)
+    monkeypatch.setattr(fits, "assess_identifiability", fail)
     assert "no slopes" in last_error_of(capsys, "fit", experiment_file, "-o", tmp_path / "run")
     assert tree(tmp_path / "run") == {run_folder.EXPERIMENT, run_folder.PARAMETERS}
 

@@ -1,0 +1,53 @@
+"""Words and options of the commands that run systems on flat animations."""
+
+from pathlib import Path
+
+from .options import Commands, add_animation, add_command, add_output
+
+
+def add_apply(commands: Commands) -> None:
+    """`jaxik apply`."""
+    apply = add_command(
+        commands, "apply", "run a run's fitted parameters on another clip",
+        """
+        jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
+        jaxik apply runs/walk walk.amc --terrain yard.glb --file-up z --floor -0.03 -o yard.npz
+        """,
+    )  # fmt: skip
+    apply.add_argument("run", type=Path, metavar="RUN", help="folder made by `jaxik fit`")
+    add_animation(apply)
+    add_output(apply, "OUT.npz")
+
+
+def add_run(commands: Commands) -> None:
+    """`jaxik run`."""
+    run = add_command(
+        commands, "run", "run a preset, or a parameter file, on a clip without fitting",
+        """
+        jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz
+        jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --parameters footik.toml
+        """,
+    )  # fmt: skip
+    add_animation(run)
+    add_output(run, "OUT.npz")
+    system = run.add_mutually_exclusive_group()
+    system.add_argument("--preset", default="record", help="of jaxik.presets (default: record)")
+    system.add_argument("--parameters", type=Path, metavar="TOML", help="instead of a preset")
+
+
+def add_compare(commands: Commands) -> None:
+    """`jaxik compare`."""
+    compare = add_command(
+        commands, "compare", "run several systems on a clip and measure them side by side",
+        """
+        jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
+        jaxik compare walk.bvh --terrain steps.obj --presets record --parameters a.toml,b.toml -o ab
+        """,
+    )  # fmt: skip
+    add_animation(compare)
+    add_output(compare, "DIR")
+    for option, description in (("--presets", "of jaxik.presets"), ("--parameters", "TOML files")):
+        compare.add_argument(
+            option, dest="systems", action="append", default=[], metavar="NAME,...",
+            type=lambda text, option=option: (option, text), help=f"{description}, in this order",
+        )  # fmt: skip

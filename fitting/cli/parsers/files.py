@@ -1,0 +1,104 @@
+"""Words and options of the commands that read and convert files."""
+
+from pathlib import Path
+
+from .options import Commands, add_command, add_output, finite
+
+
+def add_inspect(commands: Commands) -> None:
+    """`jaxik inspect`."""
+    inspect = add_command(
+        commands, "inspect", "print what a loader understood of a clip",
+        """
+        jaxik inspect walk.bvh
+        jaxik inspect walk.amc --asf skeleton.asf --json
+        """,
+    )  # fmt: skip
+    inspect.add_argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc or .npz")
+    inspect.add_argument("--json", action="store_true", help="as JSON")
+    inspect.add_argument("--asf", type=Path, help="skeleton of an .amc, where it is not beside it")
+    inspect.add_argument("--scale", type=float, help="metres per unit of the file")
+
+
+def add_terrain(commands: Commands) -> None:
+    """`jaxik terrain`."""
+    terrain = add_command(
+        commands, "terrain", "reconstruct the ground of a captured clip from its stances",
+        """
+        jaxik terrain walk.bvh -o ground.ply
+        jaxik terrain walk.amc -o ground.obj --sole 0.045 --model smooth --margin 2
+
+        Three models are fitted to the stances: a plane, a smooth surface, and level blocks on a
+        grid. The table shows how well each predicts a stance from all the others; the simplest one
+        that is not clearly worse is written. A plot and all numbers go beside it: ground.png,
+        ground.json.
+        """,
+    )  # fmt: skip
+    terrain.add_argument("clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc or .npz")
+    add_output(terrain, "MESH", ".ply, .obj or .stl")
+    terrain.add_argument(
+        "--sole", type=finite, default=0.055, metavar="M",
+        help="height of the ball joint over the sole, m (default: 0.055, an adult's in shoes)",
+    )  # fmt: skip
+    terrain.add_argument(
+        "--model", choices=("auto", "plane", "smooth", "blocks"), default="auto",
+        help="what is written (default: chosen by the error of prediction)",
+    )  # fmt: skip
+    terrain.add_argument(
+        "--margin", type=finite, default=1.0, metavar="M", help="of ground around the stances, m"
+    )
+
+
+def add_record(commands: Commands) -> None:
+    """`jaxik record`."""
+    record = add_command(
+        commands, "record", "show or convert the game's parameter record",
+        """
+        jaxik record show footik.bin
+        jaxik record to-toml footik.bin -o footik.toml
+        jaxik record to-bytes footik.toml --base footik.bin -o edited.bin
+        """,
+    )  # fmt: skip
+    ways = record.add_subparsers(dest="way", required=True, metavar="show|to-toml|to-bytes")
+    show = add_command(
+        ways, "show", "print a record with its own names and ours",
+        """
+        jaxik record show footik.bin
+        jaxik record show footik.bin --csv > footik.csv
+        """,
+    )  # fmt: skip
+    show.add_argument("file", type=Path, help="binary record, .csv or parameter .toml")
+    show.add_argument("--csv", action="store_true", help="as CSV with the record's own names")
+    to_toml = add_command(
+        ways, "to-toml", "a record as parameters with our names and units",
+        "jaxik record to-toml footik.bin --length-unit cm -o footik.toml",
+    )  # fmt: skip
+    to_toml.add_argument("file", type=Path, help="binary record or .csv")
+    add_output(to_toml, "TOML")
+    to_bytes = add_command(
+        ways, "to-bytes", "parameters as a binary record",
+        """
+        jaxik record to-bytes footik.toml --base footik.bin -o edited.bin
+
+        With the record that `to-toml` read as the base, and the same options, everything that was
+        not edited comes out unchanged, to the byte.
+        """,
+    )  # fmt: skip
+    to_bytes.add_argument("file", type=Path, help="parameter .toml, or .csv")
+    add_output(to_bytes, "BIN")
+    to_bytes.add_argument("--base", type=Path, help="record with padding, tail and knee axis")
+    for way in (show, to_toml, to_bytes):
+        way.add_argument(
+            "--length-unit", choices=("auto", "m", "cm"), default="auto",
+            help="of rays and ankle heights in the record (default: by their size)",
+        )  # fmt: skip
+        way.add_argument(
+            "--knee", choices=("interior", "flexion"), default="interior",
+            help="which angle the record's knee limits are (default: interior)",
+        )  # fmt: skip
+        way.add_argument(
+            "--lean-sign", type=int, choices=(1, -1), default=1, help="of the undulation rates"
+        )
+        way.add_argument(
+            "--tick-hz", type=finite, default=30.0, help="rate of the gains' ticks (default: 30)"
+        )

@@ -1,0 +1,98 @@
+"""Words and options of the commands that search."""
+
+from pathlib import Path
+
+from .options import Commands, add_command, add_output, finite
+
+
+def add_fit(commands: Commands) -> None:
+    """`jaxik fit`."""
+    fit = add_command(
+        commands, "fit", "fit an experiment's free parameters to its clips",
+        """
+        jaxik fit data/experiments/uneven_walk.toml -o runs/walk
+
+        Ctrl-C ends the search; the best point so far is written as any other fit, with status 130.
+        """,
+    )  # fmt: skip
+    fit.add_argument(
+        "experiment", type=Path, metavar="EXPERIMENT.toml", help="clips, terrain, free parameters"
+    )
+    add_output(fit, "RUN", "run folder")
+
+
+def add_ablate(commands: Commands) -> None:
+    """`jaxik ablate`."""
+    ablate = add_command(
+        commands, "ablate", "fit an experiment without each of its rules, cross-validated",
+        """
+        jaxik ablate data/experiments/blocks.toml -o runs/ablation
+
+        The experiment's [[without]] tables say what is left out. Each fit is written when it is
+        done: after Ctrl-C (status 130) the same command continues.
+        """,
+    )  # fmt: skip
+    ablate.add_argument(
+        "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
+    )
+    ablate.add_argument(
+        "--folds", type=int, default=2, metavar="N", help="parts of each clip (default: 2)"
+    )
+    add_output(ablate, "DIR")
+
+
+def add_sample(commands: Commands) -> None:
+    """`jaxik sample`."""
+    sample = add_command(
+        commands, "sample", "sample the posterior around a run's fit, or continue its chain",
+        """
+        jaxik sample runs/walk
+        jaxik sample runs/walk --max-steps 40000      continue, if 20000 were not enough
+
+        Ctrl-C keeps the chain and ends with status 130; the same command continues it, even after
+        the process was killed.
+        """,
+    )  # fmt: skip
+    sample.add_argument("run", type=Path, metavar="RUN", help="folder made by `jaxik fit`")
+    sample.add_argument("--max-steps", type=int, metavar="N", help="of the sampler, over all calls")
+
+
+def add_translate(commands: Commands) -> None:
+    """`jaxik translate`."""
+    translate = add_command(
+        commands, "translate", "fit the parameters of one system to the motion of another",
+        """
+        jaxik translate --from mec.toml --to record --clip walk.bvh --terrain hill.obj -o runs/mec
+        jaxik translate --from unreal --to record --fps 30 --clip a.npz --terrain a.obj -o runs/a
+
+        Ctrl-C ends the search; the best point so far is written as any other fit, with status 130.
+        The folder is a run: `jaxik sample` and `jaxik apply` take it.
+        """,
+    )  # fmt: skip
+    for option, dest, description in (
+        ("--from", "source", "whose motion is reproduced"),
+        ("--to", "target", "whose parameters are fitted, starting from these values"),
+    ):
+        translate.add_argument(
+            option, dest=dest, required=True, metavar="SYSTEM",
+            help=f"preset or parameter .toml {description}",
+        )  # fmt: skip
+    for option, metavar, description in (
+        ("--clip", "CLIP", "over flat ground, as `jaxik run` takes it"),
+        ("--terrain", "MESH", "for the clip in the same position"),
+    ):
+        translate.add_argument(
+            option, type=Path, action="append", required=True, metavar=metavar,
+            help=f"{description}; may be given several times",
+        )  # fmt: skip
+    translate.add_argument(
+        "--free", metavar="NAME,...", help="what is fitted, or a .toml with a [free] table "
+        "(default: every parameter that moves these clips)",
+    )  # fmt: skip
+    translate.add_argument(
+        "--fps", type=finite, metavar="HZ", help="resample the clips first (default: as they are)"
+    )
+    translate.add_argument(
+        "--file-up", choices=("y", "z"), default="y", help="up axis of the meshes"
+    )
+    add_output(translate, "DIR")

@@ -1,0 +1,60 @@
+"""Options that several commands share, and how a command is added to the parser."""
+
+import argparse
+import math
+import textwrap
+from pathlib import Path
+from typing import TypeAlias
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def add_command(
+    commands: Commands, name: str, summary: str, example: str
+) -> argparse.ArgumentParser:
+    """Adds a command to the parser; the example may be indented."""
+    return commands.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog="example:\n" + textwrap.indent(textwrap.dedent(example).strip(), "  "),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_output(command: argparse.ArgumentParser, metavar: str, description: str = "") -> None:
+    """Adds `-o`, where results are written."""
+    command.add_argument(
+        "-o", "--output", type=Path, required=True, metavar=metavar, help=description or None
+    )
+
+
+def add_animation(command: argparse.ArgumentParser) -> None:
+    """Adds a flat animation, its terrain, and how they lie."""
+    command.add_argument(
+        "clip", type=Path, metavar="CLIP",
+        help=".bvh, .amc or .npz over flat ground; for a blocks .npz its flat animation",
+    )  # fmt: skip
+    command.add_argument(
+        "--terrain", type=Path, required=True, metavar="MESH", help=".ply, .obj, .npz, .glb, ..."
+    )
+    command.add_argument("--file-up", choices=("y", "z"), default="y", help="up axis of the mesh")
+    command.add_argument(
+        "--floor", type=finite, default=0.0, metavar="M", help="height of the clip's floor, m"
+    )
+    command.add_argument(
+        "--root", choices=("auto", "animation", "ground"), default="auto",
+        help="keep the root of the clip, or let it follow the ground below it; auto keeps it where "
+        "foot IK reaches the ground from there, or where the feet follow this terrain already",
+    )  # fmt: skip
+
+
+def finite(text: str) -> float:
+    """A finite number, as the `type` of an option."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r}; wanted a finite number")
+    return value

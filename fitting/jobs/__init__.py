@@ -1,0 +1,22 @@
+"""Whole jobs, from files to a folder with results and a report: what the command line runs.
+
+Each job checks everything the user gave before it computes anything, writes its results as soon as
+they exist, and draws its report last. Without an `output` nothing is written. `progress` is called
+with reports of a running search or sampling; `log` with lines and tables as the command line prints
+them, so `log=print` shows the same.
+
+Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
+bits; a system that was made in 32 bits is taken with the values it has there.
+
+`fits` searches: `fit`, `sample`, `ablate` and `translate`. `animations` runs finished systems:
+`solve`, `apply` and `compare`.
+"""
+
+from .animations import apply as apply
+from .animations import compare as compare
+from .animations import solve as solve
+from .fits import ablate as ablate
+from .fits import fit as fit
+from .fits import sample as sample
+from .fits import translate as translate
+from .output import Log as Log

@@ -1,0 +1,120 @@
+"""Jobs that run finished systems on flat animations, and measure what comes out."""
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+
+import numpy as np
+
+import jaxik
+from fitting.analysis import accuracy
+from fitting.datasets.clips import Clip, load_clip, save_clip
+from fitting.datasets.clips.formats.npz import check_clip_file, is_blocks_file
+from fitting.experiments.parameter_files import load_system
+from fitting.report import comparison_report, fit_tables, placement_report
+from fitting.report.formatting import aligned
+from fitting.runtime.precision import in_float64, with_floats
+from fitting.studies import comparison, run_folder
+from fitting.studies.animations import AnimationFiles, load_animation
+from fitting.studies.comparison import Comparison
+
+from .output import Log, checked_folder, log_output, silent
+
+
+@in_float64
+def compare(
+    systems: Mapping[str, jaxik.FootIK],
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    during: Callable[[str], AbstractContextManager] = nullcontext,
+    log: Log = silent,
+) -> Comparison:
+    """Runs several systems on a flat animation and measures them side by side; warns as `solve`.
+
+    Args:
+        systems: by name.
+        animation: the clip, the terrain, and where the root is put for all systems.
+        output: folder for the table, the numbers and the figure.
+        during: makes a context for the run of each system, from its name.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: a file cannot be read, a system does not fit the clip or gives poses that are
+            not finite, or the folder cannot be made.
+    """
+    folder = checked_folder(output)
+    systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
+    title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
+    loaded = load_animation(animation)
+    compared = comparison.compare(systems, loaded, title=title, during=during)
+    if folder is not None:
+        comparison_report.write(folder, compared)
+    table = aligned(comparison_report.transposed(comparison_report.table(compared)))
+    log(f"{table}\n\nroot: {loaded.root.reason}")
+    log_output(log, folder, comparison_report.TABLE)
+    for name, (placement, cause) in compared.placements.items():
+        placement_report.warn(placement, cause, name)
+    return compared
+
+
+@in_float64
+def apply(
+    run: str | Path,
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    log: Log = silent,
+) -> Clip:
+    """Solves a flat animation with the fitted system of a run; see `solve`.
+
+    Raises:
+        ValueError: as `solve`, or the folder holds no finished fit.
+    """
+    run_folder.load_fit(Path(run))
+    ik, _ = load_system(Path(run) / run_folder.PARAMETERS)
+    return solve(ik, animation, output, log=log)
+
+
+@in_float64
+def solve(
+    ik: jaxik.FootIK,
+    animation: AnimationFiles,
+    output: str | Path | None = None,
+    *,
+    log: Log = silent,
+) -> Clip:
+    """Solves a flat animation, and measures how its feet are placed on the ground.
+
+    Where a captured motion is known, the log also shows the difference. Feet that are visibly off
+    the ground, slide or pop are a warning, with the most likely cause.
+
+    Args:
+        ik: the system.
+        animation: the clip, the terrain, and where the root is put.
+        output: .npz file for the solved clip.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: a file cannot be read or written, or the system does not fit the clip or gives
+            poses that are not finite.
+    """
+    path = None if output is None else Path(output)
+    if path is not None:
+        check_clip_file(path)
+    ik, loaded = with_floats(ik, np.float64), load_animation(animation)
+    loaded.check_shapes(ik)
+    began = time.perf_counter()
+    result, solved = loaded.solve(ik)
+    seconds = time.perf_counter() - began
+    placement, cause = loaded.assess(solved)
+    if path is not None:
+        save_clip(path, solved, joints=placement_report.arrays(solved, placement))
+    log(placement_report.solved_text(result, seconds, path))
+    log(f"root: {loaded.root.reason}\n\n{placement_report.text(placement)}")
+    if is_blocks_file(animation.clip):
+        errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)
+        log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")
+    placement_report.warn(placement, cause)
+    return solved
