@@ -125,6 +125,10 @@ class Rig:
     """m, knee to ankle."""
     foot: Float[Array, "*b legs"]
     """m, ankle to ball."""
+    ankle_height: Float[Array, "*b legs"]
+    """m, of the ankle above the sole while the foot stands flat."""
+    ball_height: Float[Array, "*b legs"]
+    """m, of the ball above the sole, likewise."""
     side: Float[Array, "*b legs"]
     """+1 left, -1 right, 0 in the middle."""
     present: Bool[Array, "*b legs"]

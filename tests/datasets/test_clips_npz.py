@@ -38,6 +38,16 @@ def test_a_saved_clip_is_loaded_exactly(walk, tmp_path):
     assert_same(load_clip(tmp_path / "clip.npz"), bare)
 
 
+def test_heights_over_the_sole_are_measured_where_an_older_file_does_not_have_them(walk, tmp_path):
+    save_clip(tmp_path / "clip.npz", walk)
+    content = dict(np.load(tmp_path / "clip.npz"))
+    heights = {name: content.pop(name) for name in ("rig_ankle_height", "rig_ball_height")}
+    np.savez(tmp_path / "older.npz", **content)
+    rig = load_clip(tmp_path / "older.npz").measured_rig
+    assert np.array_equal(rig.ankle_height, heights["rig_ankle_height"])
+    assert np.array_equal(rig.ball_height, heights["rig_ball_height"])
+
+
 def test_a_save_that_fails_leaves_the_old_file_and_nothing_else(walk, tmp_path, monkeypatch):
     save_clip(tmp_path / "clip.npz", walk)
     before = (tmp_path / "clip.npz").read_bytes()

@@ -13,7 +13,7 @@ from fitting.datasets.clips.contacts import detect_stances, runs
 from fitting.datasets.clips.formats.bvh import read_bvh
 from fitting.datasets.clips.joint_roles import find_roles, partners
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
-from fitting.datasets.clips.rigs import LegMotion, knee_axis
+from fitting.datasets.clips.rigs import LegMotion, knee_axis, measure_soles
 from jaxik.maths import quat
 from jaxik.world.skeleton import Transform, forward_kinematics
 from support.sample_clips import BVH, stair_walk
@@ -238,3 +238,21 @@ def test_a_character_that_always_lies_on_its_side_faces_z(walk):
 def test_the_rig_of_a_clip_without_legs_raises_an_error(walk):
     with pytest.raises(ValueError, match="stair walk was loaded without legs"):
         _ = replace(walk, measured_rig=None).rig
+
+
+def test_heights_over_the_sole_are_those_of_a_flat_stance_over_the_floor():
+    walk = stair_walk(lambda points: np.zeros(len(points)))
+    assert np.allclose(walk.rig.ankle_height, 0.05, atol=1e-12)
+    assert np.allclose(walk.rig.ball_height, 0.0, atol=1e-12)
+    assert not walk.remarks
+    raised = measure_soles(walk.positions_ws + [0.0, 0.3, 0.0], walk.rig.joints, walk.stance, 0.3)
+    assert raised.measured.all() and np.allclose(raised.ankle, 0.05, atol=1e-12)
+
+
+def test_on_stairs_or_without_a_stance_heights_over_the_sole_are_those_of_feet_so_long(walk):
+    for stance in (walk.stance, np.zeros_like(walk.stance)):
+        soles = measure_soles(walk.positions_ws, walk.rig.joints, stance)
+        assert not soles.measured.any()
+        assert np.allclose(soles.ball, 0.45 * np.hypot(0.1, 0.05))
+        assert np.allclose(soles.ankle - soles.ball, 0.05)
+    assert len([remark for remark in walk.remarks if "no level floor" in remark]) == 2

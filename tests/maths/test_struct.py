@@ -50,6 +50,8 @@ def test_static_fields_belong_to_the_structure():
             thigh=one,
             shin=one,
             foot=one,
+            ankle_height=one,
+            ball_height=one,
             side=one,
             present=jnp.ones(1, bool),
             names=(name,),
@@ -58,7 +60,7 @@ def test_static_fields_belong_to_the_structure():
         )
         for name in ("left", "right")
     ]
-    assert len(jax.tree.leaves(rigs[0])) == 7
+    assert len(jax.tree.leaves(rigs[0])) == 9
     assert jax.tree.structure(rigs[0]) != jax.tree.structure(rigs[1])
     assert jax.tree.map(lambda x: x + 1, rigs[1]).names == ("right",)
 

@@ -87,6 +87,8 @@ def to_rig(rig: reference.Rig) -> jaxik.Rig:
         thigh=ones * sample_poses.THIGH,
         shin=ones * sample_poses.SHIN,
         foot=ones * 0.15,
+        ankle_height=ones * 0.085,
+        ball_height=ones * 0.05,
         side=jnp.asarray(rig.side, float),
         present=jnp.ones(legs, bool),
         names=tuple(f"leg {leg}" for leg in range(legs)),

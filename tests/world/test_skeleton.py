@@ -216,6 +216,8 @@ def test_names_and_joints_of_a_rig_are_static():
         thigh=jnp.full(2, 0.4),
         shin=jnp.full(2, 0.4),
         foot=jnp.full(2, 0.15),
+        ankle_height=jnp.full(2, 0.08),
+        ball_height=jnp.full(2, 0.05),
         side=jnp.asarray([1.0, -1.0]),
         present=jnp.asarray([True, True]),
         names=("left", "right"),
@@ -223,7 +225,7 @@ def test_names_and_joints_of_a_rig_are_static():
         pelvis=0,
     )
     leaves, structure = jax.tree.flatten(rig)
-    assert len(leaves) == 7
+    assert len(leaves) == 9
     assert jax.tree.unflatten(structure, leaves).names == ("left", "right")
     batch = jax.vmap(lambda thigh: jax.tree.map(lambda x: x, rig).thigh * thigh)(jnp.arange(3.0))
     assert batch.shape == (3, 2)

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from jaxik.world.skeleton import Rig
+
 from . import contacts
 from .clip import Clip
 from .joint_roles import Roles, find_roles
 from .kinematics import continuous, local_from_world, world_from_local
 from .recording import INCH, Y_UP_FROM_Z_UP, Recording
-from .rigs import measure_rig
+from .rigs import measure_rig, measure_soles
 
 RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
 RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
@@ -87,6 +89,7 @@ def clip_from_recording(
             if not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
         rig = measure_rig(roles, positions_ws, rotations_ws, stance)
+        remarks += _guessed_soles(rig, positions_ws, stance)
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
         float(rate), recording.frame_time, source, float(scale), up,
@@ -127,8 +130,19 @@ def clip_from_joints(
     return Clip(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
         rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
-        stance=motion.stance,
+        stance=motion.stance, remarks=_guessed_soles(rig, motion.positions_ws, motion.stance),
     )  # fmt: skip
+
+
+def _guessed_soles(rig: Rig, positions_ws: np.ndarray, stance: np.ndarray) -> tuple[str, ...]:
+    """A remark for each foot whose height over its sole is a guess."""
+    measured = measure_soles(positions_ws, rig.joints, stance).measured
+    return tuple(
+        f"the {name} foot stands flat on no level floor at height 0; its ankle is taken to be "
+        f"{height:.3f} m over its sole, from the foot's length"
+        for name, height, known in zip(rig.names, rig.ankle_height, measured, strict=True)
+        if not known
+    )
 
 
 def _common_rate(frame_time: float, remarks: list[str]) -> float:

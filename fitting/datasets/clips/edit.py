@@ -25,6 +25,10 @@ RAMP_SPEED = 2.0  # times the median step
 RAMP_GAP = 0.02  # s: a ramp that overshoots slows down for as long
 MIRROR_VECTOR = np.array([-1.0, 1.0, 1.0])
 MIRROR_ROTATION = np.array([1.0, 1.0, -1.0, -1.0])  # wxyz
+MIRRORED = (  # of a rig, what the legs of a mirror image exchange
+    "knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "ankle_height", "ball_height",
+    "present",
+)  # fmt: skip
 
 
 def resample(clip: Clip, fps: float) -> Clip:
@@ -175,10 +179,7 @@ def mirror(clip: Clip) -> Clip:
 def _mirror_rig(rig: Rig, legs: list[int]) -> Rig:
     """The rig with each leg's mirrored counterpart; names, joints and sides stay in place."""
     with jax.enable_x64(True):
-        swapped = {
-            name: np.asarray(getattr(rig, name))[legs]
-            for name in ("knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "present")
-        }
+        swapped = {name: np.asarray(getattr(rig, name))[legs] for name in MIRRORED}
         # A rotation about an axis becomes the opposite rotation about the mirrored axis.
         swapped["knee_axis_ls"] = swapped["knee_axis_ls"] * MIRROR_ROTATION[1:]
         swapped["ankle_from_foot"] = swapped["ankle_from_foot"] * MIRROR_ROTATION

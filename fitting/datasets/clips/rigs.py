@@ -1,5 +1,6 @@
 """Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its joints."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,6 +20,10 @@ Rotations = Float64[np.ndarray, "frames 4"]  # wxyz
 UP = np.array([0.0, 1.0, 0.0])
 KNEE_MOTION = np.radians(3.0)  # RMS knee rotation below which the motion shows no axis
 FLAT_FRACTION = 0.25  # of the stance frames, those with the slowest ankle: the foot is flat
+LEVEL = 0.4  # of a foot's length, in which the heights of its ball lie on a level floor
+HIGHEST_BALL = 0.75  # of a foot's length, its ball's height over the sole; higher is no floor
+USUAL_BALL = 0.45  # likewise, of the feet of people
+USUAL_FOOT = 0.15  # of a leg's length, ankle to ball; for a foot that is a single point
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,17 @@ class LegMotion:
     ankle_rot: Rotations
     left_ws: Vectors
     """Unit, to the character's left."""
+
+
+class SoleHeights(NamedTuple):
+    """Heights of joints above the sole of a foot that stands flat, one for each leg."""
+
+    ankle: Float64[np.ndarray, " legs"]
+    """Metres."""
+    ball: Float64[np.ndarray, " legs"]
+    """Metres."""
+    measured: Bool[np.ndarray, " legs"]
+    """False where the clip shows no foot flat on a level floor: a guess from the foot's length."""
 
 
 class LegMeasurement(NamedTuple):
@@ -59,7 +75,8 @@ def measure_rig(
 
     Bone lengths are medians over the frames. The knee axis is the principal axis of the knee's
     rotations; if the knee hardly moves, it is perpendicular to thigh and shin. Foot axes are those
-    of a flat foot: up is the world's, forward points from ankle to ball.
+    of a flat foot: up is the world's, forward points from ankle to ball. Heights over the sole are
+    those of `measure_soles` over a floor at y = 0.
 
     Args:
         roles: which joint is which.
@@ -75,6 +92,7 @@ def measure_rig(
         for index, leg in enumerate(roles.legs)
     ]
     axes, feet, lengths = (np.stack(part) for part in zip(*legs, strict=True))
+    soles = measure_soles(positions_ws, [leg.joints for leg in roles.legs], stance)
     with jax.enable_x64(True):
         return Rig(
             knee_axis_ls=jnp.asarray(axes),
@@ -82,12 +100,50 @@ def measure_rig(
             thigh=jnp.asarray(lengths[:, 0]),
             shin=jnp.asarray(lengths[:, 1]),
             foot=jnp.asarray(lengths[:, 2]),
+            ankle_height=jnp.asarray(soles.ankle),
+            ball_height=jnp.asarray(soles.ball),
             side=jnp.asarray(side),
             present=jnp.ones(len(legs), bool),
             names=tuple(leg.name for leg in roles.legs),
             joints=tuple(leg.joints for leg in roles.legs),
             pelvis=roles.pelvis,
         )
+
+
+def measure_soles(
+    positions_ws: Float64[np.ndarray, "frames joints 3"],
+    legs: Sequence[tuple[int, int, int, int]],
+    stance: Bool[np.ndarray, "frames legs"],
+    floor: float = 0.0,
+) -> SoleHeights:
+    """How far ankle and ball of each foot are above its sole while it stands flat.
+
+    These are medians of their heights above the floor. Where balls stand at different heights, or
+    nowhere near the floor, the clip shows no floor for that foot. Its ball is then as high as that
+    of a person's foot of its length, and its ankle as much higher as the flat foot shows.
+
+    Args:
+        positions_ws: m, y up.
+        legs: indices of hip, knee, ankle and ball of each leg.
+        stance: when each foot stands.
+        floor: height of the floor, m.
+    """
+    heights, measured = [], []
+    for leg, (hip, knee, ankle, toe) in enumerate(legs):
+        bones = np.diff(positions_ws[:, [hip, knee, ankle, toe]], axis=1)
+        thigh, shin, foot = np.median(np.linalg.norm(bones, axis=-1), axis=0)
+        foot = foot if foot > 0 else USUAL_FOOT * (thigh + shin)
+        flat = flat_frames(positions_ws[:, ankle], positions_ws[:, toe], stance[:, leg])
+        above = positions_ws[flat][:, [ankle, toe], 1] - floor
+        (ankle_height, ball_height), balls = np.median(above, axis=0), above[:, 1]
+        level = np.quantile(balls, 0.9) - np.quantile(balls, 0.1) <= LEVEL * foot
+        on_floor = -LEVEL * foot <= ball_height <= HIGHEST_BALL * foot
+        measured.append(bool(stance[:, leg].any() and level and on_floor))
+        if not measured[-1]:
+            rise = max(np.median(above[:, 0] - balls), 0.0)
+            ankle_height, ball_height = USUAL_BALL * foot + rise, USUAL_BALL * foot
+        heights.append([max(ankle_height, 0.0), max(ball_height, 0.0)])
+    return SoleHeights(*np.array(heights).T, np.array(measured))
 
 
 def left_directions(

@@ -19,6 +19,10 @@ class LegSummary(TypedDict):
     thigh: float
     shin: float
     foot: float
+    ankle_height: float
+    """Over the sole."""
+    ball_height: float
+    """Likewise."""
     knee_axis: list[float]
     """Unit, knee space."""
     ankle_from_foot: list[float]
@@ -99,6 +103,8 @@ def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
             "thigh": float(rig.thigh[leg]),
             "shin": float(rig.shin[leg]),
             "foot": float(rig.foot[leg]),
+            "ankle_height": float(rig.ankle_height[leg]),
+            "ball_height": float(rig.ball_height[leg]),
             "knee_axis": np.asarray(rig.knee_axis_ls[leg]).tolist(),
             "ankle_from_foot": np.asarray(rig.ankle_from_foot[leg]).tolist(),
             "contacts": len(contacts.runs(stance[:, leg])),
@@ -129,6 +135,8 @@ def as_text(summary: ClipSummary) -> str:
             f"  {name:<7} {names}",
             f"          thigh {leg['thigh']:.3f} m, shin {leg['shin']:.3f} m, "
             f"foot {leg['foot']:.3f} m; knee opens about ({axis})",
+            f"          ankle {leg['ankle_height']:.3f} m and ball {leg['ball_height']:.3f} m over "
+            "the sole",
             f"          stands {leg['contacts']} times, {leg['contact_share']:.0%} of the frames "
             f"(from the {leg['contacts_from']})",
         ]

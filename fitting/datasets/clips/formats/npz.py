@@ -10,9 +10,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
+from fitting.datasets.clips.rigs import SoleHeights, measure_soles
 from fitting.runtime import files
 from jaxik.world.skeleton import Rig
 
@@ -24,6 +26,7 @@ OPTIONAL = ("stance", "mask", "slide")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
 RIG_ARRAYS = ("knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "side", "present")
+SOLE_ARRAYS = ("ankle_height", "ball_height")  # measured where an older file does not have them
 VARIANTS = {"captured": "", "base": "base_"}  # prefix of their arrays in a blocks file
 BLOCKS_ARRAYS = ("fps", "pelvis", "pelvis_rot", "foot_rot", "stance")
 BLOCKS_JOINTS = ("hip", "knee", "ankle", "ball")
@@ -54,7 +57,8 @@ def save_clip(
         if (value := getattr(clip, name)) is not None:
             content[name] = np.asarray(value)
     if (rig := clip.measured_rig) is not None:
-        content |= {f"rig_{name}": np.asarray(getattr(rig, name)) for name in RIG_ARRAYS}
+        arrays = (*RIG_ARRAYS, *SOLE_ARRAYS)
+        content |= {f"rig_{name}": np.asarray(getattr(rig, name)) for name in arrays}
         content["rig_names"] = np.array(rig.names)
         content["rig_joints"] = np.array(rig.joints)
         content["rig_pelvis"] = np.array(rig.pelvis)
@@ -142,13 +146,27 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
 
 
 def _read_rig(content: Arrays) -> Rig:
+    arrays = {name: content[f"rig_{name}"] for name in RIG_ARRAYS}
+    joints = tuple((int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"])
+    if all(f"rig_{name}" in content for name in SOLE_ARRAYS):
+        arrays |= {name: content[f"rig_{name}"] for name in SOLE_ARRAYS}
+    else:
+        arrays |= dict(zip(SOLE_ARRAYS, _measure_soles(content, joints)[:2], strict=True))
     with jax.enable_x64(True):
         return Rig(
-            **{name: jax.device_put(content[f"rig_{name}"]) for name in RIG_ARRAYS},
+            **jax.device_put(arrays),
             names=tuple(map(str, content["rig_names"])),
-            joints=tuple((int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"]),
+            joints=joints,
             pelvis=int(content["rig_pelvis"]),
         )
+
+
+def _measure_soles(content: Arrays, joints: tuple[tuple[int, int, int, int], ...]) -> SoleHeights:
+    positions_ws, stance = content["positions_ws"], content.get("stance")
+    if stance is None:
+        balls = positions_ws[:, [leg[3] for leg in joints]]
+        stance = contacts.detect_stances(balls, float(content["fps"]))
+    return measure_soles(positions_ws, joints, stance)
 
 
 def _check_arrays(path: Path, content: Arrays, required: set[str]) -> None:
