@@ -58,6 +58,7 @@ def frames_from_clip(
         world_from_model=world,
         pose=pose,
         weight=array(np.ones((clip.frame_count, legs))),
+        grounded=array(np.ones(clip.frame_count)),
         slide=array(slide),
         velocity_ws=array(root_velocity),
         foot_speed=array(np.linalg.norm(ankle_velocity, axis=-1)),

@@ -50,7 +50,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
     """Outputs of the stages that need no memory, given which feet stand."""
     rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
     up = terrain.leg_up_ws
-    weight = jnp.where(rig.present, frame.weight * ik.leg.weight, 0.0)
+    weight = jnp.where(rig.present, frame.grounded * frame.weight * ik.leg.weight, 0.0)
     with jax.named_scope("root"):
         root_ws = vec.scale(terrain.up_ws, ik.root.sense(inputs))
         frame = frame.translated(root_ws)
@@ -73,6 +73,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
         platform=frame.platform,
         present=rig.present,
         weight=weight,
+        grounded=frame.grounded,
         root_ws=root_ws,
         hip_ws=frame.world_from_model.apply(frame.pose.hip.pos),
         ankle_ws=ankle.pos,
@@ -114,6 +115,9 @@ def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Adv
         awake = ik.effector.awake(now, state.effector)
         pelvis_now = PelvisMoment(now.dt, now.started, now.gate, sensed, now.terrain, lean, awake)
         pelvis = ik.pelvis.advance(pelvis_now, ankle, state.pelvis)
+        offset_ws = vec.scale(pelvis.offset_ws, sensed.grounded)
+        pelvis = dataclasses.replace(pelvis, offset_ws=offset_ws)
+        lean = dataclasses.replace(lean, rot_ws=_part_of(lean.rot_ws, sensed.grounded))
     with jax.named_scope("effector"):
         effector_state, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
     after = State(
@@ -142,6 +146,11 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
     corrections = Corrections(leg.hip, leg.knee, foot.ankle)
     trace = Trace(sensed, advanced)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
+
+
+def _part_of(rot: Array, weight: Array) -> Array:
+    """A rotation by a part of the way, 0..1; exactly `rot` at weight 1."""
+    return jnp.where(weight < 1, quat.nlerp_identity(rot, weight), rot)
 
 
 def body_transform(inputs: Inputs, rot_ws: Array, offset_ws: Array) -> Transform:

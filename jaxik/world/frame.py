@@ -50,6 +50,8 @@ class Frame:
     """Legs, model space."""
     weight: Float[Array, "*b legs"]
     """0..1, how much foot IK each leg gets."""
+    grounded: Float[Array, "*b"]
+    """0..1; 0 in the air, on a ladder or on a seat: then there is no foot IK at all."""
     slide: Float[Array, "*b"]
     """0..1; 1 while the character slides."""
     velocity_ws: Float[Array, "*b 3"]
@@ -162,6 +164,8 @@ class Sensed:
     present: Bool[Array, " legs"]
     weight: Float[Array, " legs"]
     """0..1, how much foot IK each leg gets."""
+    grounded: Float[Array, ""]
+    """0..1, how much of its motion the body gets; the weights have it as a factor."""
     root_ws: Float[Array, "3"]
     """m, offset that put the character on its ground."""
     hip_ws: Float[Array, "legs 3"]

@@ -146,7 +146,7 @@ class Stride:
 class Frame:
     """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space.
 
-    `speed` is that of the character, `foot_speed` (legs) that of the animated ankles and
+    `grounded` is 0..1, 0 in the air. `speed` is that of the character, `foot_speed` (legs) that of the animated ankles and
     `toe_speed` (legs) that of the toes, m/s, world space; all default to 0. Without `velocity_ws`
     (3), m/s, the character moves forward.
     """
@@ -165,6 +165,7 @@ class Frame:
     velocity_ws: Array | None = None
     toe_speed: Array = field(default_factory=lambda: np.zeros(0))
     stride: Stride | None = None
+    grounded: float = 1.0
 
     def __post_init__(self) -> None:
         legs = len(self.weight)

@@ -113,6 +113,7 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
         world_from_model=transform("world_from_model"),
         pose=jaxik.LegPose(*map(transform, ("hip", "knee", "ankle", "toe"))),
         weight=stacked(frame.weight for frame in frames),
+        grounded=jnp.asarray([float(frame.grounded) for frame in frames]),
         slide=jnp.asarray([float(frame.slide) for frame in frames]),
         velocity_ws=stacked(frame.travel_ws for frame in frames),
         foot_speed=stacked(frame.foot_speed for frame in frames),
@@ -279,8 +280,8 @@ def wandering(
 ) -> list:
     """A clip with a bit of everything.
 
-    It has steps, drifting feet, slides, half-weighted legs, uneven frame times, a turning root,
-    swinging hips and tilted feet. Its footholds are known in the first half only.
+    It has steps, drifting feet, slides, half-weighted legs, time in the air, uneven frame times, a
+    turning root, swinging hips and tilted feet. Its footholds are known in the first half only.
 
     Between the fractions `stand` of the clip (start, end, start, end, ...) the root stands still,
     at a speed of exactly 0, and the feet, paused in their step, only sway and bob a little.
@@ -314,6 +315,7 @@ def wandering(
             weight[0] = 0.5
         if 0.77 < fraction < 0.78:
             weight[-1] = 0.0
+        grounded = 0.0 if 0.85 < fraction < 0.88 else 0.4 if 0.88 < fraction < 0.91 else 1.0
         frame = sample_poses.make_frame(
             rig,
             np.array(ankles),
@@ -321,6 +323,7 @@ def wandering(
             hinge_yaw=0.2 * np.sin(phase),
             world_from_model=reference.Transform(place.copy(), turned),
             weight=weight,
+            grounded=grounded,
             slide=float(0.3 < fraction < 0.5),
             dt=dt,
         )

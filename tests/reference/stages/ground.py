@@ -240,7 +240,7 @@ def is_slow(parameters: Parameters, name: str, leg: int, moved: Array, dt: float
 def weights_of_legs(parameters: Parameters, frame: Frame) -> list[float]:
     """How much foot IK each leg gets, 0..1."""
     return [
-        float(weight * parameters.of_leg("leg.weight", leg))
+        float(frame.grounded * weight * parameters.of_leg("leg.weight", leg))
         for leg, weight in enumerate(frame.weight)
     ]
 

@@ -18,6 +18,7 @@ from reference.maths import (
     rotate,
     unit,
 )
+from reference.stages import ground
 
 # Forward distance from ankle hit to toe hit, m, below which their heights give no pitch.
 SHORT_FOOT = 0.01
@@ -43,7 +44,7 @@ def solve_leg(
 ) -> tuple[Transform, Transform, Transform, bool]:
     """Hip, knee and ankle that bring the ankle to `target`, and whether they do; model space."""
     hip, knee, ankle = (carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle))
-    weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
+    weight = ground.weights_of_legs(parameters, frame)[leg]
     axis = rotate(knee.rot, rig.knee_axis_ls[leg])
     distance = length(target - hip.pos)
 
@@ -185,7 +186,7 @@ def foot(
         tilt = maths.multiply(from_axis_angle(roll_axis, roll - joint_roll), tilt)
 
     wanted = maths.multiply(maths.inverse(world_from_model), maths.multiply(tilt, rot_ws))
-    weight = float(frame.weight[leg] * parameters.of_leg("leg.weight", leg))
+    weight = ground.weights_of_legs(parameters, frame)[leg]
     return maths.nlerp(ankle.rot, wanted, weight)
 
 

@@ -94,7 +94,8 @@ def step(
 
     targets = [target for target, _ in goals]
     pelvis = pelvis_height(parameters, feet, targets, up, state, frame)
-    body = limb.body(frame, up * pelvis, maths.IDENTITY)
+    offset_ws = up * pelvis * frame.grounded
+    body = limb.body(frame, offset_ws, maths.IDENTITY)
 
     solved, reached, weights, hints = [], [], [], []
     for leg in legs:
@@ -116,8 +117,8 @@ def step(
         "body_pos": body.pos,
         "body_rot": body.rot,
         "pelvis_height": np.array(pelvis),
-        "pelvis_offset_ws": up * pelvis,
-        "body_offset_ws": up * pelvis,
+        "pelvis_offset_ws": offset_ws,
+        "body_offset_ws": offset_ws,
         "found": np.array([foot.found for foot in feet]),
         "extra": np.array([foot.extra for foot in feet]),
         "pitch": np.array([foot.pitch for foot in feet]),

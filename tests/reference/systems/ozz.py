@@ -72,7 +72,8 @@ def step(
         for leg in legs
     ]
     pelvis = pelvis_height(parameters, feet, up, state, frame)
-    body_offset_ws = up * lift + up * pelvis
+    pelvis_offset_ws = up * pelvis * frame.grounded
+    body_offset_ws = up * lift + pelvis_offset_ws
     body = limb.body(frame, body_offset_ws, maths.IDENTITY)
 
     solved, reached, foot_reached, weights = [], [], [], []
@@ -92,7 +93,7 @@ def step(
         "body_rot": body.rot,
         "lift": np.array(lift),
         "pelvis_height": np.array(pelvis),
-        "pelvis_offset_ws": up * pelvis,
+        "pelvis_offset_ws": pelvis_offset_ws,
         "body_offset_ws": body_offset_ws,
         "found": np.array([foot.hit.found for foot in feet]),
         "target_ws": np.array([foot.target_ws for foot in feet]),

@@ -55,7 +55,9 @@ def step(
     targets = [target + offset for target, offset in zip(targets, offsets, strict=True)]
 
     pelvis = ground.pelvis_height(parameters, feet, targets, up, state, frame)
-    pelvis_offset_ws = pelvis * (up if parameters["pelvis.vertical_only"] else smooth_normal)
+    direction = up if parameters["pelvis.vertical_only"] else smooth_normal
+    pelvis_offset_ws = frame.grounded * pelvis * direction
+    body_rot_ws = maths.nlerp(maths.IDENTITY, body_rot_ws, frame.grounded)
     body = limb.body(frame, pelvis_offset_ws, body_rot_ws)
 
     solved = []

@@ -147,7 +147,7 @@ def step(
 
     goal = pelvis_goal(parameters, pelvis, feet, targets, ups, terrain.up, state, frame)
     eased = follow_goal(parameters, state, goal, frame.dt)
-    offset_ws = terrain.up * eased.value
+    offset_ws = terrain.up * eased.value * frame.grounded
     body = limb.body(frame, offset_ws, maths.IDENTITY)
 
     forward = ground.forward(frame.world_from_model.rot, terrain.up)

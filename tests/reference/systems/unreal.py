@@ -68,12 +68,13 @@ def step(
     goals = [offset - hip_goal for offset in offsets]
     state = advance(parameters, state, idle, hip_goal, goals, leg_weights, frame.dt)
 
-    body = limb.body(frame, terrain.up * state.hip, maths.IDENTITY)
+    offset_ws = terrain.up * state.hip * frame.grounded
+    body = limb.body(frame, offset_ws, maths.IDENTITY)
     solved, reached, targets = [], [], []
     for leg in legs:
         raised = characters.under(terrain, leg).up * state.effector[leg]
         target_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
-        target_ws = target_ws + terrain.up * state.hip + raised
+        target_ws = target_ws + offset_ws + raised
         target_ms = maths.unapply(frame.world_from_model, target_ws)
         hip, knee, ankle, arrived = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
         # The body does not rotate, so the animated model-space rotation is the world's as well.
@@ -87,8 +88,8 @@ def step(
         "body_rot": body.rot,
         "hip": np.array(state.hip),
         "pelvis_height": np.array(state.hip),
-        "pelvis_offset_ws": terrain.up * state.hip,
-        "body_offset_ws": terrain.up * state.hip,
+        "pelvis_offset_ws": offset_ws,
+        "body_offset_ws": offset_ws,
         "half_height": np.array(state.half_height),
         "effector": np.array(state.effector),
         "asleep": np.array(state.asleep),
