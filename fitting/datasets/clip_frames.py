@@ -27,7 +27,7 @@ def frames_from_clip(
 ) -> jaxik.Frame:
     """The clip as the pipeline's input: one `Frame` whose leaves have a leading frames axis.
 
-    Foot IK is at full weight, the ground does not move, and the character slides where the clip
+    Foot IK is at full weight, there are no platforms, and the character slides where the clip
     says so. Strides follow from the clip's contact labels. Numbers are in JAX's default precision.
 
     Args:
@@ -53,7 +53,7 @@ def frames_from_clip(
     def array(values: np.ndarray) -> Array:
         return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
 
-    upright = np.tile([1.0, 0.0, 0.0, 0.0], (clip.frame_count, 1))
+    none = jaxik.Transform(*(array(np.zeros((clip.frame_count, 0, size))) for size in (3, 4)))
     frames = jaxik.Frame(
         world_from_model=world,
         pose=pose,
@@ -65,7 +65,8 @@ def frames_from_clip(
         toe_speed=array(np.linalg.norm(toe_velocity, axis=-1)),
         stride=Stride(*map(array, _stride(clip))),
         dt=array(np.full(clip.frame_count, 1.0 / clip.fps)),
-        platform=jaxik.Transform(array(np.zeros(world.pos.shape)), array(upright)),
+        platforms=none,
+        platforms_before=none,
     )
     return frames if rise is None else frames.translated(array(_along(up_ws, rise)))
 

@@ -30,9 +30,7 @@ def sense_contacts(rule: AbstractContact, inputs: Inputs, state: State) -> tuple
     """
     frames, gate = inputs.frame, inputs.gate
     with jax.named_scope("contact"):
-        sensed = jax.vmap(lambda frame: rule.sense(dataclasses.replace(inputs, frame=frame)))(
-            frames
-        )
+        sensed = jax.vmap(lambda frame: rule.sense(inputs.at(frame)))(frames)
         if not jax.tree.leaves(state.contact):
             return state.contact, sensed
 
@@ -70,7 +68,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
         leg_up_ws=up,
         dt=frame.dt,
         slide=frame.slide,
-        platform=frame.platform,
+        carry=frame.carry(ground.ankle),
         present=rig.present,
         weight=weight,
         grounded=frame.grounded,

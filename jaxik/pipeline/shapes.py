@@ -49,6 +49,7 @@ def check_inputs(ik: Rule, inputs: Inputs, *, clip: bool) -> None:
     legs = inputs.rig.side.shape[0]
     _check_terrain(inputs.terrain, legs)
     _check_frame(inputs.frame, legs, clip=clip)
+    _check_platforms(inputs.frame, inputs.terrain)
 
 
 def check_state(state: PyTree, fresh: PyTree) -> None:
@@ -96,11 +97,21 @@ def _check_frame(frame: Frame, legs: int, *, clip: bool) -> None:
     _check_arrays("frames" if clip else "frame", frame, shape, legs)
 
 
+def _check_platforms(frame: Frame, terrain: Terrain | LegTerrains) -> None:
+    if terrain.platform_count > (count := _platform_count(frame)):
+        raise ValueError(
+            f"the terrain moves with platform {terrain.platform_count - 1}, but platforms has "
+            f"{count} platforms, numbered from 0; Frame.with_platforms gives a clip its platforms"
+        )
+
+
 def _check_arrays(name: str, struct: object, batch: Shape, legs: int) -> None:
     for path, array, shape in _declared_shapes(struct, batch, legs):
         if np.shape(array) != shape:
             counts = f"{legs} legs in rig.side"
             counts += "".join(f", {frames} frames in frames.dt" for frames in batch)
+            if path.startswith("platforms"):
+                counts += f", as many platforms in platforms_before as in {name}.platforms"
             raise ValueError(
                 f"{name}.{path} has shape {np.shape(array)}, wanted {shape}: {counts}; {BATCHES}"
             )
@@ -112,13 +123,22 @@ def _declared_shapes(struct: object, batch: Shape, legs: int) -> Iterator[tuple[
     for field in dataclasses.fields(struct):  # type: ignore[arg-type]
         value = getattr(struct, field.name)
         if dataclasses.is_dataclass(value):
-            inner = (*batch, legs) if isinstance(struct, LegPose) else batch
+            inner = batch
+            if isinstance(struct, LegPose):
+                inner = (*batch, legs)
+            elif isinstance(struct, Frame) and field.name.startswith("platforms"):
+                inner = (*batch, _platform_count(struct))
             for path, array, shape in _declared_shapes(value, inner, legs):
                 yield f"{field.name}.{path}", array, shape
         elif not field.metadata.get("static", False):
             names = getattr(field.type, "dim_str").split()  # noqa: B009
             sizes = [axes[name] if name in axes else (int(name),) for name in names]
             yield field.name, value, sum(sizes, ())
+
+
+def _platform_count(frame: Frame) -> int:
+    """How many platforms a frame has, as far as its shape says."""
+    return sum(np.shape(frame.platforms.pos)[-2:-1])
 
 
 def _shapes(tree: PyTree) -> list[Shape]:

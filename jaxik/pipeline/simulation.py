@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.world.frame import Frame, Sensed
-from jaxik.world.skeleton import Rig
+from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
 from .phases import advance, pose, sense, sense_contacts
@@ -57,14 +57,14 @@ def step(
         ValueError: if an array has a shape that does not fit the legs of the rig, or is that of
             several characters, or the memory is that of another system; it says which.
     """
-    inputs = Inputs(rig, terrain, frame, gate)
-    check_inputs(ik, inputs, clip=False)
+    check_inputs(ik, Inputs(rig, terrain, frame, gate), clip=False)
+    inputs = Inputs(rig, terrain, frame, gate).at(frame)
     check_state(state, jax.eval_shape(init, ik, rig))
     with jax.named_scope("contact"):
         now = Moment(frame.dt, state.started, gate)
         memory, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
     sensed = sense(ik, inputs, contact)
-    sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, terrain)
+    sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, inputs.terrain)
     advanced = advance(ik, sensed_now, state, memory)
     result = pose(ik, inputs, sensed, advanced)
     return advanced.state, result if trace else dataclasses.replace(result, trace=None)
@@ -94,20 +94,19 @@ def resume(
     check_inputs(ik, inputs, clip=True)
     check_state(state, jax.eval_shape(init, ik, rig))
 
-    def at(frame: Frame) -> Inputs:
-        return dataclasses.replace(inputs, frame=frame)
-
     memories, contacts = sense_contacts(ik.contact, inputs, state)
-    sensed = jax.vmap(lambda frame, contact: sense(ik, at(frame), contact))(frames, contacts)
+    sensed = jax.vmap(lambda frame, contact: sense(ik, inputs.at(frame), contact))(frames, contacts)
 
-    def scanned(state: State, frame: tuple[Sensed, PyTree]) -> tuple[State, Advanced]:
-        sensed, memory = frame
-        now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain)
+    def scanned(state: State, frame: tuple[Sensed, PyTree, Transform]) -> tuple[State, Advanced]:
+        sensed, memory, platforms = frame
+        now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain.at(platforms))
         advanced = advance(ik, now, state, memory)
         return advanced.state, advanced
 
-    after, advanced = jax.lax.scan(scanned, state, (sensed, memories))
-    result = jax.vmap(lambda frame, s, a: pose(ik, at(frame), s, a))(frames, sensed, advanced)
+    after, advanced = jax.lax.scan(scanned, state, (sensed, memories, frames.platforms))
+    result = jax.vmap(lambda frame, s, a: pose(ik, inputs.at(frame), s, a))(
+        frames, sensed, advanced
+    )
     return after, result
 
 

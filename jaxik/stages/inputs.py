@@ -19,6 +19,10 @@ class Inputs:
     frame: Frame
     gate: AbstractGate
 
+    def at(self, frame: Frame) -> "Inputs":
+        """The inputs of one frame, with what moves of the terrain where it then is."""
+        return Inputs(self.rig, self.terrain.at(frame.platforms), frame, self.gate)
+
 
 @struct
 class Moment:

@@ -54,7 +54,7 @@ class TargetState:
     height: Float[Array, " legs"]
     """m, along up."""
     velocity: Float[Array, " legs"]
-    """m/s; 0 unless it follows as a spring."""
+    """m/s, over the ground; 0 unless it follows as a spring."""
 
 
 class SlopeTarget(AbstractTarget):
@@ -112,7 +112,8 @@ class SlopeTarget(AbstractTarget):
         self, now: SensedMoment, state: TargetState
     ) -> tuple[TargetState, Float[Array, " legs"]]:
         foothold, gate, dt = now.sensed.foothold, now.gate, now.dt
-        gap = foothold.height - state.height
+        before = state.height + now.sensed.ground_rise
+        gap = foothold.height - before
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         fraction = gate.choose(
             rising,
@@ -120,7 +121,7 @@ class SlopeTarget(AbstractTarget):
             smoothing.fraction_of_half_life(self.fall_half_life, dt),
         )
         height, velocity = smoothing.follow(
-            smoothing.Motion(state.height, state.velocity),
+            smoothing.Motion(before, state.velocity),
             foothold.height,
             now.progress(fraction),
             dt,

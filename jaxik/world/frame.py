@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, UInt
 from jaxik.maths import quat, vec
 from jaxik.maths.struct import struct
 
-from .skeleton import LegPose, Transform
+from .skeleton import LegPose, Still, Transform
 from .terrain import Hit
 
 FORWARD = (0.0, 0.0, 1.0)  # model space
@@ -20,7 +20,8 @@ class Stride:
     """Where each foot of the animation last stood and where it will stand next.
 
     Positions are those of the ball of the foot; their height is ignored. While a foot stands,
-    `last_ws` is its present position.
+    `last_ws` is its present position. Footholds on a platform are where they are now: the game
+    moves them with it.
     """
 
     standing: Float[Array, "*b legs"]
@@ -55,16 +56,18 @@ class Frame:
     slide: Float[Array, "*b"]
     """0..1; 1 while the character slides."""
     velocity_ws: Float[Array, "*b 3"]
-    """m/s, of the character."""
+    """m/s, of the character, over the ground: the motion of its platform does not count."""
     foot_speed: Float[Array, "*b legs"]
-    """m/s, of the animated ankles, world space."""
+    """m/s, of the animated ankles, likewise."""
     toe_speed: Float[Array, "*b legs"]
-    """m/s, of the animated toes, world space."""
+    """m/s, of the animated toes, likewise."""
     stride: Stride
     dt: Float[Array, "*b"]
     """s, since the previous frame."""
-    platform: Transform
-    """`world_from_platform`: the ground's own motion."""
+    platforms: Transform
+    """`world_from_platform` of each moving terrain (platforms); there may be none."""
+    platforms_before: Transform
+    """The same in the previous frame; on the first frame, the same as `platforms`."""
 
     @property
     def speed(self) -> Float[Array, "*b"]:
@@ -75,6 +78,28 @@ class Frame:
         """The frame with the whole character moved by `offset_ws`, m."""
         world = Transform(self.world_from_model.pos + offset_ws, self.world_from_model.rot)
         return dataclasses.replace(self, world_from_model=world)
+
+    def with_platforms(self, tracks: Transform) -> "Frame":
+        """The clip with moving terrains.
+
+        Args:
+            tracks: `world_from_platform` (frames, platforms), in the order of the numbers given to
+                `jaxik.world.terrain.moving`.
+        """
+        before = (jnp.concatenate([x[:1], x[:-1]]) for x in (tracks.pos, tracks.rot))
+        return dataclasses.replace(self, platforms=tracks, platforms_before=Transform(*before))
+
+    def carry(self, hit: Hit) -> Transform | Still:
+        """World motion, since the previous frame, of what rays hit; misses do not move."""
+        if hit.platform is None:
+            return Still()
+        motions = self.platforms @ self.platforms_before.inverse()
+        number = jnp.where(hit.platform < 0, 0, hit.platform)
+        pos, rot = (x.at[number].get(mode="clip") for x in (motions.pos, motions.rot))
+        static = (hit.platform < 0)[..., None]
+        return Transform(
+            jnp.where(static, 0.0, pos), jnp.where(static, quat.identity(rot.dtype), rot)
+        )
 
 
 @struct
@@ -160,7 +185,8 @@ class Sensed:
     """Up of each leg, or one for all."""
     dt: Float[Array, ""]
     slide: Float[Array, ""]
-    platform: Transform
+    carry: Transform | Still
+    """World motion, since the previous frame, of the ground under each foot."""
     present: Bool[Array, " legs"]
     weight: Float[Array, " legs"]
     """0..1, how much foot IK each leg gets."""
@@ -190,10 +216,24 @@ class Sensed:
     slope: Slope
 
     @property
+    def ground_rise(self) -> Float[Array, " legs"]:
+        """m, how far the place under each foot has risen along up since the previous frame."""
+        return rise_of(self.carry, self.foothold.point_ws, self.leg_up_ws)
+
+    @property
     def turned(self) -> Float[Array, " legs"]:
         """0..1, how far each foot turns to the ground under it."""
         standing = self.contact.weight
         return self.ground.ankle.found * (standing + self.ground.swing * (1.0 - standing))
+
+
+def rise_of(
+    carry: Transform | Still, points_ws: Float[Array, "*b 3"], up_ws: Float[Array, "*#b 3"]
+) -> Float[Array, "*b"]:
+    """m, how far places that are at these points now have risen along up since the last frame."""
+    if isinstance(carry, Still):
+        return jnp.zeros_like(points_ws[..., 0])
+    return vec.dot(points_ws - carry.inverse().apply(points_ws), up_ws)
 
 
 def animated_ankles(frame: Frame) -> Transform:

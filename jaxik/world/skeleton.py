@@ -22,6 +22,11 @@ class Transform:
         """The transform that moves nothing."""
         return cls(jnp.zeros(3, dtype), quat.identity(dtype))
 
+    @classmethod
+    def none(cls, like: Float[Array, "*b"]) -> "Transform":
+        """No transforms: a last batch axis of length 0 after those of `like`, with its dtype."""
+        return cls(*(jnp.zeros((*like.shape, 0, size), like.dtype) for size in (3, 4)))
+
     def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*c 3"]:
         """Points of space b, m, in space a."""
         return vec.add(self.pos, quat.rotate(self.rot, points))
@@ -29,6 +34,10 @@ class Transform:
     def apply_rot(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*c 4"]:
         """Rotations of space b in space a."""
         return quat.multiply(self.rot, rot)
+
+    def turn(self, vectors: Float[Array, "*p 3"]) -> Float[Array, "*c 3"]:
+        """Directions and distances of space b in space a: turned, not moved."""
+        return quat.rotate(self.rot, vectors)
 
     def inverse(self) -> "Transform":
         """`b_from_a`."""
@@ -45,6 +54,23 @@ class Transform:
     def __matmul__(self, other: "Transform") -> "Transform":
         """`a_from_b @ b_from_c` is `a_from_c`."""
         return Transform(self.apply(other.pos), self.apply_rot(other.rot))
+
+
+@struct
+class Still:
+    """The transform that moves nothing. It has no numbers, so that it costs nothing either."""
+
+    def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
+        """The same points."""
+        return points
+
+    def apply_rot(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*p 4"]:
+        """The same rotations."""
+        return rot
+
+    def turn(self, vectors: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
+        """The same directions and distances."""
+        return vectors
 
 
 class Skeleton(eqx.Module):

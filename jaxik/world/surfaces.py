@@ -1,4 +1,4 @@
-"""The surfaces of a terrain, planes and triangle meshes, and how rays along -up hit them."""
+"""The surfaces of a terrain and how rays along -up hit them: planes, meshes, what moves."""
 
 from abc import abstractmethod
 
@@ -10,10 +10,22 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from jaxik.maths import vec
 
 from .grid import Grid
+from .skeleton import Transform
+
+STATIC = -1  # the platform of what never moves
 
 
 class AbstractSurface(eqx.Module):
     """Something that rays along -up can hit."""
+
+    @property
+    def platform(self) -> int:
+        """Number of the platform that it moves with, or `STATIC`."""
+        return STATIC
+
+    def at(self, platforms: Transform) -> "AbstractSurface":
+        """The surface where the platforms `world_from_platform` are."""
+        return self
 
     @abstractmethod
     def intersect(
@@ -90,6 +102,31 @@ class Mesh(AbstractSurface):
         # Without the barrier each use of a hit would compute it from the corners again.
         x, y, z, distance = vec.stacked_barrier(*vec.components(normal), distance)
         return distance, vec.stack(x, y, z), hit
+
+
+class MovingSurface(AbstractSurface):
+    """A surface given in the space of a platform, which moves."""
+
+    surface: AbstractSurface
+    world_from_platform: Transform
+    number: int = eqx.field(static=True)
+    """Of the platform, among `Frame.platforms`."""
+
+    @property
+    def platform(self) -> int:
+        return self.number
+
+    def at(self, platforms: Transform) -> "MovingSurface":
+        pose = Transform(platforms.pos[..., self.number, :], platforms.rot[..., self.number, :])
+        return MovingSurface(self.surface, pose, self.number)
+
+    def intersect(
+        self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        platform_from_world = self.world_from_platform.inverse()
+        origins, up = platform_from_world.apply(origins_ws), platform_from_world.turn(up_ws)
+        distance, normal, hit = self.surface.intersect(origins, up, mask)
+        return distance, self.world_from_platform.turn(normal), hit
 
 
 def _plane_distance(

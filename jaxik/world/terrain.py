@@ -6,19 +6,22 @@ hit is a discrete answer without a gradient. Where it is hit, and at what angle,
 plane of the triangle and is differentiable in the ray, up and the vertices.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, UInt
+from jaxtyping import Array, ArrayLike, Float, Int, UInt
 
 from jaxik.maths import vec
 from jaxik.maths.struct import struct
 
 from . import arguments, grid
 from .heightfield import Heightfield, HeightFunction, HeightOf
-from .surfaces import AbstractSurface, Mesh, Plane
+from .skeleton import Transform
+from .surfaces import STATIC, AbstractSurface, Mesh, MovingSurface, Plane
 
 ALL_LAYERS = 0xFFFFFFFF  # a mask that includes every layer
 HORIZON = 1e4  # m; longer rays, infinite ones too, end here
@@ -36,6 +39,9 @@ class Hit:
     """m from the origin; the full length of the ray for a miss."""
     found: Float[Array, "*b"]
     """1 or 0."""
+    platform: Int[Array, "*b"] | None = None
+    """Number of the platform that was hit, `STATIC` for static ground and misses; None where the
+    terrain has no platforms."""
 
 
 @struct
@@ -55,6 +61,16 @@ class Terrain:
     def leg_up_ws(self) -> Float[Array, "*t 3"]:
         """Up of the legs, which all share it."""
         return self.up_ws
+
+    @property
+    def platform_count(self) -> int:
+        """How many platforms it needs at least; 0 where nothing moves."""
+        return 1 + max((surface.platform for surface in self.surfaces), default=STATIC)
+
+    def at(self, platforms: Transform) -> "Terrain":
+        """The terrain with what moves where the platforms `world_from_platform` (platforms) are."""
+        surfaces = tuple(surface.at(platforms) for surface in self.surfaces)
+        return Terrain(self.up_ws, surfaces)
 
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"], surface: int = 0) -> "Terrain":
         """This terrain with moved vertices in one of its meshes; see `Mesh.with_vertices`.
@@ -95,6 +111,16 @@ class LegTerrains:
         """Up of each leg."""
         return jnp.stack([terrain.up_ws for terrain in self.legs])
 
+    @property
+    def platform_count(self) -> int:
+        """How many platforms it needs at least; 0 where nothing moves."""
+        return max(terrain.platform_count for terrain in (self.body, *self.legs))
+
+    def at(self, platforms: Transform) -> "LegTerrains":
+        """The terrains with what moves where the platforms are; see `Terrain.at`."""
+        legs = tuple(terrain.at(platforms) for terrain in self.legs)
+        return LegTerrains(self.body.at(platforms), legs)
+
 
 def cast(
     terrain: Terrain | LegTerrains,
@@ -114,27 +140,31 @@ def cast(
         mask: the layers that each ray can hit, one bit per layer (`layer_mask`).
     """
     reach, mask = jnp.asarray(reach, origins_ws.dtype), jnp.asarray(mask, jnp.uint32)
+    moves = terrain.platform_count > 0
     if isinstance(terrain, Terrain):
-        return _nearest(terrain, origins_ws, reach, mask)
+        return _nearest(terrain, origins_ws, reach, mask, moves)
     reach, mask = (jnp.broadcast_to(x, origins_ws.shape[:-1]) for x in (reach, mask))
     hits = [
-        _nearest(ground, origins_ws[..., leg, :], reach[..., leg], mask[..., leg])
+        _nearest(ground, origins_ws[..., leg, :], reach[..., leg], mask[..., leg], moves)
         for leg, ground in enumerate(terrain.legs)
     ]
     axis = origins_ws.ndim - 2
     return jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=axis), *hits)
 
 
-@jax.jit  # outside jit, a call then compiles once per shape and not once per operation
+# Outside jit, a call then compiles once per shape and not once per operation.
+@functools.partial(jax.jit, static_argnames="moves")
 def _nearest(
     terrain: Terrain,
     origins_ws: Float[Array, "*b 3"],
     reach: Float[Array, "*#b"],
     mask: UInt[Array, "*#b"],
+    moves: bool,
 ) -> Hit:
     distance = jnp.broadcast_to(jnp.minimum(reach, HORIZON), origins_ws.shape[:-1])
     normal = jnp.broadcast_to(terrain.up_ws, origins_ws.shape)
     found = jnp.zeros(distance.shape, bool)
+    platform = jnp.full(distance.shape, STATIC)
     for surface in terrain.surfaces:
         drop, facing, hit = surface.intersect(origins_ws, terrain.up_ws, mask)
         nearer = hit & (drop <= distance)
@@ -142,10 +172,11 @@ def _nearest(
         pairs = zip(vec.components(facing), vec.components(normal), strict=True)
         normal = vec.barrier(vec.stack(*(jnp.where(nearer, new, old) for new, old in pairs)))
         found |= nearer
+        platform = jnp.where(nearer, surface.platform, platform)
     # Hits have many consumers, each of which would compute them again without the barrier.
     distance, found = vec.stacked_barrier(distance, found.astype(distance.dtype))
     point = origins_ws - vec.scale(terrain.up_ws, distance)
-    return Hit(point, normal, distance, found)
+    return Hit(point, normal, distance, found, platform if moves else None)
 
 
 def layer_mask(*layers: int) -> int:
@@ -317,3 +348,29 @@ def combine(*terrains: Terrain) -> Terrain:
             raise ValueError(f"combined terrains must share one up direction; got {listed}")
     surfaces = (surface for terrain in terrains for surface in terrain.surfaces)
     return Terrain(ups[0], tuple(surfaces))
+
+
+def moving(terrain: Terrain, platform: int) -> Terrain:
+    """The terrain with its surfaces on a platform: they are given in its space and move with it.
+
+    Where platforms are, `Frame.platforms` says in each frame; `Terrain.at` puts them there for rays
+    outside the pipeline. Until then the platform is at the world's origin. `combine` mixes terrains
+    of several platforms with static ones.
+
+    Planes move in any way. Meshes, heightfields and functions may be shifted and turned about up;
+    while they are tilted, rays hit them in a wrong place.
+
+    Args:
+        terrain: its up direction is that of the platform's space and of the world.
+        platform: number of the platform, from 0.
+
+    Raises:
+        ValueError: the number is negative, or the terrain moves already.
+    """
+    if platform < 0:
+        raise ValueError(f"platforms are numbered from 0; got {platform}")
+    if terrain.platform_count:
+        raise ValueError("the terrain moves with a platform already; move each terrain only once")
+    pose = Transform.identity(terrain.up_ws.dtype)
+    surfaces = (MovingSurface(surface, pose, platform) for surface in terrain.surfaces)
+    return Terrain(terrain.up_ws, tuple(surfaces))

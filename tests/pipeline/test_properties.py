@@ -41,25 +41,25 @@ from support.clips import (
 
 EXACT = 1e-9  # m, and length of the difference of unit quaternions
 JOINTS = ("hip", "knee", "ankle", "toe")
+DRIFTING = dataclasses.replace(BROKEN, platform=0)
 PARAMETERS = {"adult": {}, "odd": ODD}
 
 
 @functools.cache
-def wander(legs: int = 2) -> jaxik.Frame:
-    """A clip with a bit of everything, on a platform that drifts and turns."""
-    frames = to_frames(wandering(make_rig(legs=legs), np.random.default_rng(1)))
+def wander(legs: int = 2, seed: int = 1, joints: int = 0) -> jaxik.Frame:
+    """A clip with a bit of everything, for ground on a platform that drifts and turns."""
+    frames = to_frames(wandering(make_rig(joints, legs), np.random.default_rng(seed)))
     time = np.cumsum(np.asarray(frames.dt))
     angle = 0.1 * np.sin(2.0 * time)
     pos = np.stack([0.05 * time, 0.0 * time, 0.03 * np.sin(time)], axis=-1)
     rot = np.stack([np.cos(angle / 2), 0 * angle, np.sin(angle / 2), 0 * angle], axis=-1)
-    platform = Transform(jnp.asarray(pos), jnp.asarray(rot))
-    return dataclasses.replace(frames, platform=platform)
+    return frames.with_platforms(Transform(jnp.asarray(pos)[:, None], jnp.asarray(rot)[:, None]))
 
 
 @functools.cache
 def wandered(name: str, legs: int = 2) -> jaxik.Result:
     return jaxik.run(
-        to_ik(PARAMETERS[name]), to_rig(make_rig(legs=legs)), to_terrain(BROKEN), wander(legs)
+        to_ik(PARAMETERS[name]), to_rig(make_rig(legs=legs)), to_terrain(DRIFTING), wander(legs)
     )
 
 
@@ -173,6 +173,8 @@ def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
 
 
 def moved_ground(ground: PlainTerrain, by: reference.Transform) -> PlainTerrain:
+    if ground.platform >= 0:  # in the space of its platform nothing changes, only in the world
+        return dataclasses.replace(ground, up=maths.rotate(by.rot, ground.up))
     return PlainTerrain(
         maths.rotate(by.rot, ground.up),
         planes=[
@@ -186,7 +188,8 @@ def moved_frames(frames: jaxik.Frame, by: Transform) -> jaxik.Frame:
     return dataclasses.replace(
         frames,
         world_from_model=by @ frames.world_from_model,
-        platform=by @ frames.platform,
+        platforms=by @ frames.platforms,
+        platforms_before=by @ frames.platforms_before,
         velocity_ws=quat.rotate(by.rot, frames.velocity_ws),
         stride=dataclasses.replace(
             frames.stride,
@@ -210,7 +213,7 @@ def some_move(kind: str) -> reference.Transform:
 @pytest.mark.parametrize("kind", ["moved", "turned about up", "turned anyhow", "turned, up too"])
 def test_moving_the_world_moves_the_result(kind, name):
     by = some_move(kind)
-    ground = moved_ground(BROKEN, by)
+    ground = moved_ground(DRIFTING, by)
     before = wandered(name)
     after = jaxik.run(
         to_ik(PARAMETERS[name]),
@@ -251,7 +254,8 @@ def test_mirroring_the_world_mirrors_the_result(name):
         ankle_from_foot=rig.ankle_from_foot * jnp.array([1.0, 1, -1, -1]),
     )
     flip = np.array([-1.0, 1.0, 1.0])
-    ground = PlainTerrain(BROKEN.up, planes=[(p * flip, n * flip) for p, n in BROKEN.planes])
+    planes = [(point * flip, normal * flip) for point, normal in DRIFTING.planes]
+    ground = dataclasses.replace(DRIFTING, planes=planes)
     ik = parameter_tree.replace(ik, {"leg.twist": -parameter_tree.get(ik, "leg.twist")})
     after = jaxik.run(ik, other, to_terrain(ground), mirrored(wander()))
     before = wandered(name)
@@ -265,7 +269,7 @@ def test_swapping_the_legs_swaps_their_results():
     swap = lambda tree: at(tree, jnp.array([1, 0]))  # noqa: E731
     rows = lambda tree: at(tree, (slice(None), jnp.array([1, 0])))  # noqa: E731
     swapped = dataclasses.replace(frames, pose=rows(frames.pose), weight=rows(frames.weight))
-    after = jaxik.run(to_ik(ODD), swap(rig), to_terrain(BROKEN), swapped)
+    after = jaxik.run(to_ik(ODD), swap(rig), to_terrain(DRIFTING), swapped)
     assert_same_pose(after.pose, rows(wandered("odd").pose))
     assert_same_transform(after.body, wandered("odd").body)
 
@@ -319,7 +323,7 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
 
 @pytest.mark.slow
 def test_steps_equal_the_scan():
-    ik, rig, ground, frames = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
+    ik, rig, ground, frames = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING), wander()
     state, whole = jaxik.init(ik, rig), wandered("odd")
     for index in range(0, FRAMES):
         state, result = jaxik.step(ik, rig, ground, state, at(frames, index), trace=True)
@@ -334,7 +338,7 @@ def test_a_clip_cut_in_two_and_resumed_equals_the_whole(name):
     ik, rig, ground, frames = (
         to_ik(PARAMETERS[name]),
         to_rig(make_rig()),
-        to_terrain(BROKEN),
+        to_terrain(DRIFTING),
         wander(),
     )
     half = FRAMES // 2
@@ -395,7 +399,14 @@ def three_legged(rig: jaxik.Rig, frames: jaxik.Frame) -> tuple[jaxik.Rig, jaxik.
     return wide, dataclasses.replace(frames, pose=pose, weight=weight, **stride_and_speeds)
 
 
-CROWD_GROUNDS = (BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)))
+CROWD_GROUNDS = [
+    dataclasses.replace(ground, platform=0)
+    for ground in (
+        BROKEN,
+        planes((0.1, 0.2, 0.05)),
+        planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)),
+    )
+]
 
 
 @functools.cache
@@ -410,9 +421,8 @@ def crowd() -> tuple[jaxik.FootIK, jaxik.Rig, object, jaxik.Frame]:
     return tuple(jax.tree.map(stack, *each) for each in (iks, rigs, grounds, frames))  # type: ignore[return-value]
 
 
-@functools.cache
 def wander_of(seed: int) -> jaxik.Frame:
-    return to_frames(wandering(make_rig(seed), np.random.default_rng(seed)))
+    return wander(seed=seed, joints=seed)
 
 
 @functools.cache
@@ -471,7 +481,7 @@ def single(tree):
 
 
 def single_inputs(ik: jaxik.FootIK):
-    return single((ik, to_rig(make_rig()), to_terrain(BROKEN), wander()))
+    return single((ik, to_rig(make_rig()), to_terrain(DRIFTING), wander()))
 
 
 @pytest.mark.parametrize("gate", [jaxik.HARD, Smooth(1.0)])
@@ -537,7 +547,8 @@ def compilations():
 def test_nothing_compiles_at_a_second_call_with_other_values(compilations):
     iks = [to_ik({}), to_ik(ODD)]
     rigs = [to_rig(make_rig(seed)) for seed in range(2)]
-    grounds = [to_terrain(BROKEN), to_terrain(planes((0.1, 0.0, 0.0)))]
+    level = dataclasses.replace(planes((0.1, 0.0, 0.0)), platform=0)
+    grounds = [to_terrain(DRIFTING), to_terrain(level)]
     clips = [wander_of(0), wander_of(1)]
     gates = [Smooth(0.5), Smooth(0.1)]
     frames = [at(clip, 3) for clip in clips]
@@ -558,7 +569,7 @@ def test_nothing_compiles_at_a_second_call_with_other_values(compilations):
 
 
 def test_only_the_smooth_program_contains_a_sigmoid():
-    inputs = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN), wander()
+    inputs = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING), wander()
     hard = str(jax.make_jaxpr(jaxik.run)(*inputs))
     smooth = str(jax.make_jaxpr(jaxik.run)(*inputs, Smooth(1.0)))
     assert not {"logistic", "tanh", "erf"} & set(re.findall(r"= (\w+)", hard))
@@ -567,7 +578,7 @@ def test_only_the_smooth_program_contains_a_sigmoid():
 
 @pytest.mark.slow
 def test_steps_and_clips_run_inside_jit_vmap_and_scan():
-    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN)
+    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING)
     frames = wander()
 
     @jax.jit
@@ -588,7 +599,7 @@ def test_steps_and_clips_run_inside_jit_vmap_and_scan():
 
 
 def test_smooth_tends_to_hard_as_softness_falls():
-    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(BROKEN)
+    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING)
     apart = []
     for softness in (1.0, 0.1, 1e-2, 1e-4, 1e-6):
         soft = jaxik.run(ik, rig, ground, wander(), Smooth(softness))

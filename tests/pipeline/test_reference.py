@@ -190,10 +190,16 @@ def test_a_full_lock_keeps_the_foothold_exactly():
 def test_a_lock_moves_with_its_platform():
     rig = make_rig(np.random.default_rng(9))
     frames = [
-        make_frame(rig, standing(), platform=Transform(np.array([0.002 * i, 0.0, 0.0]), STILL.rot))
+        make_frame(
+            rig,
+            standing(),
+            platforms=[Transform(np.array([0.002 * i, 0.0, 0.0]), STILL.rot)],
+            platforms_before=[Transform(np.array([0.002 * (i - 1), 0.0, 0.0]), STILL.rot)],
+        )
         for i in range(20)
     ]
-    output = run(Parameters({"lock.lock_half_life": 0.0}), rig, plane(0.0, 0.0), frames)
+    ground = dataclasses.replace(plane(0.0, 0.0), platform=0)
+    output = run(Parameters({"lock.lock_half_life": 0.0}), rig, ground, frames)
     assert output["locked"].all()
     assert np.allclose(np.diff(output["target_ws"], axis=0), [0.002, 0.0, 0.0], atol=EXACT)
 

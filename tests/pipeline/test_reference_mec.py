@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from reference import maths
 from reference.characters import Frame, Ground, Parameters
 from reference.maths import Array, Transform
-from reference.sample_poses import ANKLE, make_frame, make_rig, plane, standing
+from reference.sample_poses import ANKLE, STILL, make_frame, make_rig, plane, standing
 from reference.systems import mec
 from reference.terrain import LegTerrains, Terrain
 
@@ -214,7 +215,8 @@ def test_a_planted_foot_keeps_its_pose_on_a_platform_and_follows_the_ground():
     assert angle_of(half["goal_rot"][0]) == pytest.approx(math.atan(0.3) / 2)
     assert not outputs[2]["planted"].any()  # ground above the start of the ray is not hit
     turned = Transform(np.array([0.1, 0.0, 0.2]), maths.from_axis_angle(maths.Y, 0.5))
-    moved = follow([slope, FLAT], [stand(), stand(platform=turned)])[1]
+    ride = stand(platforms=[turned], platforms_before=[STILL])
+    moved = follow([slope, replace(FLAT, platform=0)], [stand(), ride])[1]
     for leg in range(2):
         stood = maths.apply(turned, np.array([(0.1, -0.1)[leg], 0.0, 0.05]))
         assert moved["target_ws"][leg] == pytest.approx(stood + ANKLE * maths.Y)

@@ -14,7 +14,8 @@ import jaxik
 from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.stages.pelvis import AbstractPelvis, PelvisState
-from jaxik.world.terrain import LegTerrains
+from jaxik.world.skeleton import Transform
+from jaxik.world.terrain import LegTerrains, moving
 from support.clips import BLENDS, animate, make_rig, planes, to_frames, to_ik, to_rig, to_terrain
 
 LEGS, FRAMES, CHARACTERS = 2, 3, 4
@@ -152,6 +153,16 @@ def test_a_frame_goes_to_step_and_a_clip_to_run():
             lambda i: i["terrain"],
             LegTerrains(GROUND, (GROUND, crowd(GROUND))),
             r"terrain.legs\[1\].up_ws has shape \(4, 3\)",
+        ),
+        (
+            lambda i: i["frames"].platforms_before,
+            Transform.none(jnp.zeros((3, 2))),
+            r"frames.platforms_before.pos .*\(3, 2, 0, 3\), wanted \(3, 0, 3\): .* as many platf",
+        ),
+        (
+            lambda i: i["terrain"],
+            moving(GROUND, 1),
+            "^the terrain moves with platform 1, but platforms has 0 platforms, numbered from 0",
         ),
     ],
 )

@@ -75,6 +75,8 @@ class Ground(Protocol):
 
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit: ...
 
+    def at(self, platforms: Sequence[Transform]) -> "Ground": ...
+
 
 def under(terrain: Ground, leg: int) -> Ground:
     """The ground as the rays of `leg` hit it."""
@@ -146,9 +148,10 @@ class Stride:
 class Frame:
     """One animated frame: joints are Transforms of (legs 3) and (legs 4) in model space.
 
-    `grounded` is 0..1, 0 in the air. `speed` is that of the character, `foot_speed` (legs) that of the animated ankles and
-    `toe_speed` (legs) that of the toes, m/s, world space; all default to 0. Without `velocity_ws`
-    (3), m/s, the character moves forward.
+    `grounded` is 0..1, 0 in the air. `speed` is that of the character, `foot_speed` (legs) that of
+    the animated ankles and `toe_speed` (legs) that of the toes, m/s, over the ground; all default
+    to 0. Without `velocity_ws` (3), m/s, the character moves forward. `platforms` are
+    world_from_platform.
     """
 
     world_from_model: Transform
@@ -159,7 +162,8 @@ class Frame:
     weight: Array
     slide: float
     dt: float
-    platform: Transform
+    platforms: Sequence[Transform] = ()
+    platforms_before: Sequence[Transform] = ()
     speed: float = 0.0
     foot_speed: Array = field(default_factory=lambda: np.zeros(0))
     velocity_ws: Array | None = None
@@ -186,7 +190,7 @@ class Frame:
 
 @dataclass
 class Hold:
-    """Memory of one foot's lock, in the space of the platform."""
+    """Memory of one foot's lock, in the world."""
 
     locked: bool
     factor: float
@@ -239,6 +243,22 @@ class Foot:
         return self.contact if self.hit.found else 0.0
 
 
+def carried(frame: Frame, hit: Hit, point: Array) -> Array:
+    """A point that was there in the previous frame, moved as the ground that was hit has moved."""
+    if hit.platform < 0:
+        return point
+    before, now = frame.platforms_before[hit.platform], frame.platforms[hit.platform]
+    return maths.apply(now, maths.unapply(before, point))
+
+
+def turned(frame: Frame, hit: Hit, rot: Array) -> Array:
+    """A rotation (4) of the previous frame, turned as the ground that was hit has turned."""
+    if hit.platform < 0:
+        return rot
+    before, now = frame.platforms_before[hit.platform], frame.platforms[hit.platform]
+    return maths.multiply(now.rot, maths.multiply(maths.inverse(before.rot), rot))
+
+
 def world_from_foot(rig: Rig, frame: Frame, leg: int) -> Array:
     """Rotation from the axes of the animated foot (x left, y up, z forward) to the world's."""
     world_from_ankle = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
@@ -264,6 +284,6 @@ def run(
     """All outputs of `step` for a whole clip, stacked over the frames."""
     state, outputs = None, []
     for frame in frames:
-        state, output = step(parameters, rig, terrain, state, frame)
+        state, output = step(parameters, rig, terrain.at(frame.platforms), state, frame)
         outputs.append(output)
     return {name: np.stack([output[name] for output in outputs]) for name in outputs[0]}

@@ -71,7 +71,6 @@ def make_frame(
         weight=np.ones(len(ankles)),
         slide=0.0,
         dt=1 / 60,
-        platform=STILL,
     )
     return dataclasses.replace(frame, **changes)
 

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reference.maths import Array
+from reference.maths import Array, Transform, apply, rotate
 
 # Cosine between a surface's normal and up below which the ray runs along the surface.
 EDGE_ON = 1e-9
@@ -23,6 +23,7 @@ class Hit(NamedTuple):
     found: bool
     point: Array
     normal: Array
+    platform: int = -1
 
 
 @dataclass
@@ -35,6 +36,7 @@ class Terrain:
         triangles: (count, 3 corners, 3), m, two-sided, in any winding.
         plane_layers: layer of each plane, 0 to 31; all 0 by default.
         triangle_layers: (count), layer of each triangle, likewise.
+        platform: number of the platform in whose space all of it is given; -1 for the world.
     """
 
     up: Array
@@ -42,6 +44,7 @@ class Terrain:
     triangles: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     plane_layers: list[int] = field(default_factory=list)
     triangle_layers: Sequence[int] | NDArray[np.integer] = ()
+    platform: int = -1
 
     def __post_init__(self) -> None:
         self.plane_layers = list(self.plane_layers) or [0] * len(self.planes)
@@ -61,6 +64,20 @@ class Terrain:
         volume = np.sum(self._first * self._side, axis=-1)
         self._usable = solid & (self._normal @ self.up > EDGE_ON)
         self._scale = np.where(self._usable, 1.0 / np.where(self._usable, volume, 1.0), 0.0)
+
+    def at(self, platforms: Sequence[Transform]) -> "Terrain":
+        """The terrain where its platform is, in world space."""
+        if self.platform < 0:
+            return self
+        pose = platforms[self.platform]
+        corners = [apply(pose, corner) for corner in self.triangles.reshape(-1, 3)]
+        return replace(
+            self,
+            planes=[
+                (apply(pose, point), rotate(pose.rot, normal)) for point, normal in self.planes
+            ],
+            triangles=np.reshape(corners, (-1, 3, 3)),
+        )
 
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:
         """The first surface at most `reach` m below `origin`, its normal towards up.
@@ -86,9 +103,10 @@ class Terrain:
             distance = float(distances[best])
             if math.isfinite(distance) and distance <= reach and (not found or distance < nearest):
                 nearest, normal, found = distance, self._normal[best], True
+        platform = self.platform if found else -1
         if math.isinf(nearest):
-            return Hit(found, origin, normal)
-        return Hit(found, origin - self.up * nearest, normal)
+            return Hit(found, origin, normal, platform)
+        return Hit(found, origin - self.up * nearest, normal, platform)
 
     def _distances(self, origin: Array) -> Array:
         """Distance down to every triangle (count), infinite where the ray misses it."""
@@ -112,6 +130,10 @@ class LegTerrains:
     def up(self) -> Array:
         """Up of the body."""
         return self.body.up
+
+    def at(self, platforms: Sequence[Transform]) -> "LegTerrains":
+        """The terrains where their platforms are."""
+        return LegTerrains(self.body.at(platforms), [leg.at(platforms) for leg in self.legs])
 
     def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit:
         """The first hit of a ray of the body."""

@@ -5,7 +5,7 @@ equal shapes fraction one compiled program.
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -109,6 +109,13 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
             reference.Transform(np.stack([t.pos for t in each]), np.stack([t.rot for t in each]))
         )
 
+    def platforms(name: str) -> jaxik.Transform:
+        poses = [pose for frame in frames for pose in getattr(frame, name)]
+        return jaxik.Transform(
+            jnp.asarray(np.reshape([pose.pos for pose in poses], (len(frames), -1, 3))),
+            jnp.asarray(np.reshape([pose.rot for pose in poses], (len(frames), -1, 4))),
+        )
+
     return jaxik.Frame(
         world_from_model=transform("world_from_model"),
         pose=jaxik.LegPose(*map(transform, ("hip", "knee", "ankle", "toe"))),
@@ -125,7 +132,8 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
             }
         ),
         dt=jnp.asarray([float(frame.dt) for frame in frames]),
-        platform=transform("platform"),
+        platforms=platforms("platforms"),
+        platforms_before=platforms("platforms_before"),
     )
 
 
@@ -153,7 +161,8 @@ def to_terrain(ground: PlainTerrain) -> terrain.Terrain:
         triangles = np.arange(len(vertices)).reshape(-1, 3)
         layers = np.asarray(ground.triangle_layers)
         surfaces.append(terrain.mesh(vertices, triangles, up=ground.up, layer=layers))
-    return terrain.combine(*surfaces)
+    combined = terrain.combine(*surfaces)
+    return combined if ground.platform < 0 else terrain.moving(combined, ground.platform)
 
 
 def to_leg_terrains(ground: LegTerrains) -> terrain.LegTerrains:
@@ -199,7 +208,7 @@ def animate(
     foot: Any = 0.0,
     slide: Any = 0.0,
     weight: Any = 1.0,
-    platform: Any = sample_poses.STILL,
+    platform: Callable[[float], reference.Transform] | None = None,
 ) -> list[reference.Frame]:
     """Frames of two legs. Each argument is a value or a function of time, s.
 
@@ -214,7 +223,7 @@ def animate(
         foot: pitch of the feet, rad, toes up.
         slide: 0..1.
         weight: 0..1, one for all legs or one per leg.
-        platform: world_from_platform.
+        platform: world_from_platform, if there is one.
     """
 
     def at(x: Any, time: float) -> Any:
@@ -234,8 +243,10 @@ def animate(
             slide=at(slide, time),
             weight=np.broadcast_to(at(weight, time), len(rig.side)).astype(float),
             dt=1.0 / hz,
-            platform=at(platform, time),
         )
+        if platform is not None:
+            frame.platforms = [platform(time)]
+            frame.platforms_before = [platform(max(index - 1, 0) / hz)]
         tilt = maths.from_axis_angle(-maths.X, at(foot, time))
         rot = np.array([maths.multiply(tilt, r) for r in frame.ankle.rot])
         frames.append(dataclasses.replace(frame, ankle=frame.ankle._replace(rot=rot)))

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxik.maths import quat, smoothing, vec
+from jaxik.maths import smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import SensedMoment
@@ -26,23 +26,23 @@ class LockState:
     factor: Float[Array, " legs"]
     """0..1, rises while locked, decays after release."""
     offset: Float[Array, "legs 3"]
-    """m, platform axes."""
+    """m, world axes."""
     foothold: Float[Array, "legs 3"]
-    """m, of the frame before, platform space."""
+    """m, of the frame before, world space."""
     ball: Float[Array, "legs 3"]
     """m, likewise."""
     ahead: Float[Array, "legs 3"]
-    """Unit, foot direction when it locked, platform axes."""
+    """Unit, foot direction when it locked, turned with its ground since then; world axes."""
 
 
 class OffsetLock(AbstractLock):
     """Cancels the motion of the foothold while its foot is locked (the record).
 
     The target is the foothold plus an offset. While the foot is locked, the foothold's motion since
-    the frame before, as seen from a moving platform, is subtracted from the offset: the foot stays
-    but its lift still follows the animation. After release the offset decays, so that neither locks
-    nor releases jump. With `hold_ball` on, the motion of the ball along the ground is cancelled
-    instead, so that the ball stays while the heel rises.
+    the frame before, over ground that may itself move, is subtracted from the offset: the foot
+    stays but its lift still follows the animation. After release the offset decays, so that neither
+    locks nor releases jump. With `hold_ball` on, the motion of the ball along the ground is
+    cancelled instead, so that the ball stays while the heel rises.
 
     A foot locks when its contact is planted and it moves slower than `max_speed`. It is released
     when its contact is lifted, or earlier for any of these reasons:
@@ -139,13 +139,12 @@ class OffsetLock(AbstractLock):
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: LockState
     ) -> tuple[LockState, Hold]:
         sensed, gate = now.sensed, now.gate
-        up, platform = sensed.leg_up_ws, sensed.platform
-        moved = foothold_ws - platform.apply(state.foothold)
-        ball_moved = vec.reject(sensed.ball_ws - platform.apply(state.ball), up)
+        up, carry = sensed.leg_up_ws, sensed.carry
+        moved = foothold_ws - carry.apply(state.foothold)
+        ball_moved = vec.reject(sensed.ball_ws - carry.apply(state.ball), up)
         ball_moved += vec.scale(up, vec.dot(moved, up))
         moved = jnp.where(now.started, jnp.where(self.hold_ball, ball_moved, moved), 0.0)
-        before = quat.rotate(platform.rot, state.offset)
-        locked_ahead = quat.rotate(platform.rot, state.ahead)
+        before, locked_ahead = carry.turn(state.offset), carry.turn(state.ahead)
         locked_ahead = gate.choose(state.locked[..., None], locked_ahead, sensed.ahead_ws)
         stays = self._may_stay(now, foothold_ws, hip_ws, before - moved)
         stays = stays * self._follows_animation(now, moved, locked_ahead)
@@ -162,15 +161,7 @@ class OffsetLock(AbstractLock):
         kept = before - vec.scale(moved, risen)
         decayed = vec.scale(before, 1.0 - unlock_fraction)
         offset_ws = gate.choose(locked[..., None], kept, decayed)
-        platform_from_world = platform.inverse()
-        after = LockState(
-            locked,
-            factor,
-            quat.rotate(platform_from_world.rot, offset_ws),
-            platform_from_world.apply(foothold_ws),
-            platform_from_world.apply(sensed.ball_ws),
-            quat.rotate(platform_from_world.rot, locked_ahead),
-        )
+        after = LockState(locked, factor, offset_ws, foothold_ws, sensed.ball_ws, locked_ahead)
         return after, Hold(offset_ws, sensed.rot_ws, locked)
 
     def _may_start(self, now: SensedMoment, moved: Array, factor: Array) -> Array:

@@ -22,19 +22,20 @@ class PlantState:
     weight: Float[Array, " legs"]
     """0..1, how much of the planting is applied."""
     foothold: Float[Array, "legs 3"]
-    """m, platform space."""
+    """m, world space."""
     clearance: Float[Array, " legs"]
     """m, of that foothold above the ground below it."""
     rot: Float[Array, "legs 4"]
-    """Of the ankles, platform axes."""
+    """Of the ankles, world axes."""
 
 
 class PlantLock(AbstractLock):
     """Keeps a foot where and how it first found ground until its ray finds none (Mec).
 
-    The kept foothold follows the ground below it, which is probed again in every frame, and a
-    moving platform. The weight of planting moves to `plant_weight` at `plant_speed`: set it to 0
-    or 1 between steps to turn planting off or on over time, at once if the speed is infinite.
+    The kept foothold follows the ground below it, which is probed again in every frame, and moves
+    with it where the ground is a platform. The weight of planting moves to `plant_weight` at
+    `plant_speed`: set it to 0 or 1 between steps to turn planting off or on over time, at once if
+    the speed is infinite.
     """
 
     plant: Leaf = switch(True, doc="Whether a foot stays where it first found ground.")
@@ -59,10 +60,10 @@ class PlantLock(AbstractLock):
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: PlantState
     ) -> tuple[PlantState, Hold]:
         sensed, gate = now.sensed, now.gate
-        up, platform, rays = sensed.leg_up_ws, sensed.platform, sensed.ground.rays
+        up, carry, rays = sensed.leg_up_ws, sensed.carry, sensed.ground.rays
         before = state.locked
-        kept_ws = gate.choose(before[..., None], platform.apply(state.foothold), foothold_ws)
-        kept_rot = quat.nlerp(sensed.rot_ws, platform.apply_rot(state.rot), before)
+        kept_ws = gate.choose(before[..., None], carry.apply(state.foothold), foothold_ws)
+        kept_rot = quat.nlerp(sensed.rot_ws, carry.apply_rot(state.rot), before)
 
         hit = cast(
             now.terrain, kept_ws + vec.scale(up, rays.above), rays.above + rays.below, rays.layers
@@ -81,12 +82,5 @@ class PlantLock(AbstractLock):
             quat.nlerp(sensed.rot_ws, kept_rot, planting),
             locked,
         )
-        platform_from_world = platform.inverse()
-        after = PlantState(
-            locked,
-            weight,
-            platform_from_world.apply(planted_ws),
-            clearance,
-            platform_from_world.apply_rot(kept_rot),
-        )
+        after = PlantState(locked, weight, planted_ws, clearance, kept_rot)
         return after, hold

@@ -69,7 +69,7 @@ def or_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit
     """The hit where its foot was `found` too; else a miss at `level_ws`, level with the foot."""
     weight = hit.found * found
     point = gate.choose(weight[..., None], hit.point, level_ws)
-    return Hit(point, hit.normal, hit.distance, weight)
+    return Hit(point, hit.normal, hit.distance, weight, hit.platform)
 
 
 def make_rays(like: Hit, above: Array, below: Array, layers: Array) -> Rays:

@@ -169,7 +169,11 @@ class StrideProbe(AbstractProbe):
         height += self._climb(normal, ankle - ball, level)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
-        hit = Hit(ankle_ws, normal, self.ray_up - height, found)
+        platform = last.platform
+        if platform is not None:
+            arriving = (last.found == 0) | (trust * fraction > 0.5)
+            platform = jnp.where(arriving, next_.platform, platform)
+        hit = Hit(ankle_ws, normal, self.ray_up - height, found, platform)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.ones_like(found), rays)
 

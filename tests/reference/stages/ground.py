@@ -8,7 +8,18 @@ import math
 import numpy as np
 
 from reference import maths
-from reference.characters import Foot, Frame, Ground, Hold, Parameters, Rig, State, world_from_foot
+from reference.characters import (
+    Foot,
+    Frame,
+    Ground,
+    Hold,
+    Parameters,
+    Rig,
+    State,
+    carried,
+    turned,
+    world_from_foot,
+)
 from reference.maths import (
     Array,
     Motion,
@@ -19,7 +30,6 @@ from reference.maths import (
     length,
     lerp,
     rotate,
-    unapply,
     unit,
 )
 from reference.terrain import Hit
@@ -131,13 +141,18 @@ def lean(
 
 
 def smooth_height(
-    parameters: Parameters, leg: int, foot: Foot, up: Array, before: Motion | None, dt: float
+    parameters: Parameters, leg: int, foot: Foot, up: Array, before: Motion | None, frame: Frame
 ) -> Motion:
     """Smoothed height of the foothold along up, m."""
     goal = float(up @ foot.foothold_ws)
+    if before is not None:
+        origin = carried(frame, foot.hit, np.zeros(3))
+        turn = turned(frame, foot.hit, maths.IDENTITY)
+        place_before = rotate(maths.inverse(turn), foot.foothold_ws - origin)
+        before = Motion(before.value + goal - float(up @ place_before), before.velocity)
     rises = before is None or goal > before.value
     half_life = parameters.of_leg(f"target.{'rise' if rises else 'fall'}_half_life", leg)
-    return maths.follow(before, goal, half_life, dt, parameters.of_leg("target.spring", leg))
+    return maths.follow(before, goal, half_life, frame.dt, parameters.of_leg("target.spring", leg))
 
 
 def clamped_target(
@@ -172,16 +187,17 @@ def lock(
         offset = moved = np.zeros(3)
     else:
         was_locked, factor = before.locked, before.factor
-        offset = rotate(frame.platform.rot, before.offset)
-        moved = foothold - apply(frame.platform, before.foothold)
+        turn = turned(frame, foot.hit, maths.IDENTITY)
+        offset = rotate(turn, before.offset)
+        moved = foothold - carried(frame, foot.hit, before.foothold)
         if parameters.of_leg("lock.hold_ball", leg):
-            rolled = foot.ball_ws - apply(frame.platform, before.ball)
+            rolled = foot.ball_ws - carried(frame, foot.hit, before.ball)
             moved = across(rolled, up) + up * float(up @ moved)
 
     # A locked foot keeps the heading it had when it was last free.
     pointed = foot.heading_ws
     if before is not None and was_locked:
-        pointed = rotate(frame.platform.rot, before.heading)
+        pointed = rotate(turned(frame, foot.hit, maths.IDENTITY), before.heading)
 
     # Where the ankle would be if the foot stayed, relative to where the hip probably is.
     hip = foot.hip_ws + pelvis_offset
@@ -219,16 +235,7 @@ def lock(
             parameters.of_leg("lock.unlock_half_life", leg), frame.dt
         )
         factor, offset, pointed = factor * remaining, offset * remaining, foot.heading_ws
-    into_platform = maths.inverse(frame.platform.rot)
-    after = Hold(
-        locked,
-        factor,
-        rotate(into_platform, offset),
-        unapply(frame.platform, foothold),
-        unapply(frame.platform, foot.ball_ws),
-        rotate(into_platform, pointed),
-    )
-    return after, offset
+    return Hold(locked, factor, offset, foothold, foot.ball_ws, pointed), offset
 
 
 def is_slow(parameters: Parameters, name: str, leg: int, moved: Array, dt: float) -> bool:

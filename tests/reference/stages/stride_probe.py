@@ -117,7 +117,9 @@ def ground_of_stride(
     passed, left = stride.fraction, 1.0 - stride.fraction
     window = smooth01(passed / EDGE_FRACTION) * smooth01(left / EDGE_FRACTION)
     ankle = apply(frame.world_from_model, frame.ankle.pos[leg])
-    return Hit(True, here + up * (beside_ball(ankle) + window * need), normal), stride
+    platform = following.platform if sure * risen > 0.5 else last.platform
+    point = here + up * (beside_ball(ankle) + window * need)
+    return Hit(True, point, normal, platform), stride
 
 
 def climb(parameters: Parameters, leg: int, up: Array, normal: Array, moved: Array) -> float:

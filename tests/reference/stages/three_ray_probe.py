@@ -9,11 +9,12 @@ from reference import characters, maths
 from reference.characters import Frame, Ground, Parameters, Rig
 from reference.maths import Array, across, apply, cross, from_axis_angle, rotate, unit
 from reference.stages import ground
+from reference.terrain import Hit
 
 
 @dataclass
 class Foot:
-    """One leg in this frame, world space. Where `found` is false, `point` is meaningless."""
+    """One leg in this frame, world space. Where `found` is false, `hit` is meaningless."""
 
     up: Array
     weight: float
@@ -21,7 +22,7 @@ class Foot:
     animated_rot: Array  # from the axes of the foot to the world
     extra: float
     found: bool
-    point: Array
+    hit: Hit
     ahead: Array
     pitch: float
     roll: float
@@ -87,7 +88,7 @@ def sense(
         animated_rot=animated_rot,
         extra=float(extra),
         found=found,
-        point=hit.point,
+        hit=hit,
         ahead=ahead,
         pitch=pitch,
         roll=roll,

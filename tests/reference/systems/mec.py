@@ -57,8 +57,8 @@ class Leg:
 
     plant_weight: float
     planted: bool
-    kept_point: Array  # in the platform's space, m
-    kept_rot: Array  # from the axes of the foot to the platform's space
+    kept_point: Array  # m, world
+    kept_rot: Array  # from the axes of the foot to the world
     fade: float
     offset_ws: Array  # m, from the animated ankle to the last goal
     rot_ws: Array  # from the animated rotation to the last goal's
@@ -158,20 +158,20 @@ def plant(
     else:
         weight = maths.move_towards(before.plant_weight, goal_weight, speed * frame.dt)
 
-    point, rot = foot.point, foot.animated_rot
+    point, rot = foot.hit.point, foot.animated_rot
     if foot.found:
         rot = three_ray_probe.flat_foot(parameters, leg, foot)
     planted = bool(foot.found and parameters.of_leg("lock.plant", leg))
     kept_point, kept_rot = np.zeros(3), maths.IDENTITY
     if planted:
         if before is not None and before.planted:
-            kept_point, kept_rot = before.kept_point, before.kept_rot
+            kept_point = characters.carried(frame, foot.hit, before.kept_point)
+            kept_rot = characters.turned(frame, foot.hit, before.kept_rot)
         else:
-            kept_point = maths.unapply(frame.platform, point)
-            kept_rot = maths.multiply(maths.inverse(frame.platform.rot), rot)
-        standing = followed(parameters, terrain, leg, foot, apply(frame.platform, kept_point))
+            kept_point, kept_rot = point, rot
+        standing = followed(parameters, terrain, leg, foot, kept_point)
         point = point + weight * (standing - point)
-        rot = maths.nlerp(rot, maths.multiply(frame.platform.rot, kept_rot), weight)
+        rot = maths.nlerp(rot, kept_rot, weight)
     after = Leg(weight, planted, kept_point, kept_rot, 0.0, np.zeros(3), maths.IDENTITY)
     return after, point, rot
 

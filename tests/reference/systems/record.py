@@ -35,7 +35,7 @@ def step(
     heights, footholds, targets = [], [], []
     for leg in legs:
         before = None if state is None else state.ground[leg]
-        height = ground.smooth_height(parameters, leg, feet[leg], up, before, frame.dt)
+        height = ground.smooth_height(parameters, leg, feet[leg], up, before, frame)
         foothold, target = ground.clamped_target(
             parameters, leg, feet[leg], up, height.value, frame
         )

@@ -132,7 +132,7 @@ def step(
         foot, swing = sense(parameters, rig, below, frame, leg, contact_of_leg)
 
         eased = ground.smooth_height(
-            parameters, leg, foot, up, None if state is None else state.ground[leg], frame.dt
+            parameters, leg, foot, up, None if state is None else state.ground[leg], frame
         )
         foothold, target = ground.clamped_target(parameters, leg, foot, up, eased.value, frame)
         hold = None if state is None else state.holds[leg]
