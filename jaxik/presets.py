@@ -16,7 +16,7 @@ from jaxik.stages.effector import (
     HeelEffector,
 )
 from jaxik.stages.foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
-from jaxik.stages.lean import NoLean, SlopeLean
+from jaxik.stages.lean import NoLean, SlopeLean, SpineLean
 from jaxik.stages.leg import HintLeg, PoleLeg, TwoBone
 from jaxik.stages.lock import NoLock, OffsetLock, PlantLock
 from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
@@ -132,7 +132,7 @@ def stride() -> FootIK:
         probe=StrideProbe(),
         contact=LabelContact(),
         target=SlopeTarget(max_ankle_height=0.8),
-        lean=NoLean(),
+        lean=SpineLean(),
         lock=OffsetLock(enabled=False, hold_ball=True),
         pelvis=ReachPelvis(),
         effector=HeelEffector(),

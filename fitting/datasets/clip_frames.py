@@ -13,6 +13,7 @@ from jaxik.world.frame import UP, Stride
 
 from .clips import contacts
 from .clips.clip import Clip
+from .clips.joint_roles import find_trunk
 from .clips.kinematics import local_from_world
 
 Direction = Sequence[float] | np.ndarray
@@ -133,7 +134,8 @@ def clip_from_result(
     """The clip with the motion that the pipeline returned.
 
     Hips, knees, ankles and toes are the solved ones. Joints below them stay rigid on their parents,
-    and all others move with the body.
+    and all others move with the body. Where the system bends the spine, its base and the head turn,
+    as far as the skeleton has these joints (`joint_roles.find_trunk`).
 
     Args:
         clip: the clip from which `frames_from_clip` made the frames.
@@ -173,7 +175,35 @@ def clip_from_result(
         else:
             positions_ws[:, joint] = body_pos + body_rot.apply(positions_ws[:, joint])
             rotations_ws[:, joint] = _wxyz(body_rot * _rotation(rotations_ws[:, joint]))
+    trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
+    if result.corrections.spine is not None and trunk.spine is not None:
+        upright = _rotation(world.rot)
+        turns = {trunk.spine: result.corrections.spine, trunk.head: result.corrections.head}
+        for joint, turn_ms in turns.items():
+            if joint is not None and turn_ms is not None:
+                turn_ws = upright * _rotation(turn_ms) * upright.inv()
+                above = _with_descendants(joint, clip.parents)
+                _turn(turn_ws, positions_ws, rotations_ws, above)
     return clip.with_motion(positions_ws, rotations_ws)
+
+
+def _with_descendants(joint: int, parents: Sequence[int]) -> list[int]:
+    """A joint and all below it in the tree, itself first."""
+    joints = [joint]
+    for child, parent in enumerate(parents):
+        if parent in joints:
+            joints.append(child)
+    return joints
+
+
+def _turn(
+    turn_ws: Rotation, positions_ws: np.ndarray, rotations_ws: np.ndarray, joints: Sequence[int]
+) -> None:
+    """Turns these joints about the first of them, in place."""
+    pivot = positions_ws[:, joints[0]].copy()
+    for joint in joints:
+        positions_ws[:, joint] = pivot + turn_ws.apply(positions_ws[:, joint] - pivot)
+        rotations_ws[:, joint] = _wxyz(turn_ws * _rotation(rotations_ws[:, joint]))
 
 
 def positions_by_role(clip: Clip) -> dict[str, np.ndarray]:

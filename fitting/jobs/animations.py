@@ -112,7 +112,8 @@ def solve(
     if path is not None:
         save_clip(path, solved, joints=placement_report.arrays(solved, placement))
     log(placement_report.solved_text(result, seconds, path))
-    log(f"root: {loaded.root.reason}\n\n{placement_report.text(placement)}")
+    where = [f"root: {loaded.root.reason}", placement_report.trunk_text(result, solved)]
+    log("\n".join(filter(None, where)) + f"\n\n{placement_report.text(placement)}")
     if is_blocks_file(animation.clip):
         errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)
         log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")

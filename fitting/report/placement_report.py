@@ -22,6 +22,7 @@ from fitting.analysis.placement import (
 from fitting.analysis.playback import stage_outputs
 from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips.clip import Clip
+from fitting.datasets.clips.joint_roles import find_trunk
 
 from .formatting import Table, aligned, percent
 
@@ -69,6 +70,22 @@ def solved_text(result: jaxik.Result, seconds: float, path: Path | None) -> str:
         f"the feet, {float(np.mean(reached)):.1%} of the targets reached"
         + ("" if path is None else f"; written to {path}")
     )
+
+
+def trunk_text(result: jaxik.Result, clip: Clip) -> str:
+    """How far spine and head of the clip lean; "" for a system that does not bend the spine."""
+    spine = result.corrections.spine
+    if spine is None:
+        return ""
+    trunk = find_trunk(clip.joint_names, clip.parents, clip.rig.pelvis)
+    angle = np.degrees(2.0 * np.arctan2(np.linalg.norm(spine[:, 1:], axis=1), np.abs(spine[:, 0])))
+    text = f"spine: leans by up to {angle.max():.1f}°"
+    if trunk.spine is None:
+        return f"{text}, not applied: the clip has no spine joint between pelvis and head"
+    text += f", applied to {clip.joint_names[trunk.spine]}"
+    if trunk.head is None:
+        return f"{text}; the clip has no joint named head that turns back"
+    return f"{text}; {clip.joint_names[trunk.head]} turns back"
 
 
 def arrays(solved: Clip, placement: Placement) -> dict[str, np.ndarray]:

@@ -141,7 +141,11 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
         leg = ik.leg.pose(inputs, sensed, LegGoal(moved, target_ms, effector.weight))
     with jax.named_scope("foot"):
         foot = ik.foot.pose(inputs, sensed, effector, leg)
-    corrections = Corrections(leg.hip, leg.knee, foot.ankle)
+    spine, head = (
+        None if rot_ws is None else in_model_space(inputs, rot_ws)
+        for rot_ws in (advanced.lean.spine_ws, advanced.lean.head_ws)
+    )
+    corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head)
     trace = Trace(sensed, advanced)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
 
@@ -159,10 +163,16 @@ def body_transform(inputs: Inputs, rot_ws: Array, offset_ws: Array) -> Transform
         rot_ws: rotation, world axes.
         offset_ws: offset, m, world space.
     """
-    model_from_world = quat.conjugate(inputs.frame.world_from_model.rot)
     present = inputs.rig.present.astype(offset_ws.dtype)
     weight = present / jnp.maximum(vec.sum_last(present), 1.0)
     pivot = vec.barrier(vec.sum_vectors(vec.scale(inputs.frame.pose.hip.pos, weight)))
-    rot = quat.multiply(model_from_world, quat.multiply(rot_ws, quat.conjugate(model_from_world)))
-    offset = quat.rotate(model_from_world, offset_ws)
+    rot = in_model_space(inputs, rot_ws)
+    offset = quat.unrotate(inputs.frame.world_from_model.rot, offset_ws)
     return Transform(pivot + offset - quat.rotate(rot, pivot), rot)
+
+
+def in_model_space(inputs: Inputs, rot_ws: Array) -> Array:
+    """The rotation about model axes that `rot_ws` is about world axes."""
+    world_from_model = inputs.frame.world_from_model.rot
+    model_from_world = quat.conjugate(world_from_model)
+    return quat.multiply(model_from_world, quat.multiply(rot_ws, world_from_model))

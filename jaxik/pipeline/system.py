@@ -77,11 +77,22 @@ class Advanced:
 
 @struct
 class Corrections:
-    """Local rotations from animation to solution: `solved = animated * correction`."""
+    """Rotations from animation to solution.
+
+    Those of the legs are local: `solved = animated * correction`. Spine and head are in model
+    space, since a frame does not tell how these joints are turned: first the spine's base turns
+    about itself, with all joints above it, then the head about itself, both after the body has
+    moved. For a joint that then has the rotation q in model space, `conj(q) * correction * q` is
+    the local correction, multiplied as those of the legs.
+    """
 
     hip: Float[Array, "*b legs 4"]
     knee: Float[Array, "*b legs 4"]
     ankle: Float[Array, "*b legs 4"]
+    spine: Float[Array, "*b 4"] | None = None
+    """None if the lean rule does not bend the spine."""
+    head: Float[Array, "*b 4"] | None = None
+    """None likewise."""
 
 
 @struct

@@ -75,22 +75,25 @@ def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(cl
     assert solved.rig.joints == clip.rig.joints
 
 
+def with_joints(clip, joints):
+    """The clip with further joints: name, parent, and offset in the parent's space, m."""
+    for name, parent, offset in joints:
+        rotations = clip.rotations_ws[:, parent]
+        turned = Rotation.from_quat(rotations, scalar_first=True).apply(offset)
+        positions = clip.positions_ws[:, parent] + turned
+        clip = dataclasses.replace(
+            clip,
+            joint_names=(*clip.joint_names, name),
+            parents=(*clip.parents, parent),
+            offsets_ls=np.concatenate([clip.offsets_ls, [offset]]),
+            positions_ws=np.concatenate([clip.positions_ws, positions[:, None]], axis=1),
+            rotations_ws=np.concatenate([clip.rotations_ws, rotations[:, None]], axis=1),
+        )
+    return clip
+
+
 def test_joints_above_the_pelvis_and_below_a_foot_stay_rigid_on_their_parents(clip, result):
-    rot = Rotation.from_quat(clip.rotations_ws[:, 4], scalar_first=True)
-    tip = clip.positions_ws[:, 4] + rot.apply([0.01, -0.02, 0.05])
-    head = clip.positions_ws[:, 0] + [0.0, 0.6, 0.0]
-    longer = dataclasses.replace(
-        clip,
-        joint_names=(*clip.joint_names, "tip", "head"),
-        parents=(*clip.parents, 4, 0),
-        offsets_ls=np.concatenate([clip.offsets_ls, [[0.01, -0.02, 0.05], [0.0, 0.6, 0.0]]]),
-        positions_ws=np.concatenate(
-            [clip.positions_ws, np.stack([tip, head], axis=1)], axis=1
-        ),
-        rotations_ws=np.concatenate(
-            [clip.rotations_ws, clip.rotations_ws[:, [4, 0]]], axis=1
-        ),
-    )  # fmt: skip
+    longer = with_joints(clip, [("tip", 4, [0.01, -0.02, 0.05]), ("head", 0, [0.0, 0.6, 0.0])])
     solved = clip_frames.clip_from_result(longer, result)
     for joint, parent, offset in ((9, 4, [0.01, -0.02, 0.05]), (10, 0, [0.0, 0.6, 0.0])):
         parent_rot = Rotation.from_quat(solved.rotations_ws[:, parent], scalar_first=True)
@@ -98,6 +101,32 @@ def test_joints_above_the_pelvis_and_below_a_foot_stay_rigid_on_their_parents(cl
         np.testing.assert_allclose(solved.positions_ws[:, joint], attached, rtol=0, atol=1e-9)
         cosine = np.abs(np.sum(solved.rotations_ws[:, joint] * solved.rotations_ws[:, parent], -1))
         np.testing.assert_allclose(cosine, 1.0, atol=1e-12)
+
+
+def test_spine_and_head_lean_as_the_system_says(clip, result):
+    joints = [("spine", 0, [0.0, 0.1, 0.0]), ("neck", 9, [0.0, 0.4, 0.0])]
+    joints += [("arm", 10, [0.2, 0.0, 0.0]), ("head", 10, [0.0, 0.1, 0.0])]
+    taller = with_joints(clip, [*joints, ("crown", 12, [0.0, 0.2, 0.0])])
+    bend = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.3, clip.frame_count), [1.0, 0.0, 0.2]))
+    corrections = dataclasses.replace(
+        result.corrections,
+        spine=jnp.asarray(bend.as_quat(scalar_first=True)),
+        head=jnp.asarray(bend.inv().as_quat(scalar_first=True)),
+    )
+    plain = clip_frames.clip_from_result(taller, result)
+    leaning = dataclasses.replace(result, corrections=corrections)
+    leant = clip_frames.clip_from_result(taller, leaning)
+    np.testing.assert_array_equal(leant.positions_ws[:, :10], plain.positions_ws[:, :10])
+    root = Rotation.from_quat(np.array(clip.world_from_model().rot), scalar_first=True)
+    turn = root * bend * root.inv()  # world axes
+    for joint, pivot in ((10, 9), (11, 9), (12, 9)):
+        arm = plain.positions_ws[:, joint] - plain.positions_ws[:, pivot]
+        expected = plain.positions_ws[:, pivot] + turn.apply(arm)
+        np.testing.assert_allclose(leant.positions_ws[:, joint], expected, atol=1e-12)
+    crown, before = (c.positions_ws[:, 13] - c.positions_ws[:, 12] for c in (leant, plain))
+    np.testing.assert_allclose(crown, before, atol=1e-12)  # the head turned back
+    legs_only = clip_frames.clip_from_result(clip, leaning)
+    np.testing.assert_array_equal(legs_only.positions_ws, plain.positions_ws[:, :9])
 
 
 def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):

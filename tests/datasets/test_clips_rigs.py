@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from fitting.datasets.clips import load_clip
 from fitting.datasets.clips.contacts import detect_stances, runs
 from fitting.datasets.clips.formats.bvh import read_bvh
-from fitting.datasets.clips.joint_roles import find_roles, partners
+from fitting.datasets.clips.joint_roles import Trunk, find_roles, find_trunk, partners
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
 from fitting.datasets.clips.rigs import LegMotion, knee_axis, measure_soles
 from jaxik.maths import quat
@@ -47,6 +47,24 @@ def test_naming_conventions_are_recognised(names):
         ("left", 1.0, (1, 2, 3, 4)),
         ("right", -1.0, (5, 6, 7, 8)),
     ]
+
+
+@pytest.mark.parametrize(
+    ("names", "parents", "trunk"),
+    [
+        ("Hips LowerBack Spine Neck Head", (-1, 0, 1, 2, 3), Trunk(1, 4)),
+        ("hip abdomen chest neck head", (-1, 0, 1, 2, 3), Trunk(1, 4)),
+        ("Root Pelvis mixamorig:Spine mixamorig:Head", (-1, 0, 1, 2), Trunk(2, 3)),
+        ("Root Pelvis Waist Head", (-1, 0, 0, 2), Trunk(2, 3)),  # legs and spine side by side
+        ("pelvis spine_01 neck_01", (-1, 0, 1), Trunk(1, None)),
+        ("Hips Head", (-1, 0), Trunk(None, 1)),
+        ("pelvis left_hip", (-1, 0), Trunk(None, None)),
+    ],
+)
+def test_the_trunk_is_the_way_from_the_pelvis_to_the_head(names, parents, trunk):
+    words = names.split()
+    pelvis = 1 if words[0] == "Root" else 0
+    assert find_trunk(tuple(words), parents, pelvis) == trunk
 
 
 def test_the_error_for_a_missing_leg_lists_the_joints():

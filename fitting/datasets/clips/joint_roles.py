@@ -26,6 +26,10 @@ DIALECTS = {
 }
 
 
+# Where no head shows the way, names of the spine's lowest joint, as `plain` spells them.
+SPINES = ("lowerback", "spine", "spine0", "spine1", "spine01", "abdomen", "torso", "chest")
+
+
 @dataclass(frozen=True)
 class Leg:
     """One leg's joints by index; the toe is the ball of the foot, or the joint nearest to it."""
@@ -45,6 +49,37 @@ class Roles:
     """Key of `DIALECTS`, or "by hand"."""
     pelvis: int
     legs: tuple[Leg, ...]
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """The joints that lean, by index; None for what a skeleton lacks."""
+
+    spine: int | None
+    """Base of the spine: the first joint from the pelvis to the head."""
+    head: int | None
+
+
+def find_trunk(names: tuple[str, ...], parents: tuple[int, ...], pelvis: int) -> Trunk:
+    """The base of the spine and the head, which all known conventions call "head".
+
+    Between pelvis and head the spine needs no known name; without a head it is a child of the
+    pelvis with a name of `SPINES`.
+    """
+    plain_names = [plain(name) for name in names]
+    if "head" not in plain_names:
+        spines = (
+            j for j, name in enumerate(plain_names) if name in SPINES and parents[j] == pelvis
+        )
+        return Trunk(next(spines, None), None)
+    head = spine = plain_names.index("head")
+    below = {-1, pelvis}
+    while parents[pelvis] >= 0:
+        pelvis = parents[pelvis]
+        below.add(pelvis)
+    while parents[spine] not in below:
+        spine = parents[spine]
+    return Trunk(None if spine == head or parents[spine] < 0 else spine, head)
 
 
 def plain(name: str) -> str:

@@ -1,0 +1,151 @@
+"""The spine that leans into hills: against NumPy, its directions, limits and derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxik
+from jaxik.maths.gate import HARD, Smooth
+from jaxik.stages.inputs import Inputs, SensedMoment
+from jaxik.stages.lean import SpineLean
+from jaxik.world.frame import Contact, Frame, GroundHits, Sensed
+from jaxik.world.skeleton import Rig, Transform
+from jaxik.world.terrain import Hit, Terrain
+from reference.characters import Parameters
+from reference.stages import spine
+from support.fragments import fragment
+from support.gradients import assert_gradients_match, finite_jacobian
+
+FRAMES, DT = 60, 1.0 / 30.0
+VALUES = {
+    "uphill_rate": -0.4,
+    "downhill_rate": -0.7,
+    "side_rate": 0.3,
+    "forward_rate_slide": 0.8,
+    "side_rate_slide": -0.5,
+    "head_share": 0.6,
+    "half_life": 0.15,
+}
+RULE = SpineLean(**VALUES)
+
+
+def leans(rule, rots, normals, weights, slides, gate=HARD):
+    """Rotations of spine and head (frames, 4), world axes."""
+    terrain = fragment(Terrain, up_ws=jnp.asarray([0.0, 1.0, 0.0], normals.dtype))
+
+    def frame(carry, inputs):
+        state, started = carry
+        rot, normal, weight, slide = inputs
+        root = fragment(Frame, world_from_model=Transform(jnp.zeros(3, rot.dtype), rot))
+        hits = fragment(Hit, found=jnp.ones_like(weight), normal=normal)
+        slope = rule.sense(
+            fragment(Inputs, frame=root, terrain=terrain),
+            fragment(GroundHits, ankle=hits),
+            fragment(Contact, weight=weight),
+            jnp.ones_like(weight),
+        )
+        sensed = fragment(Sensed, slope=slope, slide=slide, up_ws=terrain.up_ws)
+        now = SensedMoment(jnp.asarray(DT, rot.dtype), started, gate, sensed, terrain)
+        state, lean = rule.advance(now, state)
+        return (state, jnp.ones_like(started)), (lean.spine_ws, lean.head_ws)
+
+    rig = fragment(Rig, side=jnp.zeros(2, normals.dtype))
+    start = rule.init(rig), jnp.zeros((), bool)
+    return jax.lax.scan(frame, start, (rots, normals, weights, slides))[1]
+
+
+lean_all = jax.jit(leans)
+
+
+def hills(frames=FRAMES, seed=3):
+    """Headings, normals of uphill and downhill ground, weights with flights, and slides."""
+    rng = np.random.default_rng(seed)
+    yaw = np.linspace(0.0, 5.0, frames)
+    rots = Rotation.from_rotvec(np.outer(yaw, [0.0, 1.0, 0.0])).as_quat(scalar_first=True)
+    rise = np.sin(np.linspace(0.0, 9.0, frames))[:, None, None] * [0.4, 0.0, 0.3]
+    normals = rise + rng.normal(0.0, 0.05, (frames, 2, 3)) + [0.0, 1.0, 0.0]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    weights = rng.uniform(0.0, 1.0, (frames, 2)) * (np.arange(frames) % 7 > 0)[:, None]
+    slides = (np.arange(frames) // 15 % 2).astype(float)
+    return rots, normals, weights, slides
+
+
+def uphill(angle, frames=FRAMES, yaw=0.0):
+    """A walk that faces `yaw` on ground that rises ahead by `angle`, rad."""
+    turned = Rotation.from_rotvec([0.0, yaw, 0.0])
+    rots = np.tile(turned.as_quat(scalar_first=True), (frames, 1))
+    normal = turned.apply([0.0, np.cos(angle), -np.sin(angle)])
+    normals = np.broadcast_to(normal, (frames, 2, 3))
+    return rots, normals, np.ones((frames, 2)), np.zeros(frames)
+
+
+def test_spine_and_head_turn_as_in_numpy():
+    clip = hills()
+    parameters = Parameters(defaults={f"lean.{name}": value for name, value in VALUES.items()})
+    state, expected = None, []
+    for frame in zip(*clip, strict=True):
+        state, *rotations = spine.lean(parameters, *frame, DT, state)
+        expected.append(rotations)
+    actual = np.stack(lean_all(RULE, *clip), axis=1)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-12)
+    assert np.degrees(Rotation.from_quat(actual[:, 0], scalar_first=True).magnitude()).max() > 5.0
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+@pytest.mark.parametrize(("angle", "rate"), [(0.3, -0.4), (-0.3, -0.7), (0.0, 0.0)])
+def test_people_lean_forward_uphill_and_backward_downhill(angle, rate, yaw):
+    trunk, head = (np.asarray(rot)[-1] for rot in lean_all(RULE, *uphill(angle, yaw=yaw)))
+    forward = Rotation.from_rotvec([0.0, yaw, 0.0]).apply([0.0, 0.0, 1.0])
+    tops = [
+        Rotation.from_quat(rot, scalar_first=True).apply([0.0, 1.0, 0.0]) @ forward
+        for rot in (trunk, head)
+    ]
+    np.testing.assert_allclose(tops[0], np.sin(-rate * angle), atol=1e-12)
+    np.testing.assert_allclose(tops[1], np.sin(0.6 * rate * angle), atol=1e-12)
+
+
+def test_a_head_that_turns_back_all_the_way_stays_level():
+    trunk, head = lean_all(dataclasses.replace(RULE, head_share=jnp.asarray(1.0)), *hills())
+    both = Rotation.from_quat(head, scalar_first=True) * Rotation.from_quat(
+        trunk, scalar_first=True
+    )
+    np.testing.assert_allclose(both.magnitude(), 0.0, atol=1e-12)
+
+
+def test_the_lean_crosses_level_ground_without_a_jump():
+    angles = np.linspace(-0.01, 0.01, 41)
+    last = [np.asarray(lean_all(RULE, *uphill(angle))[0])[-1, 1] for angle in angles]
+    assert np.abs(np.diff(last)).max() < 0.7 * 0.0005 / 2 * 1.01
+
+
+def test_single_precision_and_lanes_give_the_same():
+    clip = hills()
+    exact = np.asarray(lean_all(RULE, *clip)[0])
+    rule = dataclasses.replace(
+        RULE, **{name: jnp.asarray(value, jnp.float32) for name, value in VALUES.items()}
+    )
+    rounded = lean_all(rule, *(jnp.asarray(values, jnp.float32) for values in clip))[0]
+    assert rounded.dtype == jnp.float32
+    np.testing.assert_allclose(rounded, exact, rtol=0, atol=2e-6)
+    shares = jnp.asarray([0.0, 0.5, 1.0])
+    few = tuple(values[:3] for values in clip)
+    head = lambda share: leans(dataclasses.replace(RULE, head_share=share), *few)[1]  # noqa: E731
+    side_by_side = jax.jit(jaxik.lanes(head))(shares)
+    np.testing.assert_allclose(side_by_side, jax.vmap(head)(shares), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
+def test_derivatives_are_difference_quotients_and_finite_on_level_ground(gate):
+    rots, normals, weights, slides = hills(frames=4)
+
+    def rotations(values, normals):
+        rule = SpineLean(**values)
+        return jnp.stack(leans(rule, rots, normals, weights, slides, gate))
+
+    assert_gradients_match(rotations, VALUES, normals)
+    level = np.broadcast_to([0.0, 1.0, 0.0], normals.shape)
+    finite_jacobian(rotations, VALUES, level)
