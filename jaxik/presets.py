@@ -1,7 +1,9 @@
 """Complete foot-IK systems: four that exist elsewhere, and `stride` for people on uneven ground.
 
-Each function returns a `FootIK` with default parameters; print it to see them. The four are
-re-implementations from descriptions and source code, tested against independent NumPy references.
+Each function returns a `FootIK` with default parameters; print it to see them. They are those of an
+adult of 1.8 m, or with a `rig` those of its body: `jaxik.world.body` says how they follow it. The
+four are re-implementations from descriptions and source code, tested against independent NumPy
+references.
 """
 
 import math
@@ -23,15 +25,17 @@ from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, Re
 from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe, StrideProbe
 from jaxik.stages.root import GroundRoot, KeepRoot
 from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
+from jaxik.world import body
+from jaxik.world.skeleton import Rig
 
 
-def record() -> FootIK:
-    """The foot IK behind a game engine's parameter record, for a 1.8 m adult.
+def record(rig: Rig | None = None) -> FootIK:
+    """The foot IK behind a game engine's parameter record.
 
     Locks standing feet, leans the body on slopes and lowers the pelvis to the lowest standing foot.
     `jaxik.record` reads and writes the record's bytes.
     """
-    return FootIK(
+    ik = FootIK(
         root=KeepRoot(),
         probe=FootProbe(),
         contact=HeightContact(),
@@ -43,9 +47,10 @@ def record() -> FootIK:
         leg=TwoBone(),
         foot=PitchRollFoot(),
     )
+    return body.scale(ik, rig)
 
 
-def ozz() -> FootIK:
+def ozz(rig: Rig | None = None) -> FootIK:
     """ozz-animation's foot IK sample.
 
     Its four switches are `root.enabled` (character height), `pelvis.enabled`, `leg.enabled`
@@ -56,7 +61,7 @@ def ozz() -> FootIK:
     way round in 10 to 14 % of cases, and it treats directions within 1.4 mrad of opposed as
     opposed, so that its aim misses by as much. `tests/solvers/test_golden.py` shows both.
     """
-    return FootIK(
+    ik = FootIK(
         root=GroundRoot(),
         probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False),
         contact=StandingContact(),
@@ -68,9 +73,10 @@ def ozz() -> FootIK:
         leg=PoleLeg(),
         foot=AimFoot(),
     )
+    return body.scale(ik, rig)
 
 
-def unreal() -> FootIK:
+def unreal(rig: Rig | None = None) -> FootIK:
     """Unreal's foot IK control rig, with its latch.
 
     It works only while the character stands still (`contact.idle_speed`). As in the original, the
@@ -81,7 +87,7 @@ def unreal() -> FootIK:
     `probe.ray_up`, and `pelvis.half_height` is what shrinks. The game keeps the capsule on the
     ground; for an animation whose root stays on its flat floor, switch `root.enabled` on.
     """
-    return FootIK(
+    ik = FootIK(
         root=GroundRoot(enabled=False),
         probe=RootProbe(),
         contact=IdleContact(),
@@ -93,16 +99,17 @@ def unreal() -> FootIK:
         leg=TwoBone(max_knee_angle=math.pi, min_knee_angle=0.0, soften=1.0),
         foot=KeepFoot(),
     )
+    return body.scale(ik, rig)
 
 
-def mec() -> FootIK:
+def mec(rig: Rig | None = None) -> FootIK:
     """Mec Foot Placer, a plug-in for Unity.
 
     Use `LegTerrains` for feet and hands that each have their own up. All switches and numbers of
     the probe, the lock and the legs can be one value per leg. The game keeps the character on the
     ground; for an animation whose root stays on its flat floor, switch `root.enabled` on.
     """
-    return FootIK(
+    ik = FootIK(
         root=GroundRoot(enabled=False),
         probe=CornerProbe(),
         contact=StandingContact(),
@@ -114,9 +121,10 @@ def mec() -> FootIK:
         leg=HintLeg(),
         foot=FlatFoot(),
     )
+    return body.scale(ik, rig)
 
 
-def stride() -> FootIK:
+def stride(rig: Rig | None = None) -> FootIK:
     """Foot IK that looks ahead to the next foothold: people on uneven ground.
 
     Each foot goes from the ground of its last foothold to that of its next. The pelvis goes where
@@ -127,7 +135,7 @@ def stride() -> FootIK:
     character's velocity. On the flat floor for which an animation was made nothing changes.
     Feet turn far enough to walk flat on slopes of 25 degrees.
     """
-    return FootIK(
+    ik = FootIK(
         root=KeepRoot(),
         probe=StrideProbe(),
         contact=LabelContact(),
@@ -139,3 +147,4 @@ def stride() -> FootIK:
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
         foot=PitchRollFoot(max_pitch=0.8, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6),
     )
+    return body.scale(ik, rig)

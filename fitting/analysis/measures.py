@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Float64
 
 from fitting.datasets.clips import contacts
 from fitting.datasets.clips.clip import Clip
-from fitting.datasets.clips.rigs import flat_frames
 from jaxik.maths import quat, vec
 from jaxik.world.frame import UP
 
@@ -88,34 +87,14 @@ def measure(motion: Motion, animated: Motion, feet: FootStates, fps: float) -> M
     )
 
 
-def sole_depths(clip: Clip, floor: float = 0.0) -> Float64[np.ndarray, "legs 2"]:
-    """How far the sole is below each ankle and each ball, m.
-
-    This is the height of the joint above the floor, as the median over the frames in which the foot
-    stands flat.
-
-    Args:
-        clip: the animation on its flat floor.
-        floor: height of that floor, m.
-    """
-    stance, joints = clip.stance_labels(), np.stack([clip.joints_ws(2), clip.joints_ws(3)], axis=2)
-    depths = []
-    for leg in range(stance.shape[1]):
-        flat = flat_frames(joints[:, leg, 0], joints[:, leg, 1], stance[:, leg])
-        depths.append(np.median(joints[flat, leg, :, 1], axis=0) - floor)
-    return np.array(depths)
-
-
-def soles(
-    clip: Clip, depths: Float64[np.ndarray, "legs 2"]
-) -> Float64[np.ndarray, "frames legs 2 3"]:
+def soles(clip: Clip) -> Float64[np.ndarray, "frames legs 2 3"]:
     """Points of the soles below ankles and balls, along each foot's up axis, m, world space.
 
-    Args:
-        clip: a motion of the rig for which the depths were measured.
-        depths: see `sole_depths`.
+    They are as far below as the clip's rig says.
     """
-    feet = quat.multiply(clip.leg_pose_ws().ankle.rot, clip.rig.ankle_from_foot)
+    rig = clip.rig
+    depths = np.stack([rig.ankle_height, rig.ball_height], axis=-1)
+    feet = quat.multiply(clip.leg_pose_ws().ankle.rot, rig.ankle_from_foot)
     up = np.asarray(quat.rotate(feet, vec.constant(UP, feet)))
     joints = np.stack([clip.joints_ws(2), clip.joints_ws(3)], axis=2)
     return joints - depths[..., None] * up[:, :, None]

@@ -94,7 +94,7 @@ def soles(solved: Clip, animated: Clip, terrain: Terrain, floor: float = 0.0) ->
         terrain: y up.
         floor: height of that floor, m.
     """
-    points = measures.soles(solved, measures.sole_depths(animated, floor))
+    points = measures.soles(solved)
     path = ground_path.path_heights(solved, terrain, floor)
     lowest = points[..., 1] if path is None else np.maximum(points[..., 1], path[:, None, None])
     ground = ground_path.heights_under(terrain, points, lowest + ground_path.STEP)

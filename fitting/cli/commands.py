@@ -62,11 +62,13 @@ def apply(options: argparse.Namespace) -> int:
 def run(options: argparse.Namespace) -> int:
     """Runs a preset or a parameter file on a clip."""
     _prepare_jax()
+    animation = _animation(options)
+    rig = animation.flat_clip.rig
     if options.parameters is not None:
-        ik, _ = parameter_files.load_system(options.parameters)
+        ik, _ = parameter_files.load_system(options.parameters, rig)
     else:
-        ik = systems.preset_system(options.preset)
-    jobs.solve(ik, _animation(options), options.output, log=print)
+        ik = systems.preset_system(options.preset, rig)
+    jobs.solve(ik, animation, options.output, log=print)
     return 0
 
 
@@ -74,8 +76,10 @@ def run(options: argparse.Namespace) -> int:
 def compare(options: argparse.Namespace) -> int:
     """Runs several systems on a clip and measures them."""
     _prepare_jax()
-    requested = comparison.named_systems(options.systems, on_ground=options.root == "auto")
     animation = _animation(options)
+    requested = comparison.named_systems(
+        options.systems, animation.flat_clip.rig, on_ground=options.root == "auto"
+    )
     jobs.compare(requested, animation, options.output, during=progress.timed, log=print)
     return 0
 
@@ -84,9 +88,6 @@ def compare(options: argparse.Namespace) -> int:
 def translate(options: argparse.Namespace) -> int:
     """Fits one system to the motion of another."""
     _prepare_jax()
-    source = translation.load_named_system(options.source, "--from")
-    target = translation.load_named_system(options.target, "--to")
-    free = None if options.free is None else translation.read_free(options.free, target.ik)
     if len(options.clip) != len(options.terrain):
         raise ValueError(
             f"{len(options.clip)} clip(s) and {len(options.terrain)} terrain(s); wanted a terrain "
@@ -96,6 +97,10 @@ def translate(options: argparse.Namespace) -> int:
         AnimationFiles(clip, mesh, options.file_up)
         for clip, mesh in zip(options.clip, options.terrain, strict=True)
     )
+    rig = animations[0].flat_clip.rig
+    source = translation.load_named_system(options.source, "--from", rig)
+    target = translation.load_named_system(options.target, "--to", rig)
+    free = None if options.free is None else translation.read_free(options.free, target.ik, rig)
     request = TranslationRequest(source, target, animations, free, options.fps)
     with progress.ProgressLine(progress.fit_line) as line:
         fitted = jobs.translate(request, options.output, progress=line, log=print)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.runtime.validation import error_context
 
-from .clips import contacts, load_clip
+from .clips import contacts, edit, load_clip
 from .clips.clip import Clip
 from .clips.formats.npz import is_blocks_file
 from .clips.kinematics import local_from_world, world_from_local
@@ -80,15 +80,19 @@ def with_rigid_legs(clip: Clip) -> Clip:
     return _rebuild_legs(clip, clip, np.zeros((clip.frame_count, len(rig.joints))))
 
 
-def load_flat_animation(path: Path) -> Clip:
+def load_flat_animation(path: Path, floor: float = 0.0) -> Clip:
     """The animation in a file, ready for foot IK: with rigid legs, and of a blocks file the base.
+
+    Args:
+        path: the file.
+        floor: height of the floor on which it was animated, m; the rig's soles are measured there.
 
     Raises:
         ValueError: as `load_clip`, or the clip has no legs.
     """
     clip = load_clip(path, variant="base" if is_blocks_file(path) else "captured")
     with error_context(path):
-        return with_rigid_legs(clip)
+        return edit.on_floor(with_rigid_legs(clip), floor)
 
 
 def ground_heights(

@@ -70,6 +70,8 @@ class Experiment:
     free: FreeTable
     """By dotted name, with overrides of the declaration."""
     preset: str = "record"
+    body: str = "clip"
+    """Whose defaults are meant: those of the first clip's rig, or of the adult."""
     name: str = ""
     fps: float | None = None
     """Clips are resampled to this rate."""
@@ -88,14 +90,16 @@ class Experiment:
     without: tuple[Ablation, ...] = ()
     """What `jaxik ablate` leaves out in turn."""
 
-    def preset_system(self) -> jaxik.FootIK:
-        """The preset with the experiment's rules."""
-        ik = preset_system(self.preset)
-        return with_rules(ik, self.rules, f"{self.path} [rules]")
+    def preset_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
+        """The preset with the experiment's rules, for a rig unless it is meant for the adult."""
+        rig = rig if self.body == "clip" else None
+        ik = preset_system(self.preset, rig)
+        return with_rules(ik, self.rules, f"{self.path} [rules]", rig)
 
-    def starting_system(self) -> jaxik.FootIK:
-        """The preset with the experiment's rules and fixed parameters."""
-        return with_parameters(self.preset_system(), self.parameters, f"{self.path} [parameters]")
+    def starting_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
+        """The preset with the experiment's rules and fixed parameters; `rig` as above."""
+        ik = self.preset_system(rig)
+        return with_parameters(ik, self.parameters, f"{self.path} [parameters]")
 
     def placed_clips(self) -> tuple[ClipEntry, ...]:
         """The clips, with the root as animated where the system is told to place it itself."""
@@ -106,14 +110,21 @@ class Experiment:
             for entry in self.clips
         )
 
-    def free_parameters(self, ik: jaxik.FootIK) -> list[FreeParameter]:
+    def free_parameters(
+        self, ik: jaxik.FootIK, rig: jaxik.Rig | None = None
+    ) -> list[FreeParameter]:
         """The free parameters, as the rules declare them and the experiment overrides them.
+
+        Args:
+            ik: the experiment's system.
+            rig: whose body their ranges are for, unless the experiment is meant for the adult.
 
         Raises:
             ValueError: a parameter is unknown, or cannot be what the experiment makes it.
         """
         with validation.error_context(f"{self.path} [free]"):
-            return [free_parameter(ik, name, **options) for name, options in self.free.items()]
+            rig = rig if self.body == "clip" else None
+            return [free_parameter(ik, name, rig, **given) for name, given in self.free.items()]
 
     def with_max_sample_steps(self, max_steps: int) -> "Experiment":
         """The experiment with another limit to the steps of the sampler."""

@@ -1,6 +1,7 @@
 """Experiment files: TOML, checked key by key.
 
 preset = "record"                    # a function of jaxik.presets
+body = "clip"                        # its defaults: for the first clip's rig, or for the "adult"
 rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
 [[clips]]
 reference = "walk.npz"               # the captured motion; paths are relative to this file
@@ -37,7 +38,7 @@ from fitting.runtime.validation import Constraint, Content, Table, check_table, 
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
-from .systems import preset_system, read_free_table, with_rules
+from .systems import BODY, preset_system, read_free_table, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
 FILE_KEYS = ("reference", "terrain", "base", "truth")
@@ -88,6 +89,7 @@ TABLES = ("free", "rules", "parameters", "sigmas", "fit", "sample")
 TOP_KEYS: dict[str, Constraint] = {
     "name": validation.TEXT,
     "preset": validation.TEXT,
+    "body": BODY,
     "loss": validation.one_of(get_args(Loss)),
     "fps": validation.FINITE_POSITIVE,
     "seed": validation.SEED,

@@ -1,6 +1,7 @@
 """Parameter files: a system as TOML, with a preset, changed rules, and one table per stage.
 
 preset = "record"
+body = "clip"               # for what is left out: the rig of the clip, or "adult"
 [rules]                     # where they differ from the preset's
 pelvis = "SupportPelvis"
 [pelvis]                    # names and units as the rules declare them
@@ -16,7 +17,7 @@ import jaxik
 from fitting.runtime.validation import TABLE, check_keys, check_table, flatten, nest, read_toml
 from jaxik.maths import parameter_tree
 
-from .systems import changed_rules, leaf_names, preset_system, with_parameters, with_rules
+from .systems import BODY, changed_rules, leaf_names, preset_system, with_parameters, with_rules
 
 
 def system_to_toml(ik: jaxik.FootIK, preset: str = "record") -> str:
@@ -26,10 +27,14 @@ def system_to_toml(ik: jaxik.FootIK, preset: str = "record") -> str:
     return tomli_w.dumps({"preset": preset} | ({"rules": rules} if rules else {}) | nest(values))
 
 
-def load_system(path: str | Path) -> tuple[jaxik.FootIK, str]:
+def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.FootIK, str]:
     """Reads a parameter file; returns the system and the name of its preset.
 
     What the file leaves out stays as in the preset.
+
+    Args:
+        path: the file.
+        rig: whose body the preset is for, unless the file says otherwise; None is the adult.
 
     Raises:
         ValueError: the file does not exist or is not TOML; a preset, stage, rule or parameter is
@@ -38,9 +43,9 @@ def load_system(path: str | Path) -> tuple[jaxik.FootIK, str]:
     path = Path(path)
     content = read_toml(path, "a parameter")
     preset = content.pop("preset", "record")
-    ik = preset_system(preset)
-    rules = content.pop("rules", {})
-    check_table({"rules": rules}, {"rules": TABLE}, str(path))
-    ik = with_rules(ik, rules, f"{path} [rules]")
+    rules, body = content.pop("rules", {}), content.pop("body", "clip")
+    check_table({"rules": rules, "body": body}, {"rules": TABLE, "body": BODY}, str(path))
+    rig = rig if body == "clip" else None
+    ik = with_rules(preset_system(preset, rig), rules, f"{path} [rules]", rig)
     check_keys(content, list(vars(ik)), str(path))
     return with_parameters(ik, flatten(content, 2), str(path)), preset

@@ -71,10 +71,11 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
         ValueError: as `make_problem`.
     """
     data = list(clips)
-    ik = experiment.starting_system()
+    rig = data[0].base.rig
+    ik = experiment.starting_system(rig)
     if any(clip.root.rise is not None for clip in data):
         ik = without_own_root(ik)
-    parameters = experiment.free_parameters(ik)
+    parameters = experiment.free_parameters(ik, rig)
     with error_context(f"{experiment.path} [free]"):
         space = make_space(ik, parameters)
     scenes = []

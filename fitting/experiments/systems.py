@@ -12,6 +12,7 @@ from fitting.runtime import validation
 from fitting.runtime.validation import Table, check_keys, check_table, flatten
 from jaxik import presets
 from jaxik.maths import parameter_tree
+from jaxik.world import body
 
 
 def _concrete_rules(rule: type[eqx.Module]) -> list[type[eqx.Module]]:
@@ -46,6 +47,7 @@ def register_rule(rule: type[Rule]) -> type[Rule]:
     raise ValueError(f"{rule.__name__} is no rule of a stage; the stages are {list(STAGES)}")
 
 
+BODY = validation.one_of(("clip", "adult"))  # whose defaults are meant
 FREE_KEYS: dict[str, validation.Constraint] = {
     **dict.fromkeys(("low", "high", "prior_mean"), validation.NUMBER),
     "prior_sd": validation.POSITIVE,
@@ -53,12 +55,16 @@ FREE_KEYS: dict[str, validation.Constraint] = {
 }
 
 
-def preset_system(name: object) -> jaxik.FootIK:
-    """The system of a preset; ValueError with the list of presets for an unknown name."""
+def preset_system(name: object, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
+    """The system of a preset, for the adult or for the body of a rig.
+
+    Raises:
+        ValueError: no such preset; the message lists those that there are.
+    """
     known = sorted(n for n, value in vars(presets).items() if _is_preset(value))
     if name not in known:
         raise ValueError(f"no preset named {name!r}; there are {known}")
-    return getattr(presets, str(name))()
+    return getattr(presets, str(name))(rig)
 
 
 def _is_preset(value: object) -> bool:
@@ -70,7 +76,9 @@ def rule_names(ik: jaxik.FootIK) -> dict[str, str]:
     return {stage: type(rule).__name__ for stage, rule in vars(ik).items()}
 
 
-def with_rules(ik: jaxik.FootIK, names: Table, where: str) -> jaxik.FootIK:
+def with_rules(
+    ik: jaxik.FootIK, names: Table, where: str, rig: jaxik.Rig | None = None
+) -> jaxik.FootIK:
     """The system with other rules at some stages.
 
     A rule that the system has already keeps its values; a new one has its defaults.
@@ -79,6 +87,7 @@ def with_rules(ik: jaxik.FootIK, names: Table, where: str) -> jaxik.FootIK:
         ik: the system.
         names: names of rules, by stage.
         where: place of the names in their file, for the error message.
+        rig: whose body the defaults are for; None is the adult.
 
     Raises:
         ValueError: a stage is unknown, or does not have the rule.
@@ -90,7 +99,8 @@ def with_rules(ik: jaxik.FootIK, names: Table, where: str) -> jaxik.FootIK:
             known = list(STAGES[stage])
             raise ValueError(f"{where}: {stage} has no rule {name!r}; it has {known}")
     changed = {stage: name for stage, name in names.items() if name != present[stage]}
-    return replace(ik, **{stage: STAGES[stage][name]() for stage, name in changed.items()})
+    rules = {stage: STAGES[stage][name]() for stage, name in changed.items()}
+    return replace(ik, **{stage: body.scale(rule, rig) for stage, rule in rules.items()})
 
 
 def changed_rules(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:
@@ -111,6 +121,7 @@ def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK
         ValueError: a name is unknown, or a value has the wrong type or shape.
     """
     check_keys(values, leaf_names(ik), where)
+    shapes = {slot.name: slot.shape for slot in parameter_tree.slots(ik)}
     for name, value in values.items():
         old = parameter_tree.get(ik, name)
         try:
@@ -120,8 +131,9 @@ def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK
         if new.dtype.kind not in ("b" if old.dtype == bool else "if") or np.isnan(new).any():
             wanted = "true or false" if old.dtype == bool else "a number"
             raise ValueError(f"{where}: {name} is {value!r}; wanted {wanted}")
-        if new.shape != old.shape and (old.ndim, new.ndim, new.size > 0) != (0, 1, True):
-            raise ValueError(f"{where}: {name} has shape {new.shape}; wanted {old.shape}")
+        single = shapes.get(name, old.shape)  # of a value that all legs share
+        if new.shape != single and (new.shape[1:] != single or not new.size):
+            raise ValueError(f"{where}: {name} has shape {new.shape}; wanted {single}")
     return parameter_tree.replace(ik, dict(values))
 
 

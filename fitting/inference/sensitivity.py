@@ -15,6 +15,7 @@ from fitting.problem.space import Space, make_space
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
+from jaxik.world.body import scaled_declarations
 
 from .optimisation.population import BATCH, from_values
 
@@ -26,10 +27,15 @@ UNLIMITED = 4.0  # times its usual range, for an infinite limit: "no limit" must
 FreeTable = Mapping[str, Mapping[str, float | int | str]]  # names, and overrides of declarations
 
 
-def all_parameters(ik: jaxik.FootIK) -> dict[str, dict[str, float]]:
-    """Every declared parameter of a system as free, leg by leg where it has a value for each."""
+def all_parameters(ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> dict[str, dict[str, float]]:
+    """Every declared parameter of a system as free, leg by leg where it has a value for each.
+
+    Args:
+        ik: the system.
+        rig: whose body the ranges are for; None is the adult.
+    """
     table: dict[str, dict[str, float]] = {}
-    for name, declaration in parameter_tree.declarations(ik).items():
+    for name, declaration in scaled_declarations(ik, rig).items():
         value = np.asarray(parameter_tree.get(ik, name))
         overrides = {"high": UNLIMITED * declaration.high} if np.isinf(value).any() else {}
         elements = [f"{name}[{i}]" for i in range(len(value))] if value.ndim else [name]
@@ -43,6 +49,8 @@ def measure_sensitivity(
 ) -> dict[str, float]:
     """How far each parameter can move these motions, in sigmas; without those that move none.
 
+    Ranges are those for the body of the first clip.
+
     Each parameter in turn is swept over its range while the others stay where they are: at the
     system's values, then at draws from the prior.
 
@@ -52,7 +60,8 @@ def measure_sensitivity(
         scenes: the clips; of these the sigmas count, the references do not.
         seed: of the draws.
     """
-    space = make_space(ik, [free_parameter(ik, name, **given) for name, given in free.items()])
+    rig = scenes[0].rig
+    space = make_space(ik, [free_parameter(ik, name, rig, **given) for name, given in free.items()])
     random = np.random.default_rng(seed)
     draws = PRIOR_SD * random.normal(size=(DRAWS, space.size))
     points = [np.asarray(space.pack({})), *draws]

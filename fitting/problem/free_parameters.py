@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxik.maths import parameter_tree
+from jaxik.world.body import scaled_declarations
+from jaxik.world.skeleton import Rig
 
 PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
 OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
@@ -44,7 +46,9 @@ class FreeParameter:
         return int(index[:-1]) if index else None
 
 
-def free_parameter(ik: eqx.Module, name: str, **overrides: float | int | str) -> FreeParameter:
+def free_parameter(
+    ik: eqx.Module, name: str, rig: Rig | None = None, **overrides: float | int | str
+) -> FreeParameter:
     """The parameter of this name as its rule declares it, with overrides.
 
     A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
@@ -54,13 +58,14 @@ def free_parameter(ik: eqx.Module, name: str, **overrides: float | int | str) ->
     Args:
         ik: system, a tree of rules.
         name: dotted name.
+        rig: whose body the declared range is for; None is the adult.
         overrides: any of `low`, `high`, `prior_mean`, `prior_sd`, `kind`, `scale`.
 
     Raises:
         ValueError: for an unknown name or override, a leg that does not exist, or bounds that are
             out of order or outside the scale's domain.
     """
-    declared = parameter_tree.declarations(ik)
+    declared = scaled_declarations(ik, rig)
     leaf = name.partition("[")[0]
     if leaf not in declared:
         nearest = difflib.get_close_matches(leaf, declared, n=1, cutoff=0.0)

@@ -200,7 +200,7 @@ def _hide(data: ClipData, frames: slice) -> ClipData:
 def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] | None) -> Row:
     """The row of a variant on a split, without its key and its name."""
     values, converged, message, seconds = {}, True, "Nothing is free.", 0.0
-    ik = variant.starting_system()
+    ik = variant.starting_system(data.measured[0][0].base.rig)
     if variant.free:
         fitted = replace(variant, clips=tuple(entry for entry, _ in data.fitted))
         resampled = (_at_rate(clip, variant.fps) for _, clip in data.fitted)

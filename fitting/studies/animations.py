@@ -35,6 +35,11 @@ class AnimationFiles:
     root: str = "auto"
     """Where the root is put; see `place_root`."""
 
+    @cached_property
+    def flat_clip(self) -> Clip:
+        """The flat animation of the file."""
+        return load_flat_animation(self.clip, self.floor)
+
     def load_terrain(self) -> Terrain:
         """The terrain of the mesh."""
         return load_terrain(self.terrain, file_up=self.file_up)
@@ -104,5 +109,5 @@ def load_animation(files: AnimationFiles) -> Animation:
         ValueError: a file does not exist or cannot be read, or the root cannot be put there.
     """
     terrain = files.load_terrain()
-    clip, root = place_root(load_flat_animation(files.clip), terrain, files.root, files.floor)
+    clip, root = place_root(files.flat_clip, terrain, files.root, files.floor)
     return Animation(clip, terrain, files.floor, root, files.load_turned_terrain)

@@ -48,13 +48,14 @@ class Comparison:
 
 @in_float64
 def named_systems(
-    options: Iterable[tuple[str, str]], *, on_ground: bool = True
+    options: Iterable[tuple[str, str]], rig: jaxik.Rig | None = None, *, on_ground: bool = True
 ) -> dict[str, jaxik.FootIK]:
     """Systems by the name of their preset or of their parameter file, in the order of the options.
 
     Args:
         options: pairs of `--presets` and names of presets, or of `--parameters` and parameter
             files, separated by commas.
+        rig: whose body they are for; None is the adult.
         on_ground: whether presets that leave the character's height to the game put it on the
             ground.
 
@@ -69,7 +70,7 @@ def named_systems(
                 raise ValueError(f"{option} {text!r}: wanted names with commas between them")
             is_file = option == "--parameters"
             name = Path(entry).stem if is_file else entry
-            ik = load_system(entry)[0] if is_file else preset_system(entry)
+            ik = load_system(entry, rig)[0] if is_file else preset_system(entry, rig)
             if on_ground and not is_file and "root.enabled" in leaf_names(ik):
                 ik = parameter_tree.replace(ik, {"root.enabled": True})
             if name in (*systems, ANIMATED):
@@ -112,8 +113,7 @@ def compare(
         grounded = np.asarray(stage_outputs(result).sensed.foothold.found) > 0
         reached[name] = np.where(grounded, np.asarray(result.reached, np.float64), np.nan)
 
-    depths = measures.sole_depths(animation.clip, animation.floor)
-    soles_ws = np.stack([measures.soles(solved, depths) for solved in clips.values()])
+    soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
     ground = ground_heights(animation.terrain, soles_ws)
     motions = {name: _motion(solved) for name, solved in clips.items()}
     measured = {}

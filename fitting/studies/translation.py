@@ -99,26 +99,34 @@ class Translation:
 
 
 @in_float64
-def load_named_system(text: str, option: str = "system") -> NamedSystem:
+def load_named_system(
+    text: str, option: str = "system", rig: jaxik.Rig | None = None
+) -> NamedSystem:
     """The system with the name of a preset, or in a parameter file (.toml).
 
     Args:
         text: the name or the path.
         option: what the user set to this text, for the error message.
+        rig: whose body the system is for; None is the adult.
 
     Raises:
         ValueError: there is no such preset or file.
     """
     path = Path(text)
     if path.suffix.lower() == ".toml":
-        ik, preset = parameter_files.load_system(path)
+        ik, preset = parameter_files.load_system(path, rig)
         return NamedSystem(path.stem, preset, ik)
     with error_context(f"{option} takes a preset or a parameter .toml"):
-        return NamedSystem(text, text, systems.preset_system(text))
+        return NamedSystem(text, text, systems.preset_system(text, rig))
 
 
-def read_free(text: str, ik: jaxik.FootIK) -> FreeTable:
+def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> FreeTable:
     """Free parameters as `--free` names them: `name,name`, or a TOML file with a [free] table.
+
+    Args:
+        text: names or path.
+        ik: the system that has them.
+        rig: whose body their ranges are for; None is the adult.
 
     Raises:
         ValueError: no parameter is named, one is unknown, or it cannot be what the table says.
@@ -135,7 +143,7 @@ def read_free(text: str, ik: jaxik.FootIK) -> FreeTable:
         raise ValueError(f"--free {text}: names no parameter")
     with error_context("--free"):
         for name, overrides in free.items():
-            free_parameter(ik, name, **overrides)
+            free_parameter(ik, name, rig, **overrides)
     return free
 
 
@@ -158,17 +166,18 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
     )
     run = run.resolve()
     data = [_source_motion(source, files, request.fps) for files in request.animations]
-    preset = systems.preset_system(target.preset)
+    rig = data[0].base.rig
+    preset = systems.preset_system(target.preset, rig)
     rules = systems.changed_rules(target.ik, preset)
     experiment = Experiment(
         path=run / run_folder.EXPERIMENT,
         clips=_clip_entries(request, run),
-        free=request.free or sensitivity.all_parameters(target.ik),
+        free=request.free or sensitivity.all_parameters(target.ik, rig),
         preset=target.preset,
         name=f"{source.name} to {target.name}",
         fps=request.fps,
         rules=rules,
-        parameters=_changed_values(target.ik, systems.with_rules(preset, rules, target.name)),
+        parameters=_changed_values(target.ik, systems.with_rules(preset, rules, target.name, rig)),
         sigmas=TOLERANCES,
     )
     problem = problem_from_clips(experiment, data)

@@ -11,7 +11,7 @@ import dataclasses
 import inspect
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,6 +24,11 @@ Tree = TypeVar("Tree", bound=eqx.Module)
 Declared = TypeVar("Declared")  # whatever type a field is annotated with
 ParameterKind = Literal["smooth", "threshold"]
 Scale = Literal["linear", "log", "gain"]
+Follows = Literal[
+    "nothing", "leg length", "speed", "time",
+    "ankle height", "ball height", "over ankle height", "over ball height",
+]  # fmt: skip
+BY_UNIT: dict[str, Follows] = {"m": "leg length", "m/s": "speed"}  # what follows the body at once
 
 MOST_SHOWN = 8  # numbers of one leaf that are printed one by one
 ALL_LAYERS = 0xFFFFFFFF
@@ -79,6 +84,21 @@ class Declaration:
     """Name of the field of the same rule that this one stays above."""
     doc: str
     """One sentence: what the parameter does."""
+    follows: Follows = "nothing"
+    """What of a body it changes with."""
+
+
+class Slot(NamedTuple):
+    """A declared field of a rule."""
+
+    name: str
+    """Dotted."""
+    value: Array
+    shape: tuple[int, ...]
+    """Of one value for all legs."""
+    per_leg: bool
+    """Whether it may be one value a leg."""
+    follows: Follows
 
 
 def _meaning(field: dataclasses.Field) -> str:
@@ -115,6 +135,7 @@ def parameter(
     kind: ParameterKind = "smooth",
     scale: Scale = "linear",
     above: str | None = None,
+    follows: Follows | None = None,
     per_leg: bool | None = None,
 ) -> Declared:
     """Declares a float field of a rule: one number for all legs, or one a leg.
@@ -128,10 +149,13 @@ def parameter(
         kind: "threshold" if it moves a hard decision, so that its derivative there is zero.
         scale: how a fit steps: "linear", by factors ("log"), or as the half-life of a "gain".
         above: the field of the same rule that it stays above, if any.
+        follows: what of a body it changes with, see `jaxik.world.body`; None takes that from the
+            unit: lengths follow that of the legs, speeds its root, all else nothing.
         per_leg: whether it may be one number a leg; None leaves that to the rule's `per_leg`, which
             is False in stages that move the whole body.
     """
-    declaration = Declaration(unit, low, high, kind, scale, above, doc)
+    follows = BY_UNIT.get(unit, "nothing") if follows is None else follows
+    declaration = Declaration(unit, low, high, kind, scale, above, doc, follows)
     metadata = {"declaration": declaration, "unit": unit, "doc": doc, "per_leg": per_leg}
     return _field(default, as_float_array, metadata)
 
@@ -192,20 +216,27 @@ def check_shapes(module: eqx.Module, legs: int) -> None:
     Raises:
         ValueError: naming the field, its shape, and the shapes that it may have.
     """
+    for slot in slots(module):
+        shape, single = np.shape(slot.value), slot.shape
+        if shape == single or (slot.per_leg and shape == (legs, *single)):
+            continue
+        wanted = f"{single}, the same for all legs"
+        if slot.per_leg:
+            wanted += f", or {(legs, *single)}, one per leg"
+        raise ValueError(f"{slot.name} has shape {shape}, wanted {wanted}")
+
+
+def slots(module: eqx.Module) -> Iterator[Slot]:
+    """Every declared field of a rule or of a tree of rules."""
     for name, owner, field in _fields(module):
         if "shape" not in field.metadata:  # a field that was not declared by the functions above
             continue
-        single: tuple[int, ...] = field.metadata["shape"]
         per_leg = field.metadata.get("per_leg")
         if per_leg is None:
             per_leg = getattr(owner, "per_leg", True)
-        shape = np.shape(getattr(owner, field.name))
-        if shape == single or (per_leg and shape == (legs, *single)):
-            continue
-        wanted = f"{single}, the same for all legs"
-        if per_leg:
-            wanted += f", or {(legs, *single)}, one per leg"
-        raise ValueError(f"{name} has shape {shape}, wanted {wanted}")
+        declaration = field.metadata.get("declaration")
+        follows = "nothing" if declaration is None else declaration.follows
+        yield Slot(name, getattr(owner, field.name), field.metadata["shape"], per_leg, follows)
 
 
 def _fields(

@@ -52,6 +52,7 @@ class HeightContact(AbstractInstantContact):
     planted_height: Leaf = parameter(
         0.10,
         unit="m",
+        follows="over ankle height",
         low=0.0,
         high=0.4,
         kind="threshold",
@@ -60,6 +61,7 @@ class HeightContact(AbstractInstantContact):
     raised_height: Leaf = parameter(
         0.16,
         unit="m",
+        follows="over ankle height",
         low=0.0,
         high=0.6,
         kind="threshold",
@@ -146,6 +148,7 @@ class SpeedContact(AbstractContact):
     planted_height: Leaf = parameter(
         0.075,
         unit="m",
+        follows="over ball height",
         low=0.0,
         high=0.4,
         kind="threshold",
@@ -154,6 +157,7 @@ class SpeedContact(AbstractContact):
     raised_height: Leaf = parameter(
         0.10,
         unit="m",
+        follows="over ball height",
         low=0.0,
         high=0.6,
         kind="threshold",

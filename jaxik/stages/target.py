@@ -75,7 +75,12 @@ class SlopeTarget(AbstractTarget):
         0.55, unit="m", low=0.0, high=1.5, doc="Highest height of the ankle in model space."
     )
     foot_height: Leaf = parameter(
-        0.08, unit="m", low=0.0, high=0.2, doc="Height of the ankle above the sole."
+        0.08,
+        unit="m",
+        follows="ankle height",
+        low=0.0,
+        high=0.2,
+        doc="Height of the ankle above the sole.",
     )
     max_slope: Leaf = parameter(
         1.0471975512,
@@ -141,7 +146,12 @@ class SoleTarget(AbstractInstantTarget):
     """
 
     foot_height: Leaf = parameter(
-        0.12, unit="m", low=0.0, high=0.2, doc="Height of the ankle above the sole."
+        0.12,
+        unit="m",
+        follows="ankle height",
+        low=0.0,
+        high=0.2,
+        doc="Height of the ankle above the sole.",
     )
     max_slope: Leaf = parameter(
         1.5,
@@ -169,6 +179,7 @@ class ContactTarget(AbstractInstantTarget):
     foot_height: Leaf = parameter(
         0.10,
         unit="m",
+        follows="ankle height",
         low=0.0,
         high=0.2,
         doc="Height of the ankle above the ground, on slopes too.",

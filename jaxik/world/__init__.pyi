@@ -1,4 +1,5 @@
 from . import arguments as arguments
+from . import body as body
 from . import cells as cells
 from . import frame as frame
 from . import grid as grid

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -43,12 +44,6 @@ def measure(
 # Soles and ground
 
 
-def test_depths_of_soles_are_the_heights_of_the_joints_in_a_flat_stance():
-    walk = stair_walk(flat)
-    np.testing.assert_allclose(measures.sole_depths(walk), [[0.05, 0.0]] * 2, atol=1e-12)
-    np.testing.assert_allclose(measures.sole_depths(walk, -0.02), [[0.07, 0.02]] * 2, atol=1e-12)
-
-
 def test_soles_rotate_with_the_foot():
     walk = stair_walk(flat)
     tilt = Rotation.from_rotvec([0.3, 0.0, 0.0])
@@ -56,8 +51,9 @@ def test_soles_rotate_with_the_foot():
     for joints in walk.rig.joints:
         foot = Rotation.from_quat(rotations[:, joints[2]], scalar_first=True)
         rotations[:, joints[2]] = (tilt * foot).as_quat(scalar_first=True)
-    depths = np.array([[0.05, 0.01]] * 2)
-    soles = measures.soles(walk.with_motion(walk.positions_ws, rotations), depths)
+    rig = dataclasses.replace(walk.measured_rig, ball_height=jnp.full(2, 0.01))
+    walk = dataclasses.replace(walk, measured_rig=rig)
+    soles = measures.soles(walk.with_motion(walk.positions_ws, rotations))
     up = tilt.apply([0.0, 1.0, 0.0])
     np.testing.assert_allclose(soles[:, :, 0], walk.joints_ws(2) - 0.05 * up, atol=1e-6)
     np.testing.assert_allclose(soles[:, :, 1], walk.joints_ws(3) - 0.01 * up, atol=1e-6)
@@ -72,7 +68,7 @@ def test_the_gap_of_a_sole_is_that_of_its_lower_point():
 
 def measure_on_floor(clip: Clip, walk: Clip) -> Measures:
     """Measures of a clip on the floor of the walk from which it was made."""
-    soles = measures.soles(clip, measures.sole_depths(walk))
+    soles = measures.soles(clip)
     still = standing(walk.frame_count)
     return measure(still, gap=measures.gaps(soles, 0 * soles[..., 1]), stance=walk.stance_labels())
 

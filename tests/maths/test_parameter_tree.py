@@ -80,7 +80,7 @@ def test_declarations_list_the_parameters_in_order_and_nothing_else():
     lift = ["lift.height", "lift.top", "lift.gain", "lift.half_life"]
     assert list(declarations) == [*lift, "max_angle", "speed"]
     assert declarations["lift.height"] == parameter_tree.Declaration(
-        "m", 0.0, 0.5, "smooth", "linear", None, "Height of the foot."
+        "m", 0.0, 0.5, "smooth", "linear", None, "Height of the foot.", "leg length"
     )
     top = declarations["lift.top"]
     assert (top.unit, top.low, top.high) == ("m", 0.0, 1.0)

@@ -215,11 +215,12 @@ def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):
     monkeypatch.setattr(Animation, "solve", lift)
     path = tmp_path / "mine.toml"
     path.write_text("leg.soften = 0.9\n[rules]\npelvis = 'CapsulePelvis'\n[pelvis]\nspeed = 4.0\n")
-    source = translation.load_named_system("ozz", "--from")
-    target = translation.load_named_system(str(path), "--to")
     clip = ROOT / "data" / "clips" / "uneven_walk_base.npz"
     ground = ROOT / "data" / "terrains" / "uneven_walk.ply"
     files = AnimationFiles(clip, ground)
+    source, target = (
+        translation.load_named_system(text, rig=files.flat_clip.rig) for text in ("ozz", str(path))
+    )
     request = translation.TranslationRequest(source, target, (files,), {"pelvis.speed": {}}, 5.0)
     prepared = translation.prepare(request, tmp_path / "run")
     assert prepared.experiment.rules == {"pelvis": "CapsulePelvis"}

@@ -143,7 +143,8 @@ def measure_soles(
             rise = max(np.median(above[:, 0] - balls), 0.0)
             ankle_height, ball_height = USUAL_BALL * foot + rise, USUAL_BALL * foot
         heights.append([max(ankle_height, 0.0), max(ball_height, 0.0)])
-    return SoleHeights(*np.array(heights).T, np.array(measured))
+    ankle, ball = np.array(heights).T
+    return SoleHeights(ankle, ball, np.array(measured))
 
 
 def left_directions(

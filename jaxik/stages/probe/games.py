@@ -165,6 +165,7 @@ class CornerProbe(AbstractProbe):
     stable_height: Leaf = parameter(
         0.12,
         unit="m",
+        follows="over ankle height",
         low=0.0,
         high=0.5,
         kind="threshold",

@@ -119,11 +119,17 @@ class StrideProbe(AbstractProbe):
         0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
     )
     ball_height: Leaf = parameter(
-        0.055, unit="m", low=0.0, high=0.15, doc="Height of the ball joint above the sole."
+        0.055,
+        unit="m",
+        follows="ball height",
+        low=0.0,
+        high=0.15,
+        doc="Height of the ball joint above the sole.",
     )
     stance_time: Leaf = parameter(
         0.65,
         unit="s",
+        follows="time",
         low=0.2,
         high=1.5,
         doc="How long a foot stands, where the animation does not give its footholds.",
@@ -131,6 +137,7 @@ class StrideProbe(AbstractProbe):
     swing_time: Leaf = parameter(
         0.45,
         unit="s",
+        follows="time",
         low=0.1,
         high=1.0,
         doc="How long a foot swings, where the animation does not give its footholds.",
