@@ -37,7 +37,7 @@ def record(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=KeepRoot(),
-        probe=FootProbe(),
+        probe=FootProbe(limited=False),
         contact=HeightContact(),
         target=SlopeTarget(),
         lean=SlopeLean(),
@@ -137,7 +137,7 @@ def stride(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=KeepRoot(),
-        probe=StrideProbe(),
+        probe=StrideProbe(max_step_up=0.6, max_step_down=0.6, max_slope=1.05),
         contact=LabelContact(),
         target=SlopeTarget(max_ankle_height=0.8),
         lean=SpineLean(),

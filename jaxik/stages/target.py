@@ -108,9 +108,8 @@ class SlopeTarget(AbstractTarget):
         frame, gate = inputs.frame, inputs.gate
         ankle_height = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
         standing = hit.point + vec.scale(up_ws, ankle_height - self.foot_height)
-        point_ws = gate.choose(
-            hit.found[..., None], standing, _below(animated_ankles(frame).pos, up_ws, contact.lift)
-        )
+        without_ground = _below(animated_ankles(frame).pos, up_ws, contact.lift)
+        point_ws = smoothing.lerp(without_ground, standing, hit.found[..., None])
         return foothold(frame, up_ws, point_ws, contact.lift, hit.found)
 
     def advance(
@@ -166,7 +165,7 @@ class SoleTarget(AbstractInstantTarget):
         hit = ground.ankle
         lift = slope_height(self.foot_height, self.max_slope, hit.normal, up_ws, gate)
         without_ground = _below(animated_ankles(frame).pos, up_ws, lift)
-        point_ws = gate.choose(hit.found[..., None], hit.point, without_ground)
+        point_ws = smoothing.lerp(without_ground, hit.point, hit.found[..., None])
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 
@@ -186,11 +185,11 @@ class ContactTarget(AbstractInstantTarget):
     )
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
-        frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
+        frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
         hit = ground.ankle
         lift = jnp.broadcast_to(self.foot_height, hit.found.shape)
         without_ground = _below(animated_ankles(frame).pos, up_ws, lift)
-        point_ws = gate.choose(hit.found[..., None], hit.point, without_ground)
+        point_ws = smoothing.lerp(without_ground, hit.point, hit.found[..., None])
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 
@@ -211,13 +210,13 @@ class RootTarget(AbstractInstantTarget):
         return jnp.zeros_like(self.adjust)
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
-        frame, gate, up_ws = inputs.frame, inputs.gate, inputs.terrain.leg_up_ws
+        frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
         hit, ankle_ws = ground.ankle, animated_ankles(frame).pos
         height_above_root = vec.dot(ankle_ws - frame.world_from_model.pos, up_ws)
         standing = contact.weight * hit.found
         lift = height_above_root + standing * self.adjust
         without_ground = _below(ankle_ws, up_ws, height_above_root)
-        point_ws = gate.choose(standing[..., None], hit.point, without_ground)
+        point_ws = smoothing.lerp(without_ground, hit.point, standing[..., None])
         return foothold(frame, up_ws, point_ws, lift, hit.found)
 
 

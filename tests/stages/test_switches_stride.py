@@ -69,7 +69,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.rise_start", "comes down", STEP_UP, (0.0, 0.3), "target height", -1),
         Case("probe.rise_end", "comes down", STEP_UP, (0.8, 1.0), "target height", -1),
         Case("probe.steepness", "comes down", STEP_UP, (1.0, 2.0), "target height", 1),
-        Case("probe.max_step", "comes down", STEP_UP, (0.25, 0.3), "target height", 1),
+        Case("probe.max_step_up", "comes down", STEP_UP, (0.25, 0.3), "target height", 1),
         Case("probe.max_slope", "comes down", UPHILL, (0.3, 0.36), "target height", 1),
         Case("probe.clearance", "lifts off", STEP_UP, (0.0, 0.05), "target height", 1, WIDE),
         Case("probe.way_slope", "lifts off", STEP_UP, (0.5, 1.0), "target height", -1),

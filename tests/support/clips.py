@@ -147,8 +147,13 @@ BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
 
 
 def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
-    """The preset or blend with this name, with some values replaced."""
-    return parameter_tree.replace((BLENDS.get(preset) or getattr(jaxik.presets, preset))(), values)
+    """The preset or blend with this name, with some values replaced.
+
+    Its probe refuses no ground, as in the originals; `tests/stages/test_limits.py` is about that.
+    """
+    ik = (BLENDS.get(preset) or getattr(jaxik.presets, preset))()
+    probe = dataclasses.replace(ik.probe, limited=False)
+    return parameter_tree.replace(dataclasses.replace(ik, probe=probe), values)
 
 
 def to_terrain(ground: PlainTerrain) -> terrain.Terrain:

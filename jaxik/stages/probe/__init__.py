@@ -1,7 +1,8 @@
 """Stage 3: rays that find the ground under each foot.
 
-`base` has the abstract rule and what all share, `games` the rules of ozz, Unreal, Mec and the
-record, `stride` the one that looks ahead to the next foothold.
+`base` has the abstract rule and what all share, `limits` decides which ground is refused, `games`
+has the rules of ozz, Unreal, Mec and the record, `stride` the one that looks ahead to the next
+foothold. To write a rule, start with `base.AbstractProbe`, or with `limits.AbstractLimitedProbe`.
 """
 
 from .base import AbstractProbe as AbstractProbe
@@ -12,4 +13,5 @@ from .base import toe_point as toe_point
 from .games import CornerProbe as CornerProbe
 from .games import FootProbe as FootProbe
 from .games import RootProbe as RootProbe
+from .limits import AbstractLimitedProbe as AbstractLimitedProbe
 from .stride import StrideProbe as StrideProbe

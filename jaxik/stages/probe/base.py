@@ -2,19 +2,18 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxik.maths import quat, vec
-from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Rule
+from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
+from jaxik.world.terrain import Hit
 
 
 class AbstractProbe(Rule):
@@ -25,12 +24,9 @@ class AbstractProbe(Rule):
         """The ground under each leg in this frame; `foot_height` is from sole to ankle, m."""
 
 
-def cast_each(
-    terrain: Terrain | LegTerrains, starts_ws: Sequence[Array], reach: Array, mask: Array
-) -> list[Hit]:
-    """The hits of several rays per leg, by one search: each search adds much to a program."""
-    hits = cast(terrain, jnp.stack(starts_ws), reach, mask)
-    return [jax.tree.map(lambda x: x[i], hits) for i in range(len(starts_ws))]  # noqa: B023
+def separate(hits: Hit) -> list[Hit]:
+    """Hits along their first axis."""
+    return [jax.tree.map(lambda x: x[i], hits) for i in range(len(hits.found))]  # noqa: B023
 
 
 def toe_point(rig: Rig, frame: Frame, toe_ls: Array) -> Array:
@@ -65,10 +61,10 @@ def no_hit(like: Hit) -> Hit:
     return with_weight(like, jnp.zeros_like(like.found))
 
 
-def or_level(hit: Hit, found: Array, level_ws: Array, gate: AbstractGate) -> Hit:
+def or_level(hit: Hit, found: Array, level_ws: Array) -> Hit:
     """The hit where its foot was `found` too; else a miss at `level_ws`, level with the foot."""
     weight = hit.found * found
-    point = gate.choose(weight[..., None], hit.point, level_ws)
+    point = lerp(level_ws, hit.point, weight[..., None])
     return Hit(point, hit.normal, hit.distance, weight, hit.platform)
 
 

@@ -5,27 +5,28 @@ from jaxtyping import Array
 
 from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, animated_ankles
-from jaxik.world.terrain import Hit, cast
+from jaxik.world.terrain import Hit
 
 from .base import (
-    AbstractProbe,
-    cast_each,
     foot_heading,
     make_rays,
     no_hit,
     or_level,
+    separate,
     toe_point,
     with_weight,
 )
+from .limits import AbstractLimitedProbe
 
 HEIGHT_BAND = 0.01  # m
 SPEED_BAND = 0.05  # m/s
 MARGIN = 0.1  # m that rays are cast too far, so that a softened reach has ground on both sides
 
 
-class FootProbe(AbstractProbe):
+class FootProbe(AbstractLimitedProbe):
     """One ray at the ankle and, with `use_toe`, one at the toe (the record; ozz has no toe ray)."""
 
     ray_up: Leaf = parameter(
@@ -62,13 +63,14 @@ class FootProbe(AbstractProbe):
         above = vec.scale(terrain.leg_up_ws, self.ray_up)
         ankle_ws = animated_ankles(frame).pos
         toe_ws = frame.world_from_model.apply(toe_point(inputs.rig, frame, self.toe_ls))
-        ankle, toe = cast_each(terrain, (ankle_ws + above, toe_ws + above), reach, self.layers)
+        starts = (ankle_ws + above, toe_ws + above)
+        ankle, toe = separate(self.cast(inputs, jnp.stack(starts), reach, self.layers))
         toe = with_weight(toe, jnp.where(self.use_toe, toe.found, 0.0))
         rays = make_rays(ankle, self.ray_up, self.ray_down, self.layers)
         return GroundHits(ankle, toe, no_hit(ankle), jnp.zeros_like(ankle.found), rays)
 
 
-class RootProbe(AbstractProbe):
+class RootProbe(AbstractLimitedProbe):
     """One vertical ray through each ankle, between two heights relative to the root.
 
     This is the trace of Unreal's foot IK: it starts at the height of the capsule's centre, `ray_up`
@@ -98,12 +100,12 @@ class RootProbe(AbstractProbe):
         up, ankle_ws = terrain.leg_up_ws, animated_ankles(frame).pos
         over_root = vec.dot(ankle_ws - frame.world_from_model.pos, up)
         start = ankle_ws + vec.scale(up, self.ray_up - over_root)
-        hit = cast(terrain, start, self.ray_up + self.ray_down, self.layers)
+        hit = self.cast(inputs, start, self.ray_up + self.ray_down, self.layers)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.zeros_like(hit.found), rays)
 
 
-class CornerProbe(AbstractProbe):
+class CornerProbe(AbstractLimitedProbe):
     """Three rays: at the foot, ahead of it for pitch, and to its right for roll (Mec).
 
     The rays for toe and corner start from where the first ray placed the foot, in the directions of
@@ -189,7 +191,7 @@ class CornerProbe(AbstractProbe):
 
         def hits_below(*points_ws: Array) -> list[Hit]:
             starts = [point + vec.scale(up, self.ray_up) for point in points_ws]
-            hits = cast_each(inputs.terrain, starts, reach + MARGIN, self.layers)
+            hits = separate(self.cast(inputs, jnp.stack(starts), reach + MARGIN, self.layers))
             near = (gate.below(hit.distance, reach, band=HEIGHT_BAND) for hit in hits)
             return [
                 with_weight(hit, hit.found * weight) for hit, weight in zip(hits, near, strict=True)
@@ -197,14 +199,13 @@ class CornerProbe(AbstractProbe):
 
         (ankle,) = hits_below(foot.pos)
         ankle = with_weight(ankle, jnp.where(self.active, ankle.found, 0.0))
-        sole = gate.choose(
-            ankle.found[..., None], ankle.point, foot.pos - vec.scale(up, foot_height)
-        )
+        level = foot.pos - vec.scale(up, foot_height)
+        sole = lerp(level, ankle.point, ankle.found[..., None])
         ahead, right = foot_heading(inputs, up)
         over = sole + vec.scale(up, foot_height)
         sides = (vec.scale(ahead, self.foot_length), vec.scale(right, self.half_width))
         toe, corner = (
-            or_level(hit, ankle.found, sole + offset, gate)
+            or_level(hit, ankle.found, sole + offset)
             for hit, offset in zip(
                 hits_below(*(over + offset for offset in sides)), sides, strict=True
             )

@@ -1,28 +1,33 @@
 """A probe that looks ahead: the ground between the last and the next foothold of each foot."""
 
-import functools
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths.smoothing import lerp
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
-from jaxik.world.terrain import Hit, LegTerrains, Terrain, cast
+from jaxik.world.terrain import Hit
 
-from .base import AbstractProbe, make_rays, no_hit
+from .base import make_rays, no_hit
+from .limits import (
+    STEP_FADE,
+    AbstractLimitedProbe,
+    climb,
+    clip_to_one,
+    least_rise,
+    smoothstep,
+)
 
 HEIGHT_BAND = 0.01  # m
-STEP_FADE = 0.10  # m, over which a step becomes too high
-SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
 PATH_RAYS = 8  # between two footholds
 ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
 FAR_BELOW = -1e6  # m, below any ground
 
 
-class StrideProbe(AbstractProbe):
+class StrideProbe(AbstractLimitedProbe):
     """Rays at the last and at the next foothold, joined by a smooth curve.
 
     A swinging foot leaves the ground of its last foothold and arrives on that of its next, so the
@@ -40,11 +45,11 @@ class StrideProbe(AbstractProbe):
     character's velocity: feet stand for `stance_time` and swing for `swing_time`, from as far ahead
     of the hip to as far behind it (Raibert 1986).
 
-    A next foothold more than `max_step` above or below the slope of the last, or on ground steeper
-    than `max_slope`, counts less and less, so that a foot neither drops off a ledge nor snaps onto
-    a wall. Rays along the path lift the foot over edges up to `max_step` high, on slopes of
-    `way_slope` before and after each edge. Where the ground is above the curve, heel and ball clear
-    it by as much as the animation lifts them, less `clearance`.
+    A next foothold more than `max_step_up` above or `max_step_down` below the slope of the last, or
+    on ground steeper than `max_slope`, counts less and less, so that a foot neither drops off a
+    ledge nor snaps onto a wall. Rays along the path lift the foot over edges up to `max_step_up`
+    high, on slopes of `way_slope` before and after each edge. Where the ground is above the curve,
+    heel and ball clear it by as much as the animation lifts them, less `clearance`.
     """
 
     ray_up: Leaf = parameter(
@@ -85,20 +90,6 @@ class StrideProbe(AbstractProbe):
         low=1.0,
         high=4.0,
         doc="How much faster than evenly the height changes in the middle of the swing.",
-    )
-    max_step: Leaf = parameter(
-        0.60,
-        unit="m",
-        low=0.1,
-        high=1.0,
-        doc="Height of a step, not of a slope, above which the next foothold is ignored.",
-    )
-    max_slope: Leaf = parameter(
-        1.05,
-        unit="rad",
-        low=0.1,
-        high=1.4,
-        doc="Slope of the ground above which the next foothold is ignored.",
     )
     clearance: Leaf = parameter(
         0.0,
@@ -147,17 +138,18 @@ class StrideProbe(AbstractProbe):
         terrain, frame = inputs.terrain, inputs.frame
         level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
         stride = self._stride(inputs, contact, level)
-        last, low = self._ground_at(terrain, level, stride.last_ws)
-        next_, high = self._ground_at(terrain, level, stride.next_ws)
+        last, low = self._ground_at(inputs, level, stride.last_ws)
+        next_, high = self._ground_at(inputs, level, stride.next_ws)
         found = jnp.where(last.found > next_.found, last.found, next_.found)
-        low = jnp.where(last.found > 0, low, jnp.where(next_.found > 0, high, 0.0))
-        normal = jnp.where(last.found[..., None] > 0, last.normal, next_.normal)
+        # Without a last foothold, the ground is that of the next, or without that the root's level.
+        low = lerp(next_.found * high, low, last.found)
+        normal = lerp(next_.normal, last.normal, last.found[..., None])
 
         way = vec.reject(stride.next_ws - stride.last_ws, level.up_ws)
         climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
-        trust = next_.found * self._trust(next_.normal, step, level)
+        trust = next_.found * self.trust(step, next_.normal, level.up_ws)
 
         since_start = stride.fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
@@ -209,33 +201,18 @@ class StrideProbe(AbstractProbe):
         fraction = jnp.where(known, labelled.fraction, fraction)
         return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known)
 
-    def _ground_at(
-        self, terrain: Terrain | LegTerrains, level: "Level", points_ws: Array
-    ) -> tuple[Hit, Array]:
+    def _ground_at(self, inputs: Inputs, level: "Level", points_ws: Array) -> tuple[Hit, Array]:
         """The ground above or below these points, and its height over the level, m."""
         above = level.project(points_ws) + vec.scale(level.up_ws, self.ray_up)
-        hit = cast(terrain, above, self.ray_up + self.ray_down, self.layers)
+        hit = self.cast(inputs, above, self.ray_up + self.ray_down, self.layers)
         return hit, level.height(hit.point)
-
-    def _trust(self, normal: Array, step: Array, level: "Level") -> Array:
-        """0..1, how much a step of this height, m, to ground with this normal counts."""
-        low_enough = 1.0 - smoothstep((jnp.abs(step) - self.max_step) / STEP_FADE)
-        return low_enough * self._gentleness(normal, level)
 
     def _climb(self, normal: Array, way: Array, level: "Level") -> Array:
         """How much higher ground with this normal is at the end of a way than at its start, m.
 
         Ground that is too steep counts as level: a foot is not to follow a wall.
         """
-        against = vec.dot(vec.reject(way, level.up_ws), normal)
-        climb = -vec.safe_divide(against, vec.dot(normal, level.up_ws))
-        return climb * self._gentleness(normal, level)
-
-    def _gentleness(self, normal: Array, level: "Level") -> Array:
-        """0..1, how much ground with this normal counts: less if it is too steep."""
-        cosine = vec.dot(normal, level.up_ws)
-        slope = vec.safe_arctan2(vec.length(vec.cross(normal, level.up_ws)), cosine)
-        return 1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE)
+        return climb(normal, way, level.up_ws) * self.gentleness(normal, level.up_ws)
 
     def _soles(self, inputs: Inputs, level: "Level", foot_height: Array) -> Array:
         """Animated heels and balls at sole height, (2 legs 3), m, world space."""
@@ -254,14 +231,14 @@ class StrideProbe(AbstractProbe):
 
         `under_soles` is the height of the ground that each sole was lifted from, m.
         """
-        terrain, gate = inputs.terrain, inputs.gate
-        level = Level(inputs.frame.world_from_model.pos, terrain.leg_up_ws)
+        gate = inputs.gate
+        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
         fractions = (jnp.arange(PATH_RAYS, dtype=top.dtype) + 0.5) / PATH_RAYS
         path_ws = stride.last_ws + vec.scale(
             stride.next_ws - stride.last_ws, fractions[:, None]
         )  # (rays legs 3)
-        hit, ground = self._ground_at(terrain, level, path_ws)
-        fade = 1.0 - smoothstep((ground - top - self.max_step) / STEP_FADE)
+        hit, ground = self._ground_at(inputs, level, path_ws)
+        fade = 1.0 - smoothstep((ground - top - self.max_step_up) / STEP_FADE)
         away = vec.length(vec.reject(path_ws[:, None] - soles, level.up_ws))  # (rays 2 legs)
         excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
         # A sole that the animation sinks into its own floor needs no correction.
@@ -299,22 +276,3 @@ def s_curve(fraction: Array, steepness: Array) -> Array:
     x = jnp.where(inside, fraction, 0.5)
     odds = jnp.exp(steepness * (jnp.log1p(-x) - jnp.log(x)))
     return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(fraction < 0.5, 0.0, 1.0))
-
-
-def least_rise(*rises: Array) -> Array:
-    """The rise nearest to 0, or 0 if some go up and others down, m."""
-    # Not `jnp.minimum`: on a plane all are equal, and its derivative would add up several of them.
-    lowest = functools.reduce(lambda a, b: jnp.where(a < b, a, b), rises)
-    highest = functools.reduce(lambda a, b: jnp.where(a > b, a, b), rises)
-    return jnp.where(lowest > 0, lowest, jnp.where(highest < 0, highest, 0.0))
-
-
-def smoothstep(x: Array) -> Array:
-    """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
-    x = clip_to_one(x)
-    return x * x * (3.0 - 2.0 * x)
-
-
-def clip_to_one(x: Array) -> Array:
-    """`x` limited to 0..1, with zero gradient outside."""
-    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))

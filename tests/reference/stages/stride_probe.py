@@ -3,7 +3,6 @@
 One leg, one frame at a time. World space; heights are above the root along the up of the leg, m.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,10 +10,10 @@ import numpy as np
 
 from reference.characters import Frame, Ground, Parameters, Rig, world_from_foot
 from reference.maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
+from reference.stages.limits import FADE, gentle, low_enough
 from reference.terrain import Hit
 
 PATH_POINTS = 8
-FADE = 0.10  # m or rad beyond a limit over which a reading fades out
 EDGE_FRACTION = 0.15  # of the swing's time at either end, over which the path fades out
 
 
@@ -90,9 +89,7 @@ def ground_of_stride(
     climbs = [climb(parameters, leg, up, hit.normal, across_ws) for hit in (last, following)]
     slope = shared_rise(high - low, *climbs)
     step = high - low - slope
-    max_step = parameters.of_leg("probe.max_step", leg)
-    too_high = smooth01((abs(step) - max_step) / FADE)
-    sure = (1.0 - too_high) * gentle(parameters, leg, up, following.normal)
+    sure = low_enough(parameters, leg, step) * gentle(parameters, leg, up, following.normal)
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
 
@@ -129,12 +126,6 @@ def climb(parameters: Parameters, leg: int, up: Array, normal: Array, moved: Arr
         return 0.0
     rise = -float(across(moved, up) @ normal) / facing
     return rise * gentle(parameters, leg, up, normal)
-
-
-def gentle(parameters: Parameters, leg: int, up: Array, normal: Array) -> float:
-    """1 for a slope that counts, 0 for one that is too steep."""
-    steepness = math.acos(clip(float(normal @ up), -1.0, 1.0))
-    return 1.0 - smooth01((steepness - parameters.of_leg("probe.max_slope", leg)) / FADE)
 
 
 def shared_rise(*rises: float) -> float:
@@ -177,7 +168,7 @@ def lift_over_edges(
         if not hit.found:
             continue
         edge = height(frame, up, hit.point)
-        beyond = edge - top - parameters.of_leg("probe.max_step", leg)
+        beyond = edge - top - parameters.of_leg("probe.max_step_up", leg)
         counts = 1.0 - smooth01(beyond / FADE)
         for point in (heel, ball):
             away = length(across(point - pos, up))

@@ -1,0 +1,140 @@
+"""Which ground a foot may stand on: neither too high, nor too low, nor too steep."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import vec
+from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths.smoothing import lerp
+from jaxik.stages.inputs import Inputs
+from jaxik.world.terrain import Hit, cast
+
+from .base import AbstractProbe
+
+STEP_FADE = 0.10  # m, over which a step becomes too high or too low
+SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
+SAME_GROUND = 1e-3  # m, between hits of one surface at most
+
+
+class AbstractLimitedProbe(AbstractProbe):
+    """Rays that refuse ground which is too high, too low or too steep.
+
+    Steps are measured from the level of the character's root, and only by what is not a slope: of
+    ground that rises evenly from below the root nothing is a step. Where the highest ground below a
+    ray is refused, that below the highest step counts, such as the floor under a table. Where that
+    is refused too, there is no ground, and the foot stays as animated.
+
+    Ground fades out over `STEP_FADE` and `SLOPE_FADE` beyond its limit: `found` falls from 1 to 0.
+    """
+
+    max_step_up: Leaf = parameter(
+        0.30,
+        unit="m",
+        low=0.1,
+        high=1.0,
+        doc="Height of a step up, not of a slope, above which ground is refused.",
+    )
+    max_step_down: Leaf = parameter(
+        0.40,
+        unit="m",
+        low=0.1,
+        high=1.0,
+        doc="Height of a step down, not of a slope, above which ground is refused.",
+    )
+    max_slope: Leaf = parameter(
+        0.785,
+        unit="rad",
+        low=0.1,
+        high=1.5,
+        doc="Slope of the ground above which it is refused.",
+    )
+    limited: bool = eqx.field(default=True, static=True, kw_only=True)
+    """Whether any ground is refused. Static: without limits, no ray is cast for them."""
+
+    def cast(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
+        """The ground below points above the feet; refused ground counts as missed.
+
+        Args:
+            inputs: the frame.
+            starts_ws: where the rays start, (... legs 3), m.
+            reach: their length, m.
+            layers: what they can hit.
+        """
+        terrain, up = inputs.terrain, inputs.terrain.leg_up_ws
+        if not self.limited:
+            return cast(terrain, starts_ws, reach, layers)
+        root = inputs.frame.world_from_model.pos
+        above = vec.dot(starts_ws - root, up) - self.max_step_up
+        above = jnp.where(above > 0, above, 0.0)
+        # Both by one search: each search adds much to a program.
+        hits = cast(
+            terrain,
+            jnp.stack([starts_ws, starts_ws - vec.scale(up, above)]),
+            jnp.stack([reach + jnp.zeros_like(above), reach - above]),
+            layers,
+        )
+        accepted = hits.found * self._trust_from(root, hits, up)
+        first, below = (jax.tree.map(lambda x: x[i], hits) for i in range(2))  # noqa: B023
+        # Ground that is refused for its slope may be hit by both rays.
+        lies_below = below.distance + above > first.distance + SAME_GROUND
+        lower = jnp.where(lies_below, (1.0 - accepted[0]) * accepted[1], 0.0)
+        found = accepted[0] + lower
+        lower = vec.safe_divide(lower, found)
+        platform = first.platform
+        if platform is not None:
+            platform = jnp.where(lower > 0.5, below.platform, platform)
+        return Hit(
+            lerp(first.point, below.point, lower[..., None]),
+            vec.normalize(lerp(first.normal, below.normal, lower[..., None]), up),
+            lerp(first.distance, below.distance + above, lower),
+            found,
+            platform,
+        )
+
+    def trust(self, step: Array, normal: Array, up_ws: Array) -> Array:
+        """0..1, how far ground with this normal is accepted after a step of this height, m."""
+        low_enough = 1.0 - smoothstep((step - self.max_step_up) / STEP_FADE)
+        high_enough = 1.0 - smoothstep((-step - self.max_step_down) / STEP_FADE)
+        return low_enough * high_enough * self.gentleness(normal, up_ws)
+
+    def gentleness(self, normal: Array, up_ws: Array) -> Array:
+        """0..1, how far ground with this normal is accepted: less if it is too steep."""
+        cosine = vec.dot(normal, up_ws)
+        slope = vec.safe_arctan2(vec.length(vec.cross(normal, up_ws)), cosine)
+        return 1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE)
+
+    def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array) -> Array:
+        """0..1, how far each hit is accepted by a character whose root is there."""
+        way = hits.point - root_ws
+        rise = vec.dot(way, up_ws)
+        slope = least_rise(rise, climb(hits.normal, way, up_ws))
+        return self.trust(rise - slope, hits.normal, up_ws)
+
+
+def climb(normal: Array, way: Array, up_ws: Array) -> Float[Array, "*b"]:
+    """How much higher a plane with this normal is at the end of a way than at its start, m."""
+    against = vec.dot(vec.reject(way, up_ws), normal)
+    return -vec.safe_divide(against, vec.dot(normal, up_ws))
+
+
+def least_rise(*rises: Array) -> Array:
+    """The rise nearest to 0, or 0 if some go up and others down, m."""
+    # Not `jnp.minimum`: on a plane all are equal, and its derivative would add up several of them.
+    lowest = functools.reduce(lambda a, b: jnp.where(a < b, a, b), rises)
+    highest = functools.reduce(lambda a, b: jnp.where(a > b, a, b), rises)
+    return jnp.where(lowest > 0, lowest, jnp.where(highest < 0, highest, 0.0))
+
+
+def smoothstep(x: Array) -> Array:
+    """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
+    x = clip_to_one(x)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def clip_to_one(x: Array) -> Array:
+    """`x` limited to 0..1, with zero gradient outside."""
+    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
