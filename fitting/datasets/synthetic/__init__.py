@@ -2,6 +2,8 @@
 
 `walker.walk` makes a human walk on a flat floor, from the curves of a measured walk cycle (`gait`)
 with the feet placed exactly (`footsteps`); it may slip, slide and stop (`speed_profile`).
+`actions` makes a run, a jump, a crouch and a turn, of feet that stand where they are told to
+(`steps`). Both carry a `body` whose bones keep their lengths.
 `multi_limb` makes a quadruped and a climber. `terrain_meshes` makes slopes, steps, rubble and the
 courses of the shipped experiments.
 
