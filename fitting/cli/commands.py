@@ -19,8 +19,9 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context, in_one_line
 from fitting.studies import comparison, translation
 from fitting.studies.animations import AnimationFiles
+from fitting.studies.suite import situations
 from fitting.studies.translation import TranslationRequest
-from jaxik import record
+from jaxik import FootIK, Rig, record
 
 from . import progress
 
@@ -74,8 +75,11 @@ def run(options: argparse.Namespace) -> int:
 
 @in_float64
 def compare(options: argparse.Namespace) -> int:
-    """Runs several systems on a clip and measures them."""
+    """Runs several systems on a clip, or through the suite, and measures them."""
     _prepare_jax()
+    if options.suite:
+        return _compare_in_suite(options)
+    _check_comparison(options)
     animation = _animation(options)
     requested = comparison.named_systems(
         options.systems, animation.flat_clip.rig, on_ground=options.root == "auto"
@@ -215,6 +219,36 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "record": convert_record,
     "cache": cache,
 }
+
+
+def _compare_in_suite(options: argparse.Namespace) -> int:
+    """Runs systems, or else all presets, through made situations."""
+    own = {"CLIP": None, "--terrain": None, "--file-up": "y", "--floor": 0.0, "--root": "auto"}
+    for name, unused in own.items():
+        given = getattr(options, name.strip("-").replace("-", "_").lower())
+        if given != unused:
+            raise ValueError(f"{name} is {given}; the suite has animations and grounds of its own")
+    requested = options.systems or [("--presets", ",".join(systems.preset_names()))]
+    comparison.named_systems(requested)  # reports mistakes before anything runs
+    plan = situations.choose(options.only, quick=options.quick)
+
+    def systems_of(rig: Rig) -> dict[str, FootIK]:
+        return comparison.named_systems(requested, rig)
+
+    finished = jobs.run_suite(
+        systems_of, plan, options.output, during=progress.timed, log=progress.print_marked
+    )
+    return _status(interrupted=finished.interrupted)
+
+
+def _check_comparison(options: argparse.Namespace) -> None:
+    """Raises ValueError for what only the suite takes, or only a comparison on a clip needs."""
+    for name in ("only", "quick"):
+        if getattr(options, name):
+            raise ValueError(f"--{name} belongs to --suite, which is not given")
+    needed = {"CLIP": options.clip, "--terrain": options.terrain, "-o/--output": options.output}
+    if missing := [name for name, given in needed.items() if given is None]:
+        raise ValueError(f"the following are required: {', '.join(missing)}; or --suite")
 
 
 def _prepare_jax() -> None:

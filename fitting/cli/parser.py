@@ -14,6 +14,7 @@ EXAMPLES = """examples:
   jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
   jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --preset record
   jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
+  jaxik compare --suite -o suite                               systems in made situations
   jaxik translate --from mec --to record --clip walk.bvh --terrain steps.obj -o translated
   jaxik inspect walk.bvh
   jaxik terrain walk.bvh -o ground.ply
@@ -22,8 +23,8 @@ EXAMPLES = """examples:
   jaxik cache                                                  where compiled programs are kept
 
 exit status: 0 when done, 2 for a mistake in the input (one line says which), 130 when
-interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` its chain, and
-`ablate` each finished fit.
+interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` its chain,
+`ablate` each finished fit, and `compare --suite` each finished situation.
 `jaxik COMMAND --help` has more examples.
 """
 

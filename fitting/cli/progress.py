@@ -1,5 +1,7 @@
 """Progress on stderr while a command works, and Ctrl-C that is never lost meanwhile."""
 
+import os
+import re
 import signal
 import sys
 import threading
@@ -14,6 +16,7 @@ import numpy as np
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress
 
+MARKED = re.compile(r"\S+!(?=\s|$)")
 Report = TypeVar("Report")
 Handler: TypeAlias = Callable[[int, FrameType | None], object] | int | None  # of a signal
 
@@ -90,6 +93,13 @@ def timed(name: str) -> Iterator[None]:
         result = f"{time.perf_counter() - start:.1f} s"
     finally:
         print(result, file=sys.stderr, flush=True)
+
+
+def print_marked(text: str) -> None:
+    """Prints text on stdout, on a terminal with red where it is marked with exclamation marks."""
+    if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
+        text = MARKED.sub("\033[31m\\g<0>\033[0m", text)
+    print(text, flush=True)
 
 
 def print_line(line: str) -> None:

@@ -55,13 +55,18 @@ FREE_KEYS: dict[str, validation.Constraint] = {
 }
 
 
+def preset_names() -> list[str]:
+    """Names of all presets, sorted."""
+    return sorted(name for name, value in vars(presets).items() if _is_preset(value))
+
+
 def preset_system(name: object, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
     """The system of a preset, for the adult or for the body of a rig.
 
     Raises:
         ValueError: no such preset; the message lists those that there are.
     """
-    known = sorted(n for n, value in vars(presets).items() if _is_preset(value))
+    known = preset_names()
     if name not in known:
         raise ValueError(f"no preset named {name!r}; there are {known}")
     return getattr(presets, str(name))(rig)

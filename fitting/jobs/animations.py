@@ -14,10 +14,14 @@ from fitting.datasets.clips.formats.npz import check_clip_file, is_blocks_file
 from fitting.experiments.parameter_files import load_system
 from fitting.report import comparison_report, fit_tables, placement_report
 from fitting.report.formatting import aligned
+from fitting.report.suite import suite_report
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import comparison, run_folder
 from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.comparison import Comparison
+from fitting.studies.suite import suite
+from fitting.studies.suite.situations import Plan
+from fitting.studies.suite.suite import Suite, SystemsOf
 
 from .output import Log, checked_folder, log_output, silent
 
@@ -57,6 +61,39 @@ def compare(
     for name, (placement, cause) in compared.placements.items():
         placement_report.warn(placement, cause, name)
     return compared
+
+
+@in_float64
+def run_suite(
+    systems_of: SystemsOf,
+    plan: Plan,
+    output: str | Path | None = None,
+    *,
+    during: Callable[[str], AbstractContextManager] = nullcontext,
+    log: Log = silent,
+) -> Suite:
+    """Runs systems through made situations and measures each against stated bounds.
+
+    KeyboardInterrupt (Ctrl-C) ends the suite; the finished situations are written and returned,
+    with `interrupted` set.
+
+    Args:
+        systems_of: makes systems for the body of a rig, by name.
+        plan: which situations; see `studies.suite.situations.choose`.
+        output: folder for the table, the numbers and the page of pictures.
+        during: makes a context for each situation, from its name.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: the folder cannot be made.
+    """
+    folder = checked_folder(output)
+    finished = suite.run_suite(systems_of, plan, during=during)
+    if folder is not None:
+        suite_report.write(folder, finished)
+    log(suite_report.text(finished))
+    log_output(log, folder, suite_report.TABLE)
+    return finished
 
 
 @in_float64

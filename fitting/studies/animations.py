@@ -1,11 +1,13 @@
 """A flat animation on a terrain, and what a system makes of it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float64
 
 import jaxik
 from fitting.analysis import placement
@@ -19,7 +21,7 @@ from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.experiments import systems
 from fitting.runtime import program_cache
 from jaxik.maths import parameter_tree
-from jaxik.world.terrain import Terrain
+from jaxik.world.terrain import Terrain, moving
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,14 @@ class Animation:
     root: RootChoice = AS_ANIMATED
     turned: Callable[[], Terrain] | None = None
     """Loads the terrain with the other axis of its file up."""
+    carried: Float64[np.ndarray, "frames 3"] | None = None
+    """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
         """The clip as the pipeline's input."""
-        return frames_from_clip(self.clip, floor=self.floor, rise=self.root.rise)
+        frames = frames_from_clip(self.clip, floor=self.floor, rise=self.root.rise)
+        return frames if self.carried is None else carried_frames(frames, self.carried)
 
     @cached_property
     def placed_clip(self) -> Clip:
@@ -86,7 +91,8 @@ class Animation:
         """
         if self.root.rise is not None:
             ik = systems.without_own_root(ik)
-        result = program_cache.run(ik, self.clip.rig, self.terrain, self.frames)
+        terrain = self.terrain if self.carried is None else moving(self.terrain, 0)
+        result = program_cache.run(ik, self.clip.rig, terrain, self.frames)
         solved = clip_from_result(self.clip, result, floor=self.floor, rise=self.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite; nothing was written")
@@ -111,3 +117,21 @@ def load_animation(files: AnimationFiles) -> Animation:
     terrain = files.load_terrain()
     clip, root = place_root(files.flat_clip, terrain, files.root, files.floor)
     return Animation(clip, terrain, files.floor, root, files.load_turned_terrain)
+
+
+def carried_frames(frames: jaxik.Frame, carried: Float64[np.ndarray, "frames 3"]) -> jaxik.Frame:
+    """The frames of a character on a vehicle, which is platform 0 and only shifts.
+
+    Args:
+        frames: in the vehicle's space.
+        carried: how far the vehicle has moved in each frame, m.
+    """
+    offsets = jnp.asarray(carried, frames.dt.dtype)
+    upright = jnp.zeros((len(carried), 1, 4), frames.dt.dtype).at[..., 0].set(1.0)
+    stride = replace(
+        frames.stride,
+        last_ws=frames.stride.last_ws + offsets[:, None],
+        next_ws=frames.stride.next_ws + offsets[:, None],
+    )
+    moved = replace(frames.translated(offsets), stride=stride)
+    return moved.with_platforms(jaxik.Transform(offsets[:, None], upright))

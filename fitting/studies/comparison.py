@@ -110,8 +110,7 @@ def compare(
     for name, ik in systems.items():
         with error_context(name), during(name):
             result, clips[name] = animation.solve(ik)
-        grounded = np.asarray(stage_outputs(result).sensed.foothold.found) > 0
-        reached[name] = np.where(grounded, np.asarray(result.reached, np.float64), np.nan)
+        reached[name] = reached_targets(result)
 
     soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
     ground = ground_heights(animation.terrain, soles_ws)
@@ -131,6 +130,12 @@ def compare(
         measures=measured,
         placements={name: animation.assess(clips[name]) for name in systems},
     )
+
+
+def reached_targets(result: jaxik.Result) -> Float64[np.ndarray, "frames legs"]:
+    """Which ankles are at their targets, 1 or 0; NaN without ground under the foot."""
+    grounded = np.asarray(stage_outputs(result).sensed.foothold.found) > 0
+    return np.where(grounded, np.asarray(result.reached, np.float64), np.nan)
 
 
 def ground_heights(

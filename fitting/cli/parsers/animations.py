@@ -42,12 +42,23 @@ def add_compare(commands: Commands) -> None:
         """
         jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
         jaxik compare walk.bvh --terrain steps.obj --presets record --parameters a.toml,b.toml -o ab
+        jaxik compare --suite -o suite                  every preset in every made situation
+        jaxik compare --suite --quick --presets record  a shorter suite, without files
+        jaxik compare --suite --only "stairs up,curb" --presets record --parameters a.toml
+
+        The suite has its own animations and grounds, from a flat walk to stairs and a train, and
+        states a bound for every measure; what is beyond it has a !. After Ctrl-C (status 130) the
+        situations that were finished are written.
         """,
     )  # fmt: skip
-    add_animation(compare)
-    add_output(compare, "DIR")
+    add_animation(compare, required=False)
+    compare.add_argument("-o", "--output", type=Path, metavar="DIR", help="needed without --suite")
     for option, description in (("--presets", "of jaxik.presets"), ("--parameters", "TOML files")):
         compare.add_argument(
             option, dest="systems", action="append", default=[], metavar="NAME,...",
             type=lambda text, option=option: (option, text), help=f"{description}, in this order",
         )  # fmt: skip
+    suite = compare.add_argument_group("made situations")
+    suite.add_argument("--suite", action="store_true", help="run them instead of a clip")
+    suite.add_argument("--only", metavar="NAME,...", help="these situations (default: all)")
+    suite.add_argument("--quick", action="store_true", help="fewer situations, shorter clips")

@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 from typing import TypeAlias
 
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Commands: TypeAlias = argparse._SubParsersAction
 
 
 def add_command(
@@ -29,14 +29,18 @@ def add_output(command: argparse.ArgumentParser, metavar: str, description: str 
     )
 
 
-def add_animation(command: argparse.ArgumentParser) -> None:
+def add_animation(command: argparse.ArgumentParser, *, required: bool = True) -> None:
     """Adds a flat animation, its terrain, and how they lie."""
     command.add_argument(
-        "clip", type=Path, metavar="CLIP",
+        "clip", type=Path, metavar="CLIP", nargs=None if required else "?",
         help=".bvh, .amc or .npz over flat ground; for a blocks .npz its flat animation",
     )  # fmt: skip
     command.add_argument(
-        "--terrain", type=Path, required=True, metavar="MESH", help=".ply, .obj, .npz, .glb, ..."
+        "--terrain",
+        type=Path,
+        required=required,
+        metavar="MESH",
+        help=".ply, .obj, .npz, .glb, ...",
     )
     command.add_argument("--file-up", choices=("y", "z"), default="y", help="up axis of the mesh")
     command.add_argument(

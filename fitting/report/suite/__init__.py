@@ -1,0 +1,1 @@
+"""The suite in words, tables and pictures. Start with `suite_report.write`."""

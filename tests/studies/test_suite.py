@@ -1,0 +1,278 @@
+"""The suite: its situations, bounds, table, numbers and page, and what the command rejects."""
+
+import json
+import math
+from contextlib import contextmanager
+
+import jax
+import numpy as np
+import pytest
+
+from fitting import jobs
+from fitting.analysis.placement import Extreme
+from fitting.cli import main, progress
+from fitting.datasets.synthetic import gait
+from fitting.experiments.systems import preset_names, preset_system
+from fitting.report.suite import suite_report, suite_tables
+from fitting.runtime.precision import in_float64
+from fitting.studies.suite import bounds, grounds, situations
+from fitting.studies.suite.bounds import Cell
+from fitting.studies.suite.suite import Suite, run_suite
+from jaxik.maths import parameter_tree
+
+BRIEF = 1.5  # s
+FEW = ("flat walk", "stairs up")
+
+
+def plan(*names: str, seconds: float = BRIEF) -> situations.Plan:
+    return situations.choose(",".join(names))._replace(seconds=seconds)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A folder for compiled programs, which are compiled without optimisations."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+@pytest.fixture(scope="module")
+def still():
+    """The record's system, without any effect."""
+    return parameter_tree.replace(
+        preset_system("record"), {"leg.weight": 0.0, "lock.enabled": False, "pelvis.limit": 0.0}
+    )
+
+
+@pytest.fixture(scope="module")
+def written(still, tmp_path_factory):
+    """A suite of a system without effect and one that fails, and the folder of its report."""
+    folder = tmp_path_factory.mktemp("suite") / "new"
+    failing = parameter_tree.replace(still, {"leg.weight": np.ones(3)})
+    suite = jobs.run_suite(lambda rig: {"still": still, "failing": failing}, plan(*FEW), folder)
+    return suite, folder
+
+
+# Situations
+
+
+def test_all_situations_have_as_many_frames_and_grounds_of_one_structure():
+    structures = set()
+    for situation in situations.SITUATIONS:
+        animation = situation.animation(BRIEF)
+        assert animation.clip.frame_count == round(BRIEF * situations.FPS)
+        leaves, structure = jax.tree.flatten(animation.terrain)
+        structures.add((structure, tuple(leaf.shape for leaf in leaves)))
+    assert len(structures) == 1
+
+
+def test_situations_keep_their_order_and_the_short_form_is_shorter():
+    every, quick = situations.choose(), situations.choose(quick=True)
+    assert every.situations == situations.SITUATIONS
+    assert set(quick.situations) < set(every.situations) and quick.seconds < every.seconds
+    chosen = situations.choose("rubble, hill", quick=True)
+    assert [entry.name for entry in chosen.situations] == ["hill", "rubble"]
+
+
+@pytest.mark.parametrize("tall", [situations.CHILD, situations.GIANT])
+def test_bodies_have_their_size_and_still_feet(tall):
+    clip = situations.walk_of(tall)(3.0)
+    size = tall / situations.ADULT
+    np.testing.assert_allclose(np.asarray(clip.rig.thigh), size * gait.THIGH, rtol=1e-5)
+    standing = clip.stance_labels()[1:] & clip.stance_labels()[:-1]
+    steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1)
+    assert steps[standing].max() < 1e-9
+
+
+def test_stairs_have_their_rises_and_rubble_its_height():
+    x, z = np.zeros(1), np.linspace(0.5, 5.0, 4501)
+    heights = grounds.stairs_up(x, z)
+    assert np.unique(np.round(np.diff(np.unique(heights)), 9)) == pytest.approx([grounds.RISE])
+    assert heights.max() == pytest.approx(grounds.RISE * grounds.STEPS)
+    patch = grounds.rubble(np.linspace(-2, 2, 81), np.linspace(-3, 17, 2001)[:, None])
+    assert grounds.RUBBLE / 2 < np.abs(patch).max() <= grounds.RUBBLE
+    assert np.abs(np.diff(patch, axis=0)).max() < 0.01
+
+
+# Bounds
+
+
+@pytest.mark.parametrize(
+    ("cell", "within"),
+    [
+        (Cell(0.02, 0.02), True),
+        (Cell(0.021, 0.02), False),
+        (Cell(0.95, 0.95, is_least=True), True),
+        (Cell(0.94, 0.95, is_least=True), False),
+        (Cell(math.nan, 0.02), True),
+    ],
+)
+def test_a_cell_is_within_its_bound(cell, within):
+    assert cell.is_within == within
+
+
+@in_float64
+def test_a_flat_floor_allows_the_bare_bounds():
+    situation = situations.SITUATIONS[0]
+    limits = bounds.bounds_of(situation.animation(3.0), is_flat=situation.is_flat)
+    assert limits["slide"] == bounds.FLAT_SLIDE
+    assert limits["pop"] == pytest.approx(bounds.POP, abs=2e-4)  # the ball rises as the foot rolls
+
+
+@in_float64
+def test_a_curb_allows_as_much_as_a_smooth_swing_onto_it_needs():
+    animation = situations.choose("curb").situations[0].animation(3.0)
+    clip = animation.clip
+    onto = []  # the swings that end on the island and began below it
+    for leg, ball in enumerate(np.moveaxis(clip.joints_ws(3), 1, 0)):
+        heights = grounds.curb(ball[:, 0], ball[:, 2])
+        stance = clip.stance_labels()[:, leg]
+        lifts = np.flatnonzero(stance[:-1] & ~stance[1:])
+        for lift in lifts:
+            later = np.flatnonzero(stance[lift + 1 :])
+            if later.size:
+                frames = later[0] + 1
+                onto.append(abs(heights[lift + frames] - heights[lift]) / frames)
+    fastest = 1.875 * max(onto) * 60.0
+    assert fastest > 0.3
+    assert bounds.swing_speed(animation) == pytest.approx(fastest, rel=0.1)
+
+
+# What is run and written
+
+
+def test_a_system_without_effect_is_within_bounds_on_the_flat_and_not_on_stairs(written):
+    suite, _ = written
+    flat, stairs = (scene.outcomes["still"].cells for scene in suite.scenes)
+    missed = [key for key, cell in flat.items() if not cell.is_within]
+    assert missed == ["reach"]  # without weight no target counts as reached
+    assert not stairs["penetration"].is_within
+    assert stairs["slide"].value == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_system_that_fails_is_noted_and_counts_as_beyond_all_bounds(written):
+    suite, folder = written
+    assert all("leg.weight" in scene.failures["failing"] for scene in suite.scenes)
+    within, count = suite.counts
+    assert count == 2 * 2 * len(bounds.REASONS) and within < count / 2
+    assert "no motion: " in (folder / suite_report.TABLE).read_text()
+
+
+def test_the_numbers_are_those_of_the_cells(written):
+    suite, folder = written
+    content = json.loads((folder / suite_report.NUMBERS).read_text())
+    assert [scene["name"] for scene in content["situations"]] == list(FEW)
+    assert (content["within"], content["cells"]) == suite.counts
+    for scene, numbers in zip(suite.scenes, content["situations"], strict=True):
+        assert numbers["bounds"] == pytest.approx(dict(scene.bounds))
+        for key, cell in scene.outcomes["still"].cells.items():
+            entry = numbers["systems"]["still"]["cells"][key]
+            assert entry["within"] == cell.is_within
+            assert entry["value"] == (None if math.isnan(cell.value) else cell.value)
+        assert "leg.weight" in numbers["systems"]["failing"]["failure"]
+
+
+def test_what_is_beyond_its_bound_has_a_mark_and_is_red_in_the_page_and_the_table(written):
+    suite, folder = written
+    table = suite_tables.table(suite)
+    stairs = next(row for row in table if row[1] == "still" and row is not table[2])
+    assert stairs[2].endswith(suite_tables.MISS)
+    text = (folder / suite_report.TABLE).read_text()
+    assert f'<span style="color:red">**{stairs[2]}**</span>' in text
+    assert all(reason in text for reason in bounds.REASONS.values())
+    assert "stairs up, still: in the ground" in text
+    assert (folder / suite_report.PAGE).read_bytes().startswith(b"\x89PNG")
+
+
+def test_misses_say_where_and_how_far():
+    extreme = Extreme(0.123, 45, "left")
+    text = suite_tables._miss("pop", Cell(0.08, 0.02, extreme), "unknown")
+    assert text == "pop 8.0 cm in 1/60 s (≤ 2.0), worst 12.3 cm, left, frame 45"
+    assert suite_tables._miss("reach", Cell(0.5, 0.95, is_least=True), "") == (
+        "reached 50.0 % (≥ 95.0)"
+    )
+
+
+@in_float64
+def test_an_interrupted_suite_keeps_what_is_finished(still, tmp_path):
+    @contextmanager
+    def during(name):
+        if name == FEW[1]:
+            raise KeyboardInterrupt
+        yield
+
+    suite = jobs.run_suite(lambda rig: {"still": still}, plan(*FEW), tmp_path, during=during)
+    assert suite.interrupted and [scene.situation.name for scene in suite.scenes] == [FEW[0]]
+    assert json.loads((tmp_path / suite_report.NUMBERS).read_text())["interrupted"]
+    assert "interrupted after 1 of 2 situations" in (tmp_path / suite_report.TABLE).read_text()
+
+
+@pytest.mark.slow
+@in_float64
+def test_a_train_that_runs_evenly_changes_nothing():
+    train = situations.choose("train").situations[0]
+    alone = situations.choose("flat walk").situations[0]
+    scenes = run_suite(
+        lambda rig: {"record": preset_system("record", rig)}, situations.Plan((alone, train), BRIEF)
+    ).scenes
+    at_rest, carried = (scene.outcomes["record"].clip.positions_ws for scene in scenes)
+    np.testing.assert_allclose(carried, at_rest, rtol=0, atol=1e-6)
+
+
+# The command
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "required: CLIP, --terrain, -o/--output; or --suite"),
+        (["walk.bvh"], "required: --terrain, -o/--output; or --suite"),
+        (["--suite", "walk.bvh"], "CLIP is walk.bvh; the suite has animations and grounds"),
+        (["--suite", "--terrain", "hill.obj"], "--terrain is hill.obj; the suite has"),
+        (["--suite", "--root", "ground"], "--root is ground; the suite has"),
+        (["--suite", "--only", "stairs"], "--only 'stairs': no such situation; there are flat wa"),
+        (["--suite", "--presets", "recrod"], "no preset named 'recrod'; there are"),
+        (["--quick", "walk.bvh"], "--quick belongs to --suite"),
+        (["--only", "hill", "walk.bvh"], "--only belongs to --suite"),
+    ],
+)
+def test_mistakes_are_one_line(words, message, capsys):
+    assert main.main(["compare", *words]) == main.MISTAKE
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_the_command_prints_the_table_whatever_is_in_it(monkeypatch, still, tmp_path, capsys):
+    monkeypatch.setattr(situations, "SHORT", BRIEF)
+    run = jobs.run_suite
+    monkeypatch.setattr(
+        jobs,
+        "run_suite",
+        lambda systems_of, *args, **named: run(lambda rig: {"still": still}, *args, **named),
+    )
+    words = ["compare", "--suite", "--quick", "--only", "stairs up", "-o", str(tmp_path)]
+    assert main.main(words) == 0
+    printed = capsys.readouterr()
+    assert "cells are within their bounds" in printed.out and "stairs up ... " in printed.err
+    assert suite_tables.MISS in printed.out and "\x1b" not in printed.out
+
+
+def test_marks_are_red_on_a_terminal(monkeypatch, capsys):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    progress.print_marked("record  8.2!  3.0")
+    assert capsys.readouterr().out == "record  \x1b[31m8.2!\x1b[0m  3.0\n"
+
+
+def test_all_presets_are_in_the_suite_unless_others_are_named(monkeypatch):
+    names = []
+
+    def run(systems_of, plan, *_, **__):
+        names.extend(systems_of(situations.walk(BRIEF).rig))
+        return Suite(plan, ())
+
+    monkeypatch.setattr(jobs, "run_suite", run)
+    assert main.main(["compare", "--suite"]) == 0
+    assert names == preset_names()
