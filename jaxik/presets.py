@@ -25,6 +25,7 @@ from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, Re
 from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe, StrideProbe
 from jaxik.stages.root import GroundRoot, KeepRoot
 from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
+from jaxik.stages.warp import StrideWarp
 from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
@@ -37,6 +38,7 @@ def record(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=KeepRoot(),
+        warp=StrideWarp(),
         probe=FootProbe(limited=False),
         contact=HeightContact(),
         target=SlopeTarget(),
@@ -63,6 +65,7 @@ def ozz(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=GroundRoot(),
+        warp=StrideWarp(),
         probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False),
         contact=StandingContact(),
         target=SoleTarget(),
@@ -89,6 +92,7 @@ def unreal(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=GroundRoot(enabled=False),
+        warp=StrideWarp(),
         probe=RootProbe(),
         contact=IdleContact(),
         target=RootTarget(),  # pyright: ignore[reportCallIssue]  # its `foot_height` is a property
@@ -111,6 +115,7 @@ def mec(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=GroundRoot(enabled=False),
+        warp=StrideWarp(),
         probe=CornerProbe(),
         contact=StandingContact(),
         target=ContactTarget(),
@@ -137,6 +142,7 @@ def stride(rig: Rig | None = None) -> FootIK:
     """
     ik = FootIK(
         root=KeepRoot(),
+        warp=StrideWarp(),
         probe=StrideProbe(max_step_up=0.6, max_step_down=0.6, max_slope=1.05),
         contact=LabelContact(),
         target=SlopeTarget(max_ankle_height=0.8),

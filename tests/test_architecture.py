@@ -16,7 +16,7 @@ WINGS = {  # in import order: a wing may import those before it
         "report", "jobs", "bench", "cli",
     ],
 }  # fmt: skip
-STAGES = ["inputs", "contact", "root", "probe", "target", "lean", "lock", "pelvis"]
+STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "pelvis"]
 STAGES += ["effector", "leg", "foot"]
 LIBRARIES_OF_JAXIK = {"jax", "equinox", "jaxtyping", "numpy", "lazy_loader"}
 ONLY_IMPORTED_BY = {

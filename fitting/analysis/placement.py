@@ -101,18 +101,20 @@ def soles(solved: Clip, animated: Clip, terrain: Terrain, floor: float = 0.0) ->
     return Soles(points[..., 1] - ground, ground, animated.stance_labels())
 
 
-def assess(feet: Soles, solved: Clip, animated: Clip) -> Placement:
+def assess(feet: Soles, solved: Clip, animated: Clip, own_speed: Clip | None = None) -> Placement:
     """What a viewer sees of the feet of a motion.
 
     Args:
         feet: of the motion.
         solved: the motion.
         animated: the animation from which it was made, with its root where the motion has it.
+        own_speed: the animation with its root at the speed at which it steps, whose slides are not
+            counted; None if it has that speed.
     """
     names, gap, stance = solved.rig.names, feet.gap, feet.stance
     in_ground, above = gap < -VISIBLE, gap > VISIBLE  # false for NaN
     known = ~np.isnan(gap)
-    slides = _slides(solved, stance) - _slides(animated, stance)
+    slides = _slides(solved, stance) - _slides(own_speed or animated, stance)
     stances = slides[~np.isnan(slides)]
     return Placement(
         sunk=_fraction(in_ground, stance & known),

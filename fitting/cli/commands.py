@@ -258,7 +258,12 @@ def _prepare_jax() -> None:
 
 def _animation(options: argparse.Namespace) -> AnimationFiles:
     return AnimationFiles(
-        options.clip, options.terrain, options.file_up, options.floor, options.root
+        options.clip,
+        options.terrain,
+        options.file_up,
+        options.floor,
+        options.root,
+        options.speed,
     )
 
 

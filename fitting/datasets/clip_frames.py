@@ -25,6 +25,7 @@ def frames_from_clip(
     floor: float = 0.0,
     up_ws: Direction = UP,
     rise: Float64[np.ndarray, " frames"] | None = None,
+    stride_scale: float | None = None,
 ) -> jaxik.Frame:
     """The clip as the pipeline's input: one `Frame` whose leaves have a leading frames axis.
 
@@ -37,6 +38,8 @@ def frames_from_clip(
         up_ws: unit normal of that floor; for a climber, the wall's.
         rise: how far the character is raised along it in each frame, m; see `ground_path`. Speeds
             stay those of the animation on its floor.
+        stride_scale: by which strides are to be scaled, where the clip's root is as much faster
+            than its feet step (`clips.edit.at_speed`); None leaves them as animated.
 
     Raises:
         ValueError: the clip has no legs.
@@ -45,9 +48,11 @@ def frames_from_clip(
     pose = _model_from_world(world, clip.leg_pose_ws())
     legs = len(clip.rig.joints)
     dtype = world.pos.dtype
+    balls = clip.joints_ws(3)
+    moved = _scaled_strides(np.asarray(world.pos), balls, up_ws, stride_scale)
     root_velocity, ankle_velocity, toe_velocity = (
         _velocity(positions, clip.fps)
-        for positions in (np.asarray(world.pos), clip.joints_ws(2), clip.joints_ws(3))
+        for positions in (np.asarray(world.pos), clip.joints_ws(2) + moved, balls + moved)
     )
     slide = np.zeros(clip.frame_count) if clip.slide is None else clip.slide
 
@@ -64,10 +69,13 @@ def frames_from_clip(
         velocity_ws=array(root_velocity),
         foot_speed=array(np.linalg.norm(ankle_velocity, axis=-1)),
         toe_speed=array(np.linalg.norm(toe_velocity, axis=-1)),
-        stride=Stride(*map(array, _stride(clip))),
+        stride=Stride(*map(array, _stride(clip, balls + moved))),
         dt=array(np.full(clip.frame_count, 1.0 / clip.fps)),
         platforms=none,
         platforms_before=none,
+        stride_scale=None
+        if stride_scale is None
+        else array(np.full(clip.frame_count, float(stride_scale))),
     )
     return frames if rise is None else frames.translated(array(_along(up_ws, rise)))
 
@@ -109,9 +117,20 @@ def _velocity(positions: np.ndarray, fps: float) -> np.ndarray:
     return np.concatenate([steps[:1], steps]) if len(steps) else np.zeros(positions.shape)
 
 
-def _stride(clip: Clip) -> tuple[np.ndarray, ...]:
+def _scaled_strides(
+    root_ws: np.ndarray, balls_ws: np.ndarray, up_ws: Direction, scale: float | None
+) -> Float64[np.ndarray, "frames legs 3"] | float:
+    """How far scaled strides move each foot, m: see `jaxik.stages.warp.StrideWarp`."""
+    if scale is None:
+        return 0.0
+    offset = balls_ws - root_ws[:, None]
+    up = np.asarray(up_ws, np.float64)
+    return (scale - 1.0) * (offset - (offset @ up)[..., None] * up)
+
+
+def _stride(clip: Clip, balls: Float64[np.ndarray, "frames legs 3"]) -> tuple[np.ndarray, ...]:
     """The fields of a `Stride`, in order; a foot that never stands has an unknown stride."""
-    stance, balls = clip.stance_labels(), clip.joints_ws(3)
+    stance = clip.stance_labels()
     known = np.broadcast_to(stance.any(axis=0), stance.shape)
     last_ws, next_ws = np.zeros(balls.shape), np.zeros(balls.shape)
     fraction = np.zeros(stance.shape)

@@ -151,7 +151,7 @@ def solve(
     log(placement_report.solved_text(result, seconds, path))
     where = [f"root: {loaded.root.reason}", placement_report.trunk_text(result, solved)]
     log("\n".join(filter(None, where)) + f"\n\n{placement_report.text(placement)}")
-    if is_blocks_file(animation.clip):
+    if is_blocks_file(animation.clip) and animation.speed == 1.0:
         errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)
         log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")
     placement_report.warn(placement, cause)

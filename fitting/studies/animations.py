@@ -15,6 +15,7 @@ from fitting.analysis.misplacement import Cause, likely_cause
 from fitting.analysis.placement import Placement
 from fitting.datasets.clip_frames import clip_from_result, frames_from_clip, raised
 from fitting.datasets.clips import Clip
+from fitting.datasets.clips.edit import at_speed
 from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import load_terrain
@@ -36,6 +37,8 @@ class AnimationFiles:
     """m, height of the floor on which the clip was animated."""
     root: str = "auto"
     """Where the root is put; see `place_root`."""
+    speed: float = 1.0
+    """Of the root, as a multiple of the clip's; strides are scaled alike."""
 
     @cached_property
     def flat_clip(self) -> Clip:
@@ -65,11 +68,16 @@ class Animation:
     """Loads the terrain with the other axis of its file up."""
     carried: Float64[np.ndarray, "frames 3"] | None = None
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
+    speed: float = 1.0
+    """Of the clip's root over that with which its feet step."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
         """The clip as the pipeline's input."""
-        frames = frames_from_clip(self.clip, floor=self.floor, rise=self.root.rise)
+        stride_scale = None if self.speed == 1.0 else self.speed
+        frames = frames_from_clip(
+            self.clip, floor=self.floor, rise=self.root.rise, stride_scale=stride_scale
+        )
         return frames if self.carried is None else carried_frames(frames, self.carried)
 
     @cached_property
@@ -100,8 +108,13 @@ class Animation:
 
     def assess(self, solved: Clip) -> tuple[Placement, Cause | None]:
         """How the feet of a solved clip are placed; why, if they are off the ground."""
-        floor = self.clip, self.terrain, self.floor
-        placed = placement.assess(placement.soles(solved, *floor), solved, self.placed_clip)
+        # Soles and slides are those of the animation at its own speed: with a faster root its
+        # standing feet skate, which is to be measured and not to be excused.
+        own = at_speed(self.clip, 1.0 / self.speed)
+        floor = own, self.terrain, self.floor
+        placed = placement.assess(
+            placement.soles(solved, *floor), solved, self.placed_clip, own_speed=own
+        )
         if not placed.misplaced:
             return placed, None
         animated = placement.soles(self.placed_clip, *floor)
@@ -115,8 +128,12 @@ def load_animation(files: AnimationFiles) -> Animation:
         ValueError: a file does not exist or cannot be read, or the root cannot be put there.
     """
     terrain = files.load_terrain()
-    clip, root = place_root(files.flat_clip, terrain, files.root, files.floor)
-    return Animation(clip, terrain, files.floor, root, files.load_turned_terrain)
+    clip = files.flat_clip
+    if files.speed != 1.0:
+        clip = at_speed(clip, files.speed)
+    clip, root = place_root(clip, terrain, files.root, files.floor)
+    turned = files.load_turned_terrain
+    return Animation(clip, terrain, files.floor, root, turned, speed=files.speed)
 
 
 def carried_frames(frames: jaxik.Frame, carried: Float64[np.ndarray, "frames 3"]) -> jaxik.Frame:

@@ -53,6 +53,12 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
         root_ws = vec.scale(terrain.up_ws, ik.root.sense(inputs))
         frame = frame.translated(root_ws)
         inputs = dataclasses.replace(inputs, frame=frame)
+    thigh, shin = bone_lengths(frame.pose)
+    with jax.named_scope("warp"):
+        warp_ws = ik.warp.sense(inputs)
+        if warp_ws is not None:
+            frame = frame.with_moved_feet(warp_ws)
+            inputs = dataclasses.replace(inputs, frame=frame)
     with jax.named_scope("probe"):
         ground = ik.probe.sense(inputs, contact, ik.target.foot_height)
     with jax.named_scope("target"):
@@ -61,7 +67,6 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
         slope = ik.lean.sense(inputs, ground, contact, weight)
     with jax.named_scope("foot"):
         rot_ws = ik.foot.sense(inputs, ground)
-    thigh, shin = bone_lengths(frame.pose)
     ankle = animated_ankles(frame)
     return Sensed(
         up_ws=terrain.up_ws,
@@ -85,6 +90,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
         contact=contact,
         foothold=foothold,
         slope=slope,
+        warp_ws=warp_ws,
     )
 
 

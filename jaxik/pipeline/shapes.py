@@ -1,6 +1,7 @@
 """The shapes that the pipeline takes, checked as it is traced: no cost at run time."""
 
 import dataclasses
+import typing
 from collections.abc import Iterator
 
 import jax
@@ -130,8 +131,9 @@ def _declared_shapes(struct: object, batch: Shape, legs: int) -> Iterator[tuple[
                 inner = (*batch, _platform_count(struct))
             for path, array, shape in _declared_shapes(value, inner, legs):
                 yield f"{field.name}.{path}", array, shape
-        elif not field.metadata.get("static", False):
-            names = getattr(field.type, "dim_str").split()  # noqa: B009
+        elif value is not None and not field.metadata.get("static", False):
+            annotation, *_ = typing.get_args(field.type) or (field.type,)  # of an optional field
+            names = getattr(annotation, "dim_str").split()  # noqa: B009
             sizes = [axes[name] if name in axes else (int(name),) for name in names]
             yield field.name, value, sum(sizes, ())
 

@@ -15,6 +15,7 @@ from jaxik.stages.pelvis import AbstractPelvis, PelvisState
 from jaxik.stages.probe import AbstractProbe
 from jaxik.stages.root import AbstractRoot
 from jaxik.stages.target import AbstractTarget
+from jaxik.stages.warp import AbstractWarp
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 
@@ -22,7 +23,7 @@ from .shapes import check_system
 
 
 class FootIK(Rule):
-    """A foot-IK system: one rule for each of ten stages, in the order in which they run.
+    """A foot-IK system: one rule for each of eleven stages, in the order in which they run.
 
     Make one from a preset of `jaxik.presets`, then exchange rules with `dataclasses.replace` and
     numbers with `jaxik.maths.parameter_tree.replace`:
@@ -38,6 +39,7 @@ class FootIK(Rule):
 
     contact: AbstractContact
     root: AbstractRoot
+    warp: AbstractWarp
     probe: AbstractProbe
     target: AbstractTarget
     lean: AbstractLean

@@ -9,3 +9,4 @@ from . import pelvis as pelvis
 from . import probe as probe
 from . import root as root
 from . import target as target
+from . import warp as warp

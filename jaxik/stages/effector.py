@@ -114,7 +114,7 @@ class HeelEffector(AbstractInstantEffector):
         ball = target.pos - arm
         axis = vec.cross(sensed.ahead_ws, sensed.leg_up_ws)
         tilted_axis = quat.rotate(tilt, axis)
-        animated = vec.length(sensed.ankle_ws - sensed.hip_ws)
+        animated = vec.length(sensed.unscaled_ankle_ws - sensed.hip_ws)
         longest = self.extension * (sensed.thigh + sensed.shin)
         longest = jnp.where(animated > longest, animated, longest)
         hip = sensed.hip_ws + pelvis.offset_ws

@@ -68,6 +68,9 @@ class Frame:
     """`world_from_platform` of each moving terrain (platforms); there may be none."""
     platforms_before: Transform
     """The same in the previous frame; on the first frame, the same as `platforms`."""
+    stride_scale: Float[Array, "*b"] | None = None
+    """Speed of the character over that of its animation, by which its strides are to be scaled.
+    None leaves them as animated and costs nothing."""
 
     @property
     def speed(self) -> Float[Array, "*b"]:
@@ -78,6 +81,13 @@ class Frame:
         """The frame with the whole character moved by `offset_ws`, m."""
         world = Transform(self.world_from_model.pos + offset_ws, self.world_from_model.rot)
         return dataclasses.replace(self, world_from_model=world)
+
+    def with_moved_feet(self, offset_ws: Float[Array, "legs 3"]) -> "Frame":
+        """The single frame with ankles and toes moved by `offset_ws`, m; knees stay."""
+        pose = self.pose
+        offset = quat.unrotate(self.world_from_model.rot, offset_ws)
+        ankle, toe = (Transform(joint.pos + offset, joint.rot) for joint in (pose.ankle, pose.toe))
+        return dataclasses.replace(self, pose=LegPose(pose.hip, pose.knee, ankle, toe))
 
     def with_platforms(self, tracks: Transform) -> "Frame":
         """The clip with moving terrains.
@@ -214,6 +224,13 @@ class Sensed:
     contact: Contact
     foothold: Foothold
     slope: Slope
+    warp_ws: Float[Array, "legs 3"] | None = None
+    """m, by which scaled strides move ankles and balls, which have moved already; None for none."""
+
+    @property
+    def unscaled_ankle_ws(self) -> Float[Array, "legs 3"]:
+        """m, the animated ankles before strides are scaled."""
+        return self.ankle_ws if self.warp_ws is None else self.ankle_ws - self.warp_ws
 
     @property
     def ground_rise(self) -> Float[Array, " legs"]:

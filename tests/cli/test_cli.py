@@ -125,6 +125,10 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
         (["run", BASE, "-o", "a.npz"], "required: --terrain"),
         (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--floor", "nan"], "finite number"),
         (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--root", "x"], "invalid choice: 'x'"),
+        (
+            ["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--speed", "0"],
+            "'0'; wanted a number a",
+        ),
         (["record", "show", "a", "--tick-hz", "x"], "'x'; wanted a finite number"),
     ],
 )

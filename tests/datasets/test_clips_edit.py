@@ -59,6 +59,21 @@ def test_impossible_rates_are_refused(walk):
         edit.resample(walk, 0.0)
 
 
+def test_a_faster_root_carries_the_same_poses_and_contacts_further(walk):
+    fast = edit.at_speed(walk, 1.5)
+    pelvis, before = (clip.positions_ws[:, clip.rig.pelvis] for clip in (fast, walk))
+    np.testing.assert_allclose(
+        pelvis - pelvis[0], (before - before[0]) * [1.5, 1.0, 1.5], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        fast.positions_ws - pelvis[:, None], walk.positions_ws - before[:, None], atol=1e-12
+    )
+    assert np.array_equal(fast.stance_labels(), walk.stance_labels())
+    for factor in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match=r"wanted a finite number above 0"):
+            edit.at_speed(walk, factor)
+
+
 def test_trim_keeps_both_ends(walk):
     cut = edit.trim(walk, 0.5, 1.0)
     assert cut.frame_count == 31

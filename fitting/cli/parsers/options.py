@@ -51,6 +51,10 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
         help="keep the root of the clip, or let it follow the ground below it; auto keeps it where "
         "foot IK reaches the ground from there, or where the feet follow this terrain already",
     )  # fmt: skip
+    command.add_argument(
+        "--speed", type=positive, default=1.0, metavar="X",
+        help="let the root travel X times as far as in the clip; strides are scaled with it",
+    )  # fmt: skip
 
 
 def finite(text: str) -> float:
@@ -61,4 +65,12 @@ def finite(text: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text!r}; wanted a finite number")
+    return value
+
+
+def positive(text: str) -> float:
+    """A finite number above 0, as the `type` of an option."""
+    value = finite(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r}; wanted a number above 0")
     return value

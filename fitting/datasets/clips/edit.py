@@ -73,6 +73,23 @@ def resample(clip: Clip, fps: float) -> Clip:
     )  # fmt: skip
 
 
+def at_speed(clip: Clip, factor: float) -> Clip:
+    """The clip over a root that travels `factor` times as far in the same time.
+
+    The pose of each frame is the same, so that standing feet skate; strides that are scaled by the
+    same factor bring them to rest (`frames_from_clip`). Contact labels stay those of the clip.
+
+    Raises:
+        ValueError: `factor` is not a finite number above 0, or the clip has no legs.
+    """
+    if not (np.isfinite(factor) and factor > 0):
+        raise ValueError(f"the speed is {factor} times the clip's; wanted a finite number above 0")
+    root = clip.positions_ws[:, clip.rig.pelvis]
+    further = (factor - 1.0) * (root - root[0]) * [1.0, 0.0, 1.0]
+    faster = clip.with_motion(clip.positions_ws + further[:, None], clip.rotations_ws)
+    return replace(faster, stance=clip.stance_labels())
+
+
 def trim(clip: Clip, start: float = 0.0, end: float | None = None) -> Clip:
     """The frames from `start` to `end`, s, both included.
 

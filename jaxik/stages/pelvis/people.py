@@ -154,5 +154,5 @@ class ReachPelvis(AbstractFollowingPelvis):
             heights = jnp.concatenate([heights, wanted[None]])
             return -self.softness * jax.nn.logsumexp(-heights / self.softness)
 
-        animated = reachable_height(sensed.ankle_ws, jnp.zeros_like(wanted))
+        animated = reachable_height(sensed.unscaled_ankle_ws, jnp.zeros_like(wanted))
         return reachable_height(target.pos, wanted) - animated

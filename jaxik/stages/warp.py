@@ -1,0 +1,74 @@
+"""Stage 3: strides scaled for a character that is faster or slower than its animation."""
+
+from abc import abstractmethod
+
+from jaxtyping import Array, Float
+
+from jaxik.maths import vec
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter
+from jaxik.world.frame import heading
+
+from .inputs import Inputs
+
+SCALE_BAND = 0.02
+
+
+class AbstractWarp(Rule):
+    """Moves the animated feet before ground is looked for under them."""
+
+    @abstractmethod
+    def sense(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
+        """How far each foot moves, m, world space; None, which costs nothing, where none does."""
+
+
+class NoWarp(AbstractWarp):
+    """Strides stay as animated, however fast the character is."""
+
+    def sense(self, inputs: Inputs) -> None:
+        return None
+
+
+class StrideWarp(AbstractWarp):
+    """Scales strides with the speed of the character, so that standing feet do not skate.
+
+    The root of a character that is k times as fast as its animation (`Frame.stride_scale`) moves by
+    k times the animated way. A foot that stands in the animation stands here too if its horizontal
+    offset from the root is scaled by k: `k p + k f = k (p + f)` is constant where the animated
+    `p + f` is. The offset is that of the ball, and the whole foot moves with it. Where the frame
+    tells no scale, nothing happens.
+
+    With `width` 1 this is exact in turns too, and steps become wider as they become longer. With 0
+    only the part of the offset along the velocity is scaled, as "stride warping" does in Unreal
+    Engine: steps keep their width, but feet skate as far as the root sways or turns. Locomotion
+    systems after Johansen (2009) adapt strides in this way too. Pelvis and heels then follow as
+    far as longer strides need them to.
+    """
+
+    min_scale: Leaf = parameter(
+        0.4, unit="1", low=0.0, high=1.0, doc="Shortest strides, as a part of the animated ones."
+    )
+    max_scale: Leaf = parameter(
+        1.5, unit="1", low=1.0, high=2.5, doc="Longest strides, as a multiple of the animated ones."
+    )
+    width: Leaf = parameter(
+        1.0,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        doc="How much the width of steps is scaled with their length.",
+    )
+
+    def sense(self, inputs: Inputs) -> Float[Array, "legs 3"] | None:
+        frame, up_ws = inputs.frame, inputs.terrain.leg_up_ws
+        if frame.stride_scale is None:
+            return None
+        scale = inputs.gate.clip(
+            frame.stride_scale, self.min_scale, self.max_scale, band=SCALE_BAND
+        )
+        ball = frame.world_from_model.apply(frame.pose.toe.pos)
+        offset = vec.reject(ball - frame.world_from_model.pos, up_ws)
+        ahead_ws, _ = heading(frame.world_from_model, up_ws)
+        way = vec.normalize(vec.reject(frame.velocity_ws, up_ws), ahead_ws)
+        across = vec.reject(offset, way)
+        scaled = offset - vec.scale(across, 1.0 - self.width)
+        return vec.scale(scaled, scale - 1.0)
