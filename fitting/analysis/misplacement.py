@@ -7,6 +7,7 @@ import numpy as np
 
 from fitting.datasets import ground_path
 from fitting.datasets.clips.clip import Clip
+from jaxik.world import body
 from jaxik.world.terrain import Terrain
 
 from .placement import VISIBLE, Soles
@@ -46,14 +47,15 @@ def likely_cause(
         terrain: y up.
         turned: makes the terrain with the other axis of its file up.
     """
+    visible = VISIBLE * body.ratio(animated.rig)
     standing = feet.stance & ~np.isnan(feet.gap)
     if standing.sum() < FOUND * feet.stance.sum():
         return _cause_of_misses(animated.joints_ws(3)[feet.stance], terrain, turned)
     gap, ground = feet.gap[standing], np.fmax.reduce(feet.ground, axis=-1)[standing]
-    if np.std(gap) <= CONSTANT * abs(np.mean(gap)) and abs(np.mean(gap)) > VISIBLE:
+    if np.std(gap) <= CONSTANT * abs(np.mean(gap)) and abs(np.mean(gap)) > visible:
         return Cause("offset", float(np.mean(gap)))
-    if np.std(ground) > VISIBLE:
-        if np.std(gap + ground) > VISIBLE and _correlation(gap + ground, ground) > CORRELATED:
+    if np.std(ground) > visible:
+        if np.std(gap + ground) > visible and _correlation(gap + ground, ground) > CORRELATED:
             followed = np.polyfit(ground, gap + ground, 1)[0]  # m for each metre of the ground
             for factor in FACTORS:
                 if abs(followed / factor - 1.0) < CLOSE:

@@ -2,7 +2,8 @@
 
 NumPy; lengths in metres, y up. The sole of a foot is known at two points: below the ankle, which
 stands for the heel, and below the ball. Each is as far below its joint, along the foot's up axis,
-as the joint is above the floor while the animated foot stands flat.
+as the joint is above the floor while the animated foot stands flat. What is visible is as large as
+the body: limits are for an adult.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float64
 from fitting.datasets import ground_path
 from fitting.datasets.clips import contacts
 from fitting.datasets.clips.clip import Clip
+from jaxik.world import body
 from jaxik.world.terrain import Terrain
 
 from . import measures
@@ -56,11 +58,11 @@ class Placement:
     """How the feet of one motion are placed; NaN where there is nothing to measure."""
 
     sunk: float
-    """Fraction of the frames of standing feet in which one is `VISIBLE` or more in the ground."""
+    """Fraction of the frames of standing feet in which one is `visible` or more in the ground."""
     floating: float
-    """Fraction of those in which it is `VISIBLE` or more above it."""
+    """Fraction of those in which it is `visible` or more above it."""
     sunk_swing: float
-    """Fraction of the frames of moving feet in which one is `VISIBLE` or more in the ground."""
+    """Fraction of the frames of moving feet in which one is `visible` or more in the ground."""
     sunk_frames: float
     """Fraction of all frames in which any foot is."""
     groundless: float
@@ -75,6 +77,13 @@ class Placement:
     """m; its frame is the first of the stance."""
     pop: Extreme
     """m in 1/60 s, change of the ankle's place relative to the body, beyond the animated one."""
+    size: float = 1.0
+    """Length of the legs relative to an adult's: limits are as many times as large."""
+
+    @property
+    def visible(self) -> float:
+        """What a viewer notices of a sole in the ground of this body or above it, m."""
+        return VISIBLE * self.size
 
     @property
     def misplaced(self) -> bool:
@@ -85,8 +94,8 @@ class Placement:
 def soles(solved: Clip, animated: Clip, terrain: Terrain, floor: float = 0.0) -> Soles:
     """The soles of a motion over a terrain.
 
-    The ground is looked for from 1 m above the sole or the ground of the path, whichever is higher:
-    a character inside a hill is found to be in it, and a roof is no ground.
+    The ground is looked for from `step_height` above the sole or the ground of the path, whichever
+    is higher: a character inside a hill is found to be in it, and a roof is no ground.
 
     Args:
         solved: the motion.
@@ -97,7 +106,7 @@ def soles(solved: Clip, animated: Clip, terrain: Terrain, floor: float = 0.0) ->
     points = measures.soles(solved)
     path = ground_path.path_heights(solved, terrain, floor)
     lowest = points[..., 1] if path is None else np.maximum(points[..., 1], path[:, None, None])
-    ground = ground_path.heights_under(terrain, points, lowest + ground_path.STEP)
+    ground = ground_path.heights_under(terrain, points, lowest + ground_path.step_height(animated))
     return Soles(points[..., 1] - ground, ground, animated.stance_labels())
 
 
@@ -112,7 +121,8 @@ def assess(feet: Soles, solved: Clip, animated: Clip, own_speed: Clip | None = N
             counted; None if it has that speed.
     """
     names, gap, stance = solved.rig.names, feet.gap, feet.stance
-    in_ground, above = gap < -VISIBLE, gap > VISIBLE  # false for NaN
+    size = body.ratio(solved.rig)
+    in_ground, above = gap < -VISIBLE * size, gap > VISIBLE * size  # false for NaN
     known = ~np.isnan(gap)
     slides = _slides(solved, stance) - _slides(own_speed or animated, stance)
     stances = slides[~np.isnan(slides)]
@@ -127,6 +137,7 @@ def assess(feet: Soles, solved: Clip, animated: Clip, own_speed: Clip | None = N
         slide=float(np.median(stances)) if stances.size else float("nan"),
         largest_slide=_extreme(slides, names),
         pop=_extreme(_pops(solved, animated), names),
+        size=size,
     )
 
 

@@ -3,7 +3,7 @@
 A flat animation keeps its root on its own floor. On a hill or on stairs that is metres away from
 the ground, further than foot IK reaches. The root then follows the ground below it, smoothed over a
 stride in both directions of time, so that it climbs stairs as evenly as a ramp and lags behind
-nothing.
+nothing. Distances are for an adult; others' are as their legs.
 """
 
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
 from scipy.ndimage import convolve1d
 
+from jaxik.world import body
 from jaxik.world.terrain import HORIZON, Terrain, cast
 
 from .clip_frames import raised
@@ -77,7 +78,7 @@ def place_root(
     rise = smooth(path, stride_seconds(clip) * clip.fps) - floor
     if root == "auto" and (above := _ground_under_stances(clip, terrain, path, floor)).size:
         heights, soles = above
-        if np.mean(np.abs(heights) > REACH) <= STRAY:
+        if np.mean(np.abs(heights) > REACH * body.ratio(clip.rig)) <= STRAY:
             return clip, RootChoice(None, f"as animated: the ground is {_range(heights)} its floor")
         if np.std(heights - soles) < FOLLOWING * np.std(heights):
             reason = "as animated: the clip follows this terrain already"
@@ -103,10 +104,17 @@ def path_heights(
     highest = heights_under(terrain, points, SKY)
     if np.mean(~np.isnan(highest)) < GROUND:
         return None
-    near = heights_under(terrain, points, floor + STEP)
+    step = step_height(clip)
+    near = heights_under(terrain, points, floor + step)
     start = near if not np.isnan(near).all() else highest
     first = jnp.asarray(start[~np.isnan(start)][0])
-    return np.asarray(_followed(terrain, jnp.asarray(points), first, 1 / clip.fps))
+    fall = FALL * body.ratio(clip.rig) ** 0.5 / clip.fps
+    return np.asarray(_followed(terrain, jnp.asarray(points), first, step, fall))
+
+
+def step_height(clip: Clip) -> float:
+    """How far above the last ground the next one may be for this body, m: `STEP` for an adult."""
+    return STEP * body.ratio(clip.rig)
 
 
 def heights_under(
@@ -127,14 +135,21 @@ def heights_under(
 
 @jax.jit
 def _followed(
-    terrain: Terrain, points_ws: Float[Array, "frames 3"], first: Array, dt: ArrayLike
+    terrain: Terrain,
+    points_ws: Float[Array, "frames 3"],
+    first: Array,
+    step: ArrayLike,
+    fall: ArrayLike,
 ) -> Float[Array, " frames"]:
-    """Heights of the ground along a path that starts at the height `first`, m."""
+    """Heights of the ground along a path, m.
+
+    It starts at the height `first`; ground more than `step` below is fallen to, by `fall` a frame.
+    """
 
     def advance(height: Array, point: Array) -> tuple[Array, Array]:
-        hit = cast(terrain, point.at[1].set(height + STEP), jnp.inf)
-        falling = jnp.maximum(hit.point[1], height - FALL * dt)
-        below = jnp.where(height - hit.point[1] > STEP, falling, hit.point[1])
+        hit = cast(terrain, point.at[1].set(height + step), jnp.inf)
+        falling = jnp.maximum(hit.point[1], height - fall)
+        below = jnp.where(height - hit.point[1] > step, falling, hit.point[1])
         height = jnp.where(hit.found > 0, below, height)
         return height, height
 
@@ -160,7 +175,11 @@ def stride_seconds(clip: Clip) -> float:
         [first for first, _ in contacts.runs(stance)] for stance in clip.stance_labels().T
     ]
     strides = [time for firsts in touchdowns for time in np.diff(firsts)]
-    return float(np.median(strides)) / clip.fps if strides else USUAL_STRIDE
+    return (
+        float(np.median(strides)) / clip.fps
+        if strides
+        else USUAL_STRIDE * body.ratio(clip.rig) ** 0.5
+    )
 
 
 def _ground_under_stances(
@@ -168,7 +187,9 @@ def _ground_under_stances(
 ) -> Float64[np.ndarray, "2 standing"]:
     """Heights of the ground below standing balls, and of these balls, m above the floor."""
     stance, balls = clip.stance_labels(), clip.joints_ws(3)
-    ground = heights_under(terrain, balls, np.maximum(path[:, None], balls[..., 1]) + STEP)
+    ground = heights_under(
+        terrain, balls, np.maximum(path[:, None], balls[..., 1]) + step_height(clip)
+    )
     known = stance & ~np.isnan(ground)
     return np.stack([ground[known], balls[known][:, 1]]) - floor
 

@@ -15,7 +15,6 @@ from fitting.analysis.placement import (
     MISSING_LIMIT,
     POP_LIMIT,
     SLIDE_LIMIT,
-    VISIBLE,
     Extreme,
     Placement,
 )
@@ -31,7 +30,6 @@ class PlacementWarning(UserWarning):
     """Feet are visibly off their ground, slide or pop."""
 
 
-SEEN = f"{100 * VISIBLE:.0f} cm"
 CAUSES = {
     "up": "the other axis of the terrain's file is up (--file-up)",
     "units": "the terrain is in another unit of length: one of its units is {0:.4g} m",
@@ -46,7 +44,7 @@ CAUSES = {
 def table(placement: Placement) -> Table:
     """What a viewer sees, a row for each kind: how often or how far, and the largest with place."""
     return [
-        [f"feet and ground, {SEEN} or more", "frames", "largest"],
+        [f"feet and ground, {_seen(placement)} or more", "frames", "largest"],
         ["standing feet in the ground", _share(placement.sunk), _place(placement.deepest)],
         ["standing feet above the ground", _share(placement.floating), _place(placement.highest)],
         ["moving feet in the ground", _share(placement.sunk_swing), ""],
@@ -120,12 +118,12 @@ def warning_texts(placement: Placement, cause: Cause | None) -> list[str]:
             amount, abs(100 * amount), "high" if amount > 0 else "low"
         )
         texts.append(f"{_off_ground(placement)}; likely cause: {reason}")
-    if placement.slide > SLIDE_LIMIT:
+    if placement.slide > SLIDE_LIMIT * placement.size:
         texts.append(
             f"standing feet slide by {_cm(placement.slide)} a stance more than animated (most: "
             f"{_place(placement.largest_slide)})"
         )
-    if placement.pop.value > POP_LIMIT:
+    if placement.pop.value > POP_LIMIT * placement.size:
         texts.append(f"feet pop in 1/60 s (most: {_place(placement.pop)})")
     return texts
 
@@ -134,10 +132,14 @@ def _off_ground(placement: Placement) -> str:
     if placement.groundless > MISSING_LIMIT:
         return f"there is no ground under {_share(placement.groundless)} of the soles"
     return (
-        f"standing feet are {SEEN} or more in the ground in {_share(placement.sunk)} of their "
-        f"frames (deepest: {_place(placement.deepest)}) and above it in "
+        f"standing feet are {_seen(placement)} or more in the ground in {_share(placement.sunk)} "
+        f"of their frames (deepest: {_place(placement.deepest)}) and above it in "
         f"{_share(placement.floating)} (highest: {_place(placement.highest)})"
     )
+
+
+def _seen(placement: Placement) -> str:
+    return f"{100 * placement.visible:.2g} cm"
 
 
 def _share(fraction: float) -> str:

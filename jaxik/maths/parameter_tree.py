@@ -157,6 +157,7 @@ def parameter(
     follows = BY_UNIT.get(unit, "nothing") if follows is None else follows
     declaration = Declaration(unit, low, high, kind, scale, above, doc, follows)
     metadata = {"declaration": declaration, "unit": unit, "doc": doc, "per_leg": per_leg}
+    metadata["follows"] = follows
     return _field(default, as_float_array, metadata)
 
 
@@ -172,7 +173,8 @@ def gain_parameter(default: float, *, doc: str) -> Declared:
 
 def constant(default: float, *, unit: str, doc: str) -> Declared:
     """Declares a float field of a rule that is a convention, such as a tick rate: never fitted."""
-    return _field(default, as_float_array, {"unit": unit, "doc": doc})
+    metadata = {"unit": unit, "doc": doc, "follows": BY_UNIT.get(unit, "nothing")}
+    return _field(default, as_float_array, metadata)
 
 
 def switch(default: bool, *, doc: str, per_leg: bool | None = None) -> Declared:
@@ -234,8 +236,7 @@ def slots(module: eqx.Module) -> Iterator[Slot]:
         per_leg = field.metadata.get("per_leg")
         if per_leg is None:
             per_leg = getattr(owner, "per_leg", True)
-        declaration = field.metadata.get("declaration")
-        follows = "nothing" if declaration is None else declaration.follows
+        follows = field.metadata.get("follows", "nothing")
         yield Slot(name, getattr(owner, field.name), field.metadata["shape"], per_leg, follows)
 
 

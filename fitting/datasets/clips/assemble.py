@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
 from . import contacts
@@ -17,12 +18,11 @@ from .clip import Clip
 from .joint_roles import Roles, find_roles
 from .kinematics import continuous, local_from_world, world_from_local
 from .recording import INCH, Y_UP_FROM_Z_UP, Recording
-from .rigs import measure_rig, measure_soles
+from .rigs import measure_rig, measure_soles, relative_size
 
 RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
 RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": INCH, "ft": 12 * INCH, "ASF unit": INCH / 0.45}
-ADULT_LEG = 0.84  # m, thigh and shin
 PLAUSIBLE_RATIO = 1.5  # to an adult's leg; beyond it the guessed unit is called doubtful
 
 
@@ -83,8 +83,9 @@ def clip_from_recording(
     )
     rig = None
     if roles is not None:
-        toes = [leg.joints[3] for leg in roles.legs]
-        stance = contacts.detect_stances(positions_ws[:, toes], rate)
+        joints = [leg.joints for leg in roles.legs]
+        balls_ws = positions_ws[:, [leg[3] for leg in joints]]
+        stance = contacts.detect_stances(balls_ws, rate, relative_size(positions_ws, joints))
         for leg, stands in zip(roles.legs, stance.T, strict=True):
             if not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
@@ -175,9 +176,9 @@ def _guess_scale(recording: Recording, roles: Roles | None, remarks: list[str]) 
     if leg == 0.0:
         remarks.append("scale not recognised, as no bone has a length; taken as metres")
         return 1.0
-    unit = min(UNITS, key=lambda name: abs(np.log(leg * UNITS[name] / ADULT_LEG)))
+    unit = min(UNITS, key=lambda name: abs(np.log(leg * UNITS[name] / body.LEG)))
     metres = leg * UNITS[unit]
-    plausible = 1 / PLAUSIBLE_RATIO < metres / ADULT_LEG < PLAUSIBLE_RATIO
+    plausible = 1 / PLAUSIBLE_RATIO < metres / body.LEG < PLAUSIBLE_RATIO
     doubt = "" if roles is not None and plausible else "; doubtful, give scale=..."
     remarks.append(f"scale guessed: legs of {leg:.4g} units in {unit} are {metres:.3f} m{doubt}")
     return UNITS[unit]

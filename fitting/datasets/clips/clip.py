@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
+from jaxik.world import body
 from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts
@@ -104,7 +105,7 @@ class Clip:
         """Whether each foot stands: the stored contact labels, or else detected from its motion."""
         if self.stance is not None:
             return self.stance
-        return contacts.detect_stances(self.joints_ws(3), self.fps)
+        return contacts.detect_stances(self.joints_ws(3), self.fps, body.ratio(self.rig))
 
     def leg_pose_ws(self) -> LegPose:
         """World transforms of the legs' joints, (frames, legs), in JAX's default precision."""

@@ -3,6 +3,9 @@
 A foot stands while its ball is slow, provided that it was put down: a ball that rises into a slow
 spell and falls out of it hangs at the top of a swing or a jump. Heights are not compared with a
 floor, since the ground may be at any height.
+
+Limits are for an adult. A body twice as large moves twice as fast if it plays the same animation,
+and the root of two times as fast at an equal Froude number. Its limit of speed lies between them.
 """
 
 from dataclasses import dataclass
@@ -11,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 MAX_SPEED = 0.25  # m/s: the ball of a standing foot is slower, even a runner's
+SPEED_POWER = 0.75  # of a body's size, with which the limit of speed grows
 HALF_WINDOW = 0.025  # s, on each side of a frame, for measuring speed
 MAX_GAP = 0.05  # s: shorter interruptions of a stance are marker noise
 MIN_STANCE = 0.06  # s: shorter slow spells are no stance; runners stand for 0.075 s
@@ -19,21 +23,22 @@ HANG_HEIGHT = 0.03  # m by which a hanging foot is higher than before and after
 
 
 def detect_stances(
-    ball_ws: Float64[np.ndarray, "frames legs 3"], fps: float
+    ball_ws: Float64[np.ndarray, "frames legs 3"], fps: float, size: float = 1.0
 ) -> Bool[np.ndarray, "frames legs"]:
     """True where a foot stands.
 
     Args:
         ball_ws: position of the ball of each foot, m, y up.
         fps: frames per second.
+        size: length of the legs relative to an adult's.
     """
-    slow = speeds(ball_ws, fps) < MAX_SPEED
+    slow = speeds(ball_ws, fps) < MAX_SPEED * size**SPEED_POWER
     stance = np.zeros_like(slow)
     for leg in range(slow.shape[1]):
         for first, last in merge_runs(runs(slow[:, leg]), round(MAX_GAP * fps)):
             long_enough = last - first + 1 >= MIN_STANCE * fps
             window = round(HANG_WINDOW * fps)
-            if long_enough and not _hangs(ball_ws[:, leg, 1], first, last, window):
+            if long_enough and not _hangs(ball_ws[:, leg, 1] / size, first, last, window):
                 stance[first : last + 1, leg] = True
     return stance
 
@@ -100,7 +105,7 @@ def footfalls(
 
 
 def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> bool:
-    """Whether the foot rises into this run of frames and falls out of it."""
+    """Whether the foot rises into this run of frames and falls out of it, with adult heights."""
     before, after = height[max(first - window, 0) : first], height[last + 1 : last + 1 + window]
     if not len(before) or not len(after):
         return False

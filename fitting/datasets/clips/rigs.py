@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
+from jaxik.world.body import LEG
 from jaxik.world.skeleton import Rig
 
 from .joint_roles import Leg, Roles
@@ -145,6 +146,20 @@ def measure_soles(
         heights.append([max(ankle_height, 0.0), max(ball_height, 0.0)])
     ankle, ball = np.array(heights).T
     return SoleHeights(ankle, ball, np.array(measured))
+
+
+def relative_size(
+    positions_ws: Float64[np.ndarray, "frames joints 3"], legs: Sequence[tuple[int, int, int, int]]
+) -> float:
+    """Mean length of the legs (thigh and shin) relative to an adult's; 1 for legs without length.
+
+    Args:
+        positions_ws: m.
+        legs: indices of hip, knee, ankle and ball of each leg.
+    """
+    bones = np.diff(positions_ws[:, np.array(legs)[:, :3]], axis=2)
+    length = np.median(np.linalg.norm(bones, axis=-1), axis=0).sum(axis=-1).mean()
+    return float(length) / LEG if length > 0 else 1.0
 
 
 def left_directions(

@@ -8,14 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
-from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths.parameter_tree import Leaf, constant, parameter
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
 
 from .base import AbstractProbe
 
-STEP_FADE = 0.10  # m, over which a step becomes too high or too low
 SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
 SAME_GROUND = 1e-3  # m, between hits of one surface at most
 
@@ -28,7 +27,7 @@ class AbstractLimitedProbe(AbstractProbe):
     ray is refused, that below the highest step counts, such as the floor under a table. Where that
     is refused too, there is no ground, and the foot stays as animated.
 
-    Ground fades out over `STEP_FADE` and `SLOPE_FADE` beyond its limit: `found` falls from 1 to 0.
+    Ground fades out over `step_fade` and `SLOPE_FADE` beyond its limit: `found` falls from 1 to 0.
     """
 
     max_step_up: Leaf = parameter(
@@ -51,6 +50,9 @@ class AbstractLimitedProbe(AbstractProbe):
         low=0.1,
         high=1.5,
         doc="Slope of the ground above which it is refused.",
+    )
+    step_fade: Leaf = constant(
+        0.10, unit="m", doc="Height over which a step becomes too high or too low."
     )
     limited: bool = eqx.field(default=True, static=True, kw_only=True)
     """Whether any ground is refused. Static: without limits, no ray is cast for them."""
@@ -97,8 +99,8 @@ class AbstractLimitedProbe(AbstractProbe):
 
     def trust(self, step: Array, normal: Array, up_ws: Array) -> Array:
         """0..1, how far ground with this normal is accepted after a step of this height, m."""
-        low_enough = 1.0 - smoothstep((step - self.max_step_up) / STEP_FADE)
-        high_enough = 1.0 - smoothstep((-step - self.max_step_down) / STEP_FADE)
+        low_enough = 1.0 - smoothstep((step - self.max_step_up) / self.step_fade)
+        high_enough = 1.0 - smoothstep((-step - self.max_step_down) / self.step_fade)
         return low_enough * high_enough * self.gentleness(normal, up_ws)
 
     def gentleness(self, normal: Array, up_ws: Array) -> Array:

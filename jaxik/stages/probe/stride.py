@@ -13,7 +13,6 @@ from jaxik.world.terrain import Hit
 
 from .base import make_rays, no_hit
 from .limits import (
-    STEP_FADE,
     AbstractLimitedProbe,
     climb,
     clip_to_one,
@@ -238,7 +237,7 @@ class StrideProbe(AbstractLimitedProbe):
             stride.next_ws - stride.last_ws, fractions[:, None]
         )  # (rays legs 3)
         hit, ground = self._ground_at(inputs, level, path_ws)
-        fade = 1.0 - smoothstep((ground - top - self.max_step_up) / STEP_FADE)
+        fade = 1.0 - smoothstep((ground - top - self.max_step_up) / self.step_fade)
         away = vec.length(vec.reject(path_ws[:, None] - soles, level.up_ws))  # (rays 2 legs)
         excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
         # A sole that the animation sinks into its own floor needs no correction.

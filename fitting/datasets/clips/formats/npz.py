@@ -14,7 +14,7 @@ from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
-from fitting.datasets.clips.rigs import SoleHeights, measure_soles
+from fitting.datasets.clips.rigs import SoleHeights, measure_soles, relative_size
 from fitting.runtime import files
 from jaxik.world.skeleton import Rig
 
@@ -165,7 +165,8 @@ def _measure_soles(content: Arrays, joints: tuple[tuple[int, int, int, int], ...
     positions_ws, stance = content["positions_ws"], content.get("stance")
     if stance is None:
         balls = positions_ws[:, [leg[3] for leg in joints]]
-        stance = contacts.detect_stances(balls, float(content["fps"]))
+        size = relative_size(positions_ws, joints)
+        stance = contacts.detect_stances(balls, float(content["fps"]), size)
     return measure_soles(positions_ws, joints, stance)
 
 
