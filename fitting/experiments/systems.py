@@ -150,7 +150,7 @@ def without_own_root(ik: jaxik.FootIK) -> jaxik.FootIK:
 
 def leaf_names(ik: jaxik.FootIK) -> list[str]:
     """Dotted names of all parameters, conventions and switches of a system."""
-    return [f"{stage}.{leaf.name}" for stage, rule in vars(ik).items() for leaf in fields(rule)]
+    return [slot.name for slot in parameter_tree.slots(ik)]
 
 
 def read_free_table(table: Table, where: str) -> FreeTable:
