@@ -17,6 +17,7 @@ from jaxik.stages.effector import (
     FoundEffector,
     HeelEffector,
 )
+from jaxik.stages.fade import SpeedFade
 from jaxik.stages.foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
 from jaxik.stages.lean import NoLean, SlopeLean, SpineLean
 from jaxik.stages.leg import HintLeg, PoleLeg, TwoBone
@@ -48,6 +49,7 @@ def record(rig: Rig | None = None) -> FootIK:
         effector=DirectEffector(),
         leg=TwoBone(),
         foot=PitchRollFoot(),
+        fade=SpeedFade(),
     )
     return body.scale(ik, rig)
 
@@ -75,6 +77,7 @@ def ozz(rig: Rig | None = None) -> FootIK:
         effector=FoundEffector(),
         leg=PoleLeg(),
         foot=AimFoot(),
+        fade=SpeedFade(),
     )
     return body.scale(ik, rig)
 
@@ -102,6 +105,7 @@ def unreal(rig: Rig | None = None) -> FootIK:
         effector=BodyEffector(latch=True),
         leg=TwoBone(max_knee_angle=math.pi, min_knee_angle=0.0, soften=1.0),
         foot=KeepFoot(),
+        fade=SpeedFade(),
     )
     return body.scale(ik, rig)
 
@@ -125,6 +129,7 @@ def mec(rig: Rig | None = None) -> FootIK:
         effector=FadeEffector(),
         leg=HintLeg(),
         foot=FlatFoot(),
+        fade=SpeedFade(),
     )
     return body.scale(ik, rig)
 
@@ -152,5 +157,6 @@ def stride(rig: Rig | None = None) -> FootIK:
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
         foot=PitchRollFoot(max_pitch=0.8, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6),
+        fade=SpeedFade(),
     )
     return body.scale(ik, rig)

@@ -17,7 +17,7 @@ WINGS = {  # in import order: a wing may import those before it
     ],
 }  # fmt: skip
 STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "pelvis"]
-STAGES += ["effector", "leg", "foot"]
+STAGES += ["effector", "fade", "leg", "foot"]
 LIBRARIES_OF_JAXIK = {"jax", "equinox", "jaxtyping", "numpy", "lazy_loader"}
 ONLY_IMPORTED_BY = {
     "trimesh": "fitting/datasets/terrain/mesh_files.py",

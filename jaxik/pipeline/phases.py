@@ -112,18 +112,26 @@ def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Adv
     with jax.named_scope("lock"):
         # With the last frame's pelvis: this frame's offset follows from the locks.
         hip_ws = sensed.hip_ws + state.pelvis.offset_ws
-        lock_state, hold = ik.lock.advance(now, foothold_ws, hip_ws, state.lock)
+        lasting = ik.fade.lasting(sensed.weight, state.fade)
+        lock_now = dataclasses.replace(now, sensed=dataclasses.replace(sensed, weight=lasting))
+        lock_state, hold = ik.lock.advance(lock_now, foothold_ws, hip_ws, state.lock)
         target_ws = foothold_ws + hold.offset_ws + vec.scale(up, sensed.foothold.lift)
         ankle = Transform(target_ws, hold.rot_ws)
     with jax.named_scope("pelvis"):
         awake = ik.effector.awake(now, state.effector)
         pelvis_now = PelvisMoment(now.dt, now.started, now.gate, sensed, now.terrain, lean, awake)
         pelvis = ik.pelvis.advance(pelvis_now, ankle, state.pelvis)
+    with jax.named_scope("fade"):
         offset_ws = vec.scale(pelvis.offset_ws, sensed.grounded)
-        pelvis = dataclasses.replace(pelvis, offset_ws=offset_ws)
-        lean = dataclasses.replace(lean, rot_ws=_part_of(lean.rot_ws, sensed.grounded))
+        body = Transform(offset_ws, _part_of(lean.rot_ws, sensed.grounded))
+        fade_state, body = ik.fade.body(now, body, sensed.weight, state.fade)
+        pelvis = dataclasses.replace(pelvis, offset_ws=body.pos)
+        lean = dataclasses.replace(lean, rot_ws=body.rot)
     with jax.named_scope("effector"):
         effector_state, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
+    with jax.named_scope("fade"):
+        fade_state, weight = ik.fade.legs(now, effector, body, sensed.weight, fade_state)
+        effector = dataclasses.replace(effector, weight=effector.weight * weight)
     after = State(
         started=jnp.ones_like(now.started),
         contact=contact,
@@ -132,6 +140,7 @@ def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Adv
         lock=lock_state,
         pelvis=pelvis,
         effector=effector_state,
+        fade=fade_state,
     )
     return Advanced(foothold_ws, hold, lean, effector, after)
 

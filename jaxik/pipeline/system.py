@@ -1,5 +1,6 @@
 """What a foot-IK system is, what it remembers, and what it returns."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -7,6 +8,7 @@ from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.struct import struct
 from jaxik.stages.contact import AbstractContact
 from jaxik.stages.effector import AbstractEffector, Effector
+from jaxik.stages.fade import AbstractFade, NoFade
 from jaxik.stages.foot import AbstractFoot
 from jaxik.stages.lean import AbstractLean, Lean
 from jaxik.stages.leg import AbstractLeg
@@ -23,7 +25,7 @@ from .shapes import check_system
 
 
 class FootIK(Rule):
-    """A foot-IK system: one rule for each of eleven stages, in the order in which they run.
+    """A foot-IK system: one rule for each of twelve stages.
 
     Make one from a preset of `jaxik.presets`, then exchange rules with `dataclasses.replace` and
     numbers with `jaxik.maths.parameter_tree.replace`:
@@ -48,6 +50,7 @@ class FootIK(Rule):
     effector: AbstractEffector
     leg: AbstractLeg
     foot: AbstractFoot
+    fade: AbstractFade = eqx.field(default_factory=NoFade)
 
 
 @struct
@@ -62,6 +65,7 @@ class State:
     lock: PyTree
     pelvis: PelvisState
     effector: PyTree
+    fade: PyTree
 
 
 @struct
@@ -138,4 +142,5 @@ def init(ik: FootIK, rig: Rig) -> State:
         ik.lock.init(rig),
         ik.pelvis.init(rig),
         ik.effector.init(rig),
+        ik.fade.init(rig),
     )

@@ -1,5 +1,6 @@
 from . import contact as contact
 from . import effector as effector
+from . import fade as fade
 from . import foot as foot
 from . import inputs as inputs
 from . import lean as lean

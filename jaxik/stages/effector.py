@@ -27,7 +27,7 @@ class Effector:
     rot_ws: Float[Array, "legs 4"]
     """Of the ankles, for the foot rule."""
     weight: Float[Array, " legs"]
-    """0..1, how much foot IK each leg gets."""
+    """0..1, how much of its weight each leg gets."""
 
 
 class AbstractEffector(Rule):
@@ -71,7 +71,7 @@ class DirectEffector(AbstractInstantEffector):
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
-        return None, Effector(target.pos, target.rot, now.sensed.weight)
+        return None, Effector(target.pos, target.rot, jnp.ones_like(now.sensed.weight))
 
 
 class FoundEffector(AbstractInstantEffector):
@@ -80,8 +80,7 @@ class FoundEffector(AbstractInstantEffector):
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
-        sensed = now.sensed
-        return None, Effector(target.pos, target.rot, sensed.weight * sensed.foothold.found)
+        return None, Effector(target.pos, target.rot, now.sensed.foothold.found)
 
 
 class HeelEffector(AbstractInstantEffector):
@@ -124,7 +123,7 @@ class HeelEffector(AbstractInstantEffector):
         raised = quat.rotate(quat.from_axis_angle(tilted_axis, -angle), arm)
         # The foot rule tilts the foot once it is raised.
         rot_ws = quat.multiply(quat.from_axis_angle(axis, -angle), target.rot)
-        return None, Effector(ball + raised, rot_ws, sensed.weight)
+        return None, Effector(ball + raised, rot_ws, jnp.ones_like(angle))
 
 
 def foot_tilt(sensed: Sensed) -> Float[Array, "legs 4"]:
@@ -233,7 +232,7 @@ class BodyEffector(AbstractEffector):
         asleep = may_sleep * (1.0 - awake * (1.0 - arrived))
 
         offset_ws = vec.scale(sensed.leg_up_ws, height - requested) + pelvis.offset_ws
-        effector = Effector(target.pos + offset_ws, target.rot, sensed.weight)
+        effector = Effector(target.pos + offset_ws, target.rot, jnp.ones_like(height))
         return BodyState(height, asleep), effector
 
     def _stands(self, now: SensedMoment) -> Float[Array, ""]:
@@ -285,8 +284,6 @@ class FadeEffector(AbstractEffector):
         rot_ws = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
         rot_ws = quat.nlerp(state.rot_ws, rot_ws, found)
         effector = Effector(
-            sensed.ankle_ws + offset_ws,
-            quat.multiply(rot_ws, sensed.ankle_rot_ws),
-            sensed.weight * weight,
+            sensed.ankle_ws + offset_ws, quat.multiply(rot_ws, sensed.ankle_rot_ws), weight
         )
         return FadeState(weight, offset_ws, rot_ws), effector

@@ -1,0 +1,238 @@
+"""How foot IK fades in and out, so that nothing pops when a weight or `Frame.grounded` jumps.
+
+The stage runs in two places: after the pelvis, where the body moves to where pelvis and lean want
+it, and after the effector, where each leg's weight moves to the one that it is to have.
+"""
+
+import dataclasses
+from abc import abstractmethod
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.gate import HARD
+from jaxik.maths.parameter_tree import Leaf, Rule, parameter
+from jaxik.maths.struct import struct
+from jaxik.world.frame import Sensed
+from jaxik.world.skeleton import Rig, Transform
+
+from .effector import Effector
+from .inputs import SensedMoment
+
+BODY_SHARE = 0.5  # of the speed, that the body takes while legs fade too
+SETTLING = 1.0  # s after a change of weights in which pelvis rules may still go to new goals
+SMALLEST = 1e-6  # m, smaller corrections fade at once
+
+
+class AbstractFade(Rule):
+    """Fades foot IK of the body and of each leg."""
+
+    per_leg: ClassVar[bool] = False
+
+    @abstractmethod
+    def init(self, rig: Rig) -> PyTree:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def lasting(self, weight: Float[Array, " legs"], state: PyTree) -> Float[Array, " legs"]:
+        """Weights for locks, which hold a foot until its leg has faded out."""
+
+    @abstractmethod
+    def body(
+        self, now: SensedMoment, goal: Transform, weight: Float[Array, " legs"], state: PyTree
+    ) -> tuple[PyTree, Transform]:
+        """Memory so far, and the body's motion in this frame.
+
+        Args:
+            now: the sensed frame.
+            goal: offset, m, and rotation about the hips that pelvis and lean want, world axes.
+            weight: that each leg is to have, 0..1.
+            state: memory after the frame before.
+        """
+
+    @abstractmethod
+    def legs(
+        self,
+        now: SensedMoment,
+        effector: Effector,
+        body: Transform,
+        weight: Float[Array, " legs"],
+        state: PyTree,
+    ) -> tuple[PyTree, Float[Array, " legs"]]:
+        """Memory after this frame, and how much foot IK each leg gets in it.
+
+        Args:
+            now: the sensed frame.
+            effector: where the legs go.
+            body: the body's motion in this frame.
+            weight: that each leg is to have, 0..1.
+            state: memory as `body` returned it.
+        """
+
+
+class NoFade(AbstractFade):
+    """Weights act at once; where they jump, so does the pose."""
+
+    def init(self, rig: Rig) -> None:
+        return None
+
+    def lasting(self, weight: Array, state: None) -> Array:
+        return weight
+
+    def body(
+        self, now: SensedMoment, goal: Transform, weight: Array, state: None
+    ) -> tuple[None, Transform]:
+        return None, goal
+
+    def legs(
+        self, now: SensedMoment, effector: Effector, body: Transform, weight: Array, state: None
+    ) -> tuple[None, Array]:
+        return None, weight
+
+
+@struct
+class SpeedFadeState:
+    """What has faded in so far."""
+
+    goal: Float[Array, " legs"]
+    """0..1, weights that the legs were to have."""
+    weight: Float[Array, " legs"]
+    """0..1, weights that they had."""
+    body: Transform
+    """Motion of the body: offset, m, and rotation, world axes."""
+    moved: Float[Array, ""]
+    """m, how far the body moved by itself in this frame."""
+    since: Float[Array, ""]
+    """s, since a weight changed or the body last was where it is to be."""
+    hip_height: Float[Array, ""]
+    """m, along up, of the animated hips."""
+    fall_speed: Float[Array, ""]
+    """m/s, at which the animated hips fell when foot IK was last off."""
+
+
+class SpeedFade(AbstractFade):
+    """Fades by a speed: whatever jumps, no ankle, ball or pelvis moves faster because of it.
+
+    A leg's weight moves in steps of `speed dt / size`, where `size` bounds how far ankle and ball
+    move between no and full foot IK. After a weight has changed, the body moves to where pelvis and
+    lean want it by at most the same speed until it is there, whatever their rules do. Weights that
+    stay as they are leave no trace.
+
+    A character that falls lands at the speed of its fall: its feet go on to the ground as animated,
+    instead of waiting for the fade.
+    """
+
+    speed: Leaf = parameter(
+        0.5,
+        unit="m/s",
+        low=0.1,
+        high=3.0,
+        scale="log",
+        doc="Speed by which joints move at most while foot IK fades in or out.",
+    )
+
+    def init(self, rig: Rig) -> SpeedFadeState:
+        zero, zeros = jnp.zeros((), rig.side.dtype), jnp.zeros_like(rig.side)
+        body = Transform(jnp.zeros(3, zero.dtype), quat.identity(zero.dtype))
+        return SpeedFadeState(zeros, zeros, body, zero, zero + SETTLING, zero, zero)
+
+    def lasting(self, weight: Array, state: SpeedFadeState) -> Array:
+        return jnp.where(state.weight > weight, state.weight, weight)
+
+    def body(
+        self, now: SensedMoment, goal: Transform, weight: Array, state: SpeedFadeState
+    ) -> tuple[SpeedFadeState, Transform]:
+        changed = now.started & jnp.any(weight != state.goal)
+        since = jnp.where(changed, 0.0, state.since + now.dt)
+        state = self._with_fall(now, weight, dataclasses.replace(state, since=since))
+        fading = jnp.any(weight != state.weight)
+        limit = self._speed(state) * jnp.where(fading, BODY_SHARE, 1.0) * now.dt
+        reach = HARD.maximum(now.sensed.thigh + now.sensed.shin, band=0.0)
+        offset = goal.pos - state.body.pos
+        gap = vec.length(offset) + reach * quat.angle(state.body.rot, goal.rot)
+        limited = now.started & (since < SETTLING) & (gap > limit)
+        part = jnp.where(limited, limit / jnp.where(limited, gap, 1.0), 1.0)
+        body = Transform(
+            jnp.where(limited, state.body.pos + vec.scale(offset, part), goal.pos),
+            jnp.where(limited, quat.nlerp(state.body.rot, goal.rot, part), goal.rot),
+        )
+        after = dataclasses.replace(
+            state,
+            goal=weight,
+            body=body,
+            moved=jnp.where(gap > limit, limit, gap),
+            since=jnp.where(limited, 0.0, since),
+        )
+        return after, body
+
+    def legs(
+        self,
+        now: SensedMoment,
+        effector: Effector,
+        body: Transform,
+        weight: Array,
+        state: SpeedFadeState,
+    ) -> tuple[SpeedFadeState, Array]:
+        limit = self._speed(state) * now.dt
+        # A leg that has not faded in moves with the body.
+        limit -= (1.0 - state.weight) * BODY_SHARE * state.moved
+        size = correction_size(now, effector, body, state.weight)
+        sized = size > SMALLEST
+        step = jnp.where(sized, limit / jnp.where(sized, size, 1.0), 1.0)
+        faded = smoothing.move_towards(state.weight, weight, now.progress(step))
+        return dataclasses.replace(state, weight=faded), faded
+
+    def _speed(self, state: SpeedFadeState) -> Array:
+        """Speed of the fade in this frame, m/s."""
+        return jnp.where(state.fall_speed > self.speed, state.fall_speed, self.speed)
+
+    def _with_fall(self, now: SensedMoment, weight: Array, state: SpeedFadeState) -> SpeedFadeState:
+        """The memory with how fast the hips fall, or fell before the landing."""
+        sensed = now.sensed
+        hips = vec.dot(sensed.hip_ws - sensed.root_ws, sensed.up_ws)
+        height = vec.safe_divide(vec.sum_last(hips), jnp.asarray(hips.shape[-1], hips.dtype))
+        speed = vec.safe_divide(state.hip_height - height, now.dt)
+        falling = now.started & (speed > 0) & jnp.all(weight == 0)
+        landing = jnp.where(state.since < SETTLING, state.fall_speed, 0.0)
+        landing = jnp.where(jnp.all(weight == 0), 0.0, landing)
+        fall_speed = jnp.where(falling, speed, landing)
+        return dataclasses.replace(state, hip_height=height, fall_speed=fall_speed)
+
+
+def correction_size(
+    now: SensedMoment, effector: Effector, body: Transform, weight: Float[Array, " legs"]
+) -> Float[Array, " legs"]:
+    """Bounds how far ankle and ball of each leg move per unit of its weight, m.
+
+    The weight turns hip and knee evenly. A leg that is straight at weight 0 starts to shorten
+    slowly, and one that is straight at 1 arrives slowly: at the other end it is twice as fast as on
+    average. The foot turns with the leg on one half of the way and back on the other.
+    """
+    sensed = now.sensed
+    carried = Transform(
+        carry(sensed, sensed.ankle_ws, body), quat.multiply(body.rot, sensed.ankle_rot_ws)
+    )
+    hip = carry(sensed, sensed.hip_ws, body)
+    reach = sensed.thigh + sensed.shin
+    to_target = effector.target_ws - hip
+    distance = vec.length(to_target)
+    beyond = distance > reach
+    within = jnp.where(beyond, reach / jnp.where(beyond, distance, 1.0), 1.0)
+    chord = vec.length(hip + vec.scale(to_target, within) - carried.pos)
+    share = vec.safe_divide(chord, reach)
+    leg_turn = share + vec.safe_sqrt(2.0 * share)
+    foot_turn = quat.angle(carried.rot, effector.rot_ws)
+    foot_turn += sensed.turned * vec.length(sensed.ground.ankle.normal - sensed.leg_up_ws)
+    arm = vec.length(sensed.ball_ws - sensed.ankle_ws)
+    end = jnp.abs(2.0 * weight - 1.0)
+    return (1.0 + end) * chord + arm * (end * leg_turn + foot_turn)
+
+
+def carry(sensed: Sensed, points_ws: Array, body: Transform) -> Float[Array, "legs 3"]:
+    """Points of the animated legs, m, on the body that turns about the mean of its hips."""
+    present = sensed.present.astype(points_ws.dtype)
+    share = present / jnp.maximum(vec.sum_last(present), 1.0)
+    pivot = vec.sum_vectors(vec.scale(sensed.hip_ws, share))
+    return pivot + body.pos + quat.rotate(body.rot, points_ws - pivot)
