@@ -110,6 +110,8 @@ class SpeedFadeState:
     """m, along up, of the animated hips."""
     fall_speed: Float[Array, ""]
     """m/s, at which the animated hips fell when foot IK was last off."""
+    speed: Float[Array, ""]
+    """m/s, of the fade in this frame: what the animation has lost of that speed, at a landing."""
 
 
 class SpeedFade(AbstractFade):
@@ -136,7 +138,7 @@ class SpeedFade(AbstractFade):
     def init(self, rig: Rig) -> SpeedFadeState:
         zero, zeros = jnp.zeros((), rig.side.dtype), jnp.zeros_like(rig.side)
         body = Transform(jnp.zeros(3, zero.dtype), quat.identity(zero.dtype))
-        return SpeedFadeState(zeros, zeros, body, zero, zero + SETTLING, zero, zero)
+        return SpeedFadeState(zeros, zeros, body, zero, zero + SETTLING, zero, zero, zero)
 
     def lasting(self, weight: Array, state: SpeedFadeState) -> Array:
         return jnp.where(state.weight > weight, state.weight, weight)
@@ -146,9 +148,9 @@ class SpeedFade(AbstractFade):
     ) -> tuple[SpeedFadeState, Transform]:
         changed = now.started & jnp.any(weight != state.goal)
         since = jnp.where(changed, 0.0, state.since + now.dt)
-        state = self._with_fall(now, weight, dataclasses.replace(state, since=since))
+        state = self._with_speed(now, weight, dataclasses.replace(state, since=since))
         fading = jnp.any(weight != state.weight)
-        limit = self._speed(state) * jnp.where(fading, BODY_SHARE, 1.0) * now.dt
+        limit = state.speed * jnp.where(fading, BODY_SHARE, 1.0) * now.dt
         reach = HARD.maximum(now.sensed.thigh + now.sensed.shin, band=0.0)
         offset = goal.pos - state.body.pos
         gap = vec.length(offset) + reach * quat.angle(state.body.rot, goal.rot)
@@ -175,7 +177,7 @@ class SpeedFade(AbstractFade):
         weight: Array,
         state: SpeedFadeState,
     ) -> tuple[SpeedFadeState, Array]:
-        limit = self._speed(state) * now.dt
+        limit = state.speed * now.dt
         # A leg that has not faded in moves with the body.
         limit -= (1.0 - state.weight) * BODY_SHARE * state.moved
         size = correction_size(now, effector, body, state.weight)
@@ -184,21 +186,24 @@ class SpeedFade(AbstractFade):
         faded = smoothing.move_towards(state.weight, weight, now.progress(step))
         return dataclasses.replace(state, weight=faded), faded
 
-    def _speed(self, state: SpeedFadeState) -> Array:
-        """Speed of the fade in this frame, m/s."""
-        return jnp.where(state.fall_speed > self.speed, state.fall_speed, self.speed)
-
-    def _with_fall(self, now: SensedMoment, weight: Array, state: SpeedFadeState) -> SpeedFadeState:
+    def _with_speed(
+        self, now: SensedMoment, weight: Array, state: SpeedFadeState
+    ) -> SpeedFadeState:
         """The memory with how fast the hips fall, or fell before the landing."""
         sensed = now.sensed
         hips = vec.dot(sensed.hip_ws - sensed.root_ws, sensed.up_ws)
-        height = vec.safe_divide(vec.sum_last(hips), jnp.asarray(hips.shape[-1], hips.dtype))
-        speed = vec.safe_divide(state.hip_height - height, now.dt)
-        falling = now.started & (speed > 0) & jnp.all(weight == 0)
+        height = vec.sum_last(hips) / hips.shape[-1]
+        falling = jnp.where(now.started, vec.safe_divide(state.hip_height - height, now.dt), 0.0)
+        falling = jnp.where(falling > 0, falling, 0.0)
         landing = jnp.where(state.since < SETTLING, state.fall_speed, 0.0)
-        landing = jnp.where(jnp.all(weight == 0), 0.0, landing)
-        fall_speed = jnp.where(falling, speed, landing)
-        return dataclasses.replace(state, hip_height=height, fall_speed=fall_speed)
+        fall_speed = jnp.where(jnp.all(weight == 0), falling, landing)
+        remaining = fall_speed - falling
+        return dataclasses.replace(
+            state,
+            hip_height=height,
+            fall_speed=fall_speed,
+            speed=jnp.where(remaining > self.speed, remaining, self.speed),
+        )
 
 
 def correction_size(

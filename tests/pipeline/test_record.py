@@ -313,7 +313,7 @@ def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, va
 def test_exactly_the_parameters_without_a_slot_are_dropped():
     ik = jaxik.presets.record()
     leaves = {name: parameter_tree.get(ik, name) for name in parameter_tree.docs(ik)}
-    other = {n: ~x if x.dtype == bool else x // 2 if x.dtype == jnp.uint32 else x * 0.8 + 0.1
+    other = {n: ~x if x.dtype == bool else x // 2 if x.dtype == jnp.uint32 else x * 0.8 + 0.11
              for n, x in leaves.items()}  # fmt: skip
     other |= {name: 1.0 for name, leaf in leaves.items() if np.isinf(leaf).any()}
     slots = {ours for _, _, ours in record.FLAGS}

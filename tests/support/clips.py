@@ -149,11 +149,13 @@ BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
 def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
     """The preset or blend with this name, with some values replaced.
 
-    Its probe refuses no ground, as in the originals; `tests/stages/test_limits.py` is about that.
+    Its probe refuses no ground, as in the originals, and nothing fades: `tests/stages/test_limits`
+    and `test_fade` are about that.
     """
     ik = (BLENDS.get(preset) or getattr(jaxik.presets, preset))()
     probe = dataclasses.replace(ik.probe, limited=False)
-    return parameter_tree.replace(dataclasses.replace(ik, probe=probe), values)
+    ik = dataclasses.replace(ik, probe=probe, fade=jaxik.stages.fade.NoFade())
+    return parameter_tree.replace(ik, values)
 
 
 def to_terrain(ground: PlainTerrain) -> terrain.Terrain:

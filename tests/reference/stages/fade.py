@@ -1,0 +1,111 @@
+"""How foot IK fades in and out, in plain NumPy: one character, one frame at a time.
+
+It takes what the other stages want in a frame, and says what the body and the legs get. Everything
+is in world space.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from reference import maths
+from reference.maths import Array, length, rotate
+
+SETTLED = 1.0  # s without a change of weights
+
+
+@dataclass
+class Wish:
+    """What the other stages want in this frame, and what limits depend on; legs first."""
+
+    dt: float
+    up: Array
+    weights: Array
+    hips: Array
+    ankles: Array
+    ankle_rots: Array
+    balls: Array
+    targets: Array
+    target_rots: Array
+    tilts: Array
+    """How far each foot turns to the ground, as the length of the normal less up."""
+    reach: Array
+    """Thigh and shin, m."""
+    lift: Array
+    """Offset of the root, m."""
+    offset: Array
+    """Of the body, m."""
+    rot: Array
+    """Of the body."""
+
+
+@dataclass
+class Memory:
+    """What has faded in so far."""
+
+    wanted: Array
+    weights: Array
+    offset: Array
+    rot: Array
+    since: float
+    hip_height: float
+    fall: float
+
+
+def step(speed: float, wish: Wish, before: Memory | None) -> Memory:
+    """Memory after one frame: `weights`, `offset` and `rot` are what legs and body get."""
+    hip_height = float(np.mean(wish.hips - wish.lift, axis=0) @ wish.up)
+    if before is None:
+        return Memory(
+            wish.weights, wish.weights, wish.offset, wish.rot, SETTLED + 1.0, hip_height, 0.0
+        )
+    since = before.since + wish.dt
+    if not np.array_equal(wish.weights, before.wanted):
+        since = 0.0
+    falling = max((before.hip_height - hip_height) / wish.dt, 0.0)
+    if wish.weights.any():
+        fall = before.fall if since < SETTLED else 0.0
+    else:
+        fall = falling
+    limit = max(speed, fall - falling) * wish.dt
+
+    legs_fade = not np.array_equal(wish.weights, before.weights)
+    body_limit = limit / 2.0 if legs_fade else limit
+    turn = maths.multiply(wish.rot, maths.inverse(before.rot))
+    angle = 2.0 * math.atan2(length(turn[1:]), abs(turn[0]))
+    gap = length(wish.offset - before.offset) + float(np.max(wish.reach)) * angle
+    offset, rot = wish.offset, wish.rot
+    if since < SETTLED and gap > body_limit:
+        since = 0.0
+        offset = before.offset + (wish.offset - before.offset) * body_limit / gap
+        rot = maths.nlerp(before.rot, wish.rot, body_limit / gap)
+
+    weights = []
+    for leg, weight in enumerate(before.weights):
+        budget = limit - (1.0 - weight) * min(gap, body_limit) / 2.0
+        size = correction(wish, leg, offset, rot, weight)
+        largest = budget / size if size > 1e-6 else 1.0
+        weights.append(maths.move_towards(weight, wish.weights[leg], largest))
+    return Memory(wish.weights, np.array(weights), offset, rot, since, hip_height, fall)
+
+
+def correction(wish: Wish, leg: int, offset: Array, rot: Array, weight: float) -> float:
+    """How far ankle and ball of a leg move per unit of its weight, m, at most."""
+    pivot = np.mean(wish.hips, axis=0)
+    hip, ankle = (
+        pivot + offset + rotate(rot, point - pivot) for point in (wish.hips[leg], wish.ankles[leg])
+    )
+    to_target = wish.targets[leg] - hip
+    if length(to_target) > wish.reach[leg]:
+        to_target = to_target * wish.reach[leg] / length(to_target)
+    way = length(hip + to_target - ankle)
+    from_middle = abs(2.0 * weight - 1.0)
+    part = way / wish.reach[leg]
+    turn = maths.multiply(
+        wish.target_rots[leg], maths.inverse(maths.multiply(rot, wish.ankle_rots[leg]))
+    )
+    foot_turn = 2.0 * math.atan2(length(turn[1:]), abs(turn[0])) + wish.tilts[leg]
+    leg_turn = part + math.sqrt(2.0 * part)
+    arm = length(wish.balls[leg] - wish.ankles[leg])
+    return way * (1.0 + from_middle) + arm * (from_middle * leg_turn + foot_turn)
