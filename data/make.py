@@ -121,6 +121,7 @@ RECORD_TRUTH = {
     "foot.max_roll": 0.12,
 }
 OZZ_TRUTH = {
+    "root.half_life": 0.0,  # as in the original
     "target.foot_height": 0.09,
     "leg.soften": 0.94,
     "leg.twist": 0.15,
@@ -129,6 +130,7 @@ OZZ_TRUTH = {
     "foot.weight": 0.8,
 }
 UNREAL_TRUTH = {
+    "root.enabled": False,  # as in the original
     "contact.idle_speed": 0.3,
     "target.adjust": 0.03,
     "pelvis.speed": 6.0,
@@ -138,6 +140,7 @@ UNREAL_TRUTH = {
 }
 MEC_TRUTH = {
     "root.enabled": True,  # the terrain differs from the floor on which the walk was made
+    "root.half_life": 0.0,
     "probe.foot_length": 0.16,
     "probe.half_width": 0.035,
     "probe.stable_height": 0.095,

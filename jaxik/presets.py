@@ -54,19 +54,22 @@ def record(rig: Rig | None = None) -> FootIK:
     return body.scale(ik, rig)
 
 
-def ozz(rig: Rig | None = None) -> FootIK:
-    """ozz-animation's foot IK sample.
+def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
+    """ozz-animation's foot IK sample, on a root that takes steps without a jump.
 
     Its four switches are `root.enabled` (character height), `pelvis.enabled`, `leg.enabled`
-    (two-bone) and `foot.enabled` (aim). Nothing has memory. `probe.use_toe`, `probe.toe_ls` and
-    `pelvis.vertical_only` belong to rules of the record and change nothing here.
+    (two-bone) and `foot.enabled` (aim). Only the root has memory. `probe.use_toe`, `probe.toe_ls`
+    and `pelvis.vertical_only` belong to rules of the record and change nothing here.
 
     Two inaccuracies of ozz 0.16 are not reproduced: with a weight below 1 its aim goes the longer
     way round in 10 to 14 % of cases, and it treats directions within 1.4 mrad of opposed as
     opposed, so that its aim misses by as much. `tests/solvers/test_golden.py` shows both.
+
+    Args:
+        faithful: put the root on the ground at once, as the sample does: nothing has memory then.
     """
     ik = FootIK(
-        root=GroundRoot(),
+        root=GroundRoot(half_life=0.0) if faithful else GroundRoot(),
         warp=StrideWarp(),
         probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False),
         contact=StandingContact(),
@@ -82,7 +85,7 @@ def ozz(rig: Rig | None = None) -> FootIK:
     return body.scale(ik, rig)
 
 
-def unreal(rig: Rig | None = None) -> FootIK:
+def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """Unreal's foot IK control rig, with its latch.
 
     It works only while the character stands still (`contact.idle_speed`). As in the original, the
@@ -90,11 +93,13 @@ def unreal(rig: Rig | None = None) -> FootIK:
     goal; better switch `effector.latch` off.
 
     The root is the bottom of the capsule. The capsule's half-height is needed twice: rays start at
-    `probe.ray_up`, and `pelvis.half_height` is what shrinks. The game keeps the capsule on the
-    ground; for an animation whose root stays on its flat floor, switch `root.enabled` on.
+    `probe.ray_up`, and `pelvis.half_height` is what shrinks.
+
+    Args:
+        faithful: leave it to the game to keep the capsule on the ground.
     """
     ik = FootIK(
-        root=GroundRoot(enabled=False),
+        root=GroundRoot(enabled=not faithful),
         warp=StrideWarp(),
         probe=RootProbe(),
         contact=IdleContact(),
@@ -110,15 +115,17 @@ def unreal(rig: Rig | None = None) -> FootIK:
     return body.scale(ik, rig)
 
 
-def mec(rig: Rig | None = None) -> FootIK:
+def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """Mec Foot Placer, a plug-in for Unity.
 
     Use `LegTerrains` for feet and hands that each have their own up. All switches and numbers of
-    the probe, the lock and the legs can be one value per leg. The game keeps the character on the
-    ground; for an animation whose root stays on its flat floor, switch `root.enabled` on.
+    the probe, the lock and the legs can be one value per leg.
+
+    Args:
+        faithful: leave it to the game to keep the character on the ground.
     """
     ik = FootIK(
-        root=GroundRoot(enabled=False),
+        root=GroundRoot(enabled=not faithful),
         warp=StrideWarp(),
         probe=CornerProbe(),
         contact=StandingContact(),

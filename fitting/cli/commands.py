@@ -81,9 +81,7 @@ def compare(options: argparse.Namespace) -> int:
         return _compare_in_suite(options)
     _check_comparison(options)
     animation = _animation(options)
-    requested = comparison.named_systems(
-        options.systems, animation.flat_clip.rig, on_ground=options.root == "auto"
-    )
+    requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
     jobs.compare(requested, animation, options.output, during=progress.timed, log=print)
     return 0
 

@@ -18,10 +18,10 @@ from fitting.analysis.playback import RAY_START, Motion, stage_outputs
 from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
 from fitting.experiments.parameter_files import load_system
-from fitting.experiments.systems import leaf_names, preset_system
+from fitting.experiments.systems import preset_system
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from jaxik.maths import parameter_tree, vec
+from jaxik.maths import vec
 from jaxik.world.terrain import Terrain, cast
 
 from .animations import Animation
@@ -48,7 +48,7 @@ class Comparison:
 
 @in_float64
 def named_systems(
-    options: Iterable[tuple[str, str]], rig: jaxik.Rig | None = None, *, on_ground: bool = True
+    options: Iterable[tuple[str, str]], rig: jaxik.Rig | None = None
 ) -> dict[str, jaxik.FootIK]:
     """Systems by the name of their preset or of their parameter file, in the order of the options.
 
@@ -56,8 +56,6 @@ def named_systems(
         options: pairs of `--presets` and names of presets, or of `--parameters` and parameter
             files, separated by commas.
         rig: whose body they are for; None is the adult.
-        on_ground: whether presets that leave the character's height to the game put it on the
-            ground.
 
     Raises:
         ValueError: there is no system; a name occurs twice; a preset or a file does not exist, or
@@ -71,8 +69,6 @@ def named_systems(
             is_file = option == "--parameters"
             name = Path(entry).stem if is_file else entry
             ik = load_system(entry, rig)[0] if is_file else preset_system(entry, rig)
-            if on_ground and not is_file and "root.enabled" in leaf_names(ik):
-                ik = parameter_tree.replace(ik, {"root.enabled": True})
             if name in (*systems, ANIMATED):
                 raise ValueError(f"{option} {text!r}: there already is a system named {name!r}")
             systems[name] = ik

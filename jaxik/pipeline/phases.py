@@ -1,14 +1,14 @@
 """The three phases of a frame: `sense`, `advance` and `pose`.
 
 `sense` and `pose` have no memory, so that a clip's frames are computed all at once; only `advance`
-has to run frame by frame. The contact is sensed and advanced before everything else.
+has to run frame by frame. Contact and root are sensed and advanced before everything else.
 """
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, vec
 from jaxik.stages.contact import AbstractContact
@@ -16,43 +16,53 @@ from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.stages.leg import LegGoal
 from jaxik.stages.pelvis import PelvisMoment
 from jaxik.stages.probe import foot_heading
+from jaxik.stages.root import AbstractRoot
 from jaxik.world.frame import Contact, Sensed, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths
 
 from .system import Advanced, Corrections, FootIK, Result, State, Trace
 
 
-def sense_contacts(rule: AbstractContact, inputs: Inputs, state: State) -> tuple[PyTree, Contact]:
-    """The contact stage for a whole clip: memory after each frame, and the contacts.
+def sense_first(
+    rule: AbstractContact | AbstractRoot, memory: PyTree, inputs: Inputs, started: Array
+) -> tuple[PyTree, PyTree]:
+    """A stage that runs before everything else, contact or root, for a whole clip.
 
-    It runs in a scan of its own before everything else, or without one if the rule has no memory.
-    The leaves of `inputs.frame` have a leading axis of frames.
+    It has a scan of its own, or none if the rule has no memory.
+
+    Args:
+        rule: of that stage.
+        memory: its memory before the clip.
+        inputs: the leaves of `frame` have a leading axis of frames.
+        started: False if there was no frame before the clip.
+
+    Returns:
+        Memory after each frame, and what the stage returns for each.
     """
     frames, gate = inputs.frame, inputs.gate
-    with jax.named_scope("contact"):
-        sensed = jax.vmap(lambda frame: rule.sense(inputs.at(frame)))(frames)
-        if not jax.tree.leaves(state.contact):
-            return state.contact, sensed
+    sensed = jax.vmap(lambda frame: rule.sense(inputs.at(frame)))(frames)
 
-        def scanned(
-            carry: tuple[PyTree, Array], frame: tuple[Contact, Array]
-        ) -> tuple[tuple[PyTree, Array], tuple[PyTree, Contact]]:
-            (memory, started), (contact, dt) = carry, frame
-            after, contact = rule.advance(Moment(dt, started, gate), contact, memory)
-            return (after, jnp.ones_like(started)), (after, contact)
+    def advanced(memory: PyTree, started: Array, sensed: PyTree, dt: Array) -> tuple:
+        return rule.advance(Moment(dt, started, gate), sensed, memory)
 
-        return jax.lax.scan(scanned, (state.contact, state.started), (sensed, frames.dt))[1]
+    if not jax.tree.leaves(memory):
+        return memory, jax.vmap(lambda *now: advanced(memory, started, *now)[1])(sensed, frames.dt)
+
+    def scanned(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
+        after, output = advanced(*carry, *now)
+        return (after, jnp.ones_like(started)), (after, output)
+
+    return jax.lax.scan(scanned, (memory, started), (sensed, frames.dt))[1]
 
 
-def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
-    """Outputs of the stages that need no memory, given which feet stand."""
+def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) -> Sensed:
+    """Outputs of the stages that need no memory, given which feet stand and the root's rise, m."""
     rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
     up = terrain.leg_up_ws
     weight = jnp.where(rig.present, frame.grounded * frame.weight * ik.leg.weight, 0.0)
-    with jax.named_scope("root"):
-        root_ws = vec.scale(terrain.up_ws, ik.root.sense(inputs))
-        frame = frame.translated(root_ws)
-        inputs = dataclasses.replace(inputs, frame=frame)
+    root_ws = vec.scale(terrain.up_ws, rise)
+    frame = frame.translated(root_ws)
+    inputs = dataclasses.replace(inputs, frame=frame)
     thigh, shin = bone_lengths(frame.pose)
     with jax.named_scope("warp"):
         warp_ws = ik.warp.sense(inputs)
@@ -94,14 +104,14 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact) -> Sensed:
     )
 
 
-def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Advanced:
+def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, PyTree]) -> Advanced:
     """Memory after this frame, and the outputs of the stages that have some.
 
     Args:
         ik: the system.
         now: the sensed frame.
         state: memory after the frame before.
-        contact: the contact stage's memory after this frame: it advances before `sense`.
+        first: memory of contact and root after this frame: they advance before `sense`.
     """
     sensed, up = now.sensed, now.sensed.leg_up_ws
     with jax.named_scope("target"):
@@ -134,7 +144,8 @@ def advance(ik: FootIK, now: SensedMoment, state: State, contact: PyTree) -> Adv
         effector = dataclasses.replace(effector, weight=effector.weight * weight)
     after = State(
         started=jnp.ones_like(now.started),
-        contact=contact,
+        contact=first[0],
+        root=first[1],
         target=target_state,
         lean=lean_state,
         lock=lock_state,

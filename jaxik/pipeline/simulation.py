@@ -15,7 +15,7 @@ from jaxik.world.frame import Frame, Sensed
 from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
-from .phases import advance, pose, sense, sense_contacts
+from .phases import advance, pose, sense, sense_first
 from .shapes import check_inputs, check_state
 from .system import Advanced, FootIK, Result, State, init
 
@@ -60,12 +60,14 @@ def step(
     check_inputs(ik, Inputs(rig, terrain, frame, gate), clip=False)
     inputs = Inputs(rig, terrain, frame, gate).at(frame)
     check_state(state, jax.eval_shape(init, ik, rig))
+    now = Moment(frame.dt, state.started, gate)
     with jax.named_scope("contact"):
-        now = Moment(frame.dt, state.started, gate)
-        memory, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
-    sensed = sense(ik, inputs, contact)
+        contact_state, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
+    with jax.named_scope("root"):
+        root_state, rise = ik.root.advance(now, ik.root.sense(inputs), state.root)
+    sensed = sense(ik, inputs, contact, rise)
     sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, inputs.terrain)
-    advanced = advance(ik, sensed_now, state, memory)
+    advanced = advance(ik, sensed_now, state, (contact_state, root_state))
     result = pose(ik, inputs, sensed, advanced)
     return advanced.state, result if trace else dataclasses.replace(result, trace=None)
 
@@ -94,16 +96,25 @@ def resume(
     check_inputs(ik, inputs, clip=True)
     check_state(state, jax.eval_shape(init, ik, rig))
 
-    memories, contacts = sense_contacts(ik.contact, inputs, state)
-    sensed = jax.vmap(lambda frame, contact: sense(ik, inputs.at(frame), contact))(frames, contacts)
+    with jax.named_scope("contact"):
+        contact_states, contacts = sense_first(ik.contact, state.contact, inputs, state.started)
+    with jax.named_scope("root"):
+        root_states, rises = sense_first(ik.root, state.root, inputs, state.started)
+    sensed = jax.vmap(lambda frame, *first: sense(ik, inputs.at(frame), *first))(
+        frames, contacts, rises
+    )
 
-    def scanned(state: State, frame: tuple[Sensed, PyTree, Transform]) -> tuple[State, Advanced]:
-        sensed, memory, platforms = frame
+    def scanned(
+        state: State, frame: tuple[Sensed, tuple[PyTree, PyTree], Transform]
+    ) -> tuple[State, Advanced]:
+        sensed, first, platforms = frame
         now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain.at(platforms))
-        advanced = advance(ik, now, state, memory)
+        advanced = advance(ik, now, state, first)
         return advanced.state, advanced
 
-    after, advanced = jax.lax.scan(scanned, state, (sensed, memories, frames.platforms))
+    after, advanced = jax.lax.scan(
+        scanned, state, (sensed, (contact_states, root_states), frames.platforms)
+    )
     result = jax.vmap(lambda frame, s, a: pose(ik, inputs.at(frame), s, a))(
         frames, sensed, advanced
     )

@@ -60,6 +60,7 @@ class State:
     started: Bool[Array, "*b"]
     """False before the first frame, where memory jumps to its goals."""
     contact: PyTree
+    root: PyTree
     target: PyTree
     lean: PyTree
     lock: PyTree
@@ -137,6 +138,7 @@ def init(ik: FootIK, rig: Rig) -> State:
     return State(
         jnp.zeros((), bool),
         ik.contact.init(rig),
+        ik.root.init(rig),
         ik.target.init(rig),
         ik.lean.init(rig),
         ik.lock.init(rig),

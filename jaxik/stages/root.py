@@ -3,14 +3,22 @@
 from abc import abstractmethod
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
+from jaxik.maths import parameter_tree, smoothing, vec
+from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.world.frame import rise_of
+from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import cast
 
-from .inputs import Inputs
+from .inputs import Inputs, Moment
+
+HEIGHT_BAND = 0.01  # m
+SPEED_BAND = 0.05  # m/s
+WEIGHT_BAND = 0.1
 
 
 class AbstractRoot(Rule):
@@ -19,21 +27,81 @@ class AbstractRoot(Rule):
     per_leg: ClassVar[bool] = False
 
     @abstractmethod
-    def sense(self, inputs: Inputs) -> Float[Array, ""]:
-        """How far the character moves along up in this frame, m."""
+    def init(self, rig: Rig) -> PyTree:
+        """Memory before the first frame."""
+
+    @abstractmethod
+    def sense(self, inputs: Inputs) -> PyTree:
+        """What `advance` needs from this frame alone."""
+
+    @abstractmethod
+    def advance(
+        self, now: Moment, sensed: PyTree, state: PyTree
+    ) -> tuple[PyTree, Float[Array, ""]]:
+        """Memory after this frame, and how far the character moves along up in it, m."""
 
 
-class KeepRoot(AbstractRoot):
+class AbstractInstantRoot(AbstractRoot):
+    """Moves the character without memory: `sense` returns how far along up, m."""
+
+    def init(self, rig: Rig) -> None:
+        return None
+
+    def advance(
+        self, now: Moment, sensed: Float[Array, ""], state: None
+    ) -> tuple[None, Float[Array, ""]]:
+        return None, sensed
+
+
+class KeepRoot(AbstractInstantRoot):
     """The character stays where the game put it."""
 
     def sense(self, inputs: Inputs) -> Float[Array, ""]:
         return jnp.zeros_like(inputs.frame.dt)
 
 
+@struct
+class RootGround:
+    """The ground that carries the character, as one frame shows it; heights along up."""
+
+    origin: Float[Array, ""]
+    """m, of the character's origin."""
+    height: Float[Array, ""]
+    """m, of the ground below it."""
+    ahead: Float[Array, ""]
+    """m, of the ground where it will be once its height has followed."""
+    speed: Float[Array, ""]
+    """m/s, at which it climbs from the one to the other."""
+    rise: Float[Array, ""]
+    """m, how far that ground has risen since the previous frame."""
+    found: Float[Array, ""]
+    """0 or 1; 0 in the air too."""
+
+
+@struct
+class RootState:
+    """The height at which the character was put."""
+
+    height: Float[Array, ""]
+    """m, along up."""
+    velocity: Float[Array, ""]
+    """m/s, over the ground."""
+    offset: Float[Array, ""]
+    """m, of that height above the character's origin."""
+
+
 class GroundRoot(AbstractRoot):
     """Puts the character's origin on the ground below it (ozz's "auto character height").
 
-    Without ground below, or with `enabled` off, the character stays where it is.
+    The height follows the ground as a critically damped spring, no faster than `max_speed`. On a
+    ramp that is late by `half_life / ln 2`; the ground is therefore looked up where the character,
+    at its present velocity, will be by then: it climbs a ramp on the ramp, and stairs almost as
+    evenly. Ground there that is higher or lower than here by more than `max_step` and a slope of 45
+    degrees is a wall or a ledge and does not count yet. A half-life of 0 jumps, as ozz does, and
+    looks straight down.
+
+    Without ground, in the air, or with `enabled` off, the character stays as far from where the
+    game has it as it was.
     """
 
     enabled: Leaf = switch(True, doc="Whether the character is placed on the ground.")
@@ -43,7 +111,7 @@ class GroundRoot(AbstractRoot):
         low=0.0,
         high=20.0,
         kind="threshold",
-        doc="Height above the character's origin at which the ray starts.",
+        doc="Height above the character's origin at which the rays start.",
     )
     ray_down: Leaf = parameter(
         float("inf"),
@@ -51,14 +119,67 @@ class GroundRoot(AbstractRoot):
         low=0.0,
         high=20.0,
         kind="threshold",
-        doc="Depth below the character's origin to which the ray looks.",
+        doc="Depth below the character's origin to which the rays look.",
     )
     layers: Leaf = parameter_tree.layers()
+    half_life: Leaf = half_life_parameter(
+        0.20, doc="Time in which the character covers half its way to the height of the ground."
+    )
+    max_speed: Leaf = parameter(
+        4.0,
+        unit="m/s",
+        low=0.5,
+        high=10.0,
+        doc="Fastest that the character rises or sinks over the ground that carries it.",
+    )
+    max_step: Leaf = parameter(
+        0.40,
+        unit="m",
+        low=0.1,
+        high=1.0,
+        kind="threshold",
+        doc="Step beyond which the ground ahead does not count yet.",
+    )
 
-    def sense(self, inputs: Inputs) -> Float[Array, ""]:
-        terrain = inputs.terrain
-        origin, up = inputs.frame.world_from_model.pos, terrain.up_ws
-        above = origin + vec.scale(up, self.ray_up)
-        hit = cast(terrain.body, above, self.ray_up + self.ray_down, self.layers)
-        height = vec.dot(hit.point - origin, up)
-        return jnp.where(self.enabled & (hit.found > 0), height, 0.0)
+    def init(self, rig: Rig) -> RootState:
+        zero = jnp.zeros((), rig.side.dtype)
+        return RootState(zero, zero, zero)
+
+    def sense(self, inputs: Inputs) -> RootGround:
+        frame, gate, up = inputs.frame, inputs.gate, inputs.terrain.up_ws
+        origin = frame.world_from_model.pos
+        # Of a critically damped spring behind a ramp, s; each frame moves to its own end.
+        lag = self.half_life / smoothing.LN2 - 0.5 * frame.dt
+        lag = jnp.where(lag > 0, lag, 0.0)
+        travel = vec.scale(vec.reject(frame.velocity_ws, up), lag)
+        points = jnp.stack([origin, origin + travel])
+        above = points + vec.scale(up, self.ray_up)
+        hits = cast(inputs.terrain.body, above, self.ray_up + self.ray_down, self.layers)
+        hit = jax.tree.map(lambda leaf: leaf[0], hits)
+        height, ahead = vec.unstack(vec.dot(hits.point, up))
+        step = jnp.abs(ahead - height) - vec.length(travel)
+        counts = hits.found[1] * gate.below(step, self.max_step, band=HEIGHT_BAND)
+        ahead = gate.choose(counts, ahead, height)
+        speed = vec.safe_divide(ahead - height, lag)
+        on_ground = gate.above(frame.grounded, jnp.full_like(height, 0.5), band=WEIGHT_BAND)
+        found = jnp.where(self.enabled, hit.found * on_ground, 0.0)
+        rise = rise_of(frame.carry(hit), hit.point, up)
+        return RootGround(vec.dot(origin, up), height, ahead, speed, rise, found)
+
+    def advance(
+        self, now: Moment, sensed: RootGround, state: RootState
+    ) -> tuple[RootState, Float[Array, ""]]:
+        gate, before = now.gate, state.height + sensed.rise
+        motion = smoothing.spring(
+            smoothing.Motion(before, state.velocity), sensed.ahead, self.half_life, now.dt
+        )
+        limit = jnp.where(self.half_life > 0, self.max_speed, jnp.inf)
+        longest = jnp.where(self.half_life > 0, self.max_speed * now.dt, jnp.inf)
+        moved = gate.clip(motion.value - before, -longest, longest, band=HEIGHT_BAND)
+        height = jnp.where(now.started, before + moved, sensed.height)
+        velocity = jnp.where(now.started, motion.velocity, sensed.speed)
+        velocity = gate.clip(velocity, -limit, limit, band=SPEED_BAND)
+        height = gate.choose(sensed.found, height, sensed.origin + state.offset)
+        velocity = gate.choose(sensed.found, velocity, jnp.zeros_like(velocity))
+        offset = height - sensed.origin
+        return RootState(height, velocity, offset), offset

@@ -22,6 +22,7 @@ STANDS = (0.05, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.95)  # start, end, ..., fractio
 SYSTEMS: dict[str, Any] = {"ozz": ozz, "unreal": unreal, "mec": mec}
 CASES: list[tuple[str, str, dict[str, Any], int]] = [
     ("ozz", "as it is", {}, 2),
+    ("ozz", "as the original", {"root.half_life": 0.0}, 2),
     ("ozz", "only its pelvis", {"root.enabled": False, "leg.enabled": False}, 2),
     ("ozz", "only its legs", {"pelvis.enabled": False, "foot.enabled": False}, 3),
     (
@@ -29,6 +30,9 @@ CASES: list[tuple[str, str, dict[str, Any], int]] = [
         "odd",
         {
             "root.ray_up": 0.02,
+            "root.half_life": 0.06,
+            "root.max_speed": 0.5,
+            "root.max_step": 0.05,
             "probe.ray_up": 0.3,
             "probe.ray_down": 0.08,
             "target.foot_height": 0.09,

@@ -175,7 +175,7 @@ def test_arrays_that_disagree_on_legs_or_frames_are_named(where, value, message)
 @pytest.mark.parametrize(
     ("ik", "rig", "part"),
     [
-        (to_ik({}, "ozz"), RIG, "target"),
+        (to_ik({}, "ozz"), RIG, "root"),
         (to_ik({}, "by speed"), RIG, "contact"),
         (to_ik({}), to_rig(make_rig(legs=3)), "target"),
     ],

@@ -28,6 +28,7 @@ IDLE = {"contact.idle_speed": 1.0}  # at a walk
 FOLLOWS = IDLE | {"effector.latch": False}
 RAISED, LOWERED = planes((0, 0, 0.1)), planes((0, 0, -0.3))
 HIGH, LOW, LOWER = planes((0, 0, 0.4)), planes((0, 0, -0.22)), planes((0, 0, -0.5))
+CLIFF = planes((0, 0, 0), (9.0, 0, -9.0))  # from 1 m ahead
 RIGHT_KINK = planes((0, 0, 0), (0, -0.5, -0.065))  # rises 0.03 m to the right of the right ankle
 
 
@@ -47,6 +48,19 @@ def roots(**base: Any) -> tuple[Case, ...]:
         ),
         Case("root.ray_down", "standing", LOWER, (0.3, 0.8), "root height", -1, base, slope=False),
         Case("root.layers", "standing", RAISED, (NONE, ALL), "root height", 1, base),
+        # Nearer to a bend, the smoother root begins to rise.
+        Case(
+            "root.half_life",
+            "goes forward",
+            RAMP_UP,
+            (0.1, 0.4),
+            "root height",
+            1,
+            base,
+            slope=False,
+        ),
+        Case("root.max_speed", "goes forward", RAMP_UP, (0.05, 0.1), "root height", 1, base),
+        Case("root.max_step", "goes forward", CLIFF, (0.1, 0.6), "root height", 1, base),
     )
 
 

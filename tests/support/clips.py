@@ -149,9 +149,12 @@ BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
 def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
     """The preset or blend with this name, with some values replaced.
 
-    Its probe refuses no ground, as in the originals, and nothing fades: `tests/stages/test_limits`
-    and `test_fade` are about that.
+    As in the originals, its probe refuses no ground, nothing fades, and `unreal` and `mec` do not
+    put themselves on the ground: `tests/stages/test_limits`, `test_fade` and `test_root` are about
+    that.
     """
+    if preset in ("unreal", "mec"):
+        values = {"root.enabled": False} | values
     ik = (BLENDS.get(preset) or getattr(jaxik.presets, preset))()
     probe = dataclasses.replace(ik.probe, limited=False)
     ik = dataclasses.replace(ik, probe=probe, fade=jaxik.stages.fade.NoFade())

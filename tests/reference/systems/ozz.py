@@ -15,13 +15,11 @@ import numpy as np
 from reference import characters, maths
 from reference.characters import Frame, Ground, Parameters, Rig
 from reference.maths import Array, Transform, apply, cross, from_axis_angle, length, rotate, unit
-from reference.stages import ground, limb, pole
+from reference.stages import ground, limb, pole, root
 from reference.terrain import Hit
 
 DEFAULTS: dict[str, Any] = {
-    "root.enabled": True,
-    "root.ray_up": 10.0,
-    "root.ray_down": math.inf,
+    **root.DEFAULTS,
     "probe.ray_up": 0.5,
     "probe.ray_down": math.inf,
     "target.foot_height": 0.12,
@@ -46,6 +44,7 @@ DEFAULTS: dict[str, Any] = {
 class State:
     """Memory between frames."""
 
+    root: root.Root
     pelvis_height: float
 
 
@@ -65,7 +64,8 @@ def step(
     """One frame."""
     up = terrain.up
     legs = range(len(frame.weight))
-    lift = root_lift(parameters, terrain, frame)
+    placed = root.place(parameters, terrain, frame, None if state is None else state.root)
+    lift = placed.lift
     leg_weights = ground.weights_of_legs(parameters, frame)
     feet = [
         sense(parameters, characters.under(terrain, leg), frame, leg, up * lift, leg_weights[leg])
@@ -101,7 +101,7 @@ def step(
         "reached": np.array(reached),
         "foot_reached": np.array(foot_reached),
     }
-    return State(pelvis), output | characters.joints(solved)
+    return State(placed, pelvis), output | characters.joints(solved)
 
 
 def run(
@@ -109,16 +109,6 @@ def run(
 ) -> dict[str, Array]:
     """All outputs of `step` for a whole clip, stacked over the frames."""
     return characters.run(step, parameters, rig, terrain, frames)
-
-
-def root_lift(parameters: Parameters, terrain: Ground, frame: Frame) -> float:
-    """Height of the ground above the character's origin, m."""
-    if not parameters["root.enabled"]:
-        return 0.0
-    origin = frame.world_from_model.pos
-    ray_up = parameters["root.ray_up"]
-    hit = terrain.cast(origin + terrain.up * ray_up, ray_up + parameters["root.ray_down"])
-    return float(terrain.up @ (hit.point - origin)) if hit.found else 0.0
 
 
 def sense(

@@ -1,0 +1,204 @@
+"""Roots that put the character on its ground: without pops, late or early nowhere."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fitting
+import jaxik
+from fitting.datasets import ground_path
+from fitting.datasets.synthetic import walker
+from jaxik.pipeline.phases import sense_first
+from jaxik.stages.inputs import Inputs
+from jaxik.stages.root import AbstractRoot, GroundRoot, KeepRoot
+from jaxik.world import terrain
+from support.clips import at
+from support.gradients import finite_jacobian
+from support.grounds import edges_between_footfalls, flight, hill
+
+HZ = 60.0
+WIDTH = 20.0  # m between two grounds of `GROUNDS`, side by side along x
+
+
+@functools.cache
+def walk() -> fitting.Clip:
+    return walker.walk(7.0, HZ)
+
+
+@functools.cache
+def frames() -> jaxik.Frame:
+    return fitting.frames_from_clip(walk())
+
+
+def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> np.ndarray:
+    """How far the rule moves the root in each frame, m."""
+    return np.asarray(_heights(ground, clip, rule))
+
+
+@jax.jit
+def _heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> jax.Array:
+    rig = walk().rig
+    started = jnp.zeros((), bool)
+    return sense_first(rule, rule.init(rig), Inputs(rig, ground, clip, jaxik.HARD), started)[1]
+
+
+@functools.cache
+def grounds() -> tuple[list[str], terrain.Terrain]:
+    """Names of grounds, and all of them side by side: one mesh, and so one program for all."""
+    edges = edges_between_footfalls(walk(), 8)
+    meshes = {
+        "hill": hill(),
+        "four steps up": flight(edges[:4]),
+        "eight steps up": flight(edges),
+        "eight steps down": flight(edges, -0.15),
+        "curb": flight(edges[3:4]),
+    }
+    vertices = [
+        np.asarray(mesh.vertices) + [WIDTH * number, 0.0, 0.0]
+        for number, mesh in enumerate(meshes.values())
+    ]
+    starts = np.cumsum([0, *map(len, vertices)])
+    faces = [
+        np.asarray(mesh.faces) + start for mesh, start in zip(meshes.values(), starts, strict=False)
+    ]
+    return list(meshes), terrain.mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def third_difference(x: np.ndarray) -> float:
+    """The largest jerk, m/s³."""
+    return float(np.abs(np.diff(x, 3)).max()) * HZ**3
+
+
+@pytest.mark.parametrize(
+    "name", ["hill", "four steps up", "eight steps up", "eight steps down", "curb"]
+)
+def test_the_root_takes_hills_and_steps_evenly_and_is_late_nowhere(name):
+    names, ground = grounds()
+    shift = np.array([WIDTH * names.index(name), 0.0, 0.0])
+    lifted = heights(ground, frames().translated(jnp.asarray(shift)), GroundRoot())
+    assert np.ptp(lifted) > 0.1
+    if name != "hill":  # which rises by 1 cm a frame itself
+        assert np.abs(np.diff(lifted)).max() < 0.01, "m in a frame"
+    pelvis = walk().positions_ws[:, walk().rig.pelvis, 1]
+    assert third_difference(lifted) < 1.1 * third_difference(pelvis)
+    clip = walk().with_motion(walk().positions_ws + shift, walk().rotations_ws)
+    path = ground_path.path_heights(clip, ground)
+    assert path is not None
+    # The average over a stride in both directions of time, which no game could compute.
+    ideal = ground_path.smooth(path, 1.05 * HZ)
+    limit = 0.06 if name == "hill" else 0.03  # the stride's average cuts the top of the hill
+    assert np.abs(lifted - ideal).max() < limit
+
+
+def test_a_half_life_of_0_puts_the_root_on_the_ground_at_once():
+    names, ground = grounds()
+    shift = jnp.array([WIDTH * names.index("eight steps up"), 0.0, 0.0])
+    clip = frames().translated(shift)
+    hit = terrain.cast(ground, clip.world_from_model.pos + jnp.array([0.0, 10.0, 0.0]), jnp.inf)
+    lifted = heights(ground, clip, GroundRoot(half_life=0.0))
+    np.testing.assert_allclose(lifted, hit.point[:, 1], atol=1e-12)
+    assert np.diff(lifted).max() == pytest.approx(0.15)
+
+
+@functools.cache
+def glide(speed: float = 1.4, count: int = 180) -> jaxik.Frame:
+    """A character that moves along +z through x = 0 without moving its legs."""
+    first = at(frames(), 0)
+    time = jnp.arange(count) / HZ
+    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), first)
+    place = jnp.stack([0 * time, 0 * time, speed * time], axis=-1)
+    return dataclasses.replace(
+        many,
+        world_from_model=jaxik.Transform(place, many.world_from_model.rot),
+        velocity_ws=jnp.broadcast_to(jnp.array([0.0, 0.0, speed]), (count, 3)),
+    )
+
+
+def step(height: float, z: float = 2.0) -> terrain.Terrain:
+    """Level ground with a step at z, m."""
+    far = jnp.array([[0.0, 0.0], [0.0, 0.0], [height, height], [height, height]])
+    spacing = jnp.array([20.0, 1.0])
+    fine = terrain.heightfield(
+        far[:2], spacing, (-10.0, 0.0, z - 1.0), interpolation="triangulated"
+    )
+    ahead = terrain.heightfield(far[2:], (20.0, 40.0), (-10.0, 0.0, z))
+    behind = terrain.heightfield(far[:2], (20.0, 40.0), (-10.0, 0.0, z - 41.0))
+    return terrain.combine(fine, ahead, behind)
+
+
+@pytest.mark.parametrize("half_life", [0.1, 0.2, 0.4])
+def test_on_a_ramp_the_root_is_on_the_ramp(half_life):
+    ramp = terrain.plane(normal=(0.0, 1.0, -0.4))
+    clip = glide()
+    lifted = heights(ramp, clip, GroundRoot(half_life=half_life))
+    ground = 0.4 * np.asarray(clip.world_from_model.pos[:, 2])
+    np.testing.assert_allclose(lifted, ground, atol=1e-4)
+
+
+@pytest.mark.parametrize("height", [-2.0, 1.5])
+def test_a_ledge_or_a_wall_ahead_does_not_count_before_it_is_below_the_character(height):
+    clip = glide()
+    lifted = heights(step(height), clip, GroundRoot())
+    before = np.asarray(clip.world_from_model.pos[:, 2]) < 2.0
+    np.testing.assert_allclose(lifted[before], 0.0, atol=1e-6)
+    assert abs(lifted[-1] - height) < 0.02
+
+
+def test_the_root_moves_no_faster_than_its_limit():
+    lifted = heights(step(-2.0), glide(), GroundRoot(max_speed=1.0))
+    speed = np.abs(np.diff(lifted)) * HZ
+    assert speed.max() == pytest.approx(1.0, abs=1e-4) and (speed > 0.99).sum() > 60
+
+
+def test_in_the_air_the_root_waits_for_the_landing():
+    clip = glide()
+    flight_time = (np.arange(180) > 60) & (np.arange(180) < 120)
+    grounded = jnp.asarray(1.0 - flight_time)
+    lifted = heights(step(0.3), dataclasses.replace(clip, grounded=grounded), GroundRoot())
+    np.testing.assert_allclose(lifted[61:120], lifted[60], atol=1e-6)
+    assert np.abs(np.diff(lifted)).max() < 0.02 and lifted[-1] == pytest.approx(0.3, abs=0.02)
+
+
+def test_over_a_hole_the_root_keeps_its_height():
+    gap = terrain.combine(
+        terrain.heightfield(jnp.full((2, 2), 0.2), (20.0, 40.0), (-10.0, 0.0, -39.0)),
+        terrain.heightfield(jnp.full((2, 2), 0.2), (20.0, 40.0), (-10.0, 0.0, 2.0)),
+    )
+    np.testing.assert_allclose(heights(gap, glide(), GroundRoot()), 0.2, atol=1e-6)
+
+
+def test_without_ground_or_switched_off_the_root_stays_where_the_game_has_it():
+    nothing = terrain.heightfield(jnp.zeros((2, 2)), 1.0, (500.0, 0.0, 0.0))
+    np.testing.assert_array_equal(heights(nothing, glide(), GroundRoot()), 0.0)
+    np.testing.assert_array_equal(heights(step(0.3), glide(), GroundRoot(enabled=False)), 0.0)
+
+
+def test_the_first_frame_is_settled():
+    assert heights(terrain.plane((0.0, 0.7, 0.0)), glide(), GroundRoot())[0] == pytest.approx(0.7)
+
+
+def test_a_root_without_memory_costs_no_scan():
+    for rule, scans in ((KeepRoot(), False), (GroundRoot(), True)):
+        program = jax.make_jaxpr(lambda clip: _heights(step(0.1), clip, rule))(glide())  # noqa: B023
+        assert ("scan[" in str(program)) == scans
+
+
+RAMP = terrain.plane(normal=(0.0, 1.0, -0.4))
+
+
+def last_height(half_life: jax.Array, max_speed: jax.Array, speed: jax.Array) -> jax.Array:
+    """Where the rule puts a character that goes up the ramp at this speed."""
+    clip = at(glide(), slice(0, 40))
+    moving = dataclasses.replace(clip, velocity_ws=clip.velocity_ws * speed)
+    return _heights(RAMP, moving, GroundRoot(half_life=half_life, max_speed=max_speed))[-1:]
+
+
+@pytest.mark.parametrize(
+    "numbers", [(0.2, 4.0, 1.0), (0.2, 4.0, 0.0), (0.0, 4.0, 1.0), (0.2, 0.5, 1.0)]
+)
+def test_the_root_has_finite_derivatives_on_the_spot_too(numbers):
+    finite_jacobian(last_height, *numbers)
