@@ -25,6 +25,7 @@ from jaxik.stages.lock import NoLock, OffsetLock, PlantLock
 from jaxik.stages.pelvis import CapsulePelvis, LegLengthPelvis, LowestPelvis, ReachPelvis
 from jaxik.stages.probe import CornerProbe, FootProbe, RootProbe, StrideProbe
 from jaxik.stages.root import GroundRoot, KeepRoot
+from jaxik.stages.separation import FootSeparation, NoSeparation
 from jaxik.stages.target import ContactTarget, RootTarget, SlopeTarget, SoleTarget
 from jaxik.stages.warp import StrideWarp
 from jaxik.world import body
@@ -45,6 +46,7 @@ def record(rig: Rig | None = None) -> FootIK:
         target=SlopeTarget(),
         lean=SlopeLean(),
         lock=OffsetLock(),
+        separation=NoSeparation(),
         pelvis=LowestPelvis(),
         effector=DirectEffector(),
         leg=TwoBone(),
@@ -76,6 +78,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         target=SoleTarget(),
         lean=NoLean(),
         lock=NoLock(),
+        separation=NoSeparation(),
         pelvis=LowestPelvis(limit=math.inf, on_gain=1.0, off_gain=1.0),
         effector=FoundEffector(),
         leg=PoleLeg(),
@@ -106,6 +109,7 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         target=RootTarget(),  # pyright: ignore[reportCallIssue]  # its `foot_height` is a property
         lean=NoLean(),
         lock=NoLock(),
+        separation=NoSeparation(),
         pelvis=CapsulePelvis(),
         effector=BodyEffector(latch=True),
         leg=TwoBone(max_knee_angle=math.pi, min_knee_angle=0.0, soften=1.0),
@@ -132,6 +136,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         target=ContactTarget(),
         lean=NoLean(),
         lock=PlantLock(),
+        separation=NoSeparation(),
         pelvis=LegLengthPelvis(),
         effector=FadeEffector(),
         leg=HintLeg(),
@@ -160,6 +165,7 @@ def stride(rig: Rig | None = None) -> FootIK:
         target=SlopeTarget(max_ankle_height=0.8),
         lean=SpineLean(),
         lock=OffsetLock(enabled=False, hold_ball=True),
+        separation=FootSeparation(),
         pelvis=ReachPelvis(),
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),

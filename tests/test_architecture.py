@@ -16,8 +16,8 @@ WINGS = {  # in import order: a wing may import those before it
         "report", "jobs", "bench", "cli",
     ],
 }  # fmt: skip
-STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "pelvis"]
-STAGES += ["effector", "fade", "leg", "foot"]
+STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "separation"]
+STAGES += ["pelvis", "effector", "fade", "leg", "foot"]
 LIBRARIES_OF_JAXIK = {"jax", "equinox", "jaxtyping", "numpy", "lazy_loader"}
 ONLY_IMPORTED_BY = {
     "trimesh": "fitting/datasets/terrain/mesh_files.py",

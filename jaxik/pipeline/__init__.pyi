@@ -5,6 +5,7 @@ from . import system as system
 from .simulation import resume as resume
 from .simulation import run as run
 from .simulation import step as step
+from .system import Corrections as Corrections
 from .system import FootIK as FootIK
 from .system import Result as Result
 from .system import State as State

@@ -85,6 +85,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) 
         slide=frame.slide,
         carry=frame.carry(ground.ankle),
         present=rig.present,
+        side=rig.side,
         weight=weight,
         grounded=frame.grounded,
         root_ws=root_ws,
@@ -126,6 +127,9 @@ def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, Py
         lock_now = dataclasses.replace(now, sensed=dataclasses.replace(sensed, weight=lasting))
         lock_state, hold = ik.lock.advance(lock_now, foothold_ws, hip_ws, state.lock)
         target_ws = foothold_ws + hold.offset_ws + vec.scale(up, sensed.foothold.lift)
+    with jax.named_scope("separation"):
+        separation_state, apart_ws = ik.separation.advance(now, foothold_ws, hold, state.separation)
+        target_ws = target_ws if apart_ws is None else target_ws + apart_ws
         ankle = Transform(target_ws, hold.rot_ws)
     with jax.named_scope("pelvis"):
         awake = ik.effector.awake(now, state.effector)
@@ -149,6 +153,7 @@ def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, Py
         target=target_state,
         lean=lean_state,
         lock=lock_state,
+        separation=separation_state,
         pelvis=pelvis,
         effector=effector_state,
         fade=fade_state,

@@ -16,6 +16,7 @@ from jaxik.stages.lock import AbstractLock, Hold
 from jaxik.stages.pelvis import AbstractPelvis, PelvisState
 from jaxik.stages.probe import AbstractProbe
 from jaxik.stages.root import AbstractRoot
+from jaxik.stages.separation import AbstractSeparation
 from jaxik.stages.target import AbstractTarget
 from jaxik.stages.warp import AbstractWarp
 from jaxik.world.frame import Sensed
@@ -25,7 +26,7 @@ from .shapes import check_system
 
 
 class FootIK(Rule):
-    """A foot-IK system: one rule for each of twelve stages.
+    """A foot-IK system: one rule for each of thirteen stages.
 
     Make one from a preset of `jaxik.presets`, then exchange rules with `dataclasses.replace` and
     numbers with `jaxik.maths.parameter_tree.replace`:
@@ -46,6 +47,7 @@ class FootIK(Rule):
     target: AbstractTarget
     lean: AbstractLean
     lock: AbstractLock
+    separation: AbstractSeparation
     pelvis: AbstractPelvis
     effector: AbstractEffector
     leg: AbstractLeg
@@ -64,6 +66,7 @@ class State:
     target: PyTree
     lean: PyTree
     lock: PyTree
+    separation: PyTree
     pelvis: PelvisState
     effector: PyTree
     fade: PyTree
@@ -142,6 +145,7 @@ def init(ik: FootIK, rig: Rig) -> State:
         ik.target.init(rig),
         ik.lean.init(rig),
         ik.lock.init(rig),
+        ik.separation.init(rig),
         ik.pelvis.init(rig),
         ik.effector.init(rig),
         ik.fade.init(rig),

@@ -9,5 +9,6 @@ from . import lock as lock
 from . import pelvis as pelvis
 from . import probe as probe
 from . import root as root
+from . import separation as separation
 from . import target as target
 from . import warp as warp

@@ -198,6 +198,8 @@ class Sensed:
     carry: Transform | Still
     """World motion, since the previous frame, of the ground under each foot."""
     present: Bool[Array, " legs"]
+    side: Float[Array, " legs"]
+    """+1 left, -1 right, 0 in the middle."""
     weight: Float[Array, " legs"]
     """0..1, how much foot IK each leg gets."""
     grounded: Float[Array, ""]
