@@ -53,10 +53,10 @@ def test_the_fields_of_all_rules_have_a_sentence_of_meaning():
 def test_printing_a_preset_lists_its_rules_and_parameters_with_units():
     lines = repr(presets.unreal()).splitlines()
     assert lines[0] == "FootIK"
-    assert "  pelvis    CapsulePelvis" in lines
+    assert "  pelvis      CapsulePelvis" in lines
     assert "    speed        15 1/s" in lines and "    half_height  0.9 m" in lines
     assert "    max_knee_angle  3.142 rad (180°)" in lines
-    assert "  lean      NoLean" in lines
+    assert "  lean        NoLean" in lines
 
 
 def test_all_rules_of_the_presets_are_known_at_their_stages():
