@@ -5,6 +5,7 @@ has to run frame by frame. Contact and root are sensed and advanced before every
 """
 
 import dataclasses
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,38 +22,47 @@ from jaxik.world.frame import Contact, Sensed, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths
 
 from .system import Advanced, Corrections, FootIK, Result, State, Trace
+from .tracks import Tracks, system_at
 
 
 def sense_first(
-    rule: AbstractContact | AbstractRoot, memory: PyTree, inputs: Inputs, started: Array
+    stage: Literal["contact", "root"], ik: FootIK, state: State, inputs: Inputs, tracks: Tracks
 ) -> tuple[PyTree, PyTree]:
-    """A stage that runs before everything else, contact or root, for a whole clip.
+    """A stage that runs before everything else, for a whole clip.
 
-    It has a scan of its own, or none if the rule has no memory.
+    It has a scan of its own, or none if its rule has no memory.
 
     Args:
-        rule: of that stage.
-        memory: its memory before the clip.
+        stage: its name.
+        ik: the system.
+        state: memory before the clip.
         inputs: the leaves of `frame` have a leading axis of frames.
-        started: False if there was no frame before the clip.
+        tracks: parameters that change along the clip.
 
     Returns:
-        Memory after each frame, and what the stage returns for each.
+        The stage's memory after each frame, and what it returns for each.
     """
-    frames, gate = inputs.frame, inputs.gate
-    sensed = jax.vmap(lambda frame: rule.sense(inputs.at(frame)))(frames)
+    frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
 
-    def advanced(memory: PyTree, started: Array, sensed: PyTree, dt: Array) -> tuple:
-        return rule.advance(Moment(dt, started, gate), sensed, memory)
+    def rule_at(at: Tracks) -> AbstractContact | AbstractRoot:
+        return getattr(system_at(ik, at), stage)
 
+    sensed = jax.vmap(lambda frame, at: rule_at(at).sense(inputs.at(frame)))(frames, tracks)
+
+    def advanced(
+        memory: PyTree, started: Array, sensed: PyTree, dt: Array, at: Tracks
+    ) -> tuple[PyTree, PyTree]:
+        return rule_at(at).advance(Moment(dt, started, gate), sensed, memory)
+
+    now = (sensed, frames.dt, tracks)
     if not jax.tree.leaves(memory):
-        return memory, jax.vmap(lambda *now: advanced(memory, started, *now)[1])(sensed, frames.dt)
+        return memory, jax.vmap(lambda *now: advanced(memory, state.started, *now)[1])(*now)
 
     def scanned(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         after, output = advanced(*carry, *now)
-        return (after, jnp.ones_like(started)), (after, output)
+        return (after, jnp.ones_like(state.started)), (after, output)
 
-    return jax.lax.scan(scanned, (memory, started), (sensed, frames.dt))[1]
+    return jax.lax.scan(scanned, (memory, state.started), now)[1]
 
 
 def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) -> Sensed:

@@ -18,6 +18,7 @@ from jaxik.world.terrain import LegTerrains, Terrain
 from .phases import advance, pose, sense, sense_first
 from .shapes import check_inputs, check_state
 from .system import Advanced, FootIK, Result, State, init
+from .tracks import Tracks, read_tracks, system_at
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -80,43 +81,49 @@ def resume(
     state: State,
     frames: Frame,
     gate: AbstractGate = HARD,
+    *,
+    tracks: Tracks | None = None,
 ) -> tuple[State, Result]:
     """A clip, or a part of one, that starts with the memory of what came before.
 
     Gives what `step` gives for each frame in turn. For the arguments see `step`; the leaves of
     `frames` and of the result have a leading axis of frames.
 
+    Args:
+        tracks: parameters that change along the clip, as in `run`.
+
     Returns:
         Memory after the last frame, so that the rest can follow, and the result.
 
     Raises:
-        ValueError: as `step`.
+        ValueError: as `run`.
     """
     inputs = Inputs(rig, terrain, frames, gate)
     check_inputs(ik, inputs, clip=True)
     check_state(state, jax.eval_shape(init, ik, rig))
 
+    values = read_tracks(ik, tracks, frames.dt.shape[0], rig.side.shape[0])
     with jax.named_scope("contact"):
-        contact_states, contacts = sense_first(ik.contact, state.contact, inputs, state.started)
+        contact_states, contacts = sense_first("contact", ik, state, inputs, values)
     with jax.named_scope("root"):
-        root_states, rises = sense_first(ik.root, state.root, inputs, state.started)
-    sensed = jax.vmap(lambda frame, *first: sense(ik, inputs.at(frame), *first))(
-        frames, contacts, rises
+        root_states, rises = sense_first("root", ik, state, inputs, values)
+    sensed = jax.vmap(lambda frame, at, *first: sense(system_at(ik, at), inputs.at(frame), *first))(
+        frames, values, contacts, rises
     )
 
     def scanned(
-        state: State, frame: tuple[Sensed, tuple[PyTree, PyTree], Transform]
+        state: State, frame: tuple[Sensed, tuple[PyTree, PyTree], Transform, Tracks]
     ) -> tuple[State, Advanced]:
-        sensed, first, platforms = frame
+        sensed, first, platforms, at = frame
         now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain.at(platforms))
-        advanced = advance(ik, now, state, first)
+        advanced = advance(system_at(ik, at), now, state, first)
         return advanced.state, advanced
 
     after, advanced = jax.lax.scan(
-        scanned, state, (sensed, (contact_states, root_states), frames.platforms)
+        scanned, state, (sensed, (contact_states, root_states), frames.platforms, values)
     )
-    result = jax.vmap(lambda frame, s, a: pose(ik, inputs.at(frame), s, a))(
-        frames, sensed, advanced
+    result = jax.vmap(lambda frame, s, a, at: pose(system_at(ik, at), inputs.at(frame), s, a))(
+        frames, sensed, advanced, values
     )
     return after, result
 
@@ -130,6 +137,7 @@ def run(
     gate: AbstractGate = HARD,
     *,
     block: int | None = None,
+    tracks: Tracks | None = None,
 ) -> Result:
     """A clip of one character, from a fresh start.
 
@@ -140,9 +148,13 @@ def run(
         block: how many frames to compute at a time, for long clips; None computes all at once. The
             result is the same, but besides arguments and results only one block has to be in
             memory, in reverse mode one block and the state before each.
+        tracks: parameters that change along the clip, by dotted name: an array (frames, ...) of
+            what the leaf would be in each frame, as `{"pelvis.limit": limits}`. A value that `ik`
+            has under that name does nothing. `step` takes another system instead.
 
     Raises:
-        ValueError: if `block` is less than 1, or an array has a wrong shape, as in `step`.
+        ValueError: if `block` is less than 1, an array has a wrong shape, as in `step`, or a track
+            has an unknown name or another shape; it says which there may be.
     """
     if block is not None and block < 1:
         raise ValueError(
@@ -151,16 +163,18 @@ def run(
     check_inputs(ik, Inputs(rig, terrain, frames, gate), clip=True)
     start, count = init(ik, rig), frames.dt.shape[0]
     if block is None or block >= count:
-        return resume(ik, rig, terrain, start, frames, gate)[1]
+        return resume(ik, rig, terrain, start, frames, gate, tracks=tracks)[1]
     blocks = count // block
+    clip = (frames, read_tracks(ik, tracks, count, rig.side.shape[0]))
 
-    def resume_block(state: State, frames: Frame) -> tuple[State, Result]:
-        return resume(ik, rig, terrain, state, frames, gate)
+    def resume_block(state: State, clip: tuple[Frame, Tracks]) -> tuple[State, Result]:
+        frames, values = clip
+        return resume(ik, rig, terrain, state, frames, gate, tracks=values)
 
-    split = jax.tree.map(lambda x: x[: blocks * block].reshape(blocks, block, *x.shape[1:]), frames)
+    split = jax.tree.map(lambda x: x[: blocks * block].reshape(blocks, block, *x.shape[1:]), clip)
     state, results = jax.lax.scan(jax.checkpoint(resume_block), start, split)
     joined = jax.tree.map(lambda x: x.reshape(blocks * block, *x.shape[2:]), results)
     if blocks * block == count:
         return joined
-    remainder = resume_block(state, jax.tree.map(lambda x: x[blocks * block :], frames))[1]
+    remainder = resume_block(state, jax.tree.map(lambda x: x[blocks * block :], clip))[1]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), joined, remainder)
