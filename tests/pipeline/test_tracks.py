@@ -15,8 +15,8 @@ from support.cases import QUICK
 from support.clips import make_rig, planes, to_frames, to_rig, to_terrain, wandering
 
 COUNT = 24
-RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.2, 0.3, -0.15)))
-SYSTEM = dataclasses.replace(jaxik.presets.record(), contact=SpeedContact())
+RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.06, 0.04, 0.1)))
+SYSTEM = dataclasses.replace(jaxik.presets.record(), contact=SpeedContact(planted_speed=5.0, raised_speed=9.0))
 
 
 @functools.cache
@@ -29,7 +29,7 @@ def tracks() -> dict[str, jax.Array]:
     """A parameter of the contact, of the body and of the pose, the last for each leg."""
     time = jnp.arange(COUNT) / COUNT
     return {
-        "contact.raised_speed": 0.3 + time,
+        "contact.raised_height": 0.02 + 0.2 * time,
         "pelvis.limit": 0.2 * time,
         "lean.spring": time > 0.5,
         "foot.max_pitch": jnp.stack([0.5 * time, 0.4 - 0.4 * time], axis=-1),
@@ -41,12 +41,12 @@ def ankles(tracks: dict[str, jax.Array], block: int | None = None) -> jax.Array:
     return jaxik.run(SYSTEM, RIG, GROUND, frames(), block=block, tracks=tracks).pose.ankle.rot
 
 
+@pytest.mark.slow
 def test_a_track_is_another_system_in_each_frame():
     step = jax.jit(jaxik.step, compiler_options=QUICK)
     state, expected = jaxik.init(SYSTEM, RIG), []
     for i in range(COUNT):
         ik = parameter_tree.replace(SYSTEM, {name: x[i] for name, x in tracks().items()})
-        # One value a leg needs a program of its own, so every frame has one.
         frame = jax.tree.map(lambda x, i=i: x[i], frames())
         state, result = step(ik, RIG, GROUND, state, frame)
         expected.append(result.pose.ankle.rot)
@@ -57,6 +57,7 @@ def test_a_track_is_another_system_in_each_frame():
     np.testing.assert_allclose(ankles(tracks(), block=7), moved, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_gradient_by_a_track_is_that_of_its_value_in_each_frame():
     def height(limits: jax.Array) -> jax.Array:
         result = jaxik.run(SYSTEM, RIG, GROUND, frames(), tracks={"pelvis.limit": limits})
