@@ -13,6 +13,7 @@ from jaxik.world.frame import UP, Stride
 
 from .clips import contacts
 from .clips.clip import Clip
+from .clips.flight import grounded_track
 from .clips.joint_roles import find_trunk
 from .clips.kinematics import local_from_world
 
@@ -55,6 +56,7 @@ def frames_from_clip(
         for positions in (np.asarray(world.pos), clip.joints_ws(2) + moved, balls + moved)
     )
     slide = np.zeros(clip.frame_count) if clip.slide is None else clip.slide
+    weight = np.ones((clip.frame_count, legs)) if clip.weight is None else clip.weight
 
     def array(values: np.ndarray) -> Array:
         return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
@@ -63,8 +65,8 @@ def frames_from_clip(
     frames = jaxik.Frame(
         world_from_model=world,
         pose=pose,
-        weight=array(np.ones((clip.frame_count, legs))),
-        grounded=array(np.ones(clip.frame_count)),
+        weight=array(weight),
+        grounded=array(grounded_track(clip)),
         slide=array(slide),
         velocity_ws=array(root_velocity),
         foot_speed=array(np.linalg.norm(ankle_velocity, axis=-1)),

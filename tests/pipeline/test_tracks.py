@@ -16,7 +16,9 @@ from support.clips import make_rig, planes, to_frames, to_rig, to_terrain, wande
 
 COUNT = 24
 RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.06, 0.04, 0.1)))
-SYSTEM = dataclasses.replace(jaxik.presets.record(), contact=SpeedContact(planted_speed=5.0, raised_speed=9.0))
+SYSTEM = dataclasses.replace(
+    jaxik.presets.record(), contact=SpeedContact(planted_speed=5.0, raised_speed=9.0)
+)
 
 
 @functools.cache

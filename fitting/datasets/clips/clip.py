@@ -17,6 +17,8 @@ from .joint_roles import find_roles
 from .kinematics import continuous
 from .rigs import left_directions
 
+TRACKS = ("stance", "mask", "slide", "grounded", "weight")  # optional fields with frames
+
 
 @dataclass(frozen=True, eq=False)
 class Clip:
@@ -55,15 +57,25 @@ class Clip:
     """False where a frame must not be trusted."""
     slide: Float64[np.ndarray, " frames"] | None = None
     """0..1, 1 while the character slides."""
+    grounded: Float64[np.ndarray, " frames"] | None = None
+    """0..1, 0 in the air, on a seat or on a ladder."""
+    weight: Float64[np.ndarray, "frames legs"] | None = None
+    """0..1, how much foot IK each leg gets."""
     remarks: tuple[str, ...] = ()
     """Guesses and oddities, for the user."""
 
     def __post_init__(self) -> None:
-        for name in ("offsets_ls", "positions_ws", "rotations_ws", "stance", "mask", "slide"):
+        for name in ("offsets_ls", "positions_ws", "rotations_ws", *TRACKS):
             if (array := getattr(self, name)) is not None:
                 view = array.view()
                 view.flags.writeable = False
                 object.__setattr__(self, name, view)
+
+    @property
+    def tracks(self) -> dict[str, np.ndarray]:
+        """What the clip has beside its motion, one entry a frame, by field."""
+        tracks = {name: getattr(self, name) for name in TRACKS}
+        return {name: track for name, track in tracks.items() if track is not None}
 
     @property
     def frame_count(self) -> int:
@@ -168,9 +180,7 @@ class Clip:
             self,
             positions_ws=self.positions_ws[frames],
             rotations_ws=self.rotations_ws[frames],
-            stance=None if self.stance is None else self.stance[frames],
-            mask=None if self.mask is None else self.mask[frames],
-            slide=None if self.slide is None else self.slide[frames],
+            **{name: track[frames] for name, track in self.tracks.items()},
         )
 
 

@@ -36,7 +36,8 @@ def resample(clip: Clip, fps: float) -> Clip:
     """The clip at another frame rate; the same object if the rate is the same.
 
     Between two frames local rotations are interpolated along the shorter arc and local positions
-    linearly, so bones keep their lengths. Contact labels and slide are taken from the nearer frame.
+    linearly, so bones keep their lengths. Contact labels and other tracks are taken from the nearer
+    frame.
     A frame between an unmasked and a masked one is masked. The new clip ends with the last whole
     frame at the new rate.
 
@@ -67,9 +68,8 @@ def resample(clip: Clip, fps: float) -> Clip:
     on_frame = time == before
     return replace(
         clip, fps=float(fps), positions_ws=positions_ws, rotations_ws=rotations_ws,
-        stance=None if clip.stance is None else clip.stance[nearest],
+        **{name: track[nearest] for name, track in clip.tracks.items() if name != "mask"},
         mask=None if clip.mask is None else clip.mask[before] & (on_frame | clip.mask[after]),
-        slide=None if clip.slide is None else clip.slide[nearest],
     )  # fmt: skip
 
 

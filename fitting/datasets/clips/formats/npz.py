@@ -12,7 +12,7 @@ import numpy as np
 
 from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
-from fitting.datasets.clips.clip import Clip
+from fitting.datasets.clips.clip import TRACKS, Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
 from fitting.datasets.clips.rigs import SoleHeights, measure_soles, relative_size
 from fitting.runtime import files
@@ -22,7 +22,6 @@ Arrays = dict[str, np.ndarray]
 
 FORMAT = "jaxik clip 1"
 ARRAYS = ("offsets_ls", "positions_ws", "rotations_ws")
-OPTIONAL = ("stance", "mask", "slide")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
 RIG_ARRAYS = ("knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "side", "present")
@@ -37,9 +36,9 @@ def save_clip(
 ) -> None:
     """Writes a clip as an NPZ archive, from which `load_clip` restores it exactly.
 
-    The keys are `format`; the clip's fields by name (`stance`, `mask`, `slide` and `dialect` only
-    if they are set); the rig's fields as `rig_<field>`, where `rig_joints` are joint indices of
-    shape (legs, 4). The file appears complete or not at all.
+    The keys are `format`; the clip's fields by name (`stance`, `mask`, `slide`, `grounded`,
+    `weight` and `dialect` only if they are set); the rig's fields as `rig_<field>`, where
+    `rig_joints` are joint indices of shape (legs, 4). The file appears complete or not at all.
 
     Args:
         path: file name.
@@ -53,7 +52,7 @@ def save_clip(
         "parents": np.array(clip.parents),
         "remarks": np.array(clip.remarks, dtype=np.str_),
     }
-    for name in (*ARRAYS, *OPTIONAL, *TEXTS, *NUMBERS, "dialect"):
+    for name in (*ARRAYS, *TRACKS, *TEXTS, *NUMBERS, "dialect"):
         if (value := getattr(clip, name)) is not None:
             content[name] = np.asarray(value)
     if (rig := clip.measured_rig) is not None:
@@ -138,11 +137,23 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
         up_axis=str(content["up_axis"]),
         dialect=str(content["dialect"]) if "dialect" in content else None,
         measured_rig=_read_rig(content) if "rig_names" in content else None,
-        stance=content.get("stance"),
-        mask=content.get("mask"),
-        slide=content.get("slide"),
+        **_read_tracks(path, content),
         remarks=tuple(map(str, content["remarks"])),
     )
+
+
+def _read_tracks(path: Path, content: Arrays) -> Arrays:
+    """The optional arrays with an entry a frame."""
+    frames = (len(content["positions_ws"]),)
+    legs = (*frames, *content.get("rig_names", np.zeros(0)).shape)
+    tracks = {name: content[name] for name in TRACKS if name in content}
+    for name, track in tracks.items():
+        shape = legs if name in ("stance", "weight") else frames
+        if track.shape != shape:
+            raise ValueError(f"{path}: {name} is {track.shape}; wanted {shape}")
+        if track.dtype.kind == "f" and not ((track >= 0.0) & (track <= 1.0)).all():
+            raise ValueError(f"{path}: {name} has values outside 0..1")
+    return tracks
 
 
 def _read_rig(content: Arrays) -> Rig:
