@@ -19,9 +19,10 @@ RED = "#CC0000"
 OFF = f"sole off its ground by {100 * VISIBLE:.0f} cm"
 SOLES = STAGES[0], STAGES[1]
 NARROWEST = 1.5  # m along the path
-PANEL = 3.2, 1.9  # inches
+PANEL = 2.6, 1.45  # inches
 MARGIN = 0.3  # m, around what is shown
 JUMP = 1.0  # m in a frame, from which a line is interrupted
+HEAD = 0.5, 1.45  # place of a column's heading, in heights of a panel
 SAMPLES = 600  # of the ground
 
 
@@ -36,11 +37,10 @@ def page(suite: Suite) -> Figure:
         row[0].set_ylim(_heights(scene))
         for system, axes in zip(suite.systems, row, strict=True):
             _panel(axes, scene, scene.outcomes.get(system))
-        row[0].set_ylabel(scene.situation.name)
+        row[0].set_ylabel(f"{scene.situation.name}\nheight, m", fontsize=10)
     for system, axes in zip(suite.systems, panels[0], strict=True):
-        axes.set_title(system, loc="center", pad=32.0)
-    figure.supxlabel("along the path, m")
-    figure.supylabel("height, m")
+        axes.annotate(system, HEAD, xycoords="axes fraction", ha="center", fontsize=15)
+    panels[-1, 0].set_xlabel("along the path, m", fontsize=9)
     legend(
         figure,
         Patch(facecolor=EARTH, edgecolor=GROUND, label="ground below the path"),
