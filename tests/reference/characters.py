@@ -49,6 +49,7 @@ DEFAULTS: dict[str, Any] = {
     "lock.hold_ball": False,
     "lock.release_heading": math.pi,
     "lock.release_speed": math.inf,
+    "lock.return_speed": math.inf,
     "pelvis.limit": 0.30,
     "pelvis.on_gain": 0.225,
     "pelvis.off_gain": 0.116,
@@ -195,6 +196,7 @@ class Hold:
     locked: bool
     factor: float
     offset: Array
+    turn: float  # rad about up, from the animated heading to the one it keeps
     foothold: Array
     ball: Array
     heading: Array
@@ -210,6 +212,7 @@ class State:
     pelvis_height: float
     pelvis_offset_ws: Array
     holds: list[Hold]
+    standing: list[Any]  # where feet stand by speed
 
 
 @dataclass

@@ -3,16 +3,18 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxik.maths import smoothing, vec
+from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import SensedMoment
+from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
 
 from .base import AbstractLock, Hold
 
 DISTANCE_BAND = 0.01  # m
 COSINE_BAND = 0.03  # about 2 degrees at a right angle
+ANGLE_BAND = 0.035  # rad, 2 degrees
 SPEED_BAND = 0.05  # m/s
 FACTOR_BAND = 0.05
 
@@ -26,23 +28,28 @@ class LockState:
     factor: Float[Array, " legs"]
     """0..1, rises while locked, decays after release."""
     offset: Float[Array, "legs 3"]
-    """m, world axes."""
+    """m, of the ball or the ankle from where it would be without a lock, world axes."""
+    turn: Float[Array, " legs"]
+    """rad about up, from the animated heading of the foot to the one it keeps."""
     foothold: Float[Array, "legs 3"]
     """m, of the frame before, world space."""
     ball: Float[Array, "legs 3"]
     """m, likewise."""
     ahead: Float[Array, "legs 3"]
-    """Unit, foot direction when it locked, turned with its ground since then; world axes."""
+    """Unit, animated heading of the foot, world axes, likewise."""
 
 
 class OffsetLock(AbstractLock):
-    """Cancels the motion of the foothold while its foot is locked (the record).
+    """Cancels the motion of a foot while it is locked (the record).
 
-    The target is the foothold plus an offset. While the foot is locked, the foothold's motion since
-    the frame before, over ground that may itself move, is subtracted from the offset: the foot
-    stays but its lift still follows the animation. After release the offset decays, so that neither
-    locks nor releases jump. With `hold_ball` on, the motion of the ball along the ground is
-    cancelled instead, so that the ball stays while the heel rises.
+    The target is the foothold plus an offset. While the foot is locked, its motion since the frame
+    before, over ground that may itself move, is subtracted from the offset. After release the
+    offset decays, by no more than `return_speed`, so that neither locks nor releases jump.
+
+    With `hold_ball` on, what stays is the ball of the foot and its heading: the foot turns about up
+    against the animation, by an angle that is kept and decays as the offset does, and its heel
+    rises about the ball as animated. With it off, only the ankle stays; the foot may turn, and a
+    rising heel pushes the ball forward. The lift follows the animation in both cases.
 
     A foot locks when its contact is planted and it moves slower than `max_speed`. It is released
     when its contact is lifted, or earlier for any of these reasons:
@@ -58,7 +65,9 @@ class OffsetLock(AbstractLock):
 
     enabled: Leaf = switch(True, doc="Whether planted feet are locked in place.")
     hold_ball: Leaf = switch(
-        False, doc="Whether a lock holds the ball only, so that the heel can rise.", per_leg=False
+        False,
+        doc="Whether a lock holds ball and heading, so that the heel can rise, or only the ankle.",
+        per_leg=False,
     )
     release_min_angle: Leaf = parameter(
         0.8726646260,
@@ -130,24 +139,27 @@ class OffsetLock(AbstractLock):
     unlock_half_life: Leaf = half_life_parameter(
         0.10, doc="Time in which a released foot covers half its way back to the foothold."
     )
+    return_speed: Leaf = parameter(
+        float("inf"),
+        unit="m/s",
+        low=0.1,
+        high=3.0,
+        doc="Highest speed at which a released foot goes back to its foothold.",
+    )
 
     def init(self, rig: Rig) -> LockState:
         zero, zeros = jnp.zeros_like(rig.side), jnp.zeros_like(rig.knee_axis_ls)
-        return LockState(zero, zero, zeros, zeros, zeros, zeros)
+        return LockState(zero, zero, zeros, zero, zeros, zeros, zeros)
 
     def advance(
         self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, state: LockState
     ) -> tuple[LockState, Hold]:
         sensed, gate = now.sensed, now.gate
-        up, carry = sensed.leg_up_ws, sensed.carry
-        moved = foothold_ws - carry.apply(state.foothold)
-        ball_moved = vec.reject(sensed.ball_ws - carry.apply(state.ball), up)
-        ball_moved += vec.scale(up, vec.dot(moved, up))
-        moved = jnp.where(now.started, jnp.where(self.hold_ball, ball_moved, moved), 0.0)
-        before, locked_ahead = carry.turn(state.offset), carry.turn(state.ahead)
-        locked_ahead = gate.choose(state.locked[..., None], locked_ahead, sensed.ahead_ws)
-        stays = self._may_stay(now, foothold_ws, hip_ws, before - moved)
-        stays = stays * self._follows_animation(now, moved, locked_ahead)
+        moved, turned = self._motion(now, foothold_ws, state)
+        before = sensed.carry.turn(state.offset)
+        kept_ws = self._of_ankle(sensed, before - moved, state.turn - turned)
+        stays = self._may_stay(now, foothold_ws + kept_ws, hip_ws)
+        stays = stays * self._follows_animation(now, before - moved, state.turn - turned, moved)
         starts = stays * self._may_start(now, moved, state.factor)
 
         ones, zeros = jnp.ones_like(state.locked), jnp.zeros_like(state.locked)
@@ -158,11 +170,47 @@ class OffsetLock(AbstractLock):
         unlock_fraction = smoothing.fraction_of_half_life(self.unlock_half_life, now.dt)
         risen = smoothing.lerp(state.factor, ones, lock_fraction)
         factor = gate.choose(locked, risen, smoothing.lerp(state.factor, zeros, unlock_fraction))
-        kept = before - vec.scale(moved, risen)
-        decayed = vec.scale(before, 1.0 - unlock_fraction)
-        offset_ws = gate.choose(locked[..., None], kept, decayed)
-        after = LockState(locked, factor, offset_ws, foothold_ws, sensed.ball_ws, locked_ahead)
-        return after, Hold(offset_ws, sensed.rot_ws, locked)
+        remaining = 1.0 - self._returned(now, before, state.turn, unlock_fraction)
+        offset_ws = gate.choose(
+            locked[..., None], before - vec.scale(moved, risen), vec.scale(before, remaining)
+        )
+        turn = gate.choose(locked, state.turn - turned * risen, state.turn * remaining)
+        after = LockState(
+            locked, factor, offset_ws, turn, foothold_ws, sensed.ball_ws, sensed.ahead_ws
+        )
+        kept_rot = quat.multiply(quat.from_axis_angle(sensed.leg_up_ws, turn), sensed.rot_ws)
+        rot_ws = jnp.where(self.hold_ball, kept_rot, sensed.rot_ws)
+        return after, Hold(self._of_ankle(sensed, offset_ws, turn), rot_ws, locked)
+
+    def _motion(
+        self, now: SensedMoment, foothold_ws: Array, state: LockState
+    ) -> tuple[Array, Array]:
+        """What a lock cancels, since the frame before: m, and rad about up."""
+        sensed = now.sensed
+        up, carry = sensed.leg_up_ws, sensed.carry
+        moved = foothold_ws - carry.apply(state.foothold)
+        ball_moved = vec.reject(sensed.ball_ws - carry.apply(state.ball), up)
+        ball_moved += vec.scale(up, vec.dot(moved, up))
+        ahead = carry.turn(state.ahead)
+        sine = vec.dot(vec.cross(ahead, sensed.ahead_ws), up)
+        turned = vec.safe_arctan2(sine, vec.dot(ahead, sensed.ahead_ws))
+        moved = jnp.where(self.hold_ball, ball_moved, moved)
+        return jnp.where(now.started, moved, 0.0), jnp.where(now.started, turned, 0.0)
+
+    def _of_ankle(self, sensed: Sensed, offset_ws: Array, turn: Array) -> Array:
+        """Offset of the ankle, m, if the lock's is `offset_ws`, and the foot turns by `turn`."""
+        arm = sensed.ball_ws - sensed.ankle_ws
+        turned_arm = quat.rotate(quat.from_axis_angle(sensed.leg_up_ws, turn), arm)
+        return jnp.where(self.hold_ball, offset_ws + (arm - turned_arm), offset_ws)
+
+    def _returned(self, now: SensedMoment, offset_ws: Array, turn: Array, fraction: Array) -> Array:
+        """Part of its way back that a released foot covers: `fraction`, or less where too fast."""
+        arm = vec.length(now.sensed.ball_ws - now.sensed.ankle_ws)
+        way = vec.length(offset_ws) + jnp.where(self.hold_ball, jnp.abs(turn) * arm, 0.0)
+        limited = jnp.isfinite(self.return_speed)
+        step = jnp.where(limited, self.return_speed, 0.0) * now.dt
+        allowed = vec.safe_divide(step, way, otherwise=1.0)
+        return jnp.where(limited & (allowed < fraction), allowed, fraction)
 
     def _may_start(self, now: SensedMoment, moved: Array, factor: Array) -> Array:
         """1 where a foot that is free may lock."""
@@ -172,13 +220,10 @@ class OffsetLock(AbstractLock):
         recovered = gate.below(factor, self.relock_threshold, band=FACTOR_BAND)
         return sensed.contact.planted * calm * recovered * sensed.foothold.found
 
-    def _may_stay(
-        self, now: SensedMoment, foothold_ws: Array, hip_ws: Array, offset_ws: Array
-    ) -> Array:
-        """1 where a foot may keep its place as far as contact, knee and offset are concerned."""
+    def _may_stay(self, now: SensedMoment, point_ws: Array, hip_ws: Array) -> Array:
+        """1 where a foot with its foothold at `point_ws` suits contact, knee and leg."""
         sensed, gate = now.sensed, now.gate
-        ankle_ws = foothold_ws + offset_ws + vec.scale(sensed.leg_up_ws, sensed.foothold.lift)
-        leg = ankle_ws - hip_ws
+        leg = point_ws + vec.scale(sensed.leg_up_ws, sensed.foothold.lift) - hip_ws
         squares = sensed.thigh**2 + sensed.shin**2
         cosine = vec.safe_divide(squares - vec.dot(leg, leg), 2.0 * sensed.thigh * sensed.shin)
         cosine = gate.clip(cosine, -jnp.ones_like(cosine), jnp.ones_like(cosine), band=COSINE_BAND)
@@ -189,17 +234,17 @@ class OffsetLock(AbstractLock):
         lengths = vec.length(leg) * vec.length(animated)
         alignment = vec.safe_divide(vec.dot(leg, animated), lengths, otherwise=1.0)
         aligned = gate.above(alignment, jnp.cos(self.release_cone), band=COSINE_BAND)
-
-        near = gate.below(vec.length(offset_ws), self.release_distance, band=DISTANCE_BAND)
         enabled = jnp.where(self.enabled & (sensed.weight > 0), 1.0, 0.0)
-        return not_folded * not_straight * aligned * near * enabled * (1.0 - sensed.contact.lifted)
+        return not_folded * not_straight * aligned * enabled * (1.0 - sensed.contact.lifted)
 
-    def _follows_animation(self, now: SensedMoment, moved: Array, locked_ahead: Array) -> Array:
-        """1 where the animated foot has not turned away and does not move too fast."""
-        sensed, gate = now.sensed, now.gate
-        alignment = vec.dot(locked_ahead, sensed.ahead_ws)
-        aligned = gate.above(alignment, jnp.cos(self.release_heading), band=COSINE_BAND)
+    def _follows_animation(
+        self, now: SensedMoment, offset_ws: Array, turn: Array, moved: Array
+    ) -> Array:
+        """1 where a foot stays near its animation, which does not move too fast."""
+        gate = now.gate
+        near = gate.below(vec.length(offset_ws), self.release_distance, band=DISTANCE_BAND)
+        aligned = gate.below(jnp.abs(turn), self.release_heading, band=ANGLE_BAND)
         # No foot points away by more than half a turn.
         aligned = jnp.where(self.release_heading < jnp.pi, aligned, 1.0)
         speed = vec.safe_divide(vec.length(moved), now.dt)
-        return aligned * gate.below(speed, self.release_speed, band=SPEED_BAND)
+        return near * aligned * gate.below(speed, self.release_speed, band=SPEED_BAND)

@@ -177,44 +177,49 @@ def lock(
     before: Hold | None,
     pelvis_offset: Array,
     frame: Frame,
-) -> tuple[Hold, Array]:
-    """Memory of the foot's lock after this frame, and the offset of the target (3), world.
+) -> tuple[Hold, Array, Array]:
+    """Memory of the foot's lock after this frame; offset of the target (3), turn of the foot (4).
 
-    `pelvis_offset` (3) is that of the previous frame, world.
+    `pelvis_offset` (3) is that of the previous frame. All of this is in world space.
     """
+    holds_ball = parameters.of_leg("lock.hold_ball", leg)
     if before is None:
-        was_locked, factor = False, 0.0
+        was_locked, factor, turn, swung = False, 0.0, 0.0, 0.0
         offset = moved = np.zeros(3)
     else:
-        was_locked, factor = before.locked, before.factor
-        turn = turned(frame, foot.hit, maths.IDENTITY)
-        offset = rotate(turn, before.offset)
+        was_locked, factor, turn = before.locked, before.factor, before.turn
+        carried_rot = turned(frame, foot.hit, maths.IDENTITY)
+        offset = rotate(carried_rot, before.offset)
         moved = foothold - carried(frame, foot.hit, before.foothold)
-        if parameters.of_leg("lock.hold_ball", leg):
+        if holds_ball:
             rolled = foot.ball_ws - carried(frame, foot.hit, before.ball)
             moved = across(rolled, up) + up * float(up @ moved)
+        pointed = rotate(carried_rot, before.heading)
+        swung = math.atan2(float(cross(pointed, foot.heading_ws) @ up), pointed @ foot.heading_ws)
 
-    # A locked foot keeps the heading it had when it was last free.
-    pointed = foot.heading_ws
-    if before is not None and was_locked:
-        pointed = rotate(turned(frame, foot.hit, maths.IDENTITY), before.heading)
+    def of_ankle(offset: Array, turn: float) -> Array:
+        """How far the ankle moves if the ball moves by the offset and the foot turns about it."""
+        if not holds_ball:
+            return offset
+        arm = foot.ankle_ws - foot.ball_ws
+        return offset + rotate(maths.from_axis_angle(up, turn), arm) - arm
 
     # Where the ankle would be if the foot stayed, relative to where the hip probably is.
     hip = foot.hip_ws + pelvis_offset
-    kept = foothold - moved + offset + up * foot.lift
+    kept = foothold + of_ankle(offset - moved, turn - swung) + up * foot.lift
     thigh = length(frame.hip.pos[leg] - frame.knee.pos[leg])
     shin = length(frame.knee.pos[leg] - frame.ankle.pos[leg])
     knee_angle = maths.interior_angle(thigh, shin, float((kept - hip) @ (kept - hip)))
     deviation = maths.angle_between(kept - hip, foot.ankle_ws - foot.hip_ws)
     takes_part = weights_of_legs(parameters, frame)[leg] > 0.0
+    most_turned = parameters.of_leg("lock.release_heading", leg)
     must_release = (
         foot.lifted
         or knee_angle < parameters.of_leg("lock.release_min_angle", leg)
         or knee_angle > parameters.of_leg("lock.release_max_angle", leg)
         or deviation > parameters.of_leg("lock.release_cone", leg)
         or length(offset - moved) > parameters.of_leg("lock.release_distance", leg)
-        or maths.angle_between(pointed, foot.heading_ws)
-        > parameters.of_leg("lock.release_heading", leg)
+        or (most_turned < math.pi and abs(turn - swung) > most_turned)
         or not is_slow(parameters, "lock.release_speed", leg, moved, frame.dt)
         or not parameters.of_leg("lock.enabled", leg)
         or not takes_part
@@ -229,13 +234,21 @@ def lock(
     if locked:
         half_life = parameters.of_leg("lock.lock_half_life", leg)
         factor += maths.fraction_of_half_life(half_life, frame.dt) * (1.0 - factor)
-        offset = offset - factor * moved
+        offset, turn = offset - factor * moved, turn - factor * swung
     else:
-        remaining = 1.0 - maths.fraction_of_half_life(
-            parameters.of_leg("lock.unlock_half_life", leg), frame.dt
-        )
-        factor, offset, pointed = factor * remaining, offset * remaining, foot.heading_ws
-    return Hold(locked, factor, offset, foothold, foot.ball_ws, pointed), offset
+        half_life = parameters.of_leg("lock.unlock_half_life", leg)
+        fraction = maths.fraction_of_half_life(half_life, frame.dt)
+        factor *= 1.0 - fraction
+        way = length(offset)
+        if holds_ball:
+            way += abs(turn) * length(foot.ankle_ws - foot.ball_ws)
+        fastest = parameters.of_leg("lock.return_speed", leg)
+        if fraction * way > fastest * frame.dt:
+            fraction = fastest * frame.dt / way
+        offset, turn = offset * (1.0 - fraction), turn * (1.0 - fraction)
+    after = Hold(locked, factor, offset, turn, foothold, foot.ball_ws, foot.heading_ws)
+    rot = maths.from_axis_angle(up, turn) if holds_ball else maths.IDENTITY
+    return after, of_ankle(offset, turn), rot
 
 
 def is_slow(parameters: Parameters, name: str, leg: int, moved: Array, dt: float) -> bool:

@@ -19,13 +19,18 @@ def raised(
     leg: int,
     foot: Foot,
     target: Array,
+    turn: Array,
     offset_ws: Array,
     up: Array,
 ) -> tuple[Array, Array, float]:
-    """Ankle target, ankle rotation, and the angle by which the heel rises about the ball, rad."""
+    """Ankle target, ankle rotation, and the angle by which the heel rises about the ball, rad.
+
+    `turn` is the rotation (4) that the foot's lock gives it, world space.
+    """
     rot_ws = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
+    rot_ws = maths.multiply(turn, rot_ws)
     tilt = onto_ground(foot, up)
-    from_ball = rotate(tilt, foot.ankle_ws - foot.ball_ws)
+    from_ball = rotate(tilt, rotate(turn, foot.ankle_ws - foot.ball_ws))
     ball = target - from_ball
     hip = foot.hip_ws + offset_ws
     longest = max(

@@ -15,7 +15,8 @@ import numpy as np
 from reference import characters, maths
 from reference.characters import Frame, Ground, Parameters, Rig
 from reference.maths import Array, Transform, apply, rotate
-from reference.stages import ground, limb, pole, three_ray_probe
+from reference.stages import contact_by_speed, ground, limb, pole, three_ray_probe
+from reference.stages.contact_by_speed import Standing
 from reference.stages.three_ray_probe import Foot
 from reference.terrain import ALL_LAYERS
 
@@ -50,6 +51,18 @@ DEFAULTS: dict[str, Any] = {
     "foot.max_tilt": math.radians(45.0),
 }
 
+# As it comes; `DEFAULTS` are those of the faithful system.
+STANDS_BY_SPEED: dict[str, Any] = {
+    **{name: value for name, value in DEFAULTS.items() if name != "leg.hint_offset"},
+    **contact_by_speed.DEFAULTS,
+    "contact.raised_speed": 0.35,
+    "probe.by_speed": True,
+    "probe.stable_speed": 0.25,
+    "probe.stable_height": 0.095,
+    "probe.extra_min": -0.03,
+    "target.foot_height": 0.085,
+}
+
 
 @dataclass
 class Leg:
@@ -62,6 +75,7 @@ class Leg:
     fade: float
     offset_ws: Array  # m, from the animated ankle to the last goal
     rot_ws: Array  # from the animated rotation to the last goal's
+    standing: Standing | None = None  # None where all feet always stand
 
 
 @dataclass
@@ -84,7 +98,11 @@ def step(
         below = characters.under(terrain, leg)
         foot = three_ray_probe.sense(parameters, rig, below, frame, leg, leg_weights[leg])
         before = None if state is None else state.legs[leg]
-        after, point, rot = plant(parameters, below, frame, leg, foot, before)
+        standing = None
+        if "contact.planted_speed" in parameters.values:
+            stood = None if before is None else before.standing
+            standing = contact_by_speed.stand(parameters, frame, leg, stood)
+        after, point, rot = plant(parameters, below, frame, leg, foot, standing, before)
         height = parameters.of_leg("target.foot_height", leg)
         goals.append(
             fade(parameters, frame, leg, foot, before, after, point + foot.up * height, rot)
@@ -101,7 +119,8 @@ def step(
     for leg in legs:
         target_ws, rot_ws = goals[leg]
         weight = leg_weights[leg] * memory[leg].fade
-        hint_ws = knee_hint(parameters, frame, leg, feet[leg])
+        bends_as_animated = "leg.hint_offset" not in parameters.values
+        hint_ws = None if bends_as_animated else knee_hint(parameters, frame, leg, feet[leg])
         hip, knee, ankle, arrived = solve_leg(
             parameters, rig, leg, frame, body, target_ws, hint_ws, weight
         )
@@ -111,7 +130,7 @@ def step(
         solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle)))
         reached.append(arrived)
         weights.append(weight)
-        hints.append(hint_ws)
+        hints.append(np.zeros(3) if hint_ws is None else hint_ws)
 
     output = {
         "body_pos": body.pos,
@@ -148,6 +167,7 @@ def plant(
     frame: Frame,
     leg: int,
     foot: Foot,
+    standing: Standing | None,
     before: Leg | None,
 ) -> tuple[Leg, Array, Array]:
     """Memory of the leg without its fade; foothold and rotation of the foot there, world."""
@@ -161,7 +181,8 @@ def plant(
     point, rot = foot.hit.point, foot.animated_rot
     if foot.found:
         rot = three_ray_probe.flat_foot(parameters, leg, foot)
-    planted = bool(foot.found and parameters.of_leg("lock.plant", leg))
+    stands = standing is None or standing.standing
+    planted = bool(foot.found and stands and parameters.of_leg("lock.plant", leg))
     kept_point, kept_rot = np.zeros(3), maths.IDENTITY
     if planted:
         if before is not None and before.planted:
@@ -169,10 +190,10 @@ def plant(
             kept_rot = characters.turned(frame, foot.hit, before.kept_rot)
         else:
             kept_point, kept_rot = point, rot
-        standing = followed(parameters, terrain, leg, foot, kept_point)
-        point = point + weight * (standing - point)
+        followed_point = followed(parameters, terrain, leg, foot, kept_point)
+        point = point + weight * (followed_point - point)
         rot = maths.nlerp(rot, kept_rot, weight)
-    after = Leg(weight, planted, kept_point, kept_rot, 0.0, np.zeros(3), maths.IDENTITY)
+    after = Leg(weight, planted, kept_point, kept_rot, 0.0, np.zeros(3), maths.IDENTITY, standing)
     return after, point, rot
 
 
@@ -252,18 +273,28 @@ def solve_leg(
     frame: Frame,
     body: Transform,
     target_ws: Array,
-    hint_ws: Array,
+    hint_ws: Array | None,
     weight: float,
 ) -> tuple[Transform, Transform, Transform, bool]:
-    """Hip, knee and ankle, model space; the pole leads from the carried hip to the hint."""
-    hip = limb.carry(body, frame.hip, leg)
+    """Hip, knee and ankle, model space.
+
+    The pole leads from the carried hip to the hint; without one it is that of the animated knee.
+    """
+    hip, knee, ankle = (
+        limb.carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle)
+    )
+    if hint_ws is None:
+        hinge = rotate(knee.rot, rig.knee_axis_ls[leg])
+        towards = maths.cross(hinge, ankle.pos - knee.pos)
+    else:
+        towards = maths.unapply(frame.world_from_model, hint_ws) - hip.pos
     return pole.solve_leg(
         rig,
         leg,
         frame,
         body,
         target=maths.unapply(frame.world_from_model, target_ws),
-        pole=maths.unapply(frame.world_from_model, hint_ws) - hip.pos,
+        pole=towards,
         soften=parameters.of_leg("leg.soften", leg),
         twist=parameters.of_leg("leg.twist", leg),
         weight=weight,

@@ -6,6 +6,8 @@ seconds, wxyz; suffixes _ws world, _ms model, _ls local. Model up is +Y, forward
 is that of the terrain.
 """
 
+import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,8 +15,21 @@ import numpy as np
 from reference import characters, maths
 from reference.characters import DEFAULTS, Frame, Ground, Parameters, Rig, State
 from reference.maths import Transform
-from reference.stages import ground, limb
+from reference.stages import contact_by_speed, ground, limb
 
+# What differs as it comes; `DEFAULTS` are those of the faithful system.
+STANDS_BY_SPEED = contact_by_speed.DEFAULTS | {
+    "contact.raised_speed": 0.35,
+    "contact.half_life": 0.03,
+    "target.max_ankle_height": 1.0,
+    "lock.hold_ball": True,
+    "lock.release_max_angle": math.pi,
+    "lock.release_heading": 0.5,
+    "lock.relock_threshold": 0.5,
+    "lock.unlock_half_life": 0.05,
+    "lock.return_speed": 0.6,
+    "leg.as_animated": True,
+}
 __all__ = ["DEFAULTS", "Frame", "Ground", "Parameters", "Rig", "State", "Transform", "run", "step"]
 
 
@@ -27,6 +42,17 @@ def step(
     forward = ground.forward(turned, up)
     legs = range(len(frame.weight))
     feet = [ground.sense(parameters, rig, terrain, frame, leg) for leg in legs]
+    standing = []
+    if "contact.planted_speed" in parameters.values:
+        for leg in legs:
+            before = None if state is None else state.standing[leg]
+            standing.append(contact_by_speed.stand(parameters, frame, leg, before))
+        feet = [
+            dataclasses.replace(
+                foot, contact=now.weight, planted=now.standing, lifted=not now.standing
+            )
+            for foot, now in zip(feet, standing, strict=True)
+        ]
 
     slide, slope, body_rot_ws, smooth_normal = ground.lean(
         parameters, feet, forward, up, state, frame
@@ -43,15 +69,16 @@ def step(
         footholds.append(foothold)
         targets.append(target)
 
-    holds, offsets = [], []
+    holds, offsets, turns = [], [], []
     pelvis_before = np.zeros(3) if state is None else state.pelvis_offset_ws
     for leg in legs:
         before = None if state is None else state.holds[leg]
-        hold, offset = ground.lock(
+        hold, offset, turn = ground.lock(
             parameters, leg, feet[leg], footholds[leg], up, before, pelvis_before, frame
         )
         holds.append(hold)
         offsets.append(offset)
+        turns.append(turn)
     targets = [target + offset for target, offset in zip(targets, offsets, strict=True)]
 
     pelvis = ground.pelvis_height(parameters, feet, targets, up, state, frame)
@@ -64,7 +91,7 @@ def step(
     for leg in legs:
         target_ms = maths.unapply(frame.world_from_model, targets[leg])
         hip, knee, ankle, reached = limb.solve_leg(parameters, rig, leg, frame, body, target_ms)
-        rot_ws = maths.multiply(turned, frame.ankle.rot[leg])
+        rot_ws = maths.multiply(turns[leg], maths.multiply(turned, frame.ankle.rot[leg]))
         rot = limb.foot(parameters, rig, leg, feet[leg], frame, knee, ankle, rot_ws, forward, up)
         ankle = Transform(ankle.pos, rot)
         solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle), reached))
@@ -76,6 +103,7 @@ def step(
         pelvis_height=pelvis,
         pelvis_offset_ws=pelvis_offset_ws,
         holds=holds,
+        standing=standing,
     )
     output = {
         "body_pos": body.pos,

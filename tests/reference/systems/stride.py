@@ -16,21 +16,15 @@ import numpy as np
 from reference import characters, maths
 from reference.characters import Foot, Frame, Ground, Hold, Parameters, Rig
 from reference.maths import Array, Motion, Transform, apply, length, lerp
-from reference.stages import ground, heel, limb, stride_probe
+from reference.stages import contact_by_speed, ground, heel, limb, stride_probe
+from reference.stages.contact_by_speed import Standing
 from reference.systems import record
 from reference.terrain import ALL_LAYERS
 
 # The alternatives in the stages that have two rules.
 CONTACTS: dict[str, dict[str, Any]] = {
     "label": {"contact.ground_height": 0.0},
-    "speed": {
-        "contact.ground_height": 0.0,
-        "contact.planted_height": 0.075,
-        "contact.raised_height": 0.10,
-        "contact.planted_speed": 0.25,
-        "contact.raised_speed": 0.50,
-        "contact.half_life": 0.0,
-    },
+    "speed": contact_by_speed.DEFAULTS,
 }
 PELVISES: dict[str, dict[str, Any]] = {
     "reach": {
@@ -88,14 +82,6 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
 
 
 @dataclass
-class Standing:
-    """Contact of one foot: whether it stands, and the smoothed weight of that."""
-
-    standing: bool
-    weight: float
-
-
-@dataclass
 class State:
     """Memory between frames; lists have one entry per leg."""
 
@@ -121,11 +107,11 @@ def step(
     ups = [characters.under(terrain, leg).up for leg in legs]
     offset_before = np.zeros(3) if state is None else state.pelvis_offset_ws
     standing, feet, heights, holds, footholds, targets = [], [], [], [], [], []
-    swings = []
+    swings, turns = [], []
     for leg, up in zip(legs, ups, strict=True):
         before = None if state is None else state.standing[leg]
         if contact == "speed":
-            contact_of_leg = contact_by_speed(parameters, frame, leg, before)
+            contact_of_leg = contact_by_speed.stand(parameters, frame, leg, before)
         else:
             label = float(frame.stride.standing[leg])
             contact_of_leg = Standing(label > 0.5, label)
@@ -137,12 +123,15 @@ def step(
         )
         foothold, target = ground.clamped_target(parameters, leg, foot, up, eased.value, frame)
         hold = None if state is None else state.holds[leg]
-        hold, offset = ground.lock(parameters, leg, foot, foothold, up, hold, offset_before, frame)
+        hold, offset, turn = ground.lock(
+            parameters, leg, foot, foothold, up, hold, offset_before, frame
+        )
         standing.append(contact_of_leg)
         feet.append(foot)
         swings.append(swing)
         heights.append(eased)
         holds.append(hold)
+        turns.append(turn)
         footholds.append(foothold)
         targets.append(target + offset)
 
@@ -155,7 +144,7 @@ def step(
     solved, reached, stretches, lifts, aims = [], [], [], [], []
     for leg, up in zip(legs, ups, strict=True):
         aim_ws, rot_ws, lift = heel.raised(
-            parameters, frame, leg, feet[leg], targets[leg], offset_ws, up
+            parameters, frame, leg, feet[leg], targets[leg], turns[leg], offset_ws, up
         )
         aim_ms = maths.unapply(frame.world_from_model, aim_ws)
         hip, knee, ankle, arrived = limb.solve_leg(parameters, rig, leg, frame, body, aim_ms)
@@ -206,30 +195,6 @@ def run(
     """All outputs of `step` for a whole clip, stacked over the frames."""
     step_with_rules = functools.partial(step, contact=contact, pelvis=pelvis)
     return characters.run(step_with_rules, parameters, rig, terrain, frames)
-
-
-def contact_by_speed(
-    parameters: Parameters, frame: Frame, leg: int, before: Standing | None
-) -> Standing:
-    """A foot stands once its toe is low and slow, until it is high or fast."""
-    height = frame.toe.pos[leg][1] - parameters.of_leg("contact.ground_height", leg)
-    speed = frame.toe_speed[leg]
-    is_planted = height <= parameters.of_leg(
-        "contact.planted_height", leg
-    ) and speed <= parameters.of_leg("contact.planted_speed", leg)
-    is_lifted = height > parameters.of_leg(
-        "contact.raised_height", leg
-    ) or speed > parameters.of_leg("contact.raised_speed", leg)
-    if is_lifted:
-        stands = False
-    elif is_planted or before is None:
-        stands = is_planted
-    else:
-        stands = before.standing
-    if before is None:
-        return Standing(stands, float(stands))
-    fraction = maths.fraction_of_half_life(parameters.of_leg("contact.half_life", leg), frame.dt)
-    return Standing(stands, lerp(before.weight, float(stands), fraction))
 
 
 def sense(
