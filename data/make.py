@@ -93,6 +93,7 @@ class SyntheticReference:
     preset: str
     truth: Mapping[str, float | bool]  # parameters that differ from the preset's
     seed: int  # of the noise
+    faithful: bool = False  # whether the preset is the original
 
 
 RECORD_TRUTH = {
@@ -154,10 +155,10 @@ MEC_TRUTH = {
     "foot.max_tilt": 0.2,
 }
 REFERENCES = (
-    SyntheticReference("uneven_walk", "uneven_walk", "record", RECORD_TRUTH, 11),
+    SyntheticReference("uneven_walk", "uneven_walk", "record", RECORD_TRUTH, 11, True),
     SyntheticReference("stop_and_go_ozz", "stop_and_go", "ozz", OZZ_TRUTH, 21),
     SyntheticReference("stop_and_go_unreal", "stop_and_go", "unreal", UNREAL_TRUTH, 22),
-    SyntheticReference("stop_and_go_mec", "stop_and_go", "mec", MEC_TRUTH, 23),
+    SyntheticReference("stop_and_go_mec", "stop_and_go", "mec", MEC_TRUTH, 23, True),
 )
 
 
@@ -168,7 +169,8 @@ def flat_animation(name: str) -> Clip:
 
 def reference_motion(reference: SyntheticReference, flat: Clip, terrain: Terrain) -> Clip:
     """What the pipeline with the true parameters makes of a flat animation, without noise."""
-    ik = parameter_tree.replace(systems.preset_system(reference.preset), reference.truth)
+    preset = systems.Preset(reference.preset, reference.faithful)
+    ik = parameter_tree.replace(preset.system(), reference.truth)
     result = jaxik.run(ik, flat.rig, terrain, clip_frames.frames_from_clip(flat))
     solved = clip_frames.clip_from_result(flat, result)
     return dataclasses.replace(solved, source=reference.name.replace("_", " "))
@@ -197,7 +199,8 @@ def truth_text(reference: SyntheticReference) -> str:
     """The true parameters and the noise as TOML, with one table per rule."""
     base = f"{reference.base}_base.npz"
     lines = [f"# What made {reference.name}.npz of {base}; all else as in the preset."]
-    lines += [f'preset = "{reference.preset}"', ""]
+    lines += [f'preset = "{reference.preset}"']
+    lines += ["faithful = true", ""] if reference.faithful else [""]
     for rule in dict.fromkeys(name.partition(".")[0] for name in reference.truth):
         lines.append(f"[{rule}]")
         for name, value in reference.truth.items():

@@ -6,10 +6,17 @@ four are re-implementations from descriptions and source code, tested against in
 references.
 """
 
+import dataclasses
 import math
 
 from jaxik.pipeline import FootIK
-from jaxik.stages.contact import HeightContact, IdleContact, LabelContact, StandingContact
+from jaxik.stages.contact import (
+    HeightContact,
+    IdleContact,
+    LabelContact,
+    SpeedContact,
+    StandingContact,
+)
 from jaxik.stages.effector import (
     BodyEffector,
     DirectEffector,
@@ -32,11 +39,17 @@ from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
 
-def record(rig: Rig | None = None) -> FootIK:
+def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """The foot IK behind a game engine's parameter record.
 
     Locks standing feet, leans the body on slopes and lowers the pelvis to the lowest standing foot.
-    `jaxik.record` reads and writes the record's bytes.
+    On the flat floor for which an animation was made only the locks change anything.
+
+    Args:
+        faithful: whether feet stand and lock by the height of their ankles and the ankles alone are
+            held, as the record's fields have it. Feet then also lock while they swing low over the
+            ground. If not, they stand while their balls are low and slow, and ball and heading are
+            held. `jaxik.record` reads and writes the bytes of the faithful system.
     """
     ik = FootIK(
         root=KeepRoot(),
@@ -53,6 +66,22 @@ def record(rig: Rig | None = None) -> FootIK:
         foot=PitchRollFoot(),
         fade=SpeedFade(),
     )
+    if not faithful:
+        ik = dataclasses.replace(
+            ik,
+            probe=FootProbe(),
+            contact=SpeedContact(raised_speed=0.35, half_life=0.03),
+            target=SlopeTarget(max_ankle_height=1.0),
+            lock=OffsetLock(
+                hold_ball=True,
+                release_max_angle=math.pi,
+                release_heading=0.5,
+                relock_threshold=0.5,
+                unlock_half_life=0.05,
+                return_speed=0.6,
+            ),
+            leg=TwoBone(as_animated=True),
+        )
     return body.scale(ik, rig)
 
 
@@ -122,16 +151,22 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
 def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """Mec Foot Placer, a plug-in for Unity.
 
+    Feet are planted while they are low and slow and their heels are down; else they move as they
+    were animated.
+
     Use `LegTerrains` for feet and hands that each have their own up. All switches and numbers of
     the probe, the lock and the legs can be one value per leg.
 
     Args:
-        faithful: leave it to the game to keep the character on the ground.
+        rig: whose body it is for; None is the adult.
+        faithful: whether, as in the original, every foot is placed and planted where its ray meets
+            ground, even while it swings, knees turn to hints over the toes, and it is left to the
+            game to keep the character on the ground. If not, knees bend as animated.
     """
     ik = FootIK(
         root=GroundRoot(enabled=not faithful),
         warp=StrideWarp(),
-        probe=CornerProbe(),
+        probe=CornerProbe(limited=False),
         contact=StandingContact(),
         target=ContactTarget(),
         lean=NoLean(),
@@ -143,6 +178,17 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         foot=FlatFoot(),
         fade=SpeedFade(),
     )
+    if not faithful:
+        ik = dataclasses.replace(
+            ik,
+            # A foot that is not stable has ground only once it is 3 cm in it.
+            probe=CornerProbe(
+                by_speed=True, stable_speed=0.25, stable_height=body.ANKLE + 0.01, extra_min=-0.03
+            ),
+            contact=SpeedContact(raised_speed=0.35),
+            target=ContactTarget(foot_height=body.ANKLE),
+            leg=PoleLeg(),
+        )
     return body.scale(ik, rig)
 
 

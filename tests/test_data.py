@@ -110,6 +110,7 @@ def test_a_reference_is_the_true_motion_plus_the_stated_noise(make, reference):
         for name, value in table.items()
     }
     assert truth["preset"] == reference.preset and values == reference.truth
+    assert truth.get("faithful", False) == reference.faithful
     base = load_clip(DATA / "clips" / f"{reference.base}_base.npz")
     noisy = load_clip(DATA / "clips" / f"{reference.name}.npz")
     ground = mesh_files.load_terrain(DATA / "terrains" / f"{reference.base}.ply")
@@ -131,7 +132,7 @@ def fixed(reference) -> set[str]:
 
 
 def test_true_parameters_are_within_bounds_and_away_from_the_preset(reference):
-    ik = systems.preset_system(reference.preset)
+    ik = systems.preset_system(reference.preset, faithful=reference.faithful)
     declared = parameter_tree.declarations(ik)
     numbers = {
         name: value for name, value in reference.truth.items() if name not in fixed(reference)
@@ -155,7 +156,7 @@ def test_the_true_parameters_of_the_uneven_walk_have_thresholds_in_order(make):
 def test_an_experiment_frees_the_true_parameters_and_fixes_the_switches(make, preset):
     (reference,) = (each for each in make.REFERENCES if each.preset == preset)
     entries = experiment_files.load_experiment(DATA / "experiments" / f"{preset}.toml")
-    assert entries.preset == preset
+    assert (entries.preset, entries.faithful) == (preset, reference.faithful)
     assert set(entries.free) >= set(reference.truth) - fixed(reference)
     assert {name: reference.truth[name] for name in fixed(reference)} == entries.parameters
     assert entries.sigmas["pelvis"] == make.POSITION_NOISE

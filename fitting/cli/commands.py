@@ -167,7 +167,9 @@ def convert_record(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.file} has {1 + len(more)} rows; give a file with one record")
     if options.way == "to-toml":
         with error_context(options.file):
-            text = parameter_files.system_to_toml(record.to_ik(only, reading))
+            text = parameter_files.system_to_toml(
+                record.to_ik(only, reading), systems.Preset("record", faithful=True)
+            )
         files.write_text(options.output, text)
         if (rest := record.besides_parameters(only)) != record.besides_parameters(record.Record()):
             warnings.warn(

@@ -13,7 +13,7 @@ from fitting.problem.loss import Loss
 from fitting.runtime import validation
 
 from .ablations import Ablation
-from .systems import preset_system, with_parameters, with_rules
+from .systems import DEFAULT_PRESET, Preset, with_parameters, with_rules
 
 DEFAULT_SIGMAS = {  # what a good fit of captured motion leaves
     "ankle": 0.02,  # m
@@ -69,7 +69,9 @@ class Experiment:
     clips: tuple[ClipEntry, ...]
     free: FreeTable
     """By dotted name, with overrides of the declaration."""
-    preset: str = "record"
+    preset: str = DEFAULT_PRESET.name
+    faithful: bool = False
+    """Whether the preset is the original, as faithful as it is known."""
     body: str = "clip"
     """Whose defaults are meant: those of the first clip's rig, or of the adult."""
     name: str = ""
@@ -93,7 +95,7 @@ class Experiment:
     def preset_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
         """The preset with the experiment's rules, for a rig unless it is meant for the adult."""
         rig = rig if self.body == "clip" else None
-        ik = preset_system(self.preset, rig)
+        ik = Preset(self.preset, self.faithful).system(rig)
         return with_rules(ik, self.rules, f"{self.path} [rules]", rig)
 
     def starting_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:

@@ -1,6 +1,7 @@
 """Experiment files: TOML, checked key by key.
 
 preset = "record"                    # a function of jaxik.presets
+faithful = true                      # the original, where the preset differs from it
 body = "clip"                        # its defaults: for the first clip's rig, or for the "adult"
 rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
 [[clips]]
@@ -38,7 +39,7 @@ from fitting.runtime.validation import Constraint, Content, Table, check_table, 
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
-from .systems import BODY, preset_system, read_free_table, with_rules
+from .systems import BODY, DEFAULT_PRESET, preset_system, read_free_table, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
 FILE_KEYS = ("reference", "terrain", "base", "truth")
@@ -89,6 +90,7 @@ TABLES = ("free", "rules", "parameters", "sigmas", "fit", "sample")
 TOP_KEYS: dict[str, Constraint] = {
     "name": validation.TEXT,
     "preset": validation.TEXT,
+    "faithful": validation.BOOLEAN,
     "body": BODY,
     "loss": validation.one_of(get_args(Loss)),
     "fps": validation.FINITE_POSITIVE,
@@ -118,7 +120,9 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         if not content.get(key):
             raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
     with validation.error_context(path):
-        ik = preset_system(content.get("preset", "record"))
+        ik = preset_system(
+            content.get("preset", DEFAULT_PRESET.name), faithful=content.get("faithful", False)
+        )
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
     check_table(content.get("sigmas", {}), SIGMA_KEYS, f"{path} [sigmas]")
     free = read_free_table(content["free"], f"{path} [free]")

@@ -1,6 +1,7 @@
 """Parameter files: a system as TOML, with a preset, changed rules, and one table per stage.
 
 preset = "record"
+faithful = true             # the original, where the preset differs from it
 body = "clip"               # for what is left out: the rig of the clip, or "adult"
 [rules]                     # where they differ from the preset's
 pelvis = "SupportPelvis"
@@ -14,21 +15,37 @@ import numpy as np
 import tomli_w
 
 import jaxik
-from fitting.runtime.validation import TABLE, check_keys, check_table, flatten, nest, read_toml
+from fitting.runtime.validation import (
+    TABLE,
+    check_keys,
+    check_table,
+    error_context,
+    flatten,
+    nest,
+    read_toml,
+)
 from jaxik.maths import parameter_tree
 
-from .systems import BODY, changed_rules, leaf_names, preset_system, with_parameters, with_rules
+from .systems import (
+    BODY,
+    DEFAULT_PRESET,
+    Preset,
+    changed_rules,
+    leaf_names,
+    with_parameters,
+    with_rules,
+)
 
 
-def system_to_toml(ik: jaxik.FootIK, preset: str = "record") -> str:
+def system_to_toml(ik: jaxik.FootIK, preset: Preset = DEFAULT_PRESET) -> str:
     """All rules, parameters, conventions and switches of a system, as TOML."""
     values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
-    rules = changed_rules(ik, preset_system(preset))
-    return tomli_w.dumps({"preset": preset} | ({"rules": rules} if rules else {}) | nest(values))
+    rules = changed_rules(ik, preset.system())
+    return tomli_w.dumps(preset.keys() | ({"rules": rules} if rules else {}) | nest(values))
 
 
-def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.FootIK, str]:
-    """Reads a parameter file; returns the system and the name of its preset.
+def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.FootIK, Preset]:
+    """Reads a parameter file; returns the system and its preset.
 
     What the file leaves out stays as in the preset.
 
@@ -42,10 +59,12 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
     """
     path = Path(path)
     content = read_toml(path, "a parameter")
-    preset = content.pop("preset", "record")
+    preset = Preset(content.pop("preset", DEFAULT_PRESET.name), content.pop("faithful", False))
     rules, body = content.pop("rules", {}), content.pop("body", "clip")
     check_table({"rules": rules, "body": body}, {"rules": TABLE, "body": BODY}, str(path))
     rig = rig if body == "clip" else None
-    ik = with_rules(preset_system(preset, rig), rules, f"{path} [rules]", rig)
+    with error_context(path):
+        ik = preset.system(rig)
+    ik = with_rules(ik, rules, f"{path} [rules]", rig)
     check_keys(content, list(vars(ik)), str(path))
     return with_parameters(ik, flatten(content, 2), str(path)), preset

@@ -33,10 +33,15 @@ def read(path: Path, reading: record.Reading, base: record.Record | None) -> lis
     suffix = path.suffix.lower()
     if suffix == ".toml":
         ik, preset = parameter_files.load_system(path)
-        if preset != "record":
-            raise ValueError(f"{path}: parameters of {preset!r}; only those of 'record' make one")
-        if rules := systems.changed_rules(ik, systems.preset_system(preset)):
-            raise ValueError(f"{path}: rules {rules}; only those of 'record' make one")
+        original = systems.Preset("record", faithful=True)
+        if preset.name != original.name:
+            raise ValueError(
+                f"{path}: parameters of {preset.name!r}; only those of 'record' make one"
+            )
+        if rules := systems.changed_rules(ik, original.system()):
+            raise ValueError(
+                f"{path}: rules {rules}; only those of 'record' with faithful = true make one"
+            )
         return [record.from_ik(ik, base, reading)]
     if base is not None:
         raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")

@@ -1,7 +1,8 @@
 """Systems by name: presets, other rules for some stages, parameters fixed or free."""
 
 from dataclasses import fields, replace
-from typing import TypeVar
+from inspect import signature
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -55,21 +56,54 @@ FREE_KEYS: dict[str, validation.Constraint] = {
 }
 
 
+class Preset(NamedTuple):
+    """A preset as files name it."""
+
+    name: str = "record"
+    faithful: bool = False
+    """Whether it is the original, as faithful as it is known."""
+
+    def system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
+        """The system of the preset; see `preset_system`."""
+        return preset_system(self.name, rig, faithful=self.faithful)
+
+    def keys(self) -> dict[str, object]:
+        """The keys that name it in a file."""
+        return {"preset": self.name} | ({"faithful": True} if self.faithful else {})
+
+
+DEFAULT_PRESET = Preset()
+
+
 def preset_names() -> list[str]:
     """Names of all presets, sorted."""
     return sorted(name for name, value in vars(presets).items() if _is_preset(value))
 
 
-def preset_system(name: object, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
-    """The system of a preset, for the adult or for the body of a rig.
+def preset_system(
+    name: object, rig: jaxik.Rig | None = None, *, faithful: object = False
+) -> jaxik.FootIK:
+    """The system of a preset.
+
+    Args:
+        name: of a function of `jaxik.presets`.
+        rig: whose body it is for; None is the adult.
+        faithful: whether it is to be the original where the preset differs from it.
 
     Raises:
-        ValueError: no such preset; the message lists those that there are.
+        ValueError: there is no such preset, or it has no other original.
     """
     known = preset_names()
     if name not in known:
         raise ValueError(f"no preset named {name!r}; there are {known}")
-    return getattr(presets, str(name))(rig)
+    if not isinstance(faithful, bool):
+        raise ValueError(f"faithful is {faithful!r}; wanted true or false")
+    if not faithful:
+        return getattr(presets, str(name))(rig)
+    originals = [n for n in known if "faithful" in signature(getattr(presets, n)).parameters]
+    if name not in originals:
+        raise ValueError(f"{name!r} has no other original; faithful is for {originals}")
+    return getattr(presets, str(name))(rig, faithful=True)
 
 
 def _is_preset(value: object) -> bool:

@@ -130,10 +130,12 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
 def _result(fitted: Fit) -> list[str]:
     experiment, summary = fitted.experiment, fitted.summary
     rules = "".join(f", `{stage}` by `{name}`" for stage, name in experiment.rules.items())
+    original = ", faithful to its original" if experiment.faithful else ""
     return [
         f"# {experiment.name}",
         f"{summary['message']} {cost_sentence(summary)}",
-        f"Preset `{experiment.preset}`{rules}, loss `{experiment.loss}`, seed {experiment.seed}.",
+        f"Preset `{experiment.preset}`{original}{rules}, loss `{experiment.loss}`, "
+        f"seed {experiment.seed}.",
     ]
 
 

@@ -57,7 +57,7 @@ def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Diff
     }
     files.write_text(run / NUMBERS, json.dumps(numbers, indent=2))
     parameters = parameter_files.system_to_toml(fitted.ik, target.preset)
-    files.write_text(run / f"{target.preset}.toml", parameters)
+    files.write_text(run / f"{target.preset.name}.toml", parameters)
     opening = [*_opening(translation, fitted, clips), _plots(run, translation, clips)]
     fit_report.write_fit(run, fitted, opening, _parameters_of_both(translation, fitted))
 

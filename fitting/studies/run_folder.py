@@ -14,6 +14,7 @@ from pathlib import Path
 import jaxik
 from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
+from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem.problem import Problem
@@ -62,7 +63,10 @@ def save_solution(
     (run / FIT).unlink(missing_ok=True)
     ik = problem.space.unpack(solution.u)
     write_text(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
-    write_text(run / PARAMETERS, parameter_files.system_to_toml(ik, experiment.preset))
+    write_text(
+        run / PARAMETERS,
+        parameter_files.system_to_toml(ik, Preset(experiment.preset, experiment.faithful)),
+    )
 
 
 def save_fit(run: Path, fitted: Fit) -> None:

@@ -59,7 +59,7 @@ class NamedSystem:
 
     name: str
     """Of a preset, or the stem of a parameter file."""
-    preset: str
+    preset: systems.Preset
     ik: jaxik.FootIK
 
 
@@ -117,7 +117,8 @@ def load_named_system(
         ik, preset = parameter_files.load_system(path, rig)
         return NamedSystem(path.stem, preset, ik)
     with error_context(f"{option} takes a preset or a parameter .toml"):
-        return NamedSystem(text, text, systems.preset_system(text, rig))
+        preset = systems.Preset(text)
+        return NamedSystem(text, preset, preset.system(rig))
 
 
 def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> FreeTable:
@@ -167,13 +168,14 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
     run = run.resolve()
     data = [_source_motion(source, files, request.fps) for files in request.animations]
     rig = data[0].base.rig
-    preset = systems.preset_system(target.preset, rig)
+    preset = target.preset.system(rig)
     rules = systems.changed_rules(target.ik, preset)
     experiment = Experiment(
         path=run / run_folder.EXPERIMENT,
         clips=_clip_entries(request, run),
         free=request.free or sensitivity.all_parameters(target.ik, rig),
-        preset=target.preset,
+        preset=target.preset.name,
+        faithful=target.preset.faithful,
         name=f"{source.name} to {target.name}",
         fps=request.fps,
         rules=rules,

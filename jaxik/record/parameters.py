@@ -1,4 +1,4 @@
-"""What a record means: the parameters of the record preset, in our names and units."""
+"""What a record means: the parameters of the faithful record preset, in our names and units."""
 
 import dataclasses
 import warnings
@@ -46,7 +46,7 @@ class Reading:
 
 
 def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
-    """The record preset with a record's parameters; those that it lacks keep their defaults.
+    """The faithful record preset with a record's parameters; those it lacks keep their defaults.
 
     Raises:
         ValueError: if a number is not finite or the knee axis is unknown.
@@ -62,7 +62,7 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
     switches = {ours: record.flag(name) for _, name, ours in FLAGS}
     ticks = {name: reading.tick_hz for name in ("lean.tick_hz", "pelvis.tick_hz")}
     return parameter_tree.replace(
-        presets.record(), values | {"probe.toe_ls": toe} | switches | ticks
+        presets.record(faithful=True), values | {"probe.toe_ls": toe} | switches | ticks
     )
 
 
@@ -73,7 +73,7 @@ def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = No
     written for knee axis, padding and tail.
 
     Args:
-        ik: a system with the rules of the record preset.
+        ik: a system with the rules of `presets.record(faithful=True)`.
         base: where knee axis, padding and tail come from. A float whose value is the same in `base`
             and `ik` keeps its bytes.
         reading: units and signs to write. With `length_unit` "auto" lengths get the unit of `base`,
@@ -132,7 +132,7 @@ def dropped(ik: FootIK, reading: Reading | None = None) -> dict[str, tuple[str, 
         By dotted name the value in `ik` and the one that `to_ik` gives, both with their units.
 
     Raises:
-        ValueError: if the system has other rules than those of the record preset.
+        ValueError: if the system has other rules than those of `presets.record(faithful=True)`.
     """
     assumed = to_ik(Record(), reading)
     for stage, rule in vars(assumed).items():

@@ -61,7 +61,10 @@ def test_bytes_without_a_base_say_what_they_put_in_its_place(binary, capsys):
 @pytest.mark.filterwarnings("default")
 def test_parameters_without_a_slot_in_the_record_are_named_when_written(binary, capsys):
     toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
-    toml.write_text("[target]\nrise_half_life = 0.1\n[lock]\nmax_speed = 0.9\nrelease_cone = 0.3\n")
+    toml.write_text(
+        "faithful = true\n[target]\nrise_half_life = 0.1\n"
+        "[lock]\nmax_speed = 0.9\nrelease_cone = 0.3\n"
+    )
     words = ["record", "to-bytes", str(toml), "--base", str(binary), "-o", str(back)]
     assert main.main(words) == 0
     assert capsys.readouterr().err == (
@@ -117,6 +120,7 @@ def test_lengths_in_centimetres_are_mentioned_in_one_line(tmp_path, capsys):
         (["to-toml", "two.csv", "-o", "a.toml"], "two.csv has 2 rows"),
         (["to-toml", "footik.bin", "-o", "no/a.toml"], "there is no folder no"),
         (["to-bytes", "one.toml", "--base", "footik.bin", "-o", "."], "cannot be written: it is a"),
+        (["to-bytes", "new.toml", "-o", "a.bin"], "only those of 'record' with faithful = true"),
         (["to-bytes", "one.toml", "--base", "no.bin", "-o", "a.bin"], "no.bin: no such file"),
         (["to-bytes", "two.csv", "--base", "footik.bin", "-o", "a.bin"], "a base completes"),
     ],
@@ -125,7 +129,11 @@ def test_a_wrong_record_is_reported_and_writes_nothing(words, message, binary, c
     monkeypatch.chdir(binary.parent)
     rows = record.to_csv([packed(), packed()])
     texts = {"bad.csv": "a,b\n1,2\n", "none.csv": rows.splitlines()[0] + "\n", "two.csv": rows}
-    texts |= {"bad.toml": "[lok]\nx = 1", "one.toml": "lock.enabled = false"}
+    texts |= {
+        "bad.toml": "[lok]\nx = 1",
+        "one.toml": "faithful = true\nlock.enabled = false",
+        "new.toml": "lock.enabled = false",
+    }
     for name, text in texts.items():
         Path(name).write_text(text)
     binaries = {"nan.bin": packed(originalGroundHeightMS=np.nan)}

@@ -6,9 +6,11 @@ import pytest
 
 import jaxik
 from fitting.experiments import parameter_files
-from fitting.experiments.systems import leaf_names
+from fitting.experiments.systems import DEFAULT_PRESET, Preset, leaf_names
 from jaxik.maths import parameter_tree
 from support.clips import ODD
+
+FAITHFUL = Preset("record", faithful=True)
 
 
 def write_file(folder, text):
@@ -19,12 +21,14 @@ def write_file(folder, text):
 
 def test_every_parameter_convention_and_switch_is_read_back_exactly(tmp_path):
     per_leg = {"foot.max_roll": jnp.array([0.1, 0.2]), "pelvis.tick_hz": jnp.array(60.0)}
-    ik = parameter_tree.replace(parameter_tree.replace(jaxik.presets.record(), ODD), per_leg)
+    ik = parameter_tree.replace(
+        parameter_tree.replace(jaxik.presets.record(faithful=True), ODD), per_leg
+    )
     ik = parameter_tree.replace(ik, {"leg.soften": jnp.nextafter(jnp.array(0.9), jnp.array(1.0))})
     back, preset = parameter_files.load_system(
-        write_file(tmp_path, parameter_files.system_to_toml(ik))
+        write_file(tmp_path, parameter_files.system_to_toml(ik, FAITHFUL))
     )
-    assert preset == "record"
+    assert preset == FAITHFUL
     for name in leaf_names(ik):
         np.testing.assert_array_equal(
             parameter_tree.get(back, name), parameter_tree.get(ik, name), err_msg=name
@@ -35,7 +39,7 @@ def test_missing_values_are_those_of_the_preset(tmp_path):
     ik, preset = parameter_files.load_system(
         write_file(tmp_path, "lock.enabled = false\nleg.soften = 1\n")
     )
-    assert preset == "record"
+    assert preset == DEFAULT_PRESET
     changed = {"lock.enabled": False, "leg.soften": 1.0}
     expected = parameter_tree.replace(jaxik.presets.record(), changed)
     for name in leaf_names(ik):
@@ -55,6 +59,8 @@ def test_a_parameter_may_have_one_value_per_leg(tmp_path):
         ("lock = [[", "not TOML"),
         ("preset = 'recrod'", r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
         ("preset = 3", "no preset named 3"),
+        ("preset = 'stride'\nfaithful = true", "'stride' has no other original; faithful is for"),
+        ("faithful = 1", "parameters.toml: faithful is 1; wanted true or false"),
         ("[lok]\nenabled = true", "unknown key 'lok'; nearest is 'lock' of"),
         ("[lock]\nspeed = 1.0", "unknown key 'lock.speed'; nearest is 'lock.max_speed'"),
         ("lock = 3", "unknown key 'lock'; nearest is 'lock.enabled'"),

@@ -90,7 +90,7 @@ def test_a_record_that_cannot_be_stored_is_an_error(wrong, message):
 
 def test_the_record_of_an_adult_has_the_default_parameters():
     meant = leaves_of(record.to_ik(packed()))
-    for name, default in leaves_of(jaxik.presets.record()).items():
+    for name, default in leaves_of(jaxik.presets.record(faithful=True)).items():
         # Defaults have seven digits, the record holds a float32.
         np.testing.assert_allclose(meant[name], default, rtol=2e-6, atol=1e-7, err_msg=name)
 
@@ -240,7 +240,7 @@ def test_a_record_round_trips_through_parameters(single, length_unit, knee_conve
 
 def test_parameters_round_trip_through_a_record():
     changes = {"lean.gain": 0.3, "leg.max_knee_angle": 2.8, "lock.enabled": False}
-    ik = parameter_tree.replace(jaxik.presets.record(), changes)
+    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), changes)
     meant = record.to_ik(record.from_ik(ik, Record()))
     for name, expected in leaves_of(ik).items():
         np.testing.assert_allclose(leaves_of(meant)[name], expected, atol=2e-6, err_msg=name)
@@ -270,7 +270,7 @@ def test_a_record_in_centimetres_stays_in_centimetres():
 
 
 def test_lengths_that_would_be_read_in_another_unit_are_not_written():
-    ik = parameter_tree.replace(jaxik.presets.record(), {"probe.ray_up": 6.0})
+    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), {"probe.ray_up": 6.0})
     with pytest.raises(ValueError, match='written in m .* set length_unit to "m" or "cm"'):
         record.from_ik(ik, Record())
     written = record.from_ik(ik, Record(), Reading(length_unit="m"))
@@ -278,7 +278,7 @@ def test_lengths_that_would_be_read_in_another_unit_are_not_written():
 
 
 def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
-    ik = jaxik.presets.record()
+    ik = jaxik.presets.record(faithful=True)
     same = parameter_tree.replace(ik, {"probe.toe_ls": [[0.01, -0.07, 0.2]] * 2})
     assert record.from_ik(same, Record()).value("footEndLS_X") == np.float32(0.01)
     with pytest.raises(ValueError, match=r"foot.max_pitch is \[0.4, 0.5\].*one value"):
@@ -301,7 +301,7 @@ def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
     ],
 )
 def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, value, message):
-    ik = parameter_tree.replace(jaxik.presets.record(), {name: value})
+    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), {name: value})
     with pytest.warns(UserWarning) as caught:
         written = record.from_ik(ik, Record())
     assert [str(warning.message) for warning in caught] == [
@@ -311,7 +311,7 @@ def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, va
 
 
 def test_exactly_the_parameters_without_a_slot_are_dropped():
-    ik = jaxik.presets.record()
+    ik = jaxik.presets.record(faithful=True)
     leaves = {name: parameter_tree.get(ik, name) for name in parameter_tree.docs(ik)}
     other = {n: ~x if x.dtype == bool else x // 2 if x.dtype == jnp.uint32 else x * 0.8 + 0.11
              for n, x in leaves.items()}  # fmt: skip
@@ -323,7 +323,7 @@ def test_exactly_the_parameters_without_a_slot_are_dropped():
 
 def test_a_record_without_a_base_says_what_it_takes_for_the_knee():
     with pytest.warns(UserWarning, match=r"2 \(\+Z\), zero padding and no tail") as caught:
-        assert record.from_ik(jaxik.presets.record()).knee_axis_type == 2
+        assert record.from_ik(jaxik.presets.record(faithful=True)).knee_axis_type == 2
     assert len(caught) == 1
 
 

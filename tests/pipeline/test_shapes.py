@@ -16,13 +16,13 @@ from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.stages.pelvis import AbstractPelvis, PelvisState
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import LegTerrains, moving
-from support.clips import BLENDS, animate, make_rig, planes, to_frames, to_ik, to_rig, to_terrain
+from support.clips import animate, make_rig, planes, to_frames, to_ik, to_rig, to_terrain
 
 LEGS, FRAMES, CHARACTERS = 2, 3, 4
 RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.1, 0.0, 0.05)))
 CLIP = to_frames(animate(make_rig(), count=FRAMES))
 FRAME = jax.tree.map(lambda leaf: leaf[0], CLIP)
-SYSTEMS = ("record", "ozz", "unreal", "mec", "stride", *BLENDS)
+SYSTEMS = ("record", "ozz", "unreal", "mec", "stride", "by speed")
 
 
 def crowd(tree: Any) -> Any:

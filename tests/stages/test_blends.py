@@ -67,7 +67,12 @@ def blend(base: jaxik.FootIK, other: jaxik.FootIK, *stages: str) -> jaxik.FootIK
     return dataclasses.replace(base, **{stage: getattr(other, stage) for stage in stages})
 
 
-RECORD, OZZ, UNREAL, MEC = presets.record(), presets.ozz(), presets.unreal(), presets.mec()
+RECORD, OZZ, UNREAL, MEC = (
+    presets.record(),
+    presets.ozz(),
+    presets.unreal(),
+    presets.mec(faithful=True),
+)
 BLENDS = {
     "record on unreal's pelvis": blend(RECORD, UNREAL, "pelvis"),
     "unreal's feet on record's pelvis": blend(UNREAL, RECORD, "pelvis"),

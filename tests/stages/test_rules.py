@@ -106,7 +106,7 @@ def test_rules_and_values_round_trip_through_a_parameter_file(tmp_path):
     ik = parameter_tree.replace(ik, {"pelvis.max_length": 0.91, "contact.idle_speed": 0.07})
     text = parameter_files.system_to_toml(ik)
     back, preset = parameter_files.load_system(write_parameters(tmp_path, text))
-    assert preset == "record" and systems.rule_names(back) == systems.rule_names(ik)
+    assert preset == systems.DEFAULT_PRESET and systems.rule_names(back) == systems.rule_names(ik)
     for name in systems.leaf_names(ik):
         np.testing.assert_array_equal(
             parameter_tree.get(back, name), parameter_tree.get(ik, name), err_msg=name
@@ -114,8 +114,10 @@ def test_rules_and_values_round_trip_through_a_parameter_file(tmp_path):
 
 
 def test_the_rules_of_a_preset_itself_are_not_written():
-    for name in PRESETS:
-        assert "rules" not in parameter_files.system_to_toml(systems.preset_system(name), name)
+    presets_of_files = [systems.Preset(name) for name in PRESETS]
+    presets_of_files += [systems.Preset(name, faithful=True) for name in ("record", "mec")]
+    for preset in presets_of_files:
+        assert "rules" not in parameter_files.system_to_toml(preset.system(), preset)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +138,7 @@ def test_wrong_rules_of_a_parameter_file_are_an_error(tmp_path, text, message):
 
 
 def test_a_system_with_other_rules_cannot_become_a_record(tmp_path, capsys):
-    path = write_parameters(tmp_path, "[rules]\npelvis = 'CapsulePelvis'\n")
+    path = write_parameters(tmp_path, "faithful = true\n[rules]\npelvis = 'CapsulePelvis'\n")
     words = ["record", "to-bytes", str(path), "-o", str(tmp_path / "a.bin")]
     assert main.main(words) == main.MISTAKE
     assert "rules {'pelvis': 'CapsulePelvis'}; only those of 'record'" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.experiments import experiment_files, parameter_files, problems
+from fitting.experiments import experiment_files, parameter_files, problems, systems
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.studies import run_folder
@@ -73,7 +73,7 @@ def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path)
     assert [row["at_bound"] for row in summary["parameters"]] == ["", "high"]
     assert summary["correlated"] == [[*NAMES, 0.95]] and summary["history"][0]["stage"] == "start"
     ik, preset = parameter_files.load_system(run / run_folder.PARAMETERS)
-    assert preset == "record" and not parameter_tree.get(ik, "lock.enabled")
+    assert preset == systems.DEFAULT_PRESET and not parameter_tree.get(ik, "lock.enabled")
     values = [float(parameter_tree.get(ik, name)) for name in NAMES]
     np.testing.assert_allclose(values, fitted.solution.values, rtol=1e-12)
     assert (experiment.free, experiment.clips) == (fitted.experiment.free, fitted.experiment.clips)

@@ -17,7 +17,7 @@ from fitting.datasets import clip_frames
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
-from fitting.experiments import parameter_files, problems
+from fitting.experiments import parameter_files, problems, systems
 from fitting.inference import sensitivity
 from fitting.report import difference_report
 from fitting.report.labels import DIFFERENCES
@@ -91,7 +91,7 @@ def error_of(capsys, *words: object) -> str:
 
 def test_the_parameters_of_the_source_are_recovered(run):
     fitted, preset = parameter_files.load_system(run / "record.toml")
-    assert preset == "record"
+    assert preset == systems.DEFAULT_PRESET
     for name, value in TRUTH.items():
         declared = parameter_tree.declarations(fitted)[name]
         tolerance = 0.05 * (declared.high - declared.low)

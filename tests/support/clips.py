@@ -5,6 +5,7 @@ equal shapes fraction one compiled program.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -143,19 +144,25 @@ def by_speed() -> jaxik.FootIK:
     return dataclasses.replace(jaxik.presets.stride(), **rules)
 
 
-BLENDS = {"by speed": by_speed}  # for `to_ik`, beside the presets
+SYSTEMS = {  # for `to_ik`, beside the presets
+    "by speed": by_speed,
+    "record": functools.partial(jaxik.presets.record, faithful=True),
+    "mec": functools.partial(jaxik.presets.mec, faithful=True),
+    "record as it comes": jaxik.presets.record,
+    "mec as it comes": jaxik.presets.mec,
+}
 
 
 def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
-    """The preset or blend with this name, with some values replaced.
+    """The preset or system with this name, with some values replaced.
 
     As in the originals, its probe refuses no ground, nothing fades, and `unreal` and `mec` do not
     put themselves on the ground: `tests/stages/test_limits`, `test_fade` and `test_root` are about
     that.
     """
-    if preset in ("unreal", "mec"):
+    if preset in ("unreal", "mec", "mec as it comes"):
         values = {"root.enabled": False} | values
-    ik = (BLENDS.get(preset) or getattr(jaxik.presets, preset))()
+    ik = (SYSTEMS.get(preset) or getattr(jaxik.presets, preset))()
     probe = dataclasses.replace(ik.probe, limited=False)
     ik = dataclasses.replace(ik, probe=probe, fade=jaxik.stages.fade.NoFade())
     return parameter_tree.replace(ik, values)

@@ -30,15 +30,17 @@ class PlantState:
 
 
 class PlantLock(AbstractLock):
-    """Keeps a foot where and how it first found ground until its ray finds none (Mec).
+    """Keeps a foot where and how it first stood on ground until its ray finds none (Mec).
 
+    It is planted once it has ground and its contact is planted, and let go once it has none or its
+    contact is lifted. With `StandingContact`, as in the original, ground alone decides.
     The kept foothold follows the ground below it, which is probed again in every frame, and moves
     with it where the ground is a platform. The weight of planting moves to `plant_weight` at
     `plant_speed`: set it to 0 or 1 between steps to turn planting off or on over time, at once if
     the speed is infinite.
     """
 
-    plant: Leaf = switch(True, doc="Whether a foot stays where it first found ground.")
+    plant: Leaf = switch(True, doc="Whether a foot stays where it first stood on ground.")
     plant_weight: Leaf = parameter(
         1.0, unit="1", low=0.0, high=1.0, doc="How much a planted foot keeps its place, 0 to 1."
     )
@@ -73,7 +75,9 @@ class PlantLock(AbstractLock):
         on_ground = hit.point + vec.scale(up, clearance)
         planted_ws = gate.choose(hit.found[..., None], on_ground, kept_ws)
 
-        locked = jnp.where(self.plant, sensed.foothold.found, 0.0)
+        contact = sensed.contact
+        stands = gate.choose(before, 1.0 - contact.lifted, contact.planted)
+        locked = jnp.where(self.plant, sensed.foothold.found * stands, 0.0)
         step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
         weight = smoothing.move_towards(state.weight, self.plant_weight, step)
         planting = locked * weight
