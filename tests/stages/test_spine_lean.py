@@ -28,20 +28,21 @@ VALUES = {
     "forward_rate_slide": 0.8,
     "side_rate_slide": -0.5,
     "head_share": 0.6,
+    "spacing": 0.4,
     "half_life": 0.15,
 }
 RULE = SpineLean(**VALUES)
 
 
-def leans(rule, rots, normals, weights, slides, gate=HARD):
+def leans(rule, rots, points, normals, weights, slides, gate=HARD):
     """Rotations of spine and head (frames, 4), world axes."""
     terrain = fragment(Terrain, up_ws=jnp.asarray([0.0, 1.0, 0.0], normals.dtype))
 
     def frame(carry, inputs):
         state, started = carry
-        rot, normal, weight, slide = inputs
+        rot, point, normal, weight, slide = inputs
         root = fragment(Frame, world_from_model=Transform(jnp.zeros(3, rot.dtype), rot))
-        hits = fragment(Hit, found=jnp.ones_like(weight), normal=normal)
+        hits = fragment(Hit, found=jnp.ones_like(weight), point=point, normal=normal)
         slope = rule.sense(
             fragment(Inputs, frame=root, terrain=terrain),
             fragment(GroundHits, ankle=hits),
@@ -55,7 +56,7 @@ def leans(rule, rots, normals, weights, slides, gate=HARD):
 
     rig = fragment(Rig, side=jnp.zeros(2, normals.dtype))
     start = rule.init(rig), jnp.zeros((), bool)
-    return jax.lax.scan(frame, start, (rots, normals, weights, slides))[1]
+    return jax.lax.scan(frame, start, (rots, points, normals, weights, slides))[1]
 
 
 lean_all = jax.jit(leans)
@@ -71,7 +72,7 @@ def hills(frames=FRAMES, seed=3):
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     weights = rng.uniform(0.0, 1.0, (frames, 2)) * (np.arange(frames) % 7 > 0)[:, None]
     slides = (np.arange(frames) // 15 % 2).astype(float)
-    return rots, normals, weights, slides
+    return rots, rng.normal(0.0, 0.3, normals.shape), normals, weights, slides
 
 
 def uphill(angle, frames=FRAMES, yaw=0.0):
@@ -80,7 +81,10 @@ def uphill(angle, frames=FRAMES, yaw=0.0):
     rots = np.tile(turned.as_quat(scalar_first=True), (frames, 1))
     normal = turned.apply([0.0, np.cos(angle), -np.sin(angle)])
     normals = np.broadcast_to(normal, (frames, 2, 3))
-    return rots, normals, np.ones((frames, 2)), np.zeros(frames)
+    ways = np.linspace(-0.4, 0.4, frames)[:, None, None] * [[1.0], [-1.0]]
+    steps = ways * turned.apply([0.0, 0.0, 1.0])
+    points = steps - (steps @ normal / normal[1])[..., None] * [0.0, 1.0, 0.0]
+    return rots, points, normals, np.ones((frames, 2)), np.zeros(frames)
 
 
 def test_spine_and_head_turn_as_in_numpy():
@@ -106,6 +110,15 @@ def test_people_lean_forward_uphill_and_backward_downhill(angle, rate, yaw):
     ]
     np.testing.assert_allclose(tops[0], np.sin(-rate * angle), atol=1e-12)
     np.testing.assert_allclose(tops[1], np.sin(0.6 * rate * angle), atol=1e-12)
+
+
+def test_stairs_are_a_slope_from_foot_to_foot():
+    rots, points, _, weights, slides = uphill(0.5)
+    level = np.broadcast_to([0.0, 1.0, 0.0], points.shape)
+    wide = np.asarray(lean_all(RULE, rots, points, level, weights, slides)[0])[-1, 1]
+    narrow = np.asarray(lean_all(RULE, rots, 0.05 * points, level, weights, slides)[0])[-1, 1]
+    ramp = np.asarray(lean_all(RULE, rots, points, *uphill(0.5)[2:])[0])[-1, 1]
+    assert 0.4 * ramp < wide < 0.9 * ramp and 0.0 < narrow < 0.05 * ramp
 
 
 def test_a_head_that_turns_back_all_the_way_stays_level():
@@ -140,12 +153,12 @@ def test_single_precision_and_lanes_give_the_same():
 
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
 def test_derivatives_are_difference_quotients_and_finite_on_level_ground(gate):
-    rots, normals, weights, slides = hills(frames=4)
+    rots, points, normals, weights, slides = hills(frames=4)
 
-    def rotations(values, normals):
+    def rotations(values, points, normals):
         rule = SpineLean(**values)
-        return jnp.stack(leans(rule, rots, normals, weights, slides, gate))
+        return jnp.stack(leans(rule, rots, points, normals, weights, slides, gate))
 
-    assert_gradients_match(rotations, VALUES, normals)
+    assert_gradients_match(rotations, VALUES, points, normals)
     level = np.broadcast_to([0.0, 1.0, 0.0], normals.shape)
-    finite_jacobian(rotations, VALUES, level)
+    finite_jacobian(rotations, VALUES, np.zeros_like(points), level)

@@ -1,9 +1,11 @@
 """The lean of people: the spine bends into the hill, and the head stays level."""
 
-import jax.numpy as jnp
-from jaxtyping import Array
+import dataclasses
 
-from jaxik.maths import quat, smoothing
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
 from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.world.frame import Contact, GroundHits, Slope
@@ -25,27 +27,32 @@ SLOPE_BAND = 0.05  # rad
 class SpineLean(AbstractLean):
     """Bends the base of the spine on slopes, differently uphill and downhill; legs stay.
 
-    The spine turns by `rate * slope`, forward and sideways, where `slope` is the smoothed angle of
-    the mean normal under the standing feet, and the rate forward is `uphill_rate` where the ground
-    rises ahead and `downhill_rate` where it falls. A rate of 1 aligns the trunk with the normal, a
-    negative rate leans it into the hill. The head turns back by `head_share` of the spine's turn,
-    so that the gaze stays level. Nothing but trunk and head moves: apply `Corrections.spine` and
-    `Corrections.head`.
+    The spine turns by `rate * slope`, forward and sideways, where the rate forward is `uphill_rate`
+    where the ground rises ahead and `downhill_rate` where it falls. A rate of 1 leans the trunk
+    with the slope, square to the ground, a negative rate leans it into the hill. The head turns
+    back by `head_share` of the spine's turn, so that the gaze stays level. Nothing but trunk and
+    head moves: apply `Corrections.spine` and `Corrections.head`.
 
-    People lean forward uphill and backward downhill (Leroux, Fung and Barbeau 2002). The default
-    rates were measured on a person who walked up and down blocks (CMU subject 03, trial 03): the
-    trunk leaned by 0.12 of the path's slope uphill and 0.26 downhill, the head by a third of that.
+    The slope aside is that of the mean normal under the standing feet. Ahead it is the tangent m
+    with the least `v (m - c / v)² + (spacing / 2)² (m - n)²`: n is the tangent from that normal, c
+    and v are covariance and variance of the height of the ground under all feet and their place
+    ahead. On stairs, which are level under each foot, it thus is the slope from foot to foot.
+
+    People lean forward uphill and backward downhill (Leroux, Fung and Barbeau 2002). The defaults
+    were measured on a person who walked up and down blocks (CMU subject 03, trial 03): there the
+    rule explains 61 % of the variance of the trunk's pitch, with like rates in both halves of 38 s,
+    but nothing of it in the few steps of trial 01. The head went with half of the trunk's lean.
     """
 
     uphill_rate: Leaf = parameter(
-        -0.12,
+        -0.65,
         unit="1",
         low=-1.0,
         high=1.0,
         doc="Lean of the spine per slope where the ground rises ahead; below 0 into the hill.",
     )
     downhill_rate: Leaf = parameter(
-        -0.26,
+        -0.25,
         unit="1",
         low=-1.0,
         high=1.0,
@@ -73,11 +80,19 @@ class SpineLean(AbstractLean):
         doc="Lean of the spine sideways per slope aside while the character slides.",
     )
     head_share: Leaf = parameter(
-        0.65,
+        0.5,
         unit="1",
         low=0.0,
         high=1.0,
         doc="Part of the lean of the spine that the head turns back; 1 keeps the gaze level.",
+    )
+    spacing: Leaf = parameter(
+        0.30,
+        unit="m",
+        low=0.05,
+        high=2.0,
+        scale="log",
+        doc="Distance between feet at which the slope between them counts as that of their soles.",
     )
     half_life: Leaf = half_life_parameter(
         0.2, doc="Time in which the lean covers half its way to that of a new slope."
@@ -88,7 +103,27 @@ class SpineLean(AbstractLean):
         return LeanState.level(rig)
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact, weight: Array) -> Slope:
-        return standing_slope(inputs, ground, contact, weight)
+        soles = standing_slope(inputs, ground, contact, weight)
+        forward = self._slope_ahead(inputs, ground, soles, weight)
+        return dataclasses.replace(soles, forward=forward)
+
+    def _slope_ahead(
+        self, inputs: Inputs, ground: GroundHits, soles: Slope, weight: Array
+    ) -> Float[Array, ""]:
+        """The slope ahead, rad, from soles and from foot to foot."""
+        weight = weight * ground.ankle.found
+        weight = vec.safe_divide(weight, vec.sum_last(weight))
+        origin = inputs.frame.world_from_model.pos
+        ahead = vec.dot(ground.ankle.point - origin, soles.forward_ws)
+        height = vec.dot(ground.ankle.point - origin, inputs.terrain.up_ws)
+        ahead, height = (x - vec.sum_last(weight * x) for x in (ahead, height))
+        variance, covariance = (
+            vec.sum_last(weight * ahead**2),
+            vec.sum_last(weight * ahead * height),
+        )
+        prior = (0.5 * self.spacing) ** 2
+        cos, sin = vec.cos_sin(soles.forward)
+        return vec.safe_arctan2(covariance * cos + prior * sin, (variance + prior) * cos)
 
     def advance(self, now: SensedMoment, state: LeanState) -> tuple[LeanState, Lean]:
         fraction = now.progress(smoothing.fraction_of_half_life(self.half_life, now.dt))

@@ -26,6 +26,7 @@ class State:
 def lean(
     parameters: Parameters,
     root_rot: Array,
+    points: Array,
     normals: Array,
     weights: Array,
     slide: float,
@@ -38,6 +39,7 @@ def lean(
     Args:
         parameters: of the rule, under `lean.`.
         root_rot: rotation of the character (4).
+        points: of the ground under each foot (legs, 3), m.
         normals: of the ground under each foot (legs, 3).
         weights: how much each foot stands (legs).
         slide: how much the character slides, 0..1.
@@ -48,7 +50,8 @@ def lean(
     ahead_ws = forward(root_rot, up)
     right_ws = cross(ahead_ws, up)
     normal = up if weights.sum() == 0 else (weights[:, None] * normals).sum(axis=0)
-    ahead = math.atan2(-float(normal @ ahead_ws), float(normal @ up))
+    under_soles = math.atan2(-float(normal @ ahead_ws), float(normal @ up))
+    ahead = between_feet(parameters["lean.spacing"], points @ ahead_ws, points @ up, under_soles)
     aside = math.atan2(-float(normal @ right_ws), float(normal @ up))
     if state is not None:
         half_life = parameters["lean.half_life"]
@@ -62,3 +65,17 @@ def lean(
     back = -parameters["lean.head_share"] * bend
     rotations = maths.from_rotvec(np.asarray(bend)), maths.from_rotvec(np.asarray(back))
     return State(ahead, aside, slide), *rotations
+
+
+def between_feet(spacing: float, places: Array, heights: Array, under_soles: float) -> float:
+    """Slope, rad, of the line through the feet that is pulled to the slope under their soles.
+
+    It is the ridge regression of heights by places with a prior `spacing / 2`, found here as
+    ordinary least squares with one more row, that pulls to the tangent under the soles.
+    """
+    places, heights = places - places.mean(), heights - heights.mean()
+    pull = spacing / 2 * math.sqrt(len(places))
+    rows = np.append(places, pull)
+    goals = np.append(heights, pull * math.tan(under_soles))
+    (tangent,), *_ = np.linalg.lstsq(rows[:, None], goals, rcond=None)
+    return math.atan(tangent)
