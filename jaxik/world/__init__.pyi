@@ -6,4 +6,5 @@ from . import grid as grid
 from . import heightfield as heightfield
 from . import skeleton as skeleton
 from . import surfaces as surfaces
+from . import sweep as sweep
 from . import terrain as terrain

@@ -12,7 +12,7 @@ SPLIT = 4  # into this many parts along each side
 DEPTH = 6  # at most this many times
 CHUNK = 1 << 20  # pairs tested at a time; bounds the memory of a build
 
-# Centres of a cell's parts, in half sides from its own centre, in the order of `Grid._look_up`.
+# Centres of a cell's parts, in half sides from its own centre, in the order of `Grid.look_up`.
 _OFFSETS = (2 * np.indices((SPLIT, SPLIT)).reshape(2, -1).T + 1) / SPLIT - 1.0
 
 

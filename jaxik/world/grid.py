@@ -55,7 +55,7 @@ class Grid(eqx.Module):
         visible = jnp.where(wall, jnp.zeros_like(layers), layers)
         return eqx.tree_at(lambda grid: (grid.corners, grid.visible), self, (corners, visible))
 
-    def _look_up(
+    def look_up(
         self, x: Float[Array, "*b"], z: Float[Array, "*b"]
     ) -> tuple[Int[Array, "*b"], Int[Array, "*b"]]:
         """Start in `members` and length of the list for a point of the plane, m.
@@ -105,7 +105,7 @@ def _first_hit(
     """`Grid.search` for points in the grid's frame; elementwise in x, y, z and mask."""
     shape = jnp.broadcast_shapes(*(number.shape for number in (x, y, z, mask)))
     x, y, z = (jnp.broadcast_to(number, shape) for number in (x, y, z))
-    start, count = grid._look_up(x, z)
+    start, count = grid.look_up(x, z)
     tolerance = 4 * jnp.finfo(x.dtype).eps
     top = y + tolerance * jnp.abs(y)  # a ray that starts on a triangle hits it
 

@@ -70,6 +70,8 @@ class Mesh(AbstractSurface):
     triangles: Int[Array, "*t triangles 3"]
     layers: UInt[Array, "*t triangles"]  # one bit each
     grid: Grid
+    wide: Grid | None = None
+    """For shapes (`jaxik.world.sweep.sweepable`): lists triangles beside a cell too."""
 
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"]) -> "Mesh":
         """The same triangles with moved vertices, m; differentiable.
@@ -78,8 +80,10 @@ class Mesh(AbstractSurface):
         (at right angles to up) than the `slack` that the mesh was built with; movement along up is
         unlimited. Beyond that, a ray may miss a moved triangle.
         """
-        grid = self.grid.with_vertices(vertices_ws, self.triangles, self.layers)
-        return Mesh(vertices_ws, self.triangles, self.layers, grid)
+        triangles, layers = self.triangles, self.layers
+        grid = self.grid.with_vertices(vertices_ws, triangles, layers)
+        wide = self.wide and self.wide.with_vertices(vertices_ws, triangles, layers)
+        return Mesh(vertices_ws, triangles, layers, grid, wide)
 
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]

@@ -86,9 +86,9 @@ class AbstractLimitedProbe(AbstractProbe):
         lower = jnp.where(lies_below, (1.0 - accepted[0]) * accepted[1], 0.0)
         found = accepted[0] + lower
         lower = vec.safe_divide(lower, found)
-        platform = first.platform
-        if platform is not None:
-            platform = jnp.where(lower > 0.5, below.platform, platform)
+        platform = None
+        if first.platform is not None and below.platform is not None:
+            platform = jnp.where(lower > 0.5, below.platform, first.platform)
         return Hit(
             lerp(first.point, below.point, lower[..., None]),
             vec.normalize(lerp(first.normal, below.normal, lower[..., None]), up),
