@@ -14,7 +14,7 @@ from fitting.problem.scene import Scene
 from fitting.runtime import program_cache
 from jaxik.maths import parameter_tree
 
-from .playback import stage_outputs
+from .playback import run, stage_outputs
 
 ROUNDING = 1e-7  # m, and in quaternions: smaller changes of a pose are rounding
 
@@ -109,9 +109,7 @@ def flipped_decisions(
 
     def decisions(moved: dict[str, float]) -> Bool[np.ndarray, " decisions"]:
         ik = space.unpack(space.pack(values | moved))
-        results = [
-            program_cache.run(ik, scene.rig, scene.terrain, scene.frames) for scene in problem.data
-        ]
+        results = [run(ik, scene) for scene in problem.data]
         return np.concatenate([_decisions(result) for result in results])
 
     unmoved, fractions = decisions({}), {}
@@ -138,12 +136,13 @@ def _decisions(result: jaxik.Result) -> Bool[np.ndarray, " decisions"]:
 def _step_each(ik: jaxik.FootIK, scene: Scene, before: jaxik.State) -> tuple[Array, ...]:
     """Body and legs of every frame, each stepped from its own state."""
 
-    def step(state: jaxik.State, frame: jaxik.Frame) -> tuple[Array, ...]:
-        result = jaxik.step(ik, scene.rig, scene.terrain, state, frame)[1]
+    def step(state: jaxik.State, frame: jaxik.Frame, values: dict[str, Array]) -> tuple[Array, ...]:
+        at = parameter_tree.replace(ik, values) if values else ik
+        result = jaxik.step(at, scene.rig, scene.terrain, state, frame)[1]
         ankle, body = result.pose.ankle, result.body
         return body.pos, body.rot, ankle.pos, ankle.rot, result.pose.knee.pos
 
-    return jax.vmap(step)(before, scene.frames)
+    return jax.vmap(step)(before, scene.frames, scene.tracks)
 
 
 def _differ(a: tuple[Array, ...], b: tuple[Array, ...]) -> Bool[np.ndarray, " frames"]:

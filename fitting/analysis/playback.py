@@ -123,7 +123,8 @@ class Playback(eqx.Module):
 def run(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
     """The result of a system on the scene's clip, in the scene's precision."""
     ik = with_floats(ik, scene.frames.dt.dtype)
-    return program_cache.run(ik, scene.rig, scene.terrain, scene.frames)
+    tracks = scene.tracks or None
+    return program_cache.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks)
 
 
 def stage_outputs(result: jaxik.Result) -> Trace:

@@ -264,6 +264,7 @@ def _animation(options: argparse.Namespace) -> AnimationFiles:
         options.floor,
         options.root,
         options.speed,
+        options.tracks,
     )
 
 

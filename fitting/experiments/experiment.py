@@ -50,6 +50,8 @@ class ClipEntry:
     """Ignores frames in which a captured marker jumps."""
     root: str = "auto"
     """Where the base's root is put: one of `ground_path.ROOTS`."""
+    tracks: Path | None = None
+    """What changes along the base; see `track_files`."""
 
 
 @dataclass(frozen=True)

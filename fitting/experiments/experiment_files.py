@@ -42,7 +42,7 @@ from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
 from .systems import BODY, DEFAULT_PRESET, preset_system, read_free_table, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
-FILE_KEYS = ("reference", "terrain", "base", "truth")
+FILE_KEYS = ("reference", "terrain", "base", "truth", "tracks")
 CLIP_KEYS: dict[str, Constraint] = {
     **dict.fromkeys((*FILE_KEYS, "label"), validation.TEXT),
     **dict.fromkeys(("start", "end"), validation.SECONDS),

@@ -6,6 +6,7 @@ they belong together.
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 
 import jaxik
 from fitting.datasets.clip_frames import frames_from_clip, raised
-from fitting.datasets.clips import Clip, edit, load_clip
+from fitting.datasets.clips import Clip, edit, flight, load_clip
 from fitting.datasets.flat_animation import flatten_clip, load_flat_animation
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain import mesh_files
@@ -27,6 +28,7 @@ from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
+from . import track_files
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment
 from .systems import without_own_root
 
@@ -39,6 +41,8 @@ class ClipData(NamedTuple):
     """The flat animation."""
     terrain: Terrain
     root: RootChoice = AS_ANIMATED
+    tracks: Mapping[str, np.ndarray] = MappingProxyType({})
+    """Parameters that change along the base, (frames, ...) by dotted name."""
 
 
 def _silent(text: str) -> None:
@@ -61,6 +65,8 @@ def make_problem(
     data = [load_clip_data(entry, experiment.fps) for entry in experiment.placed_clips()]
     for clip in data:
         log(f"root of {clip.base.source}: {clip.root.reason}")
+        if in_the_air := flight.describe(clip.base):
+            log(f"{clip.base.source}: {in_the_air}")
     return problem_from_clips(experiment, data)
 
 
@@ -79,6 +85,12 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     with error_context(f"{experiment.path} [free]"):
         space = make_space(ik, parameters)
     scenes = []
+    for clip in data:
+        if both := sorted({p.name for p in parameters if p.leaf in clip.tracks}):
+            raise ValueError(
+                f"{experiment.path} [free]: {both} cannot be free: a track of {clip.base.source} "
+                "sets it in every frame"
+            )
     for entry, clip in zip(experiment.clips, data, strict=True):
         scene = make_scene(clip, experiment.sigmas, entry.label)
         with error_context(f"{experiment.path} [parameters]"):
@@ -100,14 +112,16 @@ def load_clip_data(entry: ClipEntry, fps: float | None) -> ClipData:
     if entry.base is None:
         base = flatten_clip(reference, mesh_files.height_function(terrain))
         base, root = place_root(base, terrain, entry.root)
-        return ClipData(reference, base, terrain, root)
+        base, tracks = track_files.along(base, entry.tracks, entry.start)
+        return ClipData(reference, base, terrain, root, tracks)
     base = _cut(load_flat_animation(entry.base), entry.base, entry, fps)
     if _outline(base) != _outline(reference):
         raise ValueError(
             f"{entry.base}: the base has {_outline(base)}; the reference has {_outline(reference)}"
         )
     base, root = place_root(base, terrain, entry.root)
-    return ClipData(reference, base, terrain, root)
+    base, tracks = track_files.along(base, entry.tracks, entry.start)
+    return ClipData(reference, base, terrain, root, tracks)
 
 
 def _outline(clip: Clip) -> str:
@@ -122,7 +136,7 @@ def _cut(clip: Clip, path: Path, entry: ClipEntry, fps: float | None) -> Clip:
 
 def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captured") -> Scene:
     """One clip as residuals need it; `sigmas` override the defaults, plots show the label."""
-    reference, base, terrain, root = data
+    reference, base, terrain, root, tracks = data
     frames = frames_from_clip(base, rise=root.rise)
     placed = raised(base, root.rise)
     legs = reference.leg_pose_ws()
@@ -146,6 +160,7 @@ def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captur
             label=label,
         ),
         sigmas=Sigmas(**{kind: jax.device_put(np.float64(s)) for kind, s in all_sigmas.items()}),
+        tracks={name: jax.device_put(values) for name, values in tracks.items()},
     )
 
 

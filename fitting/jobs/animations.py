@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxik
 from fitting.analysis import accuracy
-from fitting.datasets.clips import Clip, load_clip, save_clip
+from fitting.datasets.clips import Clip, flight, load_clip, save_clip
 from fitting.datasets.clips.formats.npz import check_clip_file, is_blocks_file
 from fitting.experiments.parameter_files import load_system
 from fitting.report import comparison_report, fit_tables, placement_report
@@ -56,7 +56,8 @@ def compare(
     if folder is not None:
         comparison_report.write(folder, compared)
     table = aligned(comparison_report.transposed(comparison_report.table(compared)))
-    log(f"{table}\n\nroot: {loaded.root.reason}")
+    where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
+    log("\n".join([table, "", *filter(None, where)]))
     log_output(log, folder, comparison_report.TABLE)
     for name, (placement, cause) in compared.placements.items():
         placement_report.warn(placement, cause, name)
@@ -149,7 +150,11 @@ def solve(
     if path is not None:
         save_clip(path, solved, joints=placement_report.arrays(solved, placement))
     log(placement_report.solved_text(result, seconds, path))
-    where = [f"root: {loaded.root.reason}", placement_report.trunk_text(result, solved)]
+    where = [
+        f"root: {loaded.root.reason}",
+        flight.describe(loaded.clip),
+        placement_report.trunk_text(result, solved),
+    ]
     log("\n".join(filter(None, where)) + f"\n\n{placement_report.text(placement)}")
     if is_blocks_file(animation.clip) and animation.speed == 1.0:
         errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)

@@ -16,7 +16,7 @@ def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Ar
 
 def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " residuals"]:
     """Residuals of one clip in standard deviations, one kind after another."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
     residuals = residuals_by_kind(scene, errors_by_kind(scene, result))
     return jnp.concatenate([of_kind.ravel() for of_kind in residuals.values()])
 

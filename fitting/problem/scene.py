@@ -55,6 +55,8 @@ class Scene(eqx.Module):
     """Frames, of the flat animation, model space."""
     reference: Reference
     sigmas: Sigmas
+    tracks: dict[str, Array] = eqx.field(default_factory=dict)
+    """Parameters that change along the clip, (frames, ...) by dotted name."""
 
 
 def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:

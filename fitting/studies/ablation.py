@@ -220,12 +220,14 @@ def _at_rate(data: ClipData, fps: float | None) -> ClipData:
         return data
     reference, base = edit.resample(data.reference, fps), edit.resample(data.base, fps)
     base, root = place_root(base, data.terrain, data.root.root)
-    return ClipData(reference, base, data.terrain, root)
+    nearest = np.round(np.arange(base.frame_count) * data.base.fps / fps).astype(int)
+    tracks = {name: values[nearest] for name, values in data.tracks.items()}
+    return ClipData(reference, base, data.terrain, root, tracks)
 
 
 def _errors(ik: jaxik.FootIK, data: ClipData, frames: slice) -> Errors:
     """Errors of the system in these frames, at the clip's own rate."""
-    animation = Animation(data.base, data.terrain, root=data.root)
+    animation = Animation(data.base, data.terrain, root=data.root, tracks=data.tracks)
     animation.check_shapes(ik)
     _, solved = animation.solve(ik)
     compared = (solved, data.reference, animation.placed_clip)
@@ -245,7 +247,7 @@ def _digest(entries: Sequence[ClipEntry]) -> str:
     """A digest of all files that a fit reads."""
     digest = hashlib.sha256()
     for entry in entries:
-        for path in (entry.reference, entry.base, entry.terrain):
+        for path in (entry.reference, entry.base, entry.terrain, entry.tracks):
             digest.update(b"" if path is None else hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 

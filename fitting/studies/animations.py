@@ -1,7 +1,7 @@
 """A flat animation on a terrain, and what a system makes of it."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from fitting.datasets.clips.edit import at_speed
 from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import load_terrain
-from fitting.experiments import systems
+from fitting.experiments import systems, track_files
 from fitting.runtime import program_cache
 from jaxik.maths import parameter_tree
 from jaxik.world.terrain import Terrain, moving
@@ -39,6 +39,8 @@ class AnimationFiles:
     """Where the root is put; see `place_root`."""
     speed: float = 1.0
     """Of the root, as a multiple of the clip's; strides are scaled alike."""
+    tracks: Path | None = None
+    """What changes along the clip; see `experiments.track_files`."""
 
     @cached_property
     def flat_clip(self) -> Clip:
@@ -70,6 +72,8 @@ class Animation:
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
     speed: float = 1.0
     """Of the clip's root over that with which its feet step."""
+    tracks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Parameters that change along the clip, (frames, ...) by dotted name."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
@@ -100,7 +104,8 @@ class Animation:
         if self.root.rise is not None:
             ik = systems.without_own_root(ik)
         terrain = self.terrain if self.carried is None else moving(self.terrain, 0)
-        result = program_cache.run(ik, self.clip.rig, terrain, self.frames)
+        tracks = {name: jnp.asarray(values) for name, values in self.tracks.items()}
+        result = program_cache.run(ik, self.clip.rig, terrain, self.frames, tracks=tracks or None)
         solved = clip_from_result(self.clip, result, floor=self.floor, rise=self.root.rise)
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite; nothing was written")
@@ -132,8 +137,9 @@ def load_animation(files: AnimationFiles) -> Animation:
     if files.speed != 1.0:
         clip = at_speed(clip, files.speed)
     clip, root = place_root(clip, terrain, files.root, files.floor)
+    clip, tracks = track_files.along(clip, files.tracks)
     turned = files.load_turned_terrain
-    return Animation(clip, terrain, files.floor, root, turned, speed=files.speed)
+    return Animation(clip, terrain, files.floor, root, turned, speed=files.speed, tracks=tracks)
 
 
 def carried_frames(frames: jaxik.Frame, carried: Float64[np.ndarray, "frames 3"]) -> jaxik.Frame:

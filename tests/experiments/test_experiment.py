@@ -199,7 +199,7 @@ def test_contacts_count_only_where_the_clip_has_labels(tmp_path):
 def test_a_missing_flat_animation_is_made_from_the_reference(tmp_path):
     clips = "\n".join(line for line in CLIP.splitlines() if not line.startswith("base")) + "\n"
     loaded = experiment_files.load_experiment(write(tmp_path, clips=clips + SECOND))
-    reference, base, _, root = problems.load_clip_data(loaded.clips[0], None)
+    reference, base, _, root, _ = problems.load_clip_data(loaded.clips[0], None)
     assert root.root == "animation"
     stands = base.stance_labels() & reference.stance_labels()
     assert np.abs(base.joints_ws(3)[..., 1][stands]).max() < 0.2

@@ -55,6 +55,10 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
         "--speed", type=positive, default=1.0, metavar="X",
         help="let the root travel X times as far as in the clip; strides are scaled with it",
     )  # fmt: skip
+    command.add_argument(
+        "--tracks", type=Path, metavar="TOML",
+        help="what changes along the clip: grounded, weights of legs, and any parameter",
+    )  # fmt: skip
 
 
 def finite(text: str) -> float:

@@ -14,6 +14,8 @@ from .clip import Clip
 CLEARANCE = 0.03  # of a leg's length: a foot of a character in the air is higher above its floor
 PEAK = 0.10  # of a leg's length, that the lowest foot of a jump reaches
 SHORTEST = 0.25  # s, longer than the flight of a runner
+LANDING = 0.1  # s before feet reach their floor, in which they prepare for the ground they meet
+MOST_SPANS = 4  # that are listed
 
 
 def grounded_track(clip: Clip) -> Float64[np.ndarray, " frames"]:
@@ -39,11 +41,16 @@ def grounded_track(clip: Clip) -> Float64[np.ndarray, " frames"]:
     for first, last in contacts.runs((height > CLEARANCE) & ~stances):
         long_enough = last - first + 1 >= SHORTEST * clip.fps
         if long_enough and height[first : last + 1].max() > PEAK:
-            grounded[first : last + 1] = 0.0
+            grounded[first : last + 1 - round(LANDING * clip.fps)] = 0.0
     return grounded
 
 
-def spans_in_the_air(clip: Clip) -> list[tuple[float, float]]:
-    """First and last time, s, of each time that a clip is not fully on the ground."""
+def describe(clip: Clip) -> str:
+    """When the clip is in the air, where foot IK leaves it alone; "" for one that never is."""
     spans = contacts.runs(grounded_track(clip) < 1.0)
-    return [(first / clip.fps, last / clip.fps) for first, last in spans]
+    if not spans:
+        return ""
+    times = [f"{first / clip.fps:.2f} to {last / clip.fps:.2f}" for first, last in spans]
+    more = f" and {len(spans) - MOST_SPANS} more" if len(spans) > MOST_SPANS else ""
+    source = "found from its feet" if clip.grounded is None else "as its track says"
+    return f"no foot IK in the air ({source}): {', '.join(times[:MOST_SPANS])} s{more}"
