@@ -7,8 +7,9 @@ leg length            by the ratio r of the legs' length to the adult's
 speed, time           by the root of r: bodies of equal shape move alike at equal Froude numbers
                       v² / (g l) (Alexander and Jayes 1983)
 ankle height          the height of the ankle over the sole itself; `ball height` likewise
-over ankle height     as far over the ankle of a flat foot as the adult's number is, by r; `over
-                      ball height` likewise
+over ankle height     as far over the ankle of a flat foot as the adult's number is, by the ratio of
+                      the feet's length: a heel rises by the length of its foot, whatever the leg;
+                      `over ball height` likewise
 
 Gains, half-lives, angles and parts of a length follow nothing.
 """
@@ -32,6 +33,8 @@ from .skeleton import Rig
 LEG = 0.84  # m, thigh and shin of the adult
 ANKLE = 0.085  # m, over the sole of a flat foot
 BALL = 0.055  # m, likewise
+FOOT = 0.12  # m, from ankle to ball
+FOOT_RANGE = 2.0  # factor by which feet may be larger or smaller than their legs say
 NOTICEABLE = 0.05  # of their mean, from which legs get values of their own
 
 Tree = TypeVar("Tree", bound=eqx.Module)
@@ -48,6 +51,8 @@ class Size(NamedTuple):
     """m, height over the sole."""
     ball: Numbers
     """m, likewise."""
+    foot: Numbers
+    """Ratio of the foot's length to the adult's."""
 
 
 def scale(system: Tree, rig: Rig | None) -> Tree:
@@ -124,8 +129,12 @@ def _size(rig: Rig, numbers: ModuleType) -> Size:
         mean = numbers.where(known, entry, 0.0).sum() / numbers.maximum(count, 1)
         return numbers.where(known, entry, numbers.where(count > 0, mean, without))
 
-    heights = (numbers.asarray(height) for height in (rig.ankle_height, rig.ball_height))
-    return Size(filled(length, LEG) / LEG, *map(filled, heights, (ANKLE, BALL)))
+    leg = filled(length, LEG) / LEG
+    ankle, ball, foot = (
+        filled(numbers.asarray(entry), adult)
+        for entry, adult in ((rig.ankle_height, ANKLE), (rig.ball_height, BALL), (rig.foot, FOOT))
+    )
+    return Size(leg, ankle, ball, numbers.clip(foot / FOOT, leg / FOOT_RANGE, leg * FOOT_RANGE))
 
 
 def _follow(value: Numbers, follows: Follows, size: Size) -> Numbers:
@@ -140,9 +149,9 @@ def _follow(value: Numbers, follows: Follows, size: Size) -> Numbers:
         case "ball height":
             return size.ball + 0.0 * value
         case "over ankle height":
-            return size.ankle + (value - ANKLE) * size.ratio
+            return size.ankle + (value - ANKLE) * size.foot
         case "over ball height":
-            return size.ball + (value - BALL) * size.ratio
+            return size.ball + (value - BALL) * size.foot
         case _:
             return value
 

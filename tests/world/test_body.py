@@ -35,10 +35,13 @@ class Kick(Rule):
     half_life: Leaf = half_life_parameter(0.1, doc="How smooth it is.")
 
 
-def make_body(leg: Any = body.LEG, ankle: Any = body.ANKLE, ball: Any = body.BALL) -> jaxik.Rig:
-    """A rig with legs, ankles and balls of these lengths and heights, m."""
+def make_body(
+    leg: Any = body.LEG, ankle: Any = body.ANKLE, ball: Any = body.BALL, foot: Any = None
+) -> jaxik.Rig:
+    """A rig with legs, ankles and balls of these lengths and heights, m; feet as long as legs."""
     rig = to_rig(make_rig())
     lengths = {"thigh": 0.5 * leg, "shin": 0.5 * leg, "ankle_height": ankle, "ball_height": ball}
+    lengths["foot"] = body.FOOT * leg / body.LEG if foot is None else foot
     return dataclasses.replace(rig, **{k: v * jnp.ones(2) for k, v in lengths.items()})
 
 
@@ -74,6 +77,15 @@ def test_heights_of_soles_are_those_of_the_rig():
     assert float(presets.stride(rig).probe.ball_height) == pytest.approx(0.12)
     contact = body.scale(SpeedContact(), rig)
     assert float(contact.planted_height) == pytest.approx(0.12 + 2.5 * 0.02)
+
+
+def test_heights_over_a_flat_foot_follow_its_length_within_twice_that_of_the_leg():
+    for foot, ratio in ((0.18, 1.5), (0.06, 0.5), (0.5, 2.0), (0.0, 0.5)):
+        rig = make_body(body.LEG, 0.1, 0.06, foot)
+        assert float(presets.record(rig).contact.planted_height) == pytest.approx(
+            0.1 + ratio * 0.015
+        )
+        assert float(presets.record(rig).probe.ray_up) == pytest.approx(0.5)
 
 
 def test_legs_share_a_number_unless_they_differ_noticeably_and_may_have_their_own():

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 MAX_SPEED = 0.25  # m/s: the ball of a standing foot is slower, even a runner's
-SPEED_POWER = 0.75  # of a body's size, with which the limit of speed grows
+SPEED_POWER = 0.7  # of a body's size, with which the limit of speed grows
 HALF_WINDOW = 0.025  # s, on each side of a frame, for measuring speed
 MAX_GAP = 0.05  # s: shorter interruptions of a stance are marker noise
 MIN_STANCE = 0.06  # s: shorter slow spells are no stance; runners stand for 0.075 s

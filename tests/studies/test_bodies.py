@@ -1,0 +1,183 @@
+"""Defaults on bodies for which nobody chose them: a child, a giant, short shins, unlike legs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.analysis import measures, placement
+from fitting.datasets.clip_frames import clip_from_result, frames_from_clip
+from fitting.datasets.clips import Clip, edit, load_clip, save_clip
+from fitting.datasets.ground_path import place_root
+from fitting.experiments import parameter_files, systems
+from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.problems import make_problem
+from jaxik import presets
+from jaxik.maths import parameter_tree
+from jaxik.stages.inputs import Inputs
+from jaxik.world import body, terrain
+from support.bodies import scaled, with_shins
+
+ROOT = Path(__file__).resolve().parents[2]
+CAPTURED = ROOT.parent / "shared" / "mocap" / "clips" / "cmu_bvh_mb" / "cmu_12_01_walk.bvh"
+PRESETS = ["record", "ozz", "unreal", "mec", "stride"]
+BODIES = {
+    "child": lambda clip: scaled(clip, 0.55),
+    "slower giant": lambda clip: scaled(clip, 2.5, froude=True),
+    "giant": lambda clip: scaled(clip, 2.5),
+    "robot with short shins": lambda clip: with_shins(clip, 0.6, 0.6),
+    "left and right unlike": lambda clip: with_shins(clip, 0.75, 0.6),
+}
+FLOOR = terrain.plane()
+run = jax.jit(jaxik.run)
+
+
+@pytest.fixture(scope="module")
+def walk() -> Clip:
+    return edit.trim(load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz"), 0.0, 3.0)
+
+
+@pytest.fixture(scope="module")
+def captured() -> Clip:
+    if not CAPTURED.is_file():
+        pytest.skip(f"captured clips are not at {CAPTURED.parent}")
+    return edit.resample(edit.drop_t_pose(load_clip(CAPTURED)), 60.0)
+
+
+@jax.jit
+def contact_weights(ik: jaxik.FootIK, rig: jaxik.Rig, frames: jaxik.Frame) -> jax.Array:
+    """0..1, (frames legs), of contact rules without memory."""
+
+    def weights(frame: jaxik.Frame) -> jax.Array:
+        return ik.contact.sense(Inputs(rig, FLOOR, frame, jaxik.HARD)).weight
+
+    return jax.vmap(weights)(frames)
+
+
+def contact_share(clip: Clip, preset: str) -> float:
+    ik = getattr(presets, preset)(clip.rig)
+    return float(jnp.mean(contact_weights(ik, clip.rig, frames_from_clip(clip))))
+
+
+@pytest.mark.parametrize("source", ["walk", "captured"])
+@pytest.mark.parametrize("name", BODIES)
+def test_feet_stand_as_long_as_an_adults_whatever_the_body(source, name, request):
+    clip = request.getfixturevalue(source)
+    other = BODIES[name](clip)
+    for preset in PRESETS:
+        share = contact_share(clip, preset)
+        assert contact_share(other, preset) == pytest.approx(share, abs=0.02), preset
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_with_ozz_soles_are_on_a_flat_floor_untouched(name, walk):
+    other = BODIES[name](walk)
+    result = run(presets.ozz(other.rig), other.rig, FLOOR, frames_from_clip(other))
+    soles = measures.soles(clip_from_result(other, result))
+    lowest = soles[..., 1].min(axis=-1)[other.stance_labels()]
+    assert np.abs(lowest).max() < 0.005
+
+
+def test_stances_are_detected_alike_at_the_same_and_at_an_equal_froude_speed(captured):
+    share = captured.stance_labels().mean()
+    assert 0.3 < share < 0.7
+    for size in (0.55, 2.5):
+        for froude in (False, True):
+            other = replace(scaled(captured, size, froude=froude), stance=None)
+            assert other.stance_labels().mean() == pytest.approx(share, abs=0.025)
+
+
+def test_a_root_follows_ground_that_is_as_large_as_its_body():
+    steps = np.repeat(0.15 * np.arange(8.0), 4)[:, None] * np.ones(40)  # m, a tread is 1 m long
+    clip = edit.trim(load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz"), 0.0, 6.0)
+    rises = []
+    for size in (1.0, 0.5, 3.0):
+        stairs = terrain.heightfield(size * steps, size * 0.25, origin=(-5.0 * size, 0.0, 0.0))
+        _, choice = place_root(scaled(clip, size), stairs)
+        assert choice.root == "ground"
+        rises.append(choice.rise / size)
+    np.testing.assert_allclose(rises[1:], [rises[0]] * 2, atol=1e-4)
+
+
+def test_what_is_visible_of_a_foot_is_as_large_as_its_body(walk):
+    shares = []
+    for size in (1.0, 0.5, 3.0):
+        clip = scaled(walk, size)
+        lowered = clip.with_motion(clip.positions_ws - [0.0, 0.03 * size, 0.0], clip.rotations_ws)
+        feet = placement.soles(lowered, clip, FLOOR)
+        assessed = placement.assess(feet, lowered, clip)
+        assert assessed.misplaced and assessed.visible == pytest.approx(0.02 * size, rel=0.02)
+        shares.append(assessed.sunk)
+    np.testing.assert_allclose(shares, shares[0])
+
+
+def test_an_experiment_is_for_the_body_of_its_clip_unless_it_says_adult(tmp_path):
+    clips, ground = ROOT / "data" / "clips", ROOT / "data" / "terrains" / "uneven_walk.ply"
+    text = f"""
+        preset = "record"
+        [[clips]]
+        reference = "{clips / "uneven_walk.npz"}"
+        base = "{tmp_path / "giant.npz"}"
+        terrain = "{ground}"
+        root = "animation"
+        [free]
+        pelvis.limit = {{}}
+        lean.gain = {{}}
+    """
+    base = load_clip(clips / "uneven_walk_base.npz")
+    save_clip(tmp_path / "giant.npz", scaled(base, 2.5))
+    highest = {}
+    for line in ("", 'body = "adult"'):
+        (tmp_path / "e.toml").write_text(line + text, encoding="utf-8")
+        space = make_problem(load_experiment(tmp_path / "e.toml")).space
+        highest[line] = space.parameters[0].high, float(space.system.pelvis.limit)
+        assert space.parameters[1].high == 0.95
+    assert highest[""] == pytest.approx((1.5, 0.75), rel=0.01)
+    assert highest['body = "adult"'] == (0.6, pytest.approx(0.3))
+    (tmp_path / "e.toml").write_text('body = "child"' + text, encoding="utf-8")
+    with pytest.raises(ValueError, match="body is 'child'; wanted one of"):
+        load_experiment(tmp_path / "e.toml")
+
+
+def test_a_parameter_file_is_for_the_body_of_the_clip_unless_it_says_adult(walk, tmp_path):
+    path, rig = tmp_path / "mine.toml", scaled(walk, 2.5).rig
+    path.write_text('[rules]\npelvis = "ReachPelvis"\n[lock]\nrelease_distance = 0.1\n')
+    ik, _ = parameter_files.load_system(path, rig)
+    assert float(ik.lock.release_distance) == pytest.approx(0.1)
+    assert float(ik.probe.ray_up) == pytest.approx(1.25, rel=0.01)
+    assert float(ik.pelvis.softness) == pytest.approx(0.0625, rel=0.01)
+    path.write_text('body = "adult"\n')
+    for name, value in zip(
+        systems.leaf_names(ik := presets.record()),
+        jax.tree.leaves(parameter_files.load_system(path, rig)[0]),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(parameter_tree.get(ik, name), value)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_system_with_a_number_for_each_leg_is_read_as_it_was_written(name, walk, tmp_path):
+    rig = walk.rig
+    unlike = replace(rig, thigh=rig.thigh * jnp.array([1.0, 0.5]))
+    ik = getattr(presets, name)(unlike)
+    path = tmp_path / "written.toml"
+    path.write_text(parameter_files.system_to_toml(ik, name), encoding="utf-8")
+    for reader in (None, rig, unlike):
+        again, _ = parameter_files.load_system(path, reader)
+        assert jax.tree.structure(again) == jax.tree.structure(ik)
+        for value, expected in zip(jax.tree.leaves(again), jax.tree.leaves(ik), strict=True):
+            assert value.dtype == expected.dtype and np.array_equal(value, expected)
+
+
+def test_a_quadruped_has_numbers_of_its_own_and_stands_as_long_when_it_is_larger():
+    clip = load_clip(ROOT / "data" / "clips" / "quadruped_base.npz").select(slice(0, 60))
+    larger = scaled(clip, 3.0)
+    assert body.ratio(larger.rig) == pytest.approx(3.0 * body.ratio(clip.rig), rel=1e-6)
+    for preset in PRESETS:
+        share = contact_share(clip, preset)
+        assert contact_share(larger, preset) == pytest.approx(share, abs=0.02)
+    assert contact_share(clip, "record") > 0.3
