@@ -102,6 +102,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) 
         hip_ws=frame.world_from_model.apply(frame.pose.hip.pos),
         ankle_ws=ankle.pos,
         ankle_rot_ws=ankle.rot,
+        foot_speed=frame.foot_speed,
         ball_ws=frame.world_from_model.apply(frame.pose.toe.pos),
         ahead_ws=foot_heading(inputs, up)[0],
         rot_ws=rot_ws,
@@ -154,7 +155,9 @@ def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, Py
     with jax.named_scope("effector"):
         effector_state, effector = ik.effector.advance(now, ankle, pelvis, state.effector)
     with jax.named_scope("fade"):
-        fade_state, weight = ik.fade.legs(now, effector, body, sensed.weight, fade_state)
+        standing = jnp.where(ik.effector.by_contact, sensed.contact.weight, 1.0)
+        wanted = sensed.weight * standing
+        fade_state, weight = ik.fade.legs(now, effector, body, wanted, fade_state)
         effector = dataclasses.replace(effector, weight=effector.weight * weight)
     after = State(
         started=jnp.ones_like(now.started),

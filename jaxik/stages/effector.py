@@ -2,11 +2,12 @@
 
 from abc import abstractmethod
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
-from jaxik.maths.parameter_tree import Leaf, Rule, parameter, switch
+from jaxik.maths.parameter_tree import Declared, Leaf, Rule, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform
@@ -30,8 +31,16 @@ class Effector:
     """0..1, how much of its weight each leg gets."""
 
 
+def _contact_switch() -> Declared:
+    doc = "Whether a foot gets as much foot IK as its contact, so that it swings as animated."
+    return switch(False, doc=doc)
+
+
 class AbstractEffector(Rule):
     """Turns the targets of the feet into those of the legs."""
+
+    by_contact: eqx.AbstractVar[Array]
+    """Whether each leg's weight has its contact as a factor."""
 
     @abstractmethod
     def init(self, rig: Rig) -> PyTree:
@@ -68,6 +77,8 @@ class AbstractInstantEffector(AbstractEffector):
 class DirectEffector(AbstractInstantEffector):
     """The targets themselves; a foot without ground goes to its animated place."""
 
+    by_contact: Leaf = _contact_switch()
+
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
     ) -> tuple[None, Effector]:
@@ -76,6 +87,8 @@ class DirectEffector(AbstractInstantEffector):
 
 class FoundEffector(AbstractInstantEffector):
     """The targets of feet with ground; other legs move with the body (ozz)."""
+
+    by_contact: Leaf = _contact_switch()
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -101,6 +114,8 @@ class HeelEffector(AbstractInstantEffector):
     max_lift: Leaf = parameter(
         0.60, unit="rad", low=0.0, high=1.2, doc="Largest angle by which the heel is lifted."
     )
+
+    by_contact: Leaf = _contact_switch()
 
     def advance(
         self, now: SensedMoment, target: Transform, pelvis: PelvisState, state: None
@@ -209,6 +224,8 @@ class BodyEffector(AbstractEffector):
         doc="Distance from its goal within which a foot counts as arrived.",
     )
 
+    by_contact: Leaf = _contact_switch()
+
     def init(self, rig: Rig) -> BodyState:
         return BodyState(jnp.zeros_like(rig.side), jnp.zeros((), rig.side.dtype))
 
@@ -264,6 +281,8 @@ class FadeEffector(AbstractEffector):
     transition_time: Leaf = parameter(
         0.20, unit="s", low=0.0, high=1.0, doc="Time in which foot IK of a leg fades in or out."
     )
+
+    by_contact: Leaf = _contact_switch()
 
     def init(self, rig: Rig) -> FadeState:
         identity = jnp.broadcast_to(quat.identity(rig.side.dtype), (*rig.side.shape, 4))

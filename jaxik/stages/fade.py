@@ -177,7 +177,9 @@ class SpeedFade(AbstractFade):
         weight: Array,
         state: SpeedFadeState,
     ) -> tuple[SpeedFadeState, Array]:
-        limit = state.speed * now.dt
+        # A foot that swings by its contact may join its animation as fast as that moves.
+        swinging = jnp.where(weight < now.sensed.weight, now.sensed.foot_speed, 0.0)
+        limit = (state.speed + swinging) * now.dt
         # A leg that has not faded in moves with the body.
         limit -= (1.0 - state.weight) * BODY_SHARE * state.moved
         size = correction_size(now, effector, body, state.weight)

@@ -212,6 +212,8 @@ class Sensed:
     """m, likewise."""
     ankle_rot_ws: Float[Array, "legs 4"]
     """Animated."""
+    foot_speed: Float[Array, " legs"]
+    """m/s, of the animated ankles."""
     ball_ws: Float[Array, "legs 3"]
     """m, animated toes, likewise."""
     ahead_ws: Float[Array, "legs 3"]

@@ -11,6 +11,8 @@ import pytest
 import jaxik
 from jaxik import HARD, Transform
 from jaxik.maths import vec
+from jaxik.stages.contact import LabelContact
+from jaxik.stages.effector import FoundEffector
 from jaxik.stages.fade import NoFade, SpeedFade
 from jaxik.stages.inputs import SensedMoment
 from jaxik.world.terrain import Terrain
@@ -199,3 +201,26 @@ def test_gradients_through_a_fade_are_finite_where_nothing_has_to_be_corrected()
     for argument in (0, 1):
         gradient = jax.jit(jax.grad(height, argument), compiler_options=QUICK)
         assert np.isfinite(gradient(jnp.asarray(0.5), jnp.zeros(())))
+
+
+def test_a_swinging_foot_is_as_animated_where_weights_go_by_contact():
+    def solved(by_contact: jax.Array) -> tuple[jax.Array, jax.Array]:
+        effector = FoundEffector(by_contact=by_contact)
+        ik = dataclasses.replace(jaxik.presets.ozz(), contact=LabelContact(), effector=effector)
+        pose = sample_poses.make_frame(make_rig(), sample_poses.standing((0.14, 0.08)))
+        frames = jax.tree.map(lambda x: jnp.repeat(x, 60, axis=0), to_frames([pose]))
+        standing = frames.stride.standing.at[10:, 0].set(0.0)
+        stride = dataclasses.replace(frames.stride, standing=standing)
+        frames = dataclasses.replace(frames, stride=stride)
+        ground = to_terrain(planes((0.0, -0.3, -0.05)))
+        result = jaxik.run(ik, to_rig(make_rig()), ground, frames)
+        moved = result.pose.ankle.pos - frames.pose.ankle.pos - result.body.pos[:, None]
+        return moved[:, 0], result.pose.ankle.pos[:, 0]
+
+    program = jax.jit(solved, compiler_options=QUICK)
+    moved, ankle = map(np.asarray, program(jnp.asarray(True)))
+    always = np.asarray(program(jnp.asarray(False))[0])
+    assert np.linalg.norm(always[-1]) > 0.03, "else a swinging foot is pulled to the ground"
+    np.testing.assert_allclose(moved[9], always[9], atol=1e-9)
+    assert np.abs(moved[-1]).max() < 1e-4
+    assert np.linalg.norm(np.diff(ankle, axis=0), axis=-1).max() < LIMIT
