@@ -142,6 +142,23 @@ def test_a_step_fades_out_gradually_as_it_becomes_too_high():
     )
 
 
+def test_stairs_are_climbed_that_are_as_high_as_a_ledge_that_is_refused():
+    frames = swing(FINE, following=1.4)
+    path = 0.5 * frames.world_from_model.pos[:, 2]  # the game has the root on the stairs
+    frames = frames.translated(path[:, None] * np.array([0.0, 1.0, 0.0]))
+    edges = np.arange(0.15, 1.4, 0.3)  # so that both footholds lie in the middle of a tread
+    steps = [(edge, edge + 0.3, 0.15 * (index + 1)) for index, edge in enumerate(edges)]
+    stairs = [
+        level_blocks((-3.0, 0.15, 0.0), *pair) for pair in zip(steps, steps[1:], strict=False)
+    ]
+    ledge = level_blocks((-3.0, 0.9, 0.0), (0.9, 3.0, 0.75))
+    triangles = np.concatenate([part.triangles for part in stairs])
+    climbed = heights(to_terrain(PlainTerrain(maths.Y, triangles=triangles)), frames)
+    assert climbed[-1] == pytest.approx(0.75, abs=1e-12)
+    assert np.abs(np.diff(climbed)).max() < 0.01
+    assert np.abs(heights(to_terrain(ledge), frames)[: len(FINE) // 2]).max() < 0.2
+
+
 # Feet that stand.
 
 

@@ -5,7 +5,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, constant, parameter
@@ -57,7 +57,9 @@ class AbstractLimitedProbe(AbstractProbe):
     limited: bool = eqx.field(default=True, static=True, kw_only=True)
     """Whether any ground is refused. Static: without limits, no ray is cast for them."""
 
-    def cast(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
+    def cast(
+        self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array, margin: ArrayLike = 0.0
+    ) -> Hit:
         """The ground below points above the feet; refused ground counts as missed.
 
         Args:
@@ -65,12 +67,13 @@ class AbstractLimitedProbe(AbstractProbe):
             starts_ws: where the rays start, (... legs 3), m.
             reach: their length, m.
             layers: what they can hit.
+            margin: how much higher and lower than a step ground may be (... legs), m.
         """
         terrain, up = inputs.terrain, inputs.terrain.leg_up_ws
         if not self.limited:
             return cast(terrain, starts_ws, reach, layers)
         root = inputs.frame.world_from_model.pos
-        above = vec.dot(starts_ws - root, up) - self.max_step_up
+        above = vec.dot(starts_ws - root, up) - self.max_step_up - margin
         above = jnp.where(above > 0, above, 0.0)
         # Both by one search: each search adds much to a program.
         hits = cast(
@@ -79,7 +82,7 @@ class AbstractLimitedProbe(AbstractProbe):
             jnp.stack([reach + jnp.zeros_like(above), reach - above]),
             layers,
         )
-        accepted = hits.found * self._trust_from(root, hits, up)
+        accepted = hits.found * self._trust_from(root, hits, up, margin)
         first, below = (jax.tree.map(lambda x: x[i], hits) for i in range(2))  # noqa: B023
         # Ground that is refused for its slope may be hit by both rays.
         lies_below = below.distance + above > first.distance + SAME_GROUND
@@ -99,9 +102,13 @@ class AbstractLimitedProbe(AbstractProbe):
 
     def trust(self, step: Array, normal: Array, up_ws: Array) -> Array:
         """0..1, how far ground with this normal is accepted after a step of this height, m."""
-        low_enough = 1.0 - smoothstep((step - self.max_step_up) / self.step_fade)
-        high_enough = 1.0 - smoothstep((-step - self.max_step_down) / self.step_fade)
-        return low_enough * high_enough * self.gentleness(normal, up_ws)
+        low_enough = 1.0 - smoothstep(self.excess(step) / self.step_fade)
+        return low_enough * self.gentleness(normal, up_ws)
+
+    def excess(self, step: Array) -> Array:
+        """By how much a step, up or down, is beyond its limit, m; negative within it."""
+        up, down = step - self.max_step_up, -step - self.max_step_down
+        return jnp.where(up > down, up, down)
 
     def gentleness(self, normal: Array, up_ws: Array) -> Array:
         """0..1, how far ground with this normal is accepted: less if it is too steep."""
@@ -109,12 +116,14 @@ class AbstractLimitedProbe(AbstractProbe):
         slope = vec.safe_arctan2(vec.length(vec.cross(normal, up_ws)), cosine)
         return 1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE)
 
-    def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array) -> Array:
+    def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: ArrayLike) -> Array:
         """0..1, how far each hit is accepted by a character whose root is there."""
         way = hits.point - root_ws
         rise = vec.dot(way, up_ws)
         slope = least_rise(rise, climb(hits.normal, way, up_ws))
-        return self.trust(rise - slope, hits.normal, up_ws)
+        step = rise - slope
+        step -= jnp.where(step > margin, margin, jnp.where(step < -margin, -margin, step))
+        return self.trust(step, hits.normal, up_ws)
 
 
 def climb(normal: Array, way: Array, up_ws: Array) -> Float[Array, "*b"]:

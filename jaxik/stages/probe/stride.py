@@ -1,6 +1,10 @@
 """A probe that looks ahead: the ground between the last and the next foothold of each foot."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, quat, vec
@@ -22,6 +26,8 @@ from .limits import (
 
 HEIGHT_BAND = 0.01  # m
 PATH_RAYS = 8  # between two footholds
+WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
+STAIRS = 0.75  # rise over run of the steepest stairs
 ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
 FAR_BELOW = -1e6  # m, below any ground
 
@@ -44,11 +50,12 @@ class StrideProbe(AbstractLimitedProbe):
     character's velocity: feet stand for `stance_time` and swing for `swing_time`, from as far ahead
     of the hip to as far behind it (Raibert 1986).
 
-    A next foothold more than `max_step_up` above or `max_step_down` below the slope of the last, or
-    on ground steeper than `max_slope`, counts less and less, so that a foot neither drops off a
-    ledge nor snaps onto a wall. Rays along the path lift the foot over edges up to `max_step_up`
-    high, on slopes of `way_slope` before and after each edge. Where the ground is above the curve,
-    heel and ball clear it by as much as the animation lifts them, less `clearance`.
+    A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
+    `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
+    a ledge nor snaps onto a wall, but climbs stairs. Rays along the way lift the foot over edges up
+    to `max_step_up` high, on slopes of `way_slope` before and after each edge. Where the ground is
+    above the curve, heel and ball clear it by as much as the animation lifts them, less
+    `clearance`.
     """
 
     ray_up: Leaf = parameter(
@@ -137,18 +144,23 @@ class StrideProbe(AbstractLimitedProbe):
         terrain, frame = inputs.terrain, inputs.frame
         level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
         stride = self._stride(inputs, contact, level)
-        last, low = self._ground_at(inputs, level, stride.last_ws)
-        next_, high = self._ground_at(inputs, level, stride.next_ws)
+        way_ws = stride.next_ws - stride.last_ws
+        path_ws = stride.last_ws + vec.scale(way_ws, WAY.astype(way_ws.dtype)[:, None])
+        path = self._ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
+        heights = level.height(path.point)
+        low, high = heights[0], heights[-1]
+        last, next_ = (jax.tree.map(lambda x: x[end], path) for end in (0, -1))  # noqa: B023
         found = jnp.where(last.found > next_.found, last.found, next_.found)
         # Without a last foothold, the ground is that of the next, or without that the root's level.
         low = lerp(next_.found * high, low, last.found)
         normal = lerp(next_.normal, last.normal, last.found[..., None])
 
-        way = vec.reject(stride.next_ws - stride.last_ws, level.up_ws)
+        way = vec.reject(way_ws, level.up_ws)
         climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
-        trust = next_.found * self.trust(step, next_.normal, level.up_ws)
+        trust = next_.found * self.gentleness(next_.normal, level.up_ws)
+        trust *= self._trust_of_way(heights - slope * WAY[:, None], path.found)
 
         since_start = stride.fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
@@ -163,7 +175,8 @@ class StrideProbe(AbstractLimitedProbe):
 
         soles = self._soles(inputs, level, foot_height)
         under_soles = height + self._climb(normal, soles - ball, level)
-        height += self._clearance_over_edges(inputs, stride, soles, under_soles, top)
+        edges = jax.tree.map(lambda x: x[1:-1], path)
+        height += self._clearance_over_edges(inputs, stride, soles, under_soles, top, edges)
         height += self._climb(normal, ankle - ball, level)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
@@ -200,11 +213,31 @@ class StrideProbe(AbstractLimitedProbe):
         fraction = jnp.where(known, labelled.fraction, fraction)
         return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known)
 
-    def _ground_at(self, inputs: Inputs, level: "Level", points_ws: Array) -> tuple[Hit, Array]:
-        """The ground above or below these points, and its height over the level, m."""
-        above = level.project(points_ws) + vec.scale(level.up_ws, self.ray_up)
-        hit = self.cast(inputs, above, self.ray_up + self.ray_down, self.layers)
-        return hit, level.height(hit.point)
+    def _ground_at(self, inputs: Inputs, level: "Level", points_ws: Array) -> Hit:
+        """The ground above or below these points."""
+        above = level.project(points_ws)
+        away = vec.length(above - level.origin_ws)
+        margin = jnp.where(away > self.max_step_up, STAIRS * (away - self.max_step_up), 0.0)
+        above += vec.scale(level.up_ws, self.ray_up)
+        return self.cast(inputs, above, self.ray_up + self.ray_down, self.layers, margin)
+
+    def _trust_of_way(self, heights: Array, found: Array) -> Float[Array, " legs"]:
+        """0..1, how far the highest step that cannot be avoided on the way is accepted.
+
+        From the last foothold to the next, any points of the way may be stepped on in turn; of all
+        such choices, that with the lowest highest step counts. So stairs are no ledge.
+
+        Args:
+            heights: of the ground along the way, without its slope (points, legs), m.
+            found: of that ground.
+        """
+        excess = [jnp.full_like(heights[0], -jnp.inf)]
+        for point in range(1, len(heights)):
+            steps = self.excess(heights[point] - heights[:point])
+            reached = (jnp.where(a > b, a, b) for a, b in zip(excess, steps, strict=True))
+            least = functools.reduce(lambda a, b: jnp.where(a < b, a, b), reached)
+            excess.append(jnp.where(found[point] > 0, least, jnp.inf))
+        return 1.0 - smoothstep(excess[-1] / self.step_fade)
 
     def _climb(self, normal: Array, way: Array, level: "Level") -> Array:
         """How much higher ground with this normal is at the end of a way than at its start, m.
@@ -224,21 +257,18 @@ class StrideProbe(AbstractLimitedProbe):
         return jnp.stack([heel, ball - vec.scale(level.up_ws, self.ball_height)])
 
     def _clearance_over_edges(
-        self, inputs: Inputs, stride: Stride, soles: Array, under_soles: Array, top: Array
+        self, inputs: Inputs, stride: Stride, soles: Array, under_soles: Array, top: Array, hit: Hit
     ) -> Float[Array, " legs"]:
         """How much higher each foot goes to clear what lies between its footholds, m.
 
-        `under_soles` is the height of the ground that each sole was lifted from, m.
+        `under_soles` is the height of the ground that each sole was lifted from, m; `hit` is the
+        ground between the footholds (points legs).
         """
         gate = inputs.gate
         level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
-        fractions = (jnp.arange(PATH_RAYS, dtype=top.dtype) + 0.5) / PATH_RAYS
-        path_ws = stride.last_ws + vec.scale(
-            stride.next_ws - stride.last_ws, fractions[:, None]
-        )  # (rays legs 3)
-        hit, ground = self._ground_at(inputs, level, path_ws)
+        ground = level.height(hit.point)
         fade = 1.0 - smoothstep((ground - top - self.max_step_up) / self.step_fade)
-        away = vec.length(vec.reject(path_ws[:, None] - soles, level.up_ws))  # (rays 2 legs)
+        away = vec.length(vec.reject(hit.point[:, None] - soles, level.up_ws))  # (rays 2 legs)
         excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
         # A sole that the animation sinks into its own floor needs no correction.
         lift = level.height(soles) - self.clearance

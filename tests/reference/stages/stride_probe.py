@@ -3,7 +3,8 @@
 One leg, one frame at a time. World space; heights are above the root along the up of the leg, m.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +90,10 @@ def ground_of_stride(
     climbs = [climb(parameters, leg, up, hit.normal, across_ws) for hit in (last, following)]
     slope = shared_rise(high - low, *climbs)
     step = high - low - slope
-    sure = low_enough(parameters, leg, step) * gentle(parameters, leg, up, following.normal)
+    sure = gentle(parameters, leg, up, following.normal)
+    sure *= climbable(
+        parameters, leg, [low, *between(parameters, terrain, frame, leg, stride), high], slope
+    )
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
 
@@ -117,6 +121,38 @@ def ground_of_stride(
     platform = following.platform if sure * risen > 0.5 else last.platform
     point = here + up * (beside_ball(ankle) + window * need)
     return Hit(True, point, normal, platform), stride
+
+
+def between(
+    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, stride: Swing
+) -> list[float | None]:
+    """Heights of the ground along the way from one foothold to the other; None without ground."""
+    heights: list[float | None] = []
+    for index in range(PATH_POINTS):
+        pos = stride.last + (stride.next - stride.last) * (index + 0.5) / PATH_POINTS
+        hit = look(parameters, terrain, leg, pos)
+        heights.append(height(frame, terrain.up, hit.point) if hit.found else None)
+    return heights
+
+
+def climbable(
+    parameters: Parameters, leg: int, heights: Sequence[float | None], slope: float
+) -> float:
+    """From 0 to 1, how far the easiest choice of points to step on has steps that are low enough.
+
+    All choices are tried: any points of the way, in their order, between the two footholds.
+    """
+    places = [0.0, *((np.arange(PATH_POINTS) + 0.5) / PATH_POINTS), 1.0]
+    levels = [None if at is None else at - slope * x for at, x in zip(heights, places, strict=True)]
+    middle = [at for at in levels[1:-1] if at is not None]
+    best = 0.0
+    for count in range(len(middle) + 1):
+        for chosen in itertools.combinations(middle, count):
+            steps = np.diff([levels[0], *chosen, levels[-1]])
+            best = max(best, min(low_enough(parameters, leg, float(step)) for step in steps))
+            if best == 1.0:
+                return best
+    return best
 
 
 def climb(parameters: Parameters, leg: int, up: Array, normal: Array, moved: Array) -> float:
