@@ -34,7 +34,13 @@ PAGES = sorted([*ROOT.glob("*.md"), *(p for name in FOLDERS for p in (ROOT / nam
 PYTHON_FILES = sorted(path for name in FOLDERS for path in (ROOT / name).rglob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TOOLS = {"bash", "git", "pip", "pre-commit", "pyright", "pytest", "ruff"}
-WRITTEN_PAGES = {"summary.md", "table.md", "compare.md", "notes.md"}  # by commands and by tests
+WRITTEN_PAGES = {
+    "summary.md",
+    "table.md",
+    "compare.md",
+    "suite.md",
+    "notes.md",
+}  # by commands and by tests
 EXPERIMENT = ROOT / "data/experiments/uneven_walk.toml"
 
 

@@ -34,7 +34,8 @@ MEASURES = {
         "Third derivative of the height of the pelvis, root mean square.",
     ),
     "reach": Column(
-        "reached", "%", 100.0, 1, "Ankle targets that the system reports as reached."
+        "reached", "%", 100.0, 1,
+        "Ankle targets of standing feet that the system reports as reached.",
     ),
 }  # fmt: skip
 assert MEASURES.keys() == REASONS.keys()

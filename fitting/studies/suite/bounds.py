@@ -20,7 +20,7 @@ FLAT_SLIDE = 0.002  # m
 POP = 0.01  # m in 1/60 s
 SWING_PEAK = 1.875  # speed of a path of minimum jerk at its middle, over its mean speed
 WALK_JERK = 80.0  # m/s³, of the pelvis in our walk over a flat floor
-MISSED = 0.05  # of the targets
+MISSED = 0.05  # of the targets of standing feet
 
 REASONS = {
     "penetration": f"in at most {SHARE_LIMIT:.0%} of the frames may a sole be {100 * VISIBLE:.0f} "
@@ -33,7 +33,7 @@ REASONS = {
     "swing from one foothold to the next needs on this ground",
     "jerk": f"the pelvis may have the animation's jerk and {WALK_JERK:.0f} m/s³ more, as much as a "
     "walk over a level floor has itself",
-    "reach": f"at most {MISSED:.0%} of the targets may be out of reach",
+    "reach": f"at most {MISSED:.0%} of the targets of standing feet may be missed",
 }
 """What each bound is and why, by measure."""
 
@@ -67,7 +67,7 @@ def cells(
     Args:
         placed: how its feet are placed.
         jerk: of the height of its pelvis, m/s³.
-        reached: fraction of its targets.
+        reached: fraction of the targets of its standing feet.
         bounds: of its situation; see `bounds_of`.
     """
     return {
