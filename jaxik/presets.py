@@ -48,8 +48,9 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     Args:
         faithful: whether feet stand and lock by the height of their ankles and the ankles alone are
             held, as the record's fields have it. Feet then also lock while they swing low over the
-            ground. If not, they stand while their balls are low and slow, and ball and heading are
-            held. `jaxik.record` reads and writes the bytes of the faithful system.
+            ground. If not, they stand while their balls are low and slow, ball and heading are
+            held, and feet that locks bring together keep apart. `jaxik.record` reads and writes the
+            bytes of the faithful system.
     """
     ik = FootIK(
         root=KeepRoot(),
@@ -80,6 +81,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
                 unlock_half_life=0.05,
                 return_speed=0.6,
             ),
+            separation=FootSeparation(),
             leg=TwoBone(as_animated=True),
         )
     return body.scale(ik, rig)
@@ -187,6 +189,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             ),
             contact=SpeedContact(raised_speed=0.35),
             target=ContactTarget(foot_height=body.ANKLE),
+            separation=FootSeparation(),
             leg=PoleLeg(),
         )
     return body.scale(ik, rig)
