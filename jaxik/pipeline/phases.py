@@ -20,6 +20,7 @@ from jaxik.stages.probe import foot_heading
 from jaxik.stages.root import AbstractRoot
 from jaxik.world.frame import Contact, Sensed, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths
+from jaxik.world.terrain import Hit
 
 from .system import Advanced, Corrections, FootIK, Result, State, Trace
 from .tracks import Tracks, system_at
@@ -93,7 +94,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) 
         leg_up_ws=up,
         dt=frame.dt,
         slide=frame.slide,
-        carry=frame.carry(ground.ankle),
+        carry=frame.carry(_shared_platform(ground.ankle)),
         present=rig.present,
         side=rig.side,
         weight=weight,
@@ -192,6 +193,14 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
     corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head)
     trace = Trace(sensed, advanced)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
+
+
+def _shared_platform(hit: Hit) -> Hit:
+    """The hits, with feet that found no ground on the platform of another foot, if there is one."""
+    if hit.platform is None:
+        return hit
+    platform = jnp.where(hit.found > 0, hit.platform, jnp.max(hit.platform))
+    return dataclasses.replace(hit, platform=platform)
 
 
 def _part_of(rot: Array, weight: Array) -> Array:

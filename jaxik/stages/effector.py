@@ -299,9 +299,10 @@ class FadeEffector(AbstractEffector):
         step = now.progress(smoothing.step_of_time(self.transition_time, now.dt))
         weight = smoothing.move_towards(state.weight, found, step)
         offset_ws = target.pos - sensed.ankle_ws
-        offset_ws = now.gate.choose(found[..., None], offset_ws, state.offset_ws)
+        kept_ws = sensed.carry.turn(state.offset_ws)
+        offset_ws = now.gate.choose(found[..., None], offset_ws, kept_ws)
         rot_ws = quat.multiply(target.rot, quat.conjugate(sensed.ankle_rot_ws))
-        rot_ws = quat.nlerp(state.rot_ws, rot_ws, found)
+        rot_ws = quat.nlerp(sensed.carry.turn_rot(state.rot_ws), rot_ws, found)
         effector = Effector(
             sensed.ankle_ws + offset_ws, quat.multiply(rot_ws, sensed.ankle_rot_ws), weight
         )

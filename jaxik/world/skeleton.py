@@ -39,6 +39,10 @@ class Transform:
         """Directions and distances of space b in space a: turned, not moved."""
         return quat.rotate(self.rot, vectors)
 
+    def turn_rot(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*c 4"]:
+        """Rotations about axes of space b as rotations about the same axes in space a."""
+        return quat.multiply(self.rot, quat.multiply(rot, quat.conjugate(self.rot)))
+
     def inverse(self) -> "Transform":
         """`b_from_a`."""
         back = quat.conjugate(self.rot)
@@ -71,6 +75,10 @@ class Still:
     def turn(self, vectors: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
         """The same directions and distances."""
         return vectors
+
+    def turn_rot(self, rot: Float[Array, "*p 4"]) -> Float[Array, "*p 4"]:
+        """The same rotations."""
+        return rot
 
 
 class Skeleton(eqx.Module):
