@@ -1,5 +1,6 @@
 """The surfaces of a terrain and how rays along -up hit them: planes, meshes, what moves."""
 
+import dataclasses
 from abc import abstractmethod
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from .grid import Grid
 from .skeleton import Transform
 
 STATIC = -1  # the platform of what never moves
+SLANTED = 5  # times that a slanted ray asks for the ground ahead
 
 
 class AbstractSurface(eqx.Module):
@@ -113,8 +115,12 @@ class MovingSurface(AbstractSurface):
 
     surface: AbstractSurface
     world_from_platform: Transform
+    up_ps: Float[Array, "*t 3"]
+    """Unit, up of the surface in the platform's space."""
     number: int = eqx.field(static=True)
     """Of the platform, among `Frame.platforms`."""
+    tilts: bool = eqx.field(static=True)
+    """Whether its up may leave the world's."""
 
     @property
     def platform(self) -> int:
@@ -122,15 +128,35 @@ class MovingSurface(AbstractSurface):
 
     def at(self, platforms: Transform) -> "MovingSurface":
         pose = Transform(platforms.pos[..., self.number, :], platforms.rot[..., self.number, :])
-        return MovingSurface(self.surface, pose, self.number)
+        return dataclasses.replace(self, world_from_platform=pose)
 
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
     ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
         platform_from_world = self.world_from_platform.inverse()
         origins, up = platform_from_world.apply(origins_ws), platform_from_world.turn(up_ws)
-        distance, normal, hit = self.surface.intersect(origins, up, mask)
+        cast = self._slanted if self.tilts else self.surface.intersect
+        distance, normal, hit = cast(origins, up, mask)
         return distance, self.world_from_platform.turn(normal), hit
+
+    def _slanted(
+        self, origins: Float[Array, "*b 3"], up: Float[Array, "3"], mask: UInt[Array, "*#b"]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
+        """Intersects rays that do not run along the up that the surface is made for.
+
+        By Newton's method: the plane of the ground below the ray, as it is where the ray meets the
+        plane found before. Where the slope of the ground times that of the tilt is below 1, there
+        is one hit and this finds it, but for rays beside the edge of a step, within its height
+        times the tilt.
+        """
+        start = origins
+        for _ in range(SLANTED):
+            start = jax.lax.stop_gradient(start)
+            drop, normal, hit = self.surface.intersect(start, self.up_ps, mask)
+            touched = start - vec.scale(self.up_ps, drop)
+            distance = _plane_distance(origins, up, touched, normal)
+            start = origins + vec.scale(self.up_ps - up, distance)
+        return distance, normal, hit & (vec.dot(normal, up) > 0)
 
 
 def _plane_distance(

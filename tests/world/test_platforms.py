@@ -44,6 +44,34 @@ def test_rays_hit_a_moved_mesh_where_embree_hits_its_copy(platform):
     assert np.abs(np.asarray(hit.distance) - drop)[both].max() < EMBREE
 
 
+TILTED = pose((0.5, 1.0, -0.3), (0.12, 0.6, -0.1))
+
+
+def test_rays_hit_a_tilted_mesh_where_embree_hits_its_copy():
+    vertices, triangles = rough()
+    moved = vertices @ matrix_of(TILTED).T + np.asarray(TILTED.pos[0])
+    ground = terrain.moving(terrain.mesh(vertices, triangles), 0, tilts=True)
+    hit = cast_all(ground.at(TILTED), origins())
+    index, drop = embree(moved, triangles, np.asarray(origins()), UP)
+    both = (index >= 0) & (np.asarray(hit.found) > 0)
+    assert ((index >= 0) == (np.asarray(hit.found) > 0)).mean() > 0.97 and both.mean() > 0.4
+    error = np.abs(np.asarray(hit.distance) - drop)[both]
+    assert (error < EMBREE).mean() > 0.99 and np.median(error) < 1e-6
+
+
+def test_a_tilted_heightfield_is_hit_where_its_surface_is():
+    rng = np.random.default_rng(4)
+    field = terrain.heightfield(rng.uniform(0.0, 0.1, (20, 20)), 0.5, (-5.0, 0.0, -5.0))
+    hit = cast_all(terrain.moving(field, 0, tilts=True).at(TILTED), origins())
+    found = np.asarray(hit.found) > 0
+    on_platform = TILTED.inverse().apply(hit.point)[found]
+    below = terrain.cast(field, on_platform + jnp.array([0.0, 1.0, 0.0]), jnp.inf)
+    np.testing.assert_allclose(below.point, on_platform, atol=1e-6)
+    # Rays stay on their lines, and normals turn with the platform.
+    np.testing.assert_array_equal(hit.point[:, [0, 2]], origins()[:, [0, 2]])
+    np.testing.assert_allclose(hit.normal[found], TILTED.turn(below.normal), atol=1e-5)
+
+
 def test_a_tilted_plane_is_hit_as_the_plane_that_it_then_is():
     platform = pose((0.0, 1.0, 0.0), (0.3, 0.2, -0.25))
     still = terrain.plane(platform.pos[0], matrix_of(platform) @ UP)

@@ -184,19 +184,23 @@ def combine(*terrains: Terrain) -> Terrain:
     return Terrain(ups[0], tuple(surfaces))
 
 
-def moving(terrain: Terrain, platform: int) -> Terrain:
+def moving(terrain: Terrain, platform: int, tilts: bool = False) -> Terrain:
     """The terrain with its surfaces on a platform: they are given in its space and move with it.
 
     Where platforms are, `Frame.platforms` says in each frame; `Terrain.at` puts them there for rays
     outside the pipeline. Until then the platform is at the world's origin. `combine` mixes terrains
     of several platforms with static ones.
 
-    Planes move in any way. Meshes, heightfields and functions may be shifted and turned about up;
-    while they are tilted, rays hit them in a wrong place.
+    Platforms may be shifted and turned about up. Planes may also tilt. Other surfaces may tilt if
+    `tilts` says so, at several times the cost of a ray, because their rays no longer run along the
+    up that they are made for: by up to about 20 degrees for walkable ground. Beside the edge of a
+    step, within its height times the tilt, a ray then hits one of its two treads.
 
     Args:
         terrain: its up direction is that of the platform's space and of the world.
         platform: number of the platform, from 0.
+        tilts: whether the platform's up may leave the world's, as that of a ship does; if not, rays
+            hit tilted ground in a wrong place, planes excepted.
 
     Raises:
         ValueError: the number is negative, or the terrain moves already.
@@ -205,6 +209,9 @@ def moving(terrain: Terrain, platform: int) -> Terrain:
         raise ValueError(f"platforms are numbered from 0; got {platform}")
     if terrain.platform_count:
         raise ValueError("the terrain moves with a platform already; move each terrain only once")
-    pose = Transform.identity(terrain.up_ws.dtype)
-    surfaces = (MovingSurface(surface, pose, platform) for surface in terrain.surfaces)
-    return Terrain(terrain.up_ws, tuple(surfaces))
+    pose, up = Transform.identity(terrain.up_ws.dtype), terrain.up_ws
+    surfaces = tuple(
+        MovingSurface(surface, pose, up, platform, tilts and not isinstance(surface, Plane))
+        for surface in terrain.surfaces
+    )
+    return Terrain(up, surfaces)
