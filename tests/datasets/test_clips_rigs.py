@@ -263,13 +263,14 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_over_the_floor():
     assert np.allclose(walk.rig.ankle_height, 0.05, atol=1e-12)
     assert np.allclose(walk.rig.ball_height, 0.0, atol=1e-12)
     assert not walk.remarks
-    raised = measure_soles(walk.positions_ws + [0.0, 0.3, 0.0], walk.rig.joints, walk.stance, 0.3)
+    higher = walk.positions_ws + [0.0, 0.3, 0.0]
+    raised = measure_soles(walk.measured_rig, higher, walk.rotations_ws, walk.stance, 0.3)
     assert raised.measured.all() and np.allclose(raised.ankle, 0.05, atol=1e-12)
 
 
 def test_on_stairs_or_without_a_stance_heights_over_the_sole_are_those_of_feet_so_long(walk):
     for stance in (walk.stance, np.zeros_like(walk.stance)):
-        soles = measure_soles(walk.positions_ws, walk.rig.joints, stance)
+        soles = measure_soles(walk.measured_rig, walk.positions_ws, walk.rotations_ws, stance)
         assert not soles.measured.any()
         assert np.allclose(soles.ball, 0.45 * np.hypot(0.1, 0.05))
         assert np.allclose(soles.ankle - soles.ball, 0.05)

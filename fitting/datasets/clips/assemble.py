@@ -90,7 +90,7 @@ def clip_from_recording(
             if not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
         rig = measure_rig(roles, positions_ws, rotations_ws, stance)
-        remarks += _guessed_soles(rig, positions_ws, stance)
+        remarks += _guessed_soles(rig, positions_ws, rotations_ws, stance)
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
         float(rate), recording.frame_time, source, float(scale), up,
@@ -128,16 +128,19 @@ def clip_from_joints(
     positions_ls, _ = local_from_world(motion.parents, motion.positions_ws, rotations_ws)
     roles = find_roles(motion.names, motion.parents, joints)
     rig = measure_rig(roles, motion.positions_ws, rotations_ws, motion.stance)
+    remarks = _guessed_soles(rig, motion.positions_ws, rotations_ws, motion.stance)
     return Clip(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
         rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
-        stance=motion.stance, remarks=_guessed_soles(rig, motion.positions_ws, motion.stance),
+        stance=motion.stance, remarks=remarks,
     )  # fmt: skip
 
 
-def _guessed_soles(rig: Rig, positions_ws: np.ndarray, stance: np.ndarray) -> tuple[str, ...]:
+def _guessed_soles(
+    rig: Rig, positions_ws: np.ndarray, rotations_ws: np.ndarray, stance: np.ndarray
+) -> tuple[str, ...]:
     """A remark for each foot whose height over its sole is a guess."""
-    measured = measure_soles(positions_ws, rig.joints, stance).measured
+    measured = measure_soles(rig, positions_ws, rotations_ws, stance).measured
     return tuple(
         f"the {name} foot stands flat on no level floor at height 0; its ankle is taken to be "
         f"{height:.3f} m over its sole, from the foot's length"

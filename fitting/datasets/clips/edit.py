@@ -14,7 +14,7 @@ from . import contacts
 from .clip import Clip
 from .joint_roles import partners
 from .kinematics import local_from_world, world_from_local
-from .rigs import measure_soles
+from .rigs import with_soles
 
 POP = 0.02  # m: a second difference at `POP_RATE` that no body produces
 POP_RATE = 120.0  # Hz
@@ -150,10 +150,8 @@ def on_floor(clip: Clip, floor: float) -> Clip:
     if floor == 0.0:  # over which they were measured
         return clip
     rig = clip.rig if clip.measured_rig is None else clip.measured_rig  # `clip.rig` explains
-    soles = measure_soles(clip.positions_ws, rig.joints, clip.stance_labels(), floor)
-    with jax.enable_x64(True):
-        heights = {"ankle_height": jnp.asarray(soles.ankle), "ball_height": jnp.asarray(soles.ball)}
-    return replace(clip, measured_rig=replace(rig, **heights))
+    rig = with_soles(rig, clip.positions_ws, clip.rotations_ws, clip.stance_labels(), floor)
+    return replace(clip, measured_rig=rig)
 
 
 def pops(clip: Clip) -> Bool[np.ndarray, " frames"]:

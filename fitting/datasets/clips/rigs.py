@@ -1,7 +1,7 @@
 """Measures a `Rig` (bone lengths, knee axes, foot axes) from the motion of its joints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -93,56 +93,81 @@ def measure_rig(
         for index, leg in enumerate(roles.legs)
     ]
     axes, feet, lengths = (np.stack(part) for part in zip(*legs, strict=True))
-    soles = measure_soles(positions_ws, [leg.joints for leg in roles.legs], stance)
     with jax.enable_x64(True):
-        return Rig(
+        rig = Rig(
             knee_axis_ls=jnp.asarray(axes),
             ankle_from_foot=jnp.asarray(feet),
             thigh=jnp.asarray(lengths[:, 0]),
             shin=jnp.asarray(lengths[:, 1]),
             foot=jnp.asarray(lengths[:, 2]),
-            ankle_height=jnp.asarray(soles.ankle),
-            ball_height=jnp.asarray(soles.ball),
+            ankle_height=jnp.zeros(len(legs)),
+            ball_height=jnp.zeros(len(legs)),
             side=jnp.asarray(side),
             present=jnp.ones(len(legs), bool),
             names=tuple(leg.name for leg in roles.legs),
             joints=tuple(leg.joints for leg in roles.legs),
             pelvis=roles.pelvis,
         )
+    return with_soles(rig, positions_ws, rotations_ws, stance)
+
+
+def with_soles(
+    rig: Rig,
+    positions_ws: Float64[np.ndarray, "frames joints 3"],
+    rotations_ws: Float64[np.ndarray, "frames joints 4"],
+    stance: Bool[np.ndarray, "frames legs"],
+    floor: float = 0.0,
+) -> Rig:
+    """The rig with the heights over the sole that `measure_soles` finds."""
+    soles = measure_soles(rig, positions_ws, rotations_ws, stance, floor)
+    with jax.enable_x64(True):
+        heights = {"ankle_height": jnp.asarray(soles.ankle), "ball_height": jnp.asarray(soles.ball)}
+    return replace(rig, **heights)
 
 
 def measure_soles(
+    rig: Rig,
     positions_ws: Float64[np.ndarray, "frames joints 3"],
-    legs: Sequence[tuple[int, int, int, int]],
+    rotations_ws: Float64[np.ndarray, "frames joints 4"],
     stance: Bool[np.ndarray, "frames legs"],
     floor: float = 0.0,
 ) -> SoleHeights:
     """How far ankle and ball of each foot are above its sole while it stands flat.
 
-    These are medians of their heights above the floor. Where balls stand at different heights, or
+    These are medians of their heights above the floor, both moved by half of what they differ from
+    the height of the ankle over the ball along the foot's own up axis: then a foot that lies flat
+    is on the floor with both. Where balls stand at different heights, or
     nowhere near the floor, the clip shows no floor for that foot. Its ball is then as high as that
-    of a person's foot of its length, and its ankle as much higher as the flat foot shows.
+    of a person's foot of its length.
 
     Args:
+        rig: the legs; their heights over the sole are not read.
         positions_ws: m, y up.
-        legs: indices of hip, knee, ankle and ball of each leg.
+        rotations_ws: wxyz.
         stance: when each foot stands.
         floor: height of the floor, m.
     """
     heights, measured = [], []
-    for leg, (hip, knee, ankle, toe) in enumerate(legs):
+    for leg, (hip, knee, ankle, toe) in enumerate(rig.joints):
         bones = np.diff(positions_ws[:, [hip, knee, ankle, toe]], axis=1)
         thigh, shin, foot = np.median(np.linalg.norm(bones, axis=-1), axis=0)
         foot = foot if foot > 0 else USUAL_FOOT * (thigh + shin)
         flat = flat_frames(positions_ws[:, ankle], positions_ws[:, toe], stance[:, leg])
         above = positions_ws[flat][:, [ankle, toe], 1] - floor
         (ankle_height, ball_height), balls = np.median(above, axis=0), above[:, 1]
+        axes = _rotation(np.asarray(rig.ankle_from_foot, np.float64)[leg : leg + 1])
+        foot_rot = _rotation(rotations_ws[:, ankle]) * axes
+        bone = foot_rot.inv().apply(positions_ws[:, ankle] - positions_ws[:, toe])
+        rise = np.median(bone[:, 1])  # of the ankle over the ball of a flat foot
         level = np.quantile(balls, 0.9) - np.quantile(balls, 0.1) <= LEVEL * foot
         on_floor = -LEVEL * foot <= ball_height <= HIGHEST_BALL * foot
         measured.append(bool(stance[:, leg].any() and level and on_floor))
         if not measured[-1]:
-            rise = max(np.median(above[:, 0] - balls), 0.0)
-            ankle_height, ball_height = USUAL_BALL * foot + rise, USUAL_BALL * foot
+            ball_height = USUAL_BALL * foot
+            ankle_height = ball_height + max(rise, 0.0)
+        else:
+            middle = (ankle_height + ball_height) / 2
+            ankle_height, ball_height = middle + rise / 2, middle - rise / 2
         heights.append([max(ankle_height, 0.0), max(ball_height, 0.0)])
     ankle, ball = np.array(heights).T
     return SoleHeights(ankle, ball, np.array(measured))

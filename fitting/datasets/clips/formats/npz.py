@@ -14,7 +14,7 @@ from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import TRACKS, Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
-from fitting.datasets.clips.rigs import SoleHeights, measure_soles, relative_size
+from fitting.datasets.clips.rigs import relative_size, with_soles
 from fitting.runtime import files
 from jaxik.world.skeleton import Rig
 
@@ -159,26 +159,26 @@ def _read_tracks(path: Path, content: Arrays) -> Arrays:
 def _read_rig(content: Arrays) -> Rig:
     arrays = {name: content[f"rig_{name}"] for name in RIG_ARRAYS}
     joints = tuple((int(h), int(k), int(a), int(t)) for h, k, a, t in content["rig_joints"])
-    if all(f"rig_{name}" in content for name in SOLE_ARRAYS):
-        arrays |= {name: content[f"rig_{name}"] for name in SOLE_ARRAYS}
-    else:
-        arrays |= dict(zip(SOLE_ARRAYS, _measure_soles(content, joints)[:2], strict=True))
+    known = all(f"rig_{name}" in content for name in SOLE_ARRAYS)
+    unknown = np.zeros(len(joints))
+    arrays |= {name: content[f"rig_{name}"] if known else unknown for name in SOLE_ARRAYS}
     with jax.enable_x64(True):
-        return Rig(
+        rig = Rig(
             **jax.device_put(arrays),
             names=tuple(map(str, content["rig_names"])),
             joints=joints,
             pelvis=int(content["rig_pelvis"]),
         )
+    return rig if known else _measure_soles(content, rig)
 
 
-def _measure_soles(content: Arrays, joints: tuple[tuple[int, int, int, int], ...]) -> SoleHeights:
+def _measure_soles(content: Arrays, rig: Rig) -> Rig:
     positions_ws, stance = content["positions_ws"], content.get("stance")
     if stance is None:
-        balls = positions_ws[:, [leg[3] for leg in joints]]
-        size = relative_size(positions_ws, joints)
+        balls = positions_ws[:, [leg[3] for leg in rig.joints]]
+        size = relative_size(positions_ws, rig.joints)
         stance = contacts.detect_stances(balls, float(content["fps"]), size)
-    return measure_soles(positions_ws, joints, stance)
+    return with_soles(rig, positions_ws, content["rotations_ws"], stance)
 
 
 def _check_arrays(path: Path, content: Arrays, required: set[str]) -> None:
