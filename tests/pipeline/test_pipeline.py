@@ -18,6 +18,7 @@ ADULT: dict = {}
 @pytest.mark.parametrize(
     ("name", "values", "legs"),
     [
+        ("as it comes", ADULT, 2),
         ("adult", ADULT, 2),
         ("odd", ODD, 2),
         ("one ray", ADULT | {"probe.use_toe": False}, 2),
@@ -30,15 +31,18 @@ def test_600_frames_agree_with_the_reference(name, values, legs):
     rig = sample_poses.make_rig(rng, legs)
     frames = wandering(rig, rng, FRAMES)
     ground = sample_poses.rough(rng, cells=14, size=4.5)
+    changes = {k: np.asarray(v) if isinstance(v, list) else v for k, v in values.items()}
+    preset = "record as it comes" if name == "as it comes" else "record"
+    defaults = reference.DEFAULTS
+    if name == "as it comes":
+        defaults = defaults | reference.STANDS_BY_SPEED
     expected = reference.run(
-        reference.Parameters(
-            {k: np.asarray(v) if isinstance(v, list) else v for k, v in values.items()}
-        ),
+        reference.Parameters(changes, defaults),
         rig,
         ground,
         frames,
     )
-    result = jaxik.run(to_ik(values), to_rig(rig), to_terrain(ground), to_frames(frames))
+    result = jaxik.run(to_ik(values, preset), to_rig(rig), to_terrain(ground), to_frames(frames))
 
     hits = np.asarray(result.trace.sensed.foothold.found)
     assert 0.2 < hits.mean() < 0.98, "the clip has both hits and misses"

@@ -66,6 +66,7 @@ CASES: list[tuple[str, str, dict[str, Any], int]] = [
     ),
     ("unreal", "without its pelvis", {"pelvis.enabled": False, "contact.idle_speed": np.inf}, 2),
     ("mec", "as it is", {}, 2),
+    ("mec as it comes", "slow and low feet", {}, 2),
     ("mec", "never planted", {"lock.plant": False, "probe.by_speed": False}, 3),
     (
         "mec",
@@ -129,7 +130,7 @@ OWN: dict[str, dict[str, Callable[[jaxik.Result], Any]]] = {  # outputs of one s
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_defaults_are_those_of_the_reference(name):
-    ik = getattr(jaxik.presets, name)()
+    ik = to_ik({}, name)
     expected = SYSTEMS[name].DEFAULTS
     for key in set(expected) - {"probe.forward"}:  # ours takes it from the rig's foot axes
         stage, _, leaf = key.partition(".")
@@ -165,9 +166,10 @@ def compare(
     """Asserts that all outputs of 600 frames agree with the reference."""
     rig = sample_poses.make_rig(rng, legs)
     frames = wandering(rig, rng, FRAMES, stand=STANDS)
-    system = SYSTEMS[name]
+    system, own = SYSTEMS[name.partition(" ")[0]], OWN[name.partition(" ")[0]]
+    defaults = system.STANDS_BY_SPEED if name.endswith("as it comes") else system.DEFAULTS
     arrays = {k: np.asarray(v) if isinstance(v, list) else v for k, v in values.items()}
-    parameters = characters.Parameters(arrays, defaults=system.DEFAULTS)
+    parameters = characters.Parameters(arrays, defaults=defaults)
     expected = system.run(parameters, rig, plain, frames)
     result = jaxik.run(to_ik(values, name), to_rig(rig), ours, to_frames(frames))
 
@@ -186,7 +188,7 @@ def compare(
         "target_ws": advanced.effector.target_ws,
         "weight": advanced.effector.weight,
         **{f"{joint}_pos": getattr(result.pose, joint).pos for joint in JOINTS},
-        **{key: read(result) for key, read in OWN[name].items()},
+        **{key: read(result) for key, read in own.items()},
     }
     if not values.get("leg.enabled", True):
         del pairs["weight"]  # the reference reports legs only, ours also feet

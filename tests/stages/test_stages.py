@@ -186,6 +186,15 @@ EXTRA = (
         {"lock.release_distance": 0.05, "lock.relock_threshold": 0.0},
     ),
     Case("lock.release_distance", "drifts", FLAT, (0.05, 0.15), "locked", 1),
+    Case(
+        "lock.return_speed",
+        "drifts",
+        FLAT,
+        (0.1, 0.4),
+        "offset",
+        -1,
+        {"lock.release_distance": 0.05, "lock.relock_threshold": 0.0},
+    ),
     Case("lock.max_speed", "drifts", FLAT, (0.2, 0.4), "locked", 1),
     Case("lock.release_heading", "turns", FLAT, (0.2, 0.5), "locked", 1, LOOSE),
     Case("lock.release_speed", "speeds up", FLAT, (0.2, 0.4), "locked", 1, LOOSE),
@@ -255,9 +264,11 @@ def test_all_fields_of_the_record_and_all_parameters_have_a_case():
     ]
     switches = {ours for _, _, ours in game.FLAGS}
     assert {case.name for case in RECORD} == {ours for _, ours, _ in game.FLOATS} | switches
-    assert not any(bool(parameter_tree.get(presets.record(), case.leaf)) for case in RULES)
+    assert not any(
+        bool(parameter_tree.get(presets.record(faithful=True), case.leaf)) for case in RULES
+    )
     switches |= {case.leaf for case in RULES}
-    declared = set(parameter_tree.declarations(presets.record())) | {
+    declared = set(parameter_tree.declarations(presets.record(faithful=True))) | {
         "lean.tick_hz",
         "pelvis.tick_hz",
     }

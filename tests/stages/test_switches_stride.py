@@ -135,6 +135,15 @@ CASES: dict[str, tuple[Case, ...]] = {
             LOCKS | {"lock.release_distance": 0.05},
         ),
         Case("lock.max_speed", "drifts", FLAT, (0.2, 0.4), "locked", 1, LOCKS),
+        Case(
+            "lock.return_speed",
+            "drifts",
+            FLAT,
+            (0.1, 0.4),
+            "offset",
+            -1,
+            LOCKS | {"lock.release_distance": 0.05, "lock.relock_threshold": 0.0},
+        ),
         Case("lock.lock_half_life", "drifts", FLAT, (0.02, 0.1), "offset", -1, LOOSE),
         Case(
             "lock.unlock_half_life",

@@ -56,6 +56,7 @@ ODD: dict[str, Any] = {  # all parameters away from their defaults
     "lock.hold_ball": True,
     "lock.release_heading": 0.15,
     "lock.release_speed": 1.2,
+    "lock.return_speed": 0.3,
     "lock.lock_half_life": 0.02,
     "lock.unlock_half_life": 0.07,
     "pelvis.limit": 0.05,

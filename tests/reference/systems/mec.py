@@ -55,6 +55,8 @@ DEFAULTS: dict[str, Any] = {
 STANDS_BY_SPEED: dict[str, Any] = {
     **{name: value for name, value in DEFAULTS.items() if name != "leg.hint_offset"},
     **contact_by_speed.DEFAULTS,
+    "contact.planted_height": 0.09,
+    "contact.raised_height": 0.12,
     "contact.raised_speed": 0.35,
     "probe.by_speed": True,
     "probe.stable_speed": 0.25,

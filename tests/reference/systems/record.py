@@ -19,6 +19,8 @@ from reference.stages import contact_by_speed, ground, limb
 
 # What differs as it comes; `DEFAULTS` are those of the faithful system.
 STANDS_BY_SPEED = contact_by_speed.DEFAULTS | {
+    "contact.planted_height": 0.09,
+    "contact.raised_height": 0.12,
     "contact.raised_speed": 0.35,
     "contact.half_life": 0.03,
     "target.max_ankle_height": 1.0,
