@@ -24,7 +24,7 @@ from jaxik.stages.effector import (
     FoundEffector,
     HeelEffector,
 )
-from jaxik.stages.fade import SpeedFade
+from jaxik.stages.fade import NoFade, SpeedFade
 from jaxik.stages.foot import AimFoot, FlatFoot, KeepFoot, PitchRollFoot
 from jaxik.stages.lean import NoLean, SlopeLean, SpineLean
 from jaxik.stages.leg import HintLeg, PoleLeg, TwoBone
@@ -65,7 +65,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         effector=DirectEffector(),
         leg=TwoBone(),
         foot=PitchRollFoot(),
-        fade=SpeedFade(),
+        fade=NoFade() if faithful else SpeedFade(),
     )
     if not faithful:
         ik = dataclasses.replace(
@@ -114,7 +114,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         effector=FoundEffector(),
         leg=PoleLeg(),
         foot=AimFoot(),
-        fade=SpeedFade(),
+        fade=NoFade() if faithful else SpeedFade(),
     )
     return body.scale(ik, rig)
 
@@ -145,7 +145,7 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         effector=BodyEffector(latch=True),
         leg=TwoBone(max_knee_angle=math.pi, min_knee_angle=0.0, soften=1.0),
         foot=KeepFoot(),
-        fade=SpeedFade(),
+        fade=NoFade() if faithful else SpeedFade(),
     )
     return body.scale(ik, rig)
 
@@ -178,7 +178,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         effector=FadeEffector(),
         leg=HintLeg(),
         foot=FlatFoot(),
-        fade=SpeedFade(),
+        fade=NoFade() if faithful else SpeedFade(),
     )
     if not faithful:
         ik = dataclasses.replace(

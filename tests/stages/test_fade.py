@@ -224,3 +224,10 @@ def test_a_swinging_foot_is_as_animated_where_weights_go_by_contact():
     np.testing.assert_allclose(moved[9], always[9], atol=1e-9)
     assert np.abs(moved[-1]).max() < 1e-4
     assert np.linalg.norm(np.diff(ankle, axis=0), axis=-1).max() < LIMIT
+
+
+@pytest.mark.parametrize("preset", PRESETS[:-1])
+def test_faithful_systems_have_no_fade_of_ours(preset):
+    faithful = getattr(jaxik.presets, preset)(faithful=True)
+    assert jax.tree.leaves(faithful.fade) == []
+    assert isinstance(getattr(jaxik.presets, preset)().fade, SpeedFade)

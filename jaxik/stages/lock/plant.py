@@ -77,7 +77,8 @@ class PlantLock(AbstractLock):
 
         contact = sensed.contact
         stands = gate.choose(before, 1.0 - contact.lifted, contact.planted)
-        locked = jnp.where(self.plant, sensed.foothold.found * stands, 0.0)
+        plants = self.plant & (sensed.weight > 0)
+        locked = jnp.where(plants, sensed.foothold.found * stands, 0.0)
         step = now.progress(smoothing.step_of_speed(self.plant_speed, now.dt))
         weight = smoothing.move_towards(state.weight, self.plant_weight, step)
         planting = locked * weight

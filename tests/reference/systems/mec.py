@@ -184,7 +184,9 @@ def plant(
     if foot.found:
         rot = three_ray_probe.flat_foot(parameters, leg, foot)
     stands = standing is None or standing.standing
-    planted = bool(foot.found and stands and parameters.of_leg("lock.plant", leg))
+    takes_part = ground.weights_of_legs(parameters, frame)[leg] > 0.0
+    plants = parameters.of_leg("lock.plant", leg) and takes_part
+    planted = bool(foot.found and stands and plants)
     kept_point, kept_rot = np.zeros(3), maths.IDENTITY
     if planted:
         if before is not None and before.planted:
