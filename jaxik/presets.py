@@ -38,6 +38,9 @@ from jaxik.stages.warp import StrideWarp
 from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
+# For locks: floors tilt by 3 cm along a walk, and no lock is to stay in a swing.
+STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
+
 
 def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """The foot IK behind a game engine's parameter record.
@@ -71,7 +74,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         ik = dataclasses.replace(
             ik,
             probe=FootProbe(),
-            contact=_contact(half_life=0.03),
+            contact=SpeedContact(**STANDING, half_life=0.03),
             target=SlopeTarget(max_ankle_height=1.0),
             lock=OffsetLock(
                 hold_ball=True,
@@ -187,7 +190,7 @@ def mec(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             probe=CornerProbe(
                 by_speed=True, stable_speed=0.25, stable_height=body.ANKLE + 0.01, extra_min=-0.03
             ),
-            contact=_contact(),
+            contact=SpeedContact(**STANDING),
             target=ContactTarget(foot_height=body.ANKLE),
             separation=FootSeparation(),
             leg=PoleLeg(),
@@ -222,10 +225,3 @@ def stride(rig: Rig | None = None) -> FootIK:
         fade=SpeedFade(),
     )
     return body.scale(ik, rig)
-
-
-def _contact(half_life: float = 0.0) -> SpeedContact:
-    """Contact for locks: floors tilt by 3 cm along a walk, and no lock is to stay in a swing."""
-    return SpeedContact(
-        planted_height=0.09, raised_height=0.12, raised_speed=0.35, half_life=half_life
-    )
