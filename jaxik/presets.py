@@ -107,7 +107,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     ik = FootIK(
         root=GroundRoot(half_life=0.0) if faithful else GroundRoot(),
         warp=StrideWarp(),
-        probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False),
+        probe=FootProbe(ray_up=0.5, ray_down=math.inf, use_toe=False, limited=not faithful),
         contact=StandingContact(),
         target=SoleTarget(),
         lean=NoLean(),
@@ -138,7 +138,7 @@ def unreal(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     ik = FootIK(
         root=GroundRoot(enabled=not faithful),
         warp=StrideWarp(),
-        probe=RootProbe(),
+        probe=RootProbe(limited=not faithful),
         contact=IdleContact(),
         target=RootTarget(),  # pyright: ignore[reportCallIssue]  # its `foot_height` is a property
         lean=NoLean(),

@@ -92,6 +92,7 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
                 "sets it in every frame"
             )
     for entry, clip in zip(experiment.clips, data, strict=True):
+        clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
         scene = make_scene(clip, experiment.sigmas, entry.label)
         with error_context(f"{experiment.path} [parameters]"):
             parameter_tree.check_shapes(ik, len(scene.rig.side))

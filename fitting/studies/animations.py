@@ -103,7 +103,8 @@ class Animation:
         """
         if self.root.rise is not None:
             ik = systems.without_own_root(ik)
-        terrain = self.terrain if self.carried is None else moving(self.terrain, 0)
+        terrain = ik.probe.prepare(self.terrain)
+        terrain = terrain if self.carried is None else moving(terrain, 0)
         tracks = {name: jnp.asarray(values) for name, values in self.tracks.items()}
         result = program_cache.run(ik, self.clip.rig, terrain, self.frames, tracks=tracks or None)
         solved = clip_from_result(self.clip, result, floor=self.floor, rise=self.root.rise)

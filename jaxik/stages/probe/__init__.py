@@ -2,7 +2,8 @@
 
 `base` has the abstract rule and what all share, `limits` decides which ground is refused, `games`
 has the rules of ozz, Unreal, Mec and the record, `stride` the one that looks ahead to the next
-foothold. To write a rule, start with `base.AbstractProbe`, or with `limits.AbstractLimitedProbe`.
+foothold, `capsule` one that is as wide as the foot. To write a rule, start with
+`base.AbstractProbe`, or with `limits.AbstractLimitedProbe`.
 """
 
 from .base import AbstractProbe as AbstractProbe
@@ -10,6 +11,7 @@ from .base import foot_heading as foot_heading
 from .base import make_rays as make_rays
 from .base import no_hit as no_hit
 from .base import toe_point as toe_point
+from .capsule import SweepProbe as SweepProbe
 from .games import CornerProbe as CornerProbe
 from .games import FootProbe as FootProbe
 from .games import RootProbe as RootProbe

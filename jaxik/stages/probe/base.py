@@ -2,6 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +14,17 @@ from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
 from jaxik.world.skeleton import Rig
-from jaxik.world.terrain import Hit
+from jaxik.world.terrain import Hit, LegTerrains, Terrain
+
+Ground = TypeVar("Ground", Terrain, LegTerrains)
 
 
 class AbstractProbe(Rule):
     """Finds the ground under the feet."""
+
+    def prepare(self, terrain: Ground) -> Ground:
+        """The terrain with all that this probe needs of it; on the host, so not under jit."""
+        return terrain
 
     @abstractmethod
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:

@@ -69,15 +69,15 @@ class AbstractLimitedProbe(AbstractProbe):
             layers: what they can hit.
             margin: how much higher and lower than a step ground may be (... legs), m.
         """
-        terrain, up = inputs.terrain, inputs.terrain.leg_up_ws
+        up = inputs.terrain.leg_up_ws
         if not self.limited:
-            return cast(terrain, starts_ws, reach, layers)
+            return self.find(inputs, starts_ws, reach, layers)
         root = inputs.frame.world_from_model.pos
         above = vec.dot(starts_ws - root, up) - self.max_step_up - margin
         above = jnp.where(above > 0, above, 0.0)
         # Both by one search: each search adds much to a program.
-        hits = cast(
-            terrain,
+        hits = self.find(
+            inputs,
             jnp.stack([starts_ws, starts_ws - vec.scale(up, above)]),
             jnp.stack([reach + jnp.zeros_like(above), reach - above]),
             layers,
@@ -99,6 +99,10 @@ class AbstractLimitedProbe(AbstractProbe):
             found,
             platform,
         )
+
+    def find(self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array) -> Hit:
+        """What lies below points above the feet, whether it is accepted or not; see `cast`."""
+        return cast(inputs.terrain, starts_ws, reach, layers)
 
     def trust(self, step: Array, normal: Array, up_ws: Array) -> Array:
         """0..1, how far ground with this normal is accepted after a step of this height, m."""
