@@ -14,6 +14,7 @@ from fitting.bench import workloads
 from fitting.bench.benchmarks import crowd
 from jaxik import lanes
 from jaxik.batching import primitives
+from jaxik.world.terrain import plane
 
 # JAX's own rules leave the batch axis where it is, or an example reads a place of its own.
 MAPPED_BY_JAX = {"dynamic_slice", "pad", "slice"}
@@ -33,10 +34,10 @@ def mapped_by_jax(monkeypatch):
     return names
 
 
-def crowd_program(function):
+def crowd_program(function, terrain):
     def program():
         people = workloads.crowd(2, 6)
-        ground = workloads.ground(workloads.mesh_field(10))
+        ground = terrain()
         jax.make_jaxpr(lanes(lambda member: function(people, ground, member)))(people.members)
 
     return program
@@ -51,8 +52,8 @@ def fit_program(function):
 
 
 PROGRAMS = {
-    "a crowd": crowd_program(crowd.forward),
-    "its gradient": crowd_program(crowd.reverse),
+    "a crowd": crowd_program(crowd.forward, lambda: workloads.ground(workloads.mesh_field(10))),
+    "its gradient": crowd_program(crowd.reverse, lambda: workloads.single(plane())),
     "a Jacobian": fit_program(lambda problem, u: problem.residuals_and_jacobian(u)),
     "a posterior": fit_program(
         lambda problem, u: lanes(problem.log_probability)(jnp.stack([u, u]))

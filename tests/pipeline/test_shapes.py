@@ -118,7 +118,9 @@ def test_several_characters_without_vmap_are_told_of_it_and_pass_with_it(argumen
     with pytest.raises(ValueError, match=f"{message}.*; many .* need jax.vmap or jaxik.lanes"):
         jax.eval_shape(lambda inputs: jaxik.run(**inputs), inputs)
     axes = {name: 0 if name == argument else None for name in INPUTS}
-    for batched in (jax.vmap, functools.partial(jaxik.lanes, block=2)):
+    # Tracing with lanes takes long, and which argument is batched is all the same to it.
+    ways = [jax.vmap, *([functools.partial(jaxik.lanes, block=2)] if argument == "ik" else [])]
+    for batched in ways:
         many = batched(lambda inputs: jaxik.run(**inputs).reached, in_axes=(axes,))
         assert jax.eval_shape(many, inputs).shape == (CHARACTERS, FRAMES, LEGS)
 
