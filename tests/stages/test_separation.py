@@ -30,7 +30,7 @@ VALUES = {"distance": 0.15, "half_life": 0.05}
 RULE = FootSeparation(**VALUES)
 
 
-def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, gate=HARD):
+def moves(rule, animated, offsets, locked, contact, weight, normals, yaw, *, gate=HARD):
     """How far the feet of a clip move (frames legs 3), m; `offsets` are those of the locks."""
     dtype = animated.dtype
     up = jnp.asarray([0.0, 1.0, 0.0], dtype)
@@ -170,7 +170,7 @@ def test_derivatives_are_difference_quotients_and_finite_where_feet_meet(gate):
     animated, offsets, *rest = stroll(3)
 
     def moved(values, animated, offsets):
-        return moves(FootSeparation(**values), animated, offsets, *rest, gate)
+        return moves(FootSeparation(**values), animated, offsets, *rest, gate=gate)
 
     assert_gradients_match(moved, VALUES, animated, offsets)
     nowhere = np.zeros_like(animated)
