@@ -163,7 +163,7 @@ def test_equal_values_per_leg_act_like_a_shared_value(preset: str):
         if name in ("pelvis.min_length", "pelvis.max_length", "pelvis.extension"):
             return True
         one_for_all = name in ("effector.latch", "lock.hold_ball")
-        return not one_for_all and not name.startswith(("root.", "lean.", "pelvis."))
+        return not one_for_all and not name.startswith(("root.", "lean.", "separation.", "pelvis."))
 
     values = {name: widened(name) for name in filter(may_be_per_leg, parameter_tree.docs(ik))}
     result = run(parameter_tree.replace(ik, values), rig, ground, frames)

@@ -5,7 +5,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, constant, parameter
@@ -58,7 +58,12 @@ class AbstractLimitedProbe(AbstractProbe):
     """Whether any ground is refused. Static: without limits, no ray is cast for them."""
 
     def cast(
-        self, inputs: Inputs, starts_ws: Array, reach: Array, layers: Array, margin: ArrayLike = 0.0
+        self,
+        inputs: Inputs,
+        starts_ws: Array,
+        reach: Array,
+        layers: Array,
+        margin: Array | None = None,
     ) -> Hit:
         """The ground below points above the feet; refused ground counts as missed.
 
@@ -67,11 +72,12 @@ class AbstractLimitedProbe(AbstractProbe):
             starts_ws: where the rays start, (... legs 3), m.
             reach: their length, m.
             layers: what they can hit.
-            margin: how much higher and lower than a step ground may be (... legs), m.
+            margin: how much higher and lower than a step ground may be (... legs), m; None is 0.
         """
         up = inputs.terrain.leg_up_ws
         if not self.limited:
             return self.find(inputs, starts_ws, reach, layers)
+        margin = jnp.zeros_like(starts_ws[..., 0]) if margin is None else margin
         root = inputs.frame.world_from_model.pos
         above = vec.dot(starts_ws - root, up) - self.max_step_up - margin
         above = jnp.where(above > 0, above, 0.0)
@@ -120,7 +126,7 @@ class AbstractLimitedProbe(AbstractProbe):
         slope = vec.safe_arctan2(vec.length(vec.cross(normal, up_ws)), cosine)
         return 1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE)
 
-    def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: ArrayLike) -> Array:
+    def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: Array) -> Array:
         """0..1, how far each hit is accepted by a character whose root is there."""
         way = hits.point - root_ws
         rise = vec.dot(way, up_ws)

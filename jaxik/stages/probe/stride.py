@@ -29,7 +29,7 @@ PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAIRS = 0.75  # rise over run of the steepest stairs
 ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
-FAR_BELOW = -1e6  # m, below any ground
+FAR = 1e6  # m, beyond any ground
 
 
 class StrideProbe(AbstractLimitedProbe):
@@ -145,7 +145,8 @@ class StrideProbe(AbstractLimitedProbe):
         level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
         stride = self._stride(inputs, contact, level)
         way_ws = stride.next_ws - stride.last_ws
-        path_ws = stride.last_ws + vec.scale(way_ws, WAY.astype(way_ws.dtype)[:, None])
+        fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
+        path_ws = stride.last_ws + vec.scale(way_ws, fractions)
         path = self._ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
         heights = level.height(path.point)
         low, high = heights[0], heights[-1]
@@ -160,7 +161,7 @@ class StrideProbe(AbstractLimitedProbe):
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
-        trust *= self._trust_of_way(heights - slope * WAY[:, None], path.found)
+        trust *= self._trust_of_way(heights - slope * fractions, path.found)
 
         since_start = stride.fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
@@ -231,12 +232,12 @@ class StrideProbe(AbstractLimitedProbe):
             heights: of the ground along the way, without its slope (points, legs), m.
             found: of that ground.
         """
-        excess = [jnp.full_like(heights[0], -jnp.inf)]
+        excess = [jnp.full_like(heights[0], -FAR)]
         for point in range(1, len(heights)):
             steps = self.excess(heights[point] - heights[:point])
             reached = (jnp.where(a > b, a, b) for a, b in zip(excess, steps, strict=True))
             least = functools.reduce(lambda a, b: jnp.where(a < b, a, b), reached)
-            excess.append(jnp.where(found[point] > 0, least, jnp.inf))
+            excess.append(jnp.where(found[point] > 0, least, FAR))
         return 1.0 - smoothstep(excess[-1] / self.step_fade)
 
     def _climb(self, normal: Array, way: Array, level: "Level") -> Array:
@@ -274,7 +275,7 @@ class StrideProbe(AbstractLimitedProbe):
         lift = level.height(soles) - self.clearance
         lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
         rise = excess - lift
-        rise = jnp.where(hit.found[:, None] > 0, rise, FAR_BELOW)
+        rise = jnp.where(hit.found[:, None] > 0, rise, -FAR)
         most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *top.shape), 0, -1), band=HEIGHT_BAND)
         zero = jnp.zeros_like(most)
         most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)

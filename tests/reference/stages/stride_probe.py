@@ -143,12 +143,12 @@ def climbable(
     All choices are tried: any points of the way, in their order, between the two footholds.
     """
     places = [0.0, *((np.arange(PATH_POINTS) + 0.5) / PATH_POINTS), 1.0]
-    levels = [None if at is None else at - slope * x for at, x in zip(heights, places, strict=True)]
-    middle = [at for at in levels[1:-1] if at is not None]
+    pairs = zip(heights, places, strict=True)
+    start, *middle, end = [at - slope * place for at, place in pairs if at is not None]
     best = 0.0
     for count in range(len(middle) + 1):
         for chosen in itertools.combinations(middle, count):
-            steps = np.diff([levels[0], *chosen, levels[-1]])
+            steps = np.diff([start, *chosen, end])
             best = max(best, min(low_enough(parameters, leg, float(step)) for step in steps))
             if best == 1.0:
                 return best
