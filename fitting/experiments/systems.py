@@ -69,7 +69,8 @@ class Preset(NamedTuple):
 
     def keys(self) -> dict[str, object]:
         """The keys that name it in a file."""
-        return {"preset": self.name} | ({"faithful": True} if self.faithful else {})
+        keys: dict[str, object] = {"preset": self.name}
+        return keys | {"faithful": True} if self.faithful else keys
 
 
 DEFAULT_PRESET = Preset()

@@ -51,7 +51,7 @@ def test_soles_rotate_with_the_foot():
     for joints in walk.rig.joints:
         foot = Rotation.from_quat(rotations[:, joints[2]], scalar_first=True)
         rotations[:, joints[2]] = (tilt * foot).as_quat(scalar_first=True)
-    rig = dataclasses.replace(walk.measured_rig, ball_height=jnp.full(2, 0.01))
+    rig = dataclasses.replace(walk.rig, ball_height=jnp.full(2, 0.01))
     walk = dataclasses.replace(walk, measured_rig=rig)
     soles = measures.soles(walk.with_motion(walk.positions_ws, rotations))
     up = tilt.apply([0.0, 1.0, 0.0])

@@ -264,7 +264,7 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_over_the_floor():
     assert np.allclose(walk.rig.ball_height, 0.0, atol=1e-12)
     assert not walk.remarks
     higher = walk.positions_ws + [0.0, 0.3, 0.0]
-    raised = measure_soles(walk.measured_rig, higher, walk.rotations_ws, walk.stance, 0.3)
+    raised = measure_soles(walk.rig, higher, walk.rotations_ws, walk.stance_labels(), 0.3)
     assert raised.measured.all() and np.allclose(raised.ankle, 0.05, atol=1e-12)
 
 

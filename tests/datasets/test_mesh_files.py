@@ -9,6 +9,8 @@ import trimesh
 
 from fitting.datasets.terrain import mesh_files
 from jaxik.world import terrain
+from jaxik.world.heightfield import Heightfield
+from jaxik.world.surfaces import Mesh
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -70,7 +72,7 @@ def test_up_layer_dtype_and_slack_reach_the_terrain(tmp_path):
 def test_the_terrain_of_the_blocks_benchmark_is_in_metres_with_y_up(mocap):
     ground = mesh_files.load_terrain(mocap / "blocks" / "terrain.ply")
     (surface,) = ground.surfaces
-    assert isinstance(surface, terrain.Mesh)
+    assert isinstance(surface, Mesh)
     corners = np.asarray(surface.vertices_ws)
     assert np.ptp(corners[:, 1]) < 1.5 < np.ptp(corners[:, 0]) < 20.0
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
@@ -87,7 +89,7 @@ def test_a_heightfield_is_read_from_an_archive(tmp_path):
     save_ramp(tmp_path / "ramp.npz")
     ground = mesh_files.load_terrain(tmp_path / "ramp.npz")
     (surface,) = ground.surfaces
-    assert isinstance(surface, terrain.Heightfield)
+    assert isinstance(surface, Heightfield)
     assert surface.interpolation == "bilinear"
     assert height(ground, 0.4, 0.3) == pytest.approx(0.2, abs=1e-12)
     assert terrain.cast(ground, jnp.array([1.1, 5.0, 0.3]), jnp.inf).found == 0.0
@@ -105,7 +107,7 @@ def test_all_of_an_archive_and_of_the_arguments_reaches_the_heightfield(tmp_path
         tmp_path / "ramp.npz", up=(0.0, 3.0, 0.0), layer=4, scale=0.01, dtype=jnp.float32
     )
     (surface,) = ground.surfaces
-    assert isinstance(surface, terrain.Heightfield)
+    assert isinstance(surface, Heightfield)
     assert surface.interpolation == "triangulated"
     np.testing.assert_array_equal(ground.up_ws, [0.0, 1.0, 0.0])
     assert {ground.up_ws.dtype, surface.heights.dtype} == {jnp.dtype(jnp.float32)}

@@ -15,7 +15,7 @@ from fitting.datasets.terrain import block_grids, mesh_files, reconstruction, su
 from fitting.datasets.terrain.block_grids import Grid
 from fitting.datasets.terrain.reconstruction import Prediction
 from fitting.report.plots import style
-from jaxik.world import terrain
+from jaxik.world.surfaces import Mesh
 from support.experiments import ROOT
 from support.footprints import hill_footprints
 from support.sample_clips import stair_walk
@@ -193,7 +193,7 @@ def test_the_command_writes_a_mesh_its_numbers_and_a_picture(clip, tmp_path, cap
     assert f"{len(numbers['stances'])} stances\n" in text and "blocks (chosen)" in text
     assert text.endswith(f"written to {out}\n")
     (surface,) = mesh_files.load_terrain(out).surfaces
-    assert isinstance(surface, terrain.Mesh)
+    assert isinstance(surface, Mesh)
     z = np.asarray(surface.vertices_ws)[:, 2]
     stances_z = [row["z"] for row in numbers["stances"]]
     assert z.min() <= min(stances_z) - 0.5 and max(stances_z) + 0.5 <= z.max()

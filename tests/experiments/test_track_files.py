@@ -1,6 +1,7 @@
 """Track files: what changes along a clip, read from TOML."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,10 +106,14 @@ def test_tracks_of_a_clip_survive_its_file_and_its_edits(clip, tmp_path):
     np.testing.assert_array_equal(loaded.grounded, grounded)
     np.testing.assert_array_equal(loaded.select(slice(3, 9)).weight, weight[3:9])
     other = {name: array for name, array in np.load(path).items()}
-    np.savez(path, **other | {"weight": weight[:, :1]})
+
+    def save(**change: Any) -> None:
+        np.savez(path, **other | change)
+
+    save(weight=weight[:, :1])
     with pytest.raises(ValueError, match=r"weight is \(30, 1\); wanted \(30, 2\)"):
         load_clip(path)
-    np.savez(path, **other | {"grounded": grounded + 0.1})
+    save(grounded=grounded + 0.1)
     with pytest.raises(ValueError, match="grounded has values outside 0..1"):
         load_clip(path)
 

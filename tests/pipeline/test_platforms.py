@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 import jaxik
@@ -104,7 +105,7 @@ def assert_same_motion(actual: jaxik.Result, expected: jaxik.Result, tolerance: 
         np.testing.assert_allclose(alike, 1.0, rtol=0, atol=tolerance, err_msg=name)
 
 
-def cast_to(tree: Any, dtype: type) -> Any:
+def cast_to(tree: Any, dtype: DTypeLike) -> Any:
     return jax.tree.map(
         lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
     )

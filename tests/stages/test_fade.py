@@ -75,7 +75,7 @@ def speeds(result: jaxik.Result) -> dict[str, float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_no_joint_moves_faster_whatever_weight_jumps(preset):
-    limits = dict.fromkeys(("hip", "ankle", "ball"), LIMIT)
+    limits: dict[str, float] = dict.fromkeys(("hip", "ankle", "ball"), LIMIT)
     if preset == "stride":
         limits["ankle"] = HEELS
     for joint, moved in speeds(jumped(preset)).items():

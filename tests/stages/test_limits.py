@@ -14,6 +14,7 @@ import jaxik
 from jaxik import HARD
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs
+from jaxik.stages.probe.limits import AbstractLimitedProbe
 from jaxik.world.frame import GroundHits
 from jaxik.world.terrain import ALL_LAYERS
 from reference import maths
@@ -57,7 +58,9 @@ def accepted_ground(ik: jaxik.FootIK, ground: Any, starts_ws: Array) -> Any:
     """Accepted ground below the starts (rays, legs, 3), of a character that stands still."""
     frame = jax.tree.map(lambda x: x[0], to_frames([FRAME]))
     inputs = Inputs(to_rig(RIG), ground, frame, HARD)
-    hit = ik.probe.cast(inputs, starts_ws, jnp.asarray(2.4), jnp.asarray(ALL_LAYERS, jnp.uint32))
+    assert isinstance(ik.probe, AbstractLimitedProbe)
+    starts, layers = jnp.asarray(starts_ws), jnp.asarray(ALL_LAYERS, jnp.uint32)
+    hit = ik.probe.cast(inputs, starts, jnp.asarray(2.4), layers)
     return hit.found, hit.point, hit.normal
 
 

@@ -41,9 +41,9 @@ def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> n
 
 @jax.jit
 def _heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> jax.Array:
-    rig = walk().rig
-    started = jnp.zeros((), bool)
-    return sense_first(rule, rule.init(rig), Inputs(rig, ground, clip, jaxik.HARD), started)[1]
+    rig, ik = walk().rig, dataclasses.replace(jaxik.presets.record(), root=rule)
+    inputs = Inputs(rig, ground, clip, jaxik.HARD)
+    return sense_first("root", ik, jaxik.init(ik, rig), inputs, tracks={})[1]
 
 
 @functools.cache

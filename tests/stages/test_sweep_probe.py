@@ -47,6 +47,7 @@ def grating() -> terrain.Terrain:
         bar.apply_translation((0.0, -0.05, place))
         bars.append(bar)
     mesh = trimesh.util.concatenate(bars)
+    assert isinstance(mesh, trimesh.Trimesh)
     level = terrain.mesh(np.array(mesh.vertices), np.array(mesh.faces))
     return terrain.combine(level, terrain.plane((0.0, -0.3, 0.0)))
 

@@ -158,6 +158,7 @@ def box_grid() -> terrain.Terrain:
         box.apply_translation((0.0, 0.95, place))
         boxes.append(box)
     mesh = trimesh.util.concatenate(boxes)
+    assert isinstance(mesh, trimesh.Trimesh)
     bars = terrain.mesh(np.array(mesh.vertices), np.array(mesh.faces))
     return sweep.sweepable(terrain.combine(bars, terrain.plane()), 0.3)
 
@@ -267,9 +268,11 @@ def test_layers_platforms_and_ups_are_those_of_rays():
     pose = Transform(jnp.array([[0.0, 0.5, 0.0]]), jnp.array([[1.0, 0.0, 0.0, 0.0]]))
     start = jnp.array([0.0, 4.0, 0.0])
     hit = sweep.sweep(both.at(pose), start, 0.1, REACH)
-    assert float(hit.distance) == pytest.approx(2.4) and int(hit.platform) == 0
+    assert hit.platform is not None and int(hit.platform) == 0
+    assert float(hit.distance) == pytest.approx(2.4)
     hit = sweep.sweep(both.at(pose), start, 0.1, REACH, terrain.layer_mask(3))
-    assert float(hit.distance) == pytest.approx(3.9) and int(hit.platform) == -1
+    assert hit.platform is not None and int(hit.platform) == -1
+    assert float(hit.distance) == pytest.approx(3.9)
     sideways = terrain.plane(normal=(1.0, 0.0, 0.0), up=(1.0, 0.0, 0.0))
     legs = terrain.LegTerrains(low, (low, sideways))
     hit = sweep.sweep(legs, jnp.array([[0.0, 1.0, 0.0], [2.0, 0.0, 0.0]]), 0.1, REACH)

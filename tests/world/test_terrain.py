@@ -9,6 +9,7 @@ import trimesh
 from jax.test_util import check_grads
 
 from jaxik.world import cells, terrain
+from jaxik.world.surfaces import Mesh
 
 # Embree computes in float32: with coordinates up to 10 m and slopes up to 20, heights agree to
 # this.
@@ -425,7 +426,7 @@ def test_an_uneven_mesh_keeps_its_lists_short():
     triangles = np.concatenate([[[0, 1, 2], [0, 2, 3]], triangles + 4])
     ground = terrain.mesh(vertices, triangles)
     (surface,) = ground.surfaces
-    assert isinstance(surface, terrain.Mesh)
+    assert isinstance(surface, Mesh)
     grid = surface.grid
     assert grid.depth > 0
     assert np.diff(grid.first).max() <= 2 * cells.CROWD
