@@ -193,7 +193,12 @@ EXTRA = (
         (0.1, 0.4),
         "offset",
         -1,
-        {"lock.release_distance": 0.05, "lock.relock_threshold": 0.0},
+        LOOSE
+        | {
+            "lock.release_distance": 0.1,
+            "lock.relock_threshold": 0.0,
+            "lock.unlock_half_life": 0.0,  # without a limit it would jump
+        },
     ),
     Case("lock.max_speed", "drifts", FLAT, (0.2, 0.4), "locked", 1),
     Case("lock.release_heading", "turns", FLAT, (0.2, 0.5), "locked", 1, LOOSE),

@@ -49,18 +49,22 @@ def roots(**base: Any) -> tuple[Case, ...]:
         Case("root.ray_down", "standing", LOWER, (0.3, 0.8), "root height", -1, base, slope=False),
         Case("root.layers", "standing", RAISED, (NONE, ALL), "root height", 1, base),
         # Nearer to a bend, the smoother root begins to rise.
-        Case(
-            "root.half_life",
-            "goes forward",
-            RAMP_UP,
-            (0.1, 0.4),
-            "root height",
-            1,
-            base,
-            slope=False,
-        ),
+        Case("root.half_life", "goes forward", RAMP_UP, (0.3, 0.8), "root height", 1, base),
         Case("root.max_speed", "goes forward", RAMP_UP, (0.05, 0.1), "root height", 1, base),
         Case("root.max_step", "goes forward", CLIFF, (0.1, 0.6), "root height", 1, base),
+    )
+
+
+def limits() -> tuple[Case, ...]:
+    """Ground that is a little beyond what the probe accepts."""
+    base = KEPT | {"probe.limited": True}
+    low = base | {"probe.max_step_up": 0.1}
+    up, down = ("standing", planes((0, 0, 0.18))), ("standing", planes((0, 0, -0.18)))
+    return (
+        Case("probe.max_step_up", *up, (0.1, 0.16), "found", 1, base),
+        Case("probe.max_step_down", *down, (0.1, 0.16), "found", 1, base),
+        Case("probe.max_slope", "standing", planes((0.4, 0, 0)), (0.3, 0.36), "found", 1, base),
+        Case("probe.step_fade", *up, (0.1, 0.2), "found", 1, low),
     )
 
 
@@ -80,6 +84,7 @@ ASIDE = (0.1, 0.0, 0.0)
 CASES: dict[str, tuple[Case, ...]] = {
     "ozz": (
         *roots(),
+        *limits(),
         Case("probe.ray_up", "standing", HIGH, (0.2, 0.6), "target height", 1, KEPT, slope=False),
         Case(
             "probe.ray_down", "standing", LOWER, (0.3, 0.8), "target height", -1, KEPT, slope=False
@@ -119,6 +124,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
     "unreal": (
         *roots(**{"root.enabled": True}),
+        *limits(),
         Case("probe.ray_up", "standing", HIGH, (0.2, 0.6), "target height", 1, slope=False),
         Case(
             "probe.ray_down",
@@ -146,6 +152,16 @@ CASES: dict[str, tuple[Case, ...]] = {
             -1,
             {"contact.idle_speed": 0.1},
         ),
+        # As the character sets off, its feet go back to their animation gradually or at once.
+        Case(
+            "effector.by_contact",
+            "speeds up",
+            RAISED,
+            (False, True),
+            "miss",
+            1,
+            {"contact.idle_speed": 0.4},
+        ),
         Case("leg.max_knee_angle", "standing", LOWERED, (2.6, 2.8), "knee angle", 1, STIFF),
         Case("leg.min_knee_angle", "standing", planes((0, 0, 0.5)), (0.9, 1.2), "knee angle", 1),
         Case(
@@ -161,6 +177,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
     "mec": (
         *roots(**{"root.enabled": True}),
+        *limits(),
         Case("probe.active", "standing", RAISED, (False, True), "target height", 1),
         Case(
             "probe.ray_up",
@@ -241,6 +258,9 @@ CASES: dict[str, tuple[Case, ...]] = {
 # Stages whose numbers have tests of their own: `test_stride_warp`, `test_separation`, `test_fade`.
 IN_OWN_TESTS = ("warp.", "separation.", "fade.")
 # Parameters that no other rule of the system reads; their cases are those of the record.
+ALWAYS_STANDING = Case(  # the feet of this contact
+    "effector.by_contact", "lifts its feet", RAISED, (False, True), "everything", 0
+)
 INERT: dict[str, tuple[Case, ...]] = {
     "ozz": (
         Case("probe.use_toe", "standing", KINK, (False, True), "everything", 0),
@@ -256,9 +276,10 @@ INERT: dict[str, tuple[Case, ...]] = {
         Case("pelvis.vertical_only", "standing", ANKLE_DEEP, (False, True), "everything", 0),
         # Along the ray.
         Case("foot.offset[1]", "standing", KINK, ((0, 0, 0), (0, 0.1, 0)), "everything", 0),
+        ALWAYS_STANDING,
     ),
     "unreal": (),
-    "mec": (),
+    "mec": (ALWAYS_STANDING,),
 }
 
 

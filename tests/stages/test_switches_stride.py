@@ -37,6 +37,9 @@ EAGER = {
 UPHILL = planes((0.4, 0, 0))
 STEP_UP = planes((0, 0, 0), (1.0, 0, -0.25))  # rises 0.2 m ahead of the ankles
 STEP_DOWN = planes((0, 0, 0), (-1.0, 0, 0.15))  # falls until 0.1 m ahead of the ankles
+# Rise or fall by 0.2 m between one ray and the next on the way of a swinging foot.
+STAIRS_UP, STAIRS_DOWN = planes((0, 0, 0), (2.0, 0, -0.8)), planes((0, 0, 0), (-2.0, 0, 0))
+CLIMBS = {"probe.max_slope": 1.3}  # as steep as these are
 TILTED, STEEP, WALL = (planes((0, left, 0)) for left in (0.4, 0.9, 4.0))  # the left foot higher
 LOWERED, RAISED = planes((0, 0, -0.5)), planes((0, 0, 0.1))
 
@@ -69,7 +72,27 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.rise_start", "comes down", STEP_UP, (0.0, 0.3), "target height", -1),
         Case("probe.rise_end", "comes down", STEP_UP, (0.8, 1.0), "target height", -1),
         Case("probe.steepness", "comes down", STEP_UP, (1.0, 2.0), "target height", 1),
-        Case("probe.max_step_up", "comes down", STEP_UP, (0.25, 0.3), "target height", 1),
+        Case(
+            "probe.max_step_up", "comes down", STAIRS_UP, (0.12, 0.18), "target height", 1, CLIMBS
+        ),
+        Case(
+            "probe.max_step_down",
+            "comes down",
+            STAIRS_DOWN,
+            (0.12, 0.18),
+            "target height",
+            -1,
+            CLIMBS,
+        ),
+        Case(
+            "probe.step_fade",
+            "comes down",
+            STAIRS_UP,
+            (0.1, 0.2),
+            "target height",
+            1,
+            CLIMBS | {"probe.max_step_up": 0.12},
+        ),
         Case("probe.max_slope", "comes down", UPHILL, (0.3, 0.36), "target height", 1),
         Case("probe.clearance", "lifts off", STEP_UP, (0.0, 0.05), "target height", 1, WIDE),
         Case("probe.way_slope", "lifts off", STEP_UP, (0.5, 1.0), "target height", -1),
@@ -142,7 +165,12 @@ CASES: dict[str, tuple[Case, ...]] = {
             (0.1, 0.4),
             "offset",
             -1,
-            LOCKS | {"lock.release_distance": 0.05, "lock.relock_threshold": 0.0},
+            LOOSE
+            | {
+                "lock.release_distance": 0.1,
+                "lock.relock_threshold": 0.0,
+                "lock.unlock_half_life": 0.0,  # without a limit it would jump
+            },
         ),
         Case("lock.lock_half_life", "drifts", FLAT, (0.02, 0.1), "offset", -1, LOOSE),
         Case(
@@ -158,6 +186,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("pelvis.extension", "standing", TILTED, (0.92, 0.95), "pelvis height", 1),
         Case("pelvis.softness", "standing", TILTED, (0.01, 0.05), "pelvis height", 1),
         *followed(),
+        Case("effector.by_contact", "lifts off", TILTED, (False, True), "miss", 1),
         Case("effector.extension", "standing", STEEP, (0.92, 0.95), "pitch", 1),
         Case(
             "effector.max_lift",

@@ -57,6 +57,7 @@ def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
         "lean forward": body[..., 2],
         "lean right": -body[..., 0],
         "contact": result.trace.sensed.contact.weight,
+        "found": result.trace.sensed.foothold.found,
         "weight": effector.weight,
         "slip": vec.length(ankle_ws[1:] - ankle_ws[:-1]),
         "miss": vec.length(ankle_ws - effector.target_ws),

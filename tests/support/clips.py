@@ -159,12 +159,14 @@ def to_ik(values: dict[str, Any], preset: str = "record") -> jaxik.FootIK:
 
     As in the originals, its probe refuses no ground, nothing fades, and `unreal` and `mec` do not
     put themselves on the ground: `tests/stages/test_limits`, `test_fade` and `test_root` are about
-    that.
+    that. With the value `probe.limited` the probe refuses ground.
     """
+    values = dict(values)
+    limited = values.pop("probe.limited", False)
     if preset in ("unreal", "mec", "mec as it comes"):
         values = {"root.enabled": False} | values
     ik = (SYSTEMS.get(preset) or getattr(jaxik.presets, preset))()
-    probe = dataclasses.replace(ik.probe, limited=False)
+    probe = dataclasses.replace(ik.probe, limited=limited)
     ik = dataclasses.replace(ik, probe=probe, fade=jaxik.stages.fade.NoFade())
     return parameter_tree.replace(ik, values)
 
