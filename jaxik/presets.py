@@ -39,6 +39,8 @@ from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
 # For locks: floors tilt by 3 cm along a walk, and no lock is to stay in a swing.
+SLOPES = {"max_pitch": 0.8, "min_pitch": -1.0, "max_roll": 0.45, "min_roll": -0.6}
+"""Limits of feet, rad, within which soles lie on slopes of 25 degrees."""
 STANDING = {"planted_height": 0.09, "raised_height": 0.12, "raised_speed": 0.35}
 
 
@@ -73,7 +75,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     if not faithful:
         ik = dataclasses.replace(
             ik,
-            probe=FootProbe(),
+            probe=FootProbe(max_step_up=0.33),  # its root may stay on the animation's floor
             contact=SpeedContact(**STANDING, half_life=0.03),
             target=SlopeTarget(max_ankle_height=1.0),
             lock=OffsetLock(
@@ -86,6 +88,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             ),
             separation=FootSeparation(),
             leg=TwoBone(as_animated=True),
+            foot=PitchRollFoot(**SLOPES),
         )
     return body.scale(ik, rig)
 
@@ -221,7 +224,7 @@ def stride(rig: Rig | None = None) -> FootIK:
         pelvis=ReachPelvis(),
         effector=HeelEffector(),
         leg=TwoBone(max_knee_angle=math.pi, soften=0.985, as_animated=True),
-        foot=PitchRollFoot(max_pitch=0.8, min_pitch=-1.0, max_roll=0.45, min_roll=-0.6),
+        foot=PitchRollFoot(**SLOPES),
         fade=SpeedFade(),
     )
     return body.scale(ik, rig)

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -105,7 +106,7 @@ def test_every_command_has_examples_that_it_accepts(command, capsys):
     examples = re.findall(rf"^  jaxik ({command} .*?)(?:   .*| > .*)?$", example, re.MULTILINE)
     assert examples
     for words in examples:
-        make_parser().parse_args(words.split())
+        make_parser().parse_args(shlex.split(words))
 
 
 def test_the_help_lists_all_commands_and_exit_statuses(capsys):

@@ -212,7 +212,7 @@ def test_the_terminal_shows_the_table_and_how_long_each_system_took(folder, comp
 
 
 def test_an_interrupt_writes_nothing(folder, tmp_path, monkeypatch, capsys):
-    def interrupt(*_):
+    def interrupt(*_, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(program_cache, "run", interrupt)

@@ -42,8 +42,8 @@ def add_compare(commands: Commands) -> None:
         """
         jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
         jaxik compare walk.bvh --terrain steps.obj --presets record --parameters a.toml,b.toml -o ab
-        jaxik compare --suite -o suite                  every preset in every made situation
-        jaxik compare --suite --quick --presets record  a shorter suite, without files
+        jaxik compare --suite -o suite                   every preset in every made situation
+        jaxik compare --suite --quick --presets record   a shorter suite, without files
         jaxik compare --suite --only "stairs up,curb" --presets record --parameters a.toml
 
         The suite has its own animations and grounds, from a flat walk to stairs and a train, and
