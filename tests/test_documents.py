@@ -15,6 +15,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tempfile
 import tomllib
 import unittest
 from collections.abc import Mapping
@@ -26,7 +27,8 @@ from sybil.document import Document
 from sybil.parsers import markdown, rest
 
 from fitting.cli.parser import make_parser
-from fitting.experiments import experiment_files
+from fitting.datasets.clips import load_clip
+from fitting.experiments import experiment_files, track_files
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("jaxik", "fitting", "data", "tests", "notebooks")
@@ -102,7 +104,15 @@ def merged(table: Mapping[str, object], changes: Mapping[str, object]) -> dict[s
 
 
 def evaluate_experiment(example: Example) -> None:
+    """Reads a part of an experiment, or a track file, which begins with what no experiment has."""
     snippet = tomllib.loads(str(example.parsed))
+    if "grounded" in snippet:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "tracks.toml")
+            path.write_text(str(example.parsed), encoding="utf-8")
+            base = load_clip(EXPERIMENT.parents[1] / "clips" / "uneven_walk_base.npz")
+            track_files.along(base, path)
+        return
     complete = tomllib.loads(EXPERIMENT.read_text(encoding="utf-8"))
     experiment_files.parse_experiment(merged(complete, snippet), EXPERIMENT)
 
