@@ -94,7 +94,7 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) 
         leg_up_ws=up,
         dt=frame.dt,
         slide=frame.slide,
-        carry=frame.carry(_shared_platform(ground.ankle)),
+        carry=frame.carry(_shared_platform(ground.ankle, rig.present)),
         present=rig.present,
         side=rig.side,
         weight=weight,
@@ -195,11 +195,12 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
 
 
-def _shared_platform(hit: Hit) -> Hit:
+def _shared_platform(hit: Hit, present: Array) -> Hit:
     """The hits, with feet that found no ground on the platform of another foot, if there is one."""
     if hit.platform is None:
         return hit
-    platform = jnp.where(hit.found > 0, hit.platform, jnp.max(hit.platform))
+    others = jnp.max(jnp.where(present, hit.platform, -1))
+    platform = jnp.where(hit.found > 0, hit.platform, others)
     return dataclasses.replace(hit, platform=platform)
 
 
