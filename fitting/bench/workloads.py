@@ -162,7 +162,7 @@ def leg_batch(legs: int) -> LegBatch:
     clip = walk(600)
     rig = single(clip.rig)
     motion = single(tiled(clip_frames.frames_from_clip(clip), max(legs // 2, 1)))
-    ik = single(jaxik.presets.record())
+    ik = single(jaxik.presets.record(faithful=True))
     tilted = single(terrain.plane(normal=(0.1, 1.0, 0.05)))
     sensed = _sensed(ik, rig, tilted, motion)
     offset = np.random.default_rng(0).uniform(-0.06, 0.06, motion.pose.ankle.pos.shape)
@@ -176,7 +176,7 @@ def _by_leg(tree: Tree) -> Tree:
 
     def flat(leaf: Array) -> Array:
         per_leg = leaf if leaf.shape[1:2] == (2,) else jnp.repeat(leaf[:, None], 2, axis=1)
-        return per_leg.reshape(-1, *per_leg.shape[2:])
+        return per_leg.reshape(2 * len(per_leg), *per_leg.shape[2:])  # some leaves are empty
 
     return jax.tree.map(flat, tree)
 
@@ -236,7 +236,7 @@ def crowd(characters: int, frame_count: int, seed: int = 0) -> Crowd:
     }
     place = random.uniform([4.0, 0.0, 2.0], [EXTENT - 4.0, 0.0, EXTENT - 20.0], (characters, 3))
     return Crowd(
-        single(jaxik.presets.record()),
+        single(jaxik.presets.record(faithful=True)),
         single(clip.rig),
         single(clip_frames.frames_from_clip(clip)),
         single(drawn),
@@ -248,7 +248,7 @@ def crowd(characters: int, frame_count: int, seed: int = 0) -> Crowd:
 
 def parameter_names(count: int) -> tuple[str, ...]:
     """Names of parameters to fit: those of `TRUTH`, then others, the smooth ones first."""
-    declared = parameter_tree.declarations(jaxik.presets.record())
+    declared = parameter_tree.declarations(jaxik.presets.record(faithful=True))
     others = [name for name in declared if name not in TRUTH and name != "probe.toe_ls"]
     others.sort(key=lambda name: declared[name].kind)
     return (*TRUTH, *others, "probe.toe_ls[2]")[:count]
@@ -258,7 +258,7 @@ def recording(frame_count: int) -> tuple[Clip, Clip, meshes.Mesh]:
     """A clip that known parameters made, plus noise; its flat animation; and its ground."""
     random = np.random.default_rng(SEED)
     base, mesh = walk(frame_count, uneven_pace=True), terrain_meshes.uneven_walk()
-    truth = parameter_tree.replace(jaxik.presets.record(), TRUTH)
+    truth = parameter_tree.replace(jaxik.presets.record(faithful=True), TRUTH)
     uneven = terrain.mesh(mesh.vertices, mesh.faces)
     solved = clip_frames.clip_from_result(
         base, jaxik.run(truth, base.rig, uneven, clip_frames.frames_from_clip(base))
@@ -272,7 +272,7 @@ def recording(frame_count: int) -> tuple[Clip, Clip, meshes.Mesh]:
 
 def problem_from_clip(clip: ClipData, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
     """The fit of these parameters to a recording."""
-    ik = jaxik.presets.record()
+    ik = jaxik.presets.record(faithful=True)
     space = make_space(ik, [free_parameter(ik, name) for name in names])
     return Problem(space, (make_scene(clip, SIGMAS),), residuals_of_scenes)
 

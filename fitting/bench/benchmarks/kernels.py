@@ -225,7 +225,7 @@ def step(measurement: Measurement, sizes: Sizes) -> None:
     clip = workloads.walk(60)
     rig, frames = workloads.single((clip.rig, frames_from_clip(clip)))
     frame = jax.tree.map(lambda leaf: leaf[30], frames)
-    ik = workloads.single(jaxik.presets.record())
+    ik = workloads.single(jaxik.presets.record(faithful=True))
     state = jaxik.init(ik, rig)
     mesh = workloads.ground(workloads.mesh_field(sizes.cells))
     grounds = {"plane": workloads.single(plane()), "mesh": mesh}

@@ -26,7 +26,7 @@ def scaling(measurement: Measurement, sizes: Sizes) -> None:
     """Time against legs, frames, legs of a character, parameters and triangles."""
     clip = workloads.walk(sizes.frames)
     rig, motion = workloads.single(clip.rig), workloads.single(frames_from_clip(clip))
-    ik, flat = workloads.single(jaxik.presets.record()), workloads.single(plane())
+    ik, flat = workloads.single(jaxik.presets.record(faithful=True)), workloads.single(plane())
 
     def legs(count: int) -> Point:
         batch = workloads.leg_batch(count)
