@@ -30,6 +30,7 @@ from jaxik.world import terrain
 VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
 TRUTH = """
 preset = "record"
+faithful = true
 [contact]
 planted_height = 0.10
 [pelvis]
@@ -50,7 +51,7 @@ def experiment(tmp_path_factory) -> Experiment:
     (folder / "truth.toml").write_text(TRUTH)
     entry = ClipEntry(folder / "walk.npz", folder / "slope.ply", truth=folder / "truth.toml")
     path, free = folder / "hill.toml", {name: {} for name in VALUES}
-    return Experiment(path, (replace(entry, truth=None), entry), free, name="hill")
+    return Experiment(path, (replace(entry, truth=None), entry), free, name="hill", faithful=True)
 
 
 @pytest.fixture(scope="module")
