@@ -131,7 +131,10 @@ def test_a_fit_with_a_track_recovers_a_known_truth(tmp_path):
         "[pelvis.limit]\ntimes = [1.0, 1.4, 1.8]\nvalues = [0.3, 0.02, 0.3]\n"
     )
     path = experiments.write(
-        tmp_path, clip='tracks = "tracks.toml"\nmask_pops = false\n', free="pelvis.on_gain = {}\n"
+        tmp_path,
+        top="faithful = true",  # its pelvis follows ankles far enough for the limit to act
+        clip='tracks = "tracks.toml"\nmask_pops = false\n',
+        free="pelvis.on_gain = {}\n",
     )
     problem = problems.make_problem(load_experiment(path))
     truth = problem.space.pack({"pelvis.on_gain": 0.35})
