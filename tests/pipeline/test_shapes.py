@@ -42,8 +42,8 @@ def with_one_a_leg(ik: jaxik.FootIK, *names: str) -> jaxik.FootIK:
     return parameter_tree.replace(ik, {name: [leaf] * LEGS for name, leaf in leaves.items()})
 
 
-BODY = ("root.", "lean.", "separation.", "pelvis.")
-ONE_FOR_ALL = ("lock.hold_ball", "effector.latch")
+BODY = ("root.", "lean.", "pelvis.")
+ONE_FOR_ALL = ("lock.hold_ball", "separation.distance", "effector.latch")
 PER_LEG_IN_THE_PELVIS = ("pelvis.min_length", "pelvis.max_length", "pelvis.extension")
 
 
