@@ -19,7 +19,7 @@ from jaxik.stages.pelvis import PelvisMoment
 from jaxik.stages.probe import foot_heading
 from jaxik.stages.root import AbstractRoot
 from jaxik.world.frame import Contact, Sensed, animated_ankles
-from jaxik.world.skeleton import Transform, bone_lengths
+from jaxik.world.skeleton import Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
 from .system import Advanced, Corrections, FootIK, Result, State, Trace
@@ -217,9 +217,7 @@ def body_transform(inputs: Inputs, rot_ws: Array, offset_ws: Array) -> Transform
         rot_ws: rotation, world axes.
         offset_ws: offset, m, world space.
     """
-    present = inputs.rig.present.astype(offset_ws.dtype)
-    weight = present / jnp.maximum(vec.sum_last(present), 1.0)
-    pivot = vec.barrier(vec.sum_vectors(vec.scale(inputs.frame.pose.hip.pos, weight)))
+    pivot = vec.barrier(mean_position(inputs.frame.pose.hip.pos, inputs.rig.present))
     rot = in_model_space(inputs, rot_ws)
     offset = quat.unrotate(inputs.frame.world_from_model.rot, offset_ws)
     return Transform(pivot + offset - quat.rotate(rot, pivot), rot)

@@ -16,7 +16,7 @@ from jaxik.maths.gate import HARD
 from jaxik.maths.parameter_tree import Leaf, Rule, parameter
 from jaxik.maths.struct import struct
 from jaxik.world.frame import Sensed
-from jaxik.world.skeleton import Rig, Transform
+from jaxik.world.skeleton import Rig, Transform, mean_position
 
 from .effector import Effector
 from .inputs import SensedMoment
@@ -151,7 +151,9 @@ class SpeedFade(AbstractFade):
         state = self._with_speed(now, weight, dataclasses.replace(state, since=since))
         fading = jnp.any(weight != state.weight)
         limit = state.speed * jnp.where(fading, BODY_SHARE, 1.0) * now.dt
-        reach = HARD.maximum(now.sensed.thigh + now.sensed.shin, band=0.0)
+        sensed = now.sensed
+        lengths = jnp.where(sensed.present, sensed.thigh + sensed.shin, 0.0)
+        reach = HARD.maximum(lengths, band=0.0)
         offset = goal.pos - state.body.pos
         gap = vec.length(offset) + reach * quat.angle(state.body.rot, goal.rot)
         limited = now.started & (since < SETTLING) & (gap > limit)
@@ -193,8 +195,7 @@ class SpeedFade(AbstractFade):
     ) -> SpeedFadeState:
         """The memory with how fast the hips fall, or fell before the landing."""
         sensed = now.sensed
-        hips = vec.dot(sensed.hip_ws - sensed.root_ws, sensed.up_ws)
-        height = vec.sum_last(hips) / hips.shape[-1]
+        height = vec.dot(_mean_hip(sensed) - sensed.root_ws, sensed.up_ws)
         falling = jnp.where(now.started, vec.safe_divide(state.hip_height - height, now.dt), 0.0)
         falling = jnp.where(falling > 0, falling, 0.0)
         landing = jnp.where(state.since < SETTLING, state.fall_speed, 0.0)
@@ -239,7 +240,10 @@ def correction_size(
 
 def carry(sensed: Sensed, points_ws: Array, body: Transform) -> Float[Array, "legs 3"]:
     """Points of the animated legs, m, on the body that turns about the mean of its hips."""
-    present = sensed.present.astype(points_ws.dtype)
-    share = present / jnp.maximum(vec.sum_last(present), 1.0)
-    pivot = vec.sum_vectors(vec.scale(sensed.hip_ws, share))
+    pivot = _mean_hip(sensed)
     return pivot + body.pos + quat.rotate(body.rot, points_ws - pivot)
+
+
+def _mean_hip(sensed: Sensed) -> Float[Array, "3"]:
+    """The mean of the animated hips, m, world space."""
+    return mean_position(sensed.hip_ws, sensed.present)

@@ -178,3 +178,9 @@ class Rig:
 def bone_lengths(pose: LegPose) -> tuple[Array, Array]:
     """Thigh and shin lengths of a pose, m, each of shape `legs`."""
     return (vec.length(pose.knee.pos - pose.hip.pos), vec.length(pose.ankle.pos - pose.knee.pos))
+
+
+def mean_position(positions: Float[Array, "legs 3"], present: Bool[Array, " legs"]) -> Array:
+    """Mean of a position, m, of each leg that is there; 0 if none is."""
+    weight = present.astype(positions.dtype)
+    return vec.sum_vectors(vec.scale(positions, weight / jnp.maximum(vec.sum_last(weight), 1.0)))

@@ -20,7 +20,6 @@ from test_properties import (
     moved_ground,
     single,
     some_move,
-    three_legged,
     wander,
 )
 
@@ -30,6 +29,7 @@ from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support.cases import QUICK, RIG
 from support.clips import BROKEN, assert_close, at, planes, to_ik, to_rig, to_terrain, to_transform
+from support.padding import three_legged
 
 pytestmark = pytest.mark.slow
 

@@ -20,6 +20,7 @@ from reference import sample_poses
 from reference.stages import fade as reference
 from support.cases import QUICK
 from support.clips import make_rig, planes, to_frames, to_ik, to_rig, to_terrain, wandering
+from support.padding import three_legged
 
 HZ = 60.0
 LIMIT = 0.01  # m a frame
@@ -192,6 +193,17 @@ def test_feet_land_at_the_speed_of_the_fall():
     assert moved.max() < 1.2 * 3.0 / HZ, "no foot is much faster than the fall"
     heights = feet[:, 0, 1] - (sample_poses.ANKLE - 0.12)
     assert heights[29] > 0.1 and abs(heights[35]) < 1e-3, "the ground is met within 0.1 s"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_leg_that_is_not_there_changes_no_landing(preset):
+    ik, ground = getattr(jaxik.presets, preset)(), to_terrain(planes((0.2, 0.1, -0.12)))
+    rig, frames = to_rig(make_rig()), falling()
+    padded_rig, padded_frames = three_legged(rig, frames)
+    run = jax.jit(jaxik.run, compiler_options=QUICK)
+    alone, padded = run(ik, rig, ground, frames), run(ik, padded_rig, ground, padded_frames)
+    np.testing.assert_allclose(padded.body.pos, alone.body.pos, atol=1e-9)
+    np.testing.assert_allclose(padded.pose.ankle.pos[:, :2], alone.pose.ankle.pos, atol=1e-9)
 
 
 def test_gradients_through_a_fade_are_finite_where_nothing_has_to_be_corrected():
