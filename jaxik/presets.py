@@ -87,6 +87,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
                 return_speed=0.6,
             ),
             separation=FootSeparation(),
+            pelvis=LowestPelvis(wait_to_rise=True),
             leg=TwoBone(as_animated=True),
             foot=PitchRollFoot(**SLOPES),
         )
@@ -97,8 +98,8 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
     """ozz-animation's foot IK sample, on a root that takes steps without a jump.
 
     Its four switches are `root.enabled` (character height), `pelvis.enabled`, `leg.enabled`
-    (two-bone) and `foot.enabled` (aim). Only the root has memory. `probe.use_toe`, `probe.toe_ls`
-    and `pelvis.vertical_only` belong to rules of the record and change nothing here.
+    (two-bone) and `foot.enabled` (aim). Only the root has memory. `probe.use_toe`, `probe.toe_ls`,
+    `pelvis.vertical_only` and `pelvis.wait_to_rise` serve other systems and change nothing here.
 
     Two inaccuracies of ozz 0.16 are not reproduced: with a weight below 1 its aim goes the longer
     way round in 10 to 14 % of cases, and it treats directions within 1.4 mrad of opposed as

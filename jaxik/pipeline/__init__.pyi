@@ -2,6 +2,7 @@ from . import phases as phases
 from . import shapes as shapes
 from . import simulation as simulation
 from . import system as system
+from . import tracks as tracks
 from .simulation import resume as resume
 from .simulation import run as run
 from .simulation import step as step

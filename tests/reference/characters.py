@@ -54,6 +54,7 @@ DEFAULTS: dict[str, Any] = {
     "pelvis.on_gain": 0.225,
     "pelvis.off_gain": 0.116,
     "pelvis.vertical_only": True,
+    "pelvis.wait_to_rise": False,
     "pelvis.tick_hz": 30.0,
     "leg.max_knee_angle": math.acos(-0.990),
     "leg.min_knee_angle": math.acos(0.766),

@@ -252,6 +252,7 @@ RULES = (  # switches of our rules that the record lacks; off by default
         },
     ),
     Case("leg.as_animated", "walks", FLAT, (False, True), "knee angle", 1),
+    Case("pelvis.wait_to_rise", "walks", RAMP_DOWN, (False, True), "pelvis height", -1),
 )
 CASES = (*RECORD, *EXTRA, *RULES)
 SLOPED = [case for case in CASES if has_slope(case, "record")]

@@ -274,6 +274,8 @@ INERT: dict[str, tuple[Case, ...]] = {
             {"probe.use_toe": True},
         ),
         Case("pelvis.vertical_only", "standing", ANKLE_DEEP, (False, True), "everything", 0),
+        # All feet always stand.
+        Case("pelvis.wait_to_rise", "standing", ANKLE_DEEP, (False, True), "everything", 0),
         # Along the ray.
         Case("foot.offset[1]", "standing", KINK, ((0, 0, 0), (0, 0.1, 0)), "everything", 0),
         ALWAYS_STANDING,

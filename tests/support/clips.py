@@ -63,6 +63,7 @@ ODD: dict[str, Any] = {  # all parameters away from their defaults
     "pelvis.on_gain": 0.3,
     "pelvis.off_gain": 0.15,
     "pelvis.vertical_only": False,
+    "pelvis.wait_to_rise": True,
     "leg.max_knee_angle": 2.8,
     "leg.min_knee_angle": 1.6,
     "leg.soften": 0.94,

@@ -32,6 +32,9 @@ class LowestPelvis(AbstractPelvis):
     Each foot requests the height from its animated ankle to its target. A foot that does not stand
     is blended, by its contact weight, into the highest request of all. With no foot standing the
     goal is 0. Without a limit and with gains of 1 this is ozz's pelvis correction.
+
+    Down a slope a walker stands on the foot behind, which is higher, and swings the other towards
+    lower ground. With `wait_to_rise` the body does not climb onto that foot first and drop then.
     """
 
     enabled: Leaf = switch(True, doc="Whether the pelvis moves.")
@@ -47,6 +50,9 @@ class LowestPelvis(AbstractPelvis):
     vertical_only: Leaf = switch(
         True, doc="Whether the pelvis moves along up, or along the ground's normal."
     )
+    wait_to_rise: Leaf = switch(
+        False, doc="Whether the pelvis rises only as far as feet that swing ask for as well."
+    )
     tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second that the gains refer to.")
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
@@ -55,8 +61,13 @@ class LowestPelvis(AbstractPelvis):
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         active = sensed.weight > 0
         highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)
-        requested = jnp.where(active, smoothing.lerp(highest, requested, weight), highest)
-        lowest = gate.minimum(requested, band=HEIGHT_BAND)
+        of_standing = jnp.where(active, smoothing.lerp(highest, requested, weight), highest)
+        lowest = gate.minimum(of_standing, band=HEIGHT_BAND)
+        of_all = gate.minimum(jnp.where(active, requested, FAR), band=HEIGHT_BAND)
+        zero = jnp.zeros_like(lowest)
+        rise = gate.clip(of_all, zero, zero + jnp.inf, band=HEIGHT_BAND)
+        waiting = gate.clip(lowest, zero - jnp.inf, rise, band=HEIGHT_BAND)
+        lowest = jnp.where(self.wait_to_rise, waiting, lowest)
         standing = gate.maximum(weight, band=0.1)
         goal = standing * gate.clip(lowest, -self.limit, self.limit, band=HEIGHT_BAND)
         goal = jnp.where(self.enabled, goal, 0.0)

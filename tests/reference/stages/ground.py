@@ -282,6 +282,8 @@ def pelvis_height(
     ]
     top = max((gap for _, gap in taking_part), default=0.0)
     low = min((top + w * (gap - top) for w, gap in taking_part), default=0.0)
+    if parameters["pelvis.wait_to_rise"]:
+        low = min(low, max(0.0, min((gap for _, gap in taking_part), default=0.0)))
     contact = max(weights)
     limit = parameters["pelvis.limit"]
     goal = contact * clip(low, -limit, limit)

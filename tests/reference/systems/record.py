@@ -30,7 +30,12 @@ STANDS_BY_SPEED = contact_by_speed.DEFAULTS | {
     "lock.relock_threshold": 0.5,
     "lock.unlock_half_life": 0.05,
     "lock.return_speed": 0.6,
+    "pelvis.wait_to_rise": True,
     "leg.as_animated": True,
+    "foot.max_pitch": 0.8,
+    "foot.min_pitch": -1.0,
+    "foot.max_roll": 0.45,
+    "foot.min_roll": -0.6,
 }
 __all__ = ["DEFAULTS", "Frame", "Ground", "Parameters", "Rig", "State", "Transform", "run", "step"]
 
