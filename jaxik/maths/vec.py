@@ -248,6 +248,18 @@ def reject(v: Float[Array, "*a 3"], direction: Float[Array, "*b 3"]) -> Float[Ar
     return v - scale(direction, dot(v, direction))
 
 
+def across(
+    direction: Float[Array, "*a 3"], up: Float[Array, "*b 3"], fallback: Float[Array, "*c 3"]
+) -> Float[Array, "*d 3"]:
+    """Unit vector at right angles to `up` that is nearest to `direction`; both of length 1.
+
+    `fallback`, with zero gradient in `direction`, where it points along `up` but for rounding.
+    """
+    part = reject(direction, up)
+    known = dot(part, part) > jnp.finfo(part.dtype).eps
+    return normalize(scale(part, known.astype(part.dtype)), fallback)
+
+
 def constant(v: tuple[float, float, float], like: Array) -> Float[Array, "3"]:
     """A fixed vector with the dtype of `like`."""
     return jnp.asarray(v, like.dtype)

@@ -110,7 +110,7 @@ class PitchRollFoot(AbstractAnimatedFoot):
         up = sensed.leg_up_ws
         left, _, sole = quat.axes(quat.multiply(effector.rot_ws, rig.ankle_from_foot))
         outer = vec.scale(left, rig.side)
-        ahead = vec.normalize(vec.reject(sole, up), sensed.slope.forward_ws)
+        ahead = vec.across(sole, up, sensed.slope.forward_ws)
         right = vec.cross(ahead, up)
 
         pitch, roll = vec.stacked_barrier(*ground_angles(sensed, ahead, right, rig.side))

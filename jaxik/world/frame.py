@@ -281,5 +281,5 @@ def heading(world_from_model: Transform, up_ws: Float[Array, "*legs 3"]) -> tupl
     """
     forward = quat.rotate(world_from_model.rot, vec.constant(FORWARD, up_ws))
     upright = quat.rotate(world_from_model.rot, vec.constant(UP, up_ws))
-    forward_ws = vec.normalize(vec.reject(forward, up_ws), upright)
+    forward_ws = vec.across(forward, up_ws, upright)
     return forward_ws, vec.cross(forward_ws, up_ws)

@@ -33,6 +33,7 @@ FUNCTIONS = {
     "length": (vec.length, (A,)),
     "normalize": (vec.normalize, (A, B)),
     "reject": (vec.reject, (A, B)),
+    "across": (vec.across, (A, B, B)),
 }
 
 
@@ -124,6 +125,24 @@ def test_a_rejection_is_at_right_angles_and_the_rest_parallel(v, pair):
     across = vec.reject(jnp.asarray(v), direction)
     assert_allclose(vec.dot(across, direction), 0, atol=1e-14)
     assert_allclose(np.cross(v - across, direction), 0, atol=1e-14)
+
+
+@few
+@given(directions())
+def test_what_is_across_up_has_length_one_or_is_the_fallback(pair):
+    direction, fallback = pair[0], np.array([0.6, 0.0, 0.8])
+    up = jnp.array([0.0, 1.0, 0.0])
+    across = vec.across(jnp.asarray(direction), up, jnp.asarray(fallback))
+    horizontal = direction * [1.0, 0.0, 1.0]
+    size = np.linalg.norm(horizontal)
+    assert_allclose(across, horizontal / size if size > 1e-7 else fallback, atol=1e-14)
+
+
+def test_a_direction_along_up_but_for_rounding_has_nothing_across_it_and_no_gradient():
+    rounded = jnp.asarray([2e-16, 1.0, -1e-16])
+    up, fallback = jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0])
+    assert_allclose(vec.across(rounded, up, fallback), fallback, atol=0)
+    assert_allclose(jax.jacobian(vec.across)(rounded, up, fallback), 0.0, atol=0)
 
 
 @few

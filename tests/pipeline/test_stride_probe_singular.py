@@ -151,7 +151,6 @@ def test_gradients_are_finite_with_an_absent_leg(present: list[bool]):
     names = ("pose", "stride", "foot_speed", "toe_speed")
     frames = dataclasses.replace(frames, **dict(zip(names, kept, strict=True)))
     rig = dataclasses.replace(to_rig(RIG), present=jnp.asarray(present))
-    for preset in ("stride", "by speed"):
-        gradients = gradients_of((to_ik(AT_WORK, preset), rig, to_ground(UPHILL), frames))
-        for path, slope in jax.tree_util.tree_leaves_with_path(gradients):
-            assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
+    gradients = gradients_of((to_ik(AT_WORK, "by speed"), rig, to_ground(UPHILL), frames))
+    for path, slope in jax.tree_util.tree_leaves_with_path(gradients):
+        assert np.isfinite(slope).all(), jax.tree_util.keystr(path)

@@ -54,7 +54,7 @@ def foot_heading(inputs: Inputs, up_ws: Array) -> tuple[Array, Array]:
     frame = inputs.frame
     foot = quat.multiply(animated_ankles(frame).rot, inputs.rig.ankle_from_foot)
     sole = quat.rotate(foot, vec.constant(FORWARD, up_ws))
-    ahead = vec.normalize(vec.reject(sole, up_ws), heading(frame.world_from_model, up_ws)[0])
+    ahead = vec.across(sole, up_ws, heading(frame.world_from_model, up_ws)[0])
     return ahead, vec.cross(ahead, up_ws)
 
 
