@@ -1,5 +1,10 @@
-"""Shared fixtures: 64-bit floats, and the reference material beside the project."""
+"""Shared fixtures: 64-bit floats, and the reference material beside the project.
 
+Programs are compiled without optimisations, which take longer than the programs run; set
+JAX_DISABLE_MOST_OPTIMIZATIONS=0 to compile them as for users, as notebooks do in any case.
+"""
+
+import os
 from pathlib import Path
 
 import jax
@@ -9,6 +14,8 @@ from fitting.runtime import xla
 
 xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
+UNOPTIMIZED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # for child processes
+jax.config.update("jax_disable_most_optimizations", UNOPTIMIZED != "0")
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -28,14 +28,6 @@ from support.experiments import CLIP, ROOT, write
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 20"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def unoptimised():
-    """Compiles without optimisations, as each program runs once or twice."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture
 def experiment_file(tmp_path, monkeypatch) -> Path:
     """Half a second of the uneven walk, with residuals that compile at once."""
@@ -90,7 +82,6 @@ import fitting
 from fitting.experiments import problems
 from support import quick
 
-jax.config.update("jax_disable_most_optimizations", True)
 problems.residuals_of_scenes = quick.residuals_of_scenes
 fitted = fitting.fit(sys.argv[1])
 posterior = fitting.sample(fitted)

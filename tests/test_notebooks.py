@@ -36,8 +36,9 @@ def test_a_notebook_is_stored_without_outputs(path):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
 def test_a_notebook_runs_without_errors_or_warnings(path):
     notebook = nbformat.read(path, as_version=4)
-    # The kernel starts as a reader's does: without our XLA flags, in the notebook's folder.
-    inherited = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    # The kernel starts as a reader's does: without the tests' settings, in the notebook's folder.
+    ours = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
+    inherited = {name: value for name, value in os.environ.items() if name not in ours}
     environment = inherited | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     client = NotebookClient(
         notebook,

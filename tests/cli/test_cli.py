@@ -44,16 +44,10 @@ SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory):
-    """A folder for compiled programs, so that the commands leave the user's alone.
-
-    Programs are compiled without optimisations, as each runs once or twice, on short clips.
-    """
+    """A folder for compiled programs, so that the commands leave the user's alone."""
     folder = tmp_path_factory.mktemp("compiled")
-    jax.clear_caches()  # optimised programs of other tests round differently from a child process
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_disable_most_optimizations", True)
     yield folder
-    jax.config.update("jax_disable_most_optimizations", False)
     jax.config.update("jax_compilation_cache_dir", None)
 
 

@@ -30,11 +30,9 @@ def plan(*names: str, seconds: float = BRIEF) -> situations.Plan:
 
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory):
-    """A folder for compiled programs, which are compiled without optimisations."""
+    """A folder for compiled programs."""
     jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    jax.config.update("jax_disable_most_optimizations", True)
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
     jax.config.update("jax_compilation_cache_dir", None)
 
 

@@ -37,12 +37,10 @@ QUANTITIES = ("ankle", "knee", "pelvis", "foot", "body")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def unoptimised(tmp_path_factory):
-    """Compiles without optimisations, as each program runs a few times on a short clip."""
+def compiled_once(tmp_path_factory):
+    """Compiles each program once for all tests."""
     jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    jax.config.update("jax_disable_most_optimizations", True)
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
     jax.config.update("jax_compilation_cache_dir", None)
 
 
