@@ -38,8 +38,9 @@ from .systems import (
 
 
 def system_to_toml(ik: jaxik.FootIK, preset: Preset = DEFAULT_PRESET) -> str:
-    """All rules, parameters, conventions and switches of a system, as TOML."""
+    """All rules, parameters, conventions, switches and options of a system, as TOML."""
     values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
+    values |= parameter_tree.options(ik)
     rules = changed_rules(ik, preset.system())
     return tomli_w.dumps(preset.keys() | ({"rules": rules} if rules else {}) | nest(values))
 

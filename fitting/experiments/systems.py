@@ -150,7 +150,7 @@ def changed_rules(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:
 
 
 def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK:
-    """The system with other values of parameters, conventions and switches.
+    """The system with other values of parameters, conventions, switches and options.
 
     Args:
         ik: the system.
@@ -160,7 +160,13 @@ def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK
     Raises:
         ValueError: a name is unknown, or a value has the wrong type or shape.
     """
-    check_keys(values, leaf_names(ik), where)
+    options = parameter_tree.options(ik)
+    check_keys(values, [*leaf_names(ik), *options], where)
+    for name in options & values.keys():
+        if not isinstance(values[name], bool):
+            raise ValueError(f"{where}: {name} is {values[name]!r}; wanted true or false")
+        ik = parameter_tree.with_option(ik, name, values[name])
+    values = {name: value for name, value in values.items() if name not in options}
     shapes = {slot.name: slot.shape for slot in parameter_tree.slots(ik)}
     for name, value in values.items():
         old = parameter_tree.get(ik, name)

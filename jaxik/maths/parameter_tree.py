@@ -252,6 +252,22 @@ def _fields(
             yield name, module, field
 
 
+def options(module: eqx.Module) -> dict[str, bool]:
+    """What is switched when a program is compiled, not while it runs, by dotted name."""
+    return {
+        name: getattr(owner, field.name)
+        for name, owner, field in _fields(module)
+        if field.metadata.get("static") and isinstance(getattr(owner, field.name), bool)
+    }
+
+
+def with_option(module: Tree, name: str, on: bool) -> Tree:
+    """The tree with one of its `options` switched."""
+    child, _, rest = name.partition(".")
+    value = with_option(getattr(module, child), rest, on) if rest else on
+    return dataclasses.replace(module, **{child: value})
+
+
 def get(module: eqx.Module, name: str) -> Array:
     """The leaf with this dotted name."""
     return operator.attrgetter(name)(module)

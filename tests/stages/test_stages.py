@@ -279,8 +279,8 @@ def test_all_fields_of_the_record_and_all_parameters_have_a_case():
         "pelvis.tick_hz",
     }
     # These clips tell no scale of strides, nothing fades and no ground is refused:
-    # `test_stride_warp`, `test_fade` and `test_limits` have those that do.
-    own = ("warp.", "fade.", "probe.max_")
+    # `test_stride_warp`, `test_fade`, `test_limits` and `test_narrow_ground` have those that do.
+    own = ("warp.", "fade.", "probe.max_", "probe.min_support", "probe.support_radius")
     declared = {name for name in declared if not name.startswith(own)}
     assert {case.leaf for case in CASES} == declared | switches
 

@@ -1,6 +1,7 @@
-"""Which ground a foot may stand on: neither too high, nor too low, nor too steep."""
+"""Which ground a foot may stand on: neither too high, nor too low, too steep or too narrow."""
 
 import functools
+import math
 
 import equinox as eqx
 import jax
@@ -13,21 +14,31 @@ from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
 
-from .base import AbstractProbe
+from .base import AbstractProbe, foot_heading
 
+RING = tuple(  # forward and right of the rays that look for support around a foothold
+    (math.cos(turn), math.sin(turn)) for turn in (i * math.pi / 4 for i in range(8))
+)
+SUPPORT_FADE = 0.25  # of the ring, over which ground becomes too narrow
 SLOPE_FADE = 0.10  # rad, over which a slope becomes too steep
 SAME_GROUND = 1e-3  # m, between hits of one surface at most
 
 
 class AbstractLimitedProbe(AbstractProbe):
-    """Rays that refuse ground which is too high, too low or too steep.
+    """Rays that refuse ground which is too high, too low, too steep or, if asked to, too narrow.
 
     Steps are measured from the level of the character's root, and only by what is not a slope: of
     ground that rises evenly from below the root nothing is a step. Where the highest ground below a
     ray is refused, that below the highest step counts, such as the floor under a table. Where that
     is refused too, there is no ground, and the foot stays as animated.
 
-    Ground fades out over `step_fade` and `SLOPE_FADE` beyond its limit: `found` falls from 1 to 0.
+    With `check_support` eight rays around each foothold, `support_radius` from it, look for ground
+    that goes on as it is there, neither higher nor lower by more than that radius. A post has none
+    around it, a beam two, an edge half, a floor all eight. Ground with less than `min_support` of
+    them is refused.
+
+    Ground fades out over `step_fade`, `SLOPE_FADE` and `SUPPORT_FADE` beyond its limit: `found`
+    falls from 1 to 0.
     """
 
     max_step_up: Leaf = parameter(
@@ -54,8 +65,24 @@ class AbstractLimitedProbe(AbstractProbe):
     step_fade: Leaf = constant(
         0.10, unit="m", doc="Height over which a step becomes too high or too low."
     )
+    min_support: Leaf = parameter(
+        0.5,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        doc="Share of the ground around a foothold that must go on; with less it is refused.",
+    )
+    support_radius: Leaf = parameter(
+        0.04,
+        unit="m",
+        low=0.01,
+        high=0.15,
+        doc="Distance from a foothold at which ground must go on: half the width of a sole.",
+    )
     limited: bool = eqx.field(default=True, static=True, kw_only=True)
     """Whether any ground is refused. Static: without limits, no ray is cast for them."""
+    check_support: bool = eqx.field(default=False, static=True, kw_only=True)
+    """Whether narrow ground is refused. Static, because it takes nine times as many rays."""
 
     def cast(
         self,
@@ -64,6 +91,7 @@ class AbstractLimitedProbe(AbstractProbe):
         reach: Array,
         layers: Array,
         margin: Array | None = None,
+        stood_on: bool = True,
     ) -> Hit:
         """The ground below points above the feet; refused ground counts as missed.
 
@@ -73,6 +101,7 @@ class AbstractLimitedProbe(AbstractProbe):
             reach: their length, m.
             layers: what they can hit.
             margin: how much higher and lower than a step ground may be (... legs), m; None is 0.
+            stood_on: whether a foot is to stand there; what it only passes may be narrow.
         """
         up = inputs.terrain.leg_up_ws
         if not self.limited:
@@ -82,13 +111,12 @@ class AbstractLimitedProbe(AbstractProbe):
         above = vec.dot(starts_ws - root, up) - self.max_step_up - margin
         above = jnp.where(above > 0, above, 0.0)
         # Both by one search: each search adds much to a program.
-        hits = self.find(
-            inputs,
-            jnp.stack([starts_ws, starts_ws - vec.scale(up, above)]),
-            jnp.stack([reach + jnp.zeros_like(above), reach - above]),
-            layers,
-        )
+        starts = jnp.stack([starts_ws, starts_ws - vec.scale(up, above)])
+        reaches = jnp.stack([reach + jnp.zeros_like(above), reach - above])
+        hits = self.find(inputs, starts, reaches, layers)
         accepted = hits.found * self._trust_from(root, hits, up, margin)
+        if self.check_support and stood_on:
+            accepted *= self._trust_of_width(inputs, starts, reaches, hits, layers)
         first, below = (jax.tree.map(lambda x: x[i], hits) for i in range(2))  # noqa: B023
         # Ground that is refused for its slope may be hit by both rays.
         lies_below = below.distance + above > first.distance + SAME_GROUND
@@ -134,6 +162,24 @@ class AbstractLimitedProbe(AbstractProbe):
         step = rise - slope
         step -= jnp.where(step > margin, margin, jnp.where(step < -margin, -margin, step))
         return self.trust(step, hits.normal, up_ws)
+
+    def _trust_of_width(
+        self, inputs: Inputs, starts_ws: Array, reach: Array, hits: Hit, layers: Array
+    ) -> Array:
+        """0..1, how far each hit is accepted for the ground around it."""
+        up, radius = inputs.terrain.leg_up_ws, self.support_radius
+        ahead, right = foot_heading(inputs, up)
+        forward, aside = jnp.moveaxis(jnp.asarray(RING, starts_ws.dtype), -1, 0)[..., None]
+        ways = vec.scale(vec.scale(ahead, forward) + vec.scale(right, aside), radius)
+        ways = ways.reshape(len(RING), *[1] * (starts_ws.ndim - ahead.ndim), *ahead.shape)
+        starts = starts_ws + ways
+        reach = jnp.broadcast_to(reach + radius, starts.shape[:-1])
+        around = cast(inputs.terrain, starts, reach, layers)
+        even = vec.dot(hits.point - starts_ws, up) + climb(hits.normal, ways, up)
+        gap = jnp.abs(vec.dot(around.point - starts, up) - even)
+        level = around.found * (1.0 - smoothstep(vec.safe_divide(gap, radius) - 0.5))
+        missing = self.min_support - level.sum(0) / len(RING)
+        return 1.0 - smoothstep(missing / SUPPORT_FADE)
 
 
 def climb(normal: Array, way: Array, up_ws: Array) -> Float[Array, "*b"]:

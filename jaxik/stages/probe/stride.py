@@ -148,6 +148,9 @@ class StrideProbe(AbstractLimitedProbe):
         fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
         path_ws = stride.last_ws + vec.scale(way_ws, fractions)
         path = self._ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
+        if self.check_support:
+            ends = self._ground_at(inputs, level, path_ws[jnp.array([0, -1])], stood_on=True)
+            path = jax.tree.map(lambda x, y: jnp.concatenate([y[:1], x[1:-1], y[1:]]), path, ends)
         heights = level.height(path.point)
         low, high = heights[0], heights[-1]
         last, next_ = (jax.tree.map(lambda x: x[end], path) for end in (0, -1))  # noqa: B023
@@ -214,13 +217,16 @@ class StrideProbe(AbstractLimitedProbe):
         fraction = jnp.where(known, labelled.fraction, fraction)
         return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known)
 
-    def _ground_at(self, inputs: Inputs, level: "Level", points_ws: Array) -> Hit:
+    def _ground_at(
+        self, inputs: Inputs, level: "Level", points_ws: Array, stood_on: bool = False
+    ) -> Hit:
         """The ground above or below these points."""
         above = level.project(points_ws)
         away = vec.length(above - level.origin_ws)
         margin = jnp.where(away > self.max_step_up, STAIRS * (away - self.max_step_up), 0.0)
         above += vec.scale(level.up_ws, self.ray_up)
-        return self.cast(inputs, above, self.ray_up + self.ray_down, self.layers, margin)
+        reach = self.ray_up + self.ray_down
+        return self.cast(inputs, above, reach, self.layers, margin, stood_on)
 
     def _trust_of_way(self, heights: Array, found: Array) -> Float[Array, " legs"]:
         """0..1, how far the highest step that cannot be avoided on the way is accepted.

@@ -6,6 +6,8 @@ Heights are above the root along up, m; everything is in world space.
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from reference.characters import Ground, Parameters
 from reference.maths import Array, across, clip, smooth01, unit
 from reference.terrain import ALL_LAYERS, Hit
@@ -29,8 +31,12 @@ def read(
     start: Array,
     reach: float,
     mask: int = ALL_LAYERS,
+    ahead: Array | None = None,
 ) -> Reading:
-    """The ground below a point, or that below the highest step where the first is refused."""
+    """The ground below a point, or that below the highest step where the first is refused.
+
+    With the heading of a foot, ground narrower than its sole is refused too.
+    """
     up = terrain.up
     first = terrain.cast(start, reach, mask)
     above = float((start - root_ws) @ up) - parameters.of_leg("probe.max_step_up", leg)
@@ -40,7 +46,13 @@ def read(
     if float((first.point - below.point) @ up) < 1e-3:  # the same ground again
         below = below._replace(found=False)
     sure = accepted(parameters, leg, up, root_ws, first)
-    rest = (1.0 - sure) * accepted(parameters, leg, up, root_ws, below)
+    rest = accepted(parameters, leg, up, root_ws, below)
+    if ahead is not None:
+        sure *= wide_enough(parameters, terrain, leg, first, start, reach, mask, ahead)
+        over = max(above, 0.0)
+        under = start - up * over
+        rest *= wide_enough(parameters, terrain, leg, below, under, reach - over, mask, ahead)
+    rest *= 1.0 - sure
     if sure + rest == 0.0:
         return Reading(0.0, first.point, first.normal)
     share = rest / (sure + rest)
@@ -74,3 +86,30 @@ def gentle(parameters: Parameters, leg: int, up: Array, normal: Array) -> float:
     """1 for a slope that counts, 0 for one that is too steep."""
     steepness = math.acos(clip(float(normal @ up), -1.0, 1.0))
     return 1.0 - smooth01((steepness - parameters.of_leg("probe.max_slope", leg)) / FADE)
+
+
+def wide_enough(
+    parameters: Parameters,
+    terrain: Ground,
+    leg: int,
+    hit: Hit,
+    start: Array,
+    reach: float,
+    mask: int,
+    ahead: Array,
+) -> float:
+    """From 0 to 1: less if the plane of a hit does not go on around it."""
+    if not hit.found:
+        return 0.0
+    up, radius = terrain.up, parameters.of_leg("probe.support_radius", leg)
+    right = np.cross(ahead, up)
+    support = 0.0
+    for turn in np.radians(range(0, 360, 45)):
+        way = radius * (math.cos(turn) * ahead + math.sin(turn) * right)
+        around = terrain.cast(start + way, reach + radius, mask)
+        if around.found:
+            expected = hit.point @ up - (way @ hit.normal) / (hit.normal @ up)
+            gap = abs(float(around.point @ up - expected))
+            support += 1.0 - smooth01(gap / radius - 0.5)
+    lacking = parameters.of_leg("probe.min_support", leg) - support / 8.0
+    return 1.0 - smooth01(lacking / 0.25)
