@@ -46,6 +46,7 @@ SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 def cache(tmp_path_factory):
     """A folder for compiled programs, so that the commands leave the user's alone."""
     folder = tmp_path_factory.mktemp("compiled")
+    jax.clear_caches()  # what other tests compiled rounds differently from a child process
     jax.config.update("jax_compilation_cache_dir", str(folder))
     yield folder
     jax.config.update("jax_compilation_cache_dir", None)

@@ -114,9 +114,9 @@ def test_values_and_derivatives_are_finite(preset: str, name: str, gate: Any):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
 
 
-@pytest.mark.parametrize(("preset", "name"), BOTH)
-def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(preset: str, name: str):
-    inputs = inputs_of(preset, name)
+@pytest.mark.parametrize("name", SINGULAR)
+def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(name: str):
+    inputs = inputs_of("by speed", name)
     tangents = tangents_of(inputs)
     forward = measured(inputs, tangents, HARD)[1]["everything"]
     backward = jax.tree.map(np.asarray, reverse_gradients(inputs))

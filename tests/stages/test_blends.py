@@ -75,9 +75,7 @@ RECORD, OZZ, UNREAL, MEC = (
 )
 BLENDS = {
     "record on unreal's pelvis": blend(RECORD, UNREAL, "pelvis"),
-    "unreal's feet on record's pelvis": blend(UNREAL, RECORD, "pelvis"),
     "mec's plant with ozz's aim": blend(MEC, OZZ, "foot"),
-    "record with ozz's root": blend(RECORD, OZZ, "root"),
     "ozz with mec's fade and unreal's idling": dataclasses.replace(
         OZZ, contact=contact.IdleContact(), effector=effector.FadeEffector()
     ),

@@ -195,9 +195,8 @@ def test_feet_land_at_the_speed_of_the_fall():
     assert heights[29] > 0.1 and abs(heights[35]) < 1e-3, "the ground is met within 0.1 s"
 
 
-@pytest.mark.parametrize("preset", ["record", "stride"])
-def test_a_leg_that_is_not_there_changes_no_landing(preset):
-    ik, ground = getattr(jaxik.presets, preset)(), to_terrain(planes((0.2, 0.1, -0.12)))
+def test_a_leg_that_is_not_there_changes_no_landing():
+    ik, ground = jaxik.presets.record(), to_terrain(planes((0.2, 0.1, -0.12)))
     rig, frames = to_rig(make_rig()), falling()
     padded_rig, padded_frames = three_legged(rig, frames)
     run = jax.jit(jaxik.run, compiler_options=QUICK)

@@ -19,7 +19,6 @@ from jaxik.stages.probe.limits import AbstractLimitedProbe
 from jaxik.world.terrain import ALL_LAYERS
 from reference import maths
 from reference.characters import Parameters
-from reference.maths import Array
 from reference.stages import limits
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import RIG
@@ -48,7 +47,7 @@ def accepted_ground(ik: jaxik.FootIK, ground: Any, starts_ws: Any) -> Any:
     return hit.found, hit.point, hit.normal
 
 
-def box(height: float, half_left: float, half_ahead: float, over: Array) -> PlainTerrain:
+def box(height: float, half_left: float, half_ahead: float, over: np.ndarray) -> PlainTerrain:
     """A plate of this size around each point, over a floor half a metre lower."""
     plates = []
     for x, _, z in over:
@@ -58,7 +57,7 @@ def box(height: float, half_left: float, half_ahead: float, over: Array) -> Plai
     return PlainTerrain(maths.Y, triangles=np.concatenate([np.array(plates), floor]))
 
 
-def found_on(ik: jaxik.FootIK, ground: PlainTerrain, at: Array) -> np.ndarray:
+def found_on(ik: jaxik.FootIK, ground: PlainTerrain, at: np.ndarray) -> np.ndarray:
     """How far the ground below each point is accepted, for the left leg."""
     starts = np.repeat((at + [0, UP_START, 0])[:, None], 2, axis=1)
     return np.asarray(accepted_ground(ik, to_terrain(ground), jnp.asarray(starts))[0])[:, 0]
