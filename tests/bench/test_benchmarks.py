@@ -39,14 +39,6 @@ SMALL = Sizes(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def fast_compilation():
-    """Compiles without most optimisations, as each program runs only twice."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def run_suite(name: str, sizes: Sizes = SMALL) -> runner.Report:
     """Runs the benchmark of the ceilings and this one."""
     benchmarks = suite.choose(suite.BENCHMARKS, name)

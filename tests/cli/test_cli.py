@@ -175,9 +175,7 @@ def test_a_sampling_that_was_killed_ends_with_the_chain_of_an_unbroken_one(
     process = subprocess.Popen(
         [sys.executable, "-m", "support.quick", "sample", str(killed)]
         + ["--max-steps", "1000000"],
-        env=os.environ
-        | {"PYTHONPATH": paths, "JAX_COMPILATION_CACHE_DIR": str(cache)}
-        | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
+        env=os.environ | {"PYTHONPATH": paths, "JAX_COMPILATION_CACHE_DIR": str(cache)},
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     journal = journal_path(killed / run_folder.CHAIN)
