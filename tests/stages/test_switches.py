@@ -256,7 +256,8 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 # Stages whose numbers have tests of their own: `test_stride_warp`, `test_separation`, `test_fade`.
-IN_OWN_TESTS = ("warp.", "separation.", "fade.")
+WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_narrow_ground`
+IN_OWN_TESTS = ("warp.", "separation.", "fade.", *WIDTHS)
 # Parameters that no other rule of the system reads; their cases are those of the record.
 ALWAYS_STANDING = Case(  # the feet of this contact
     "effector.by_contact", "lifts its feet", RAISED, (False, True), "everything", 0

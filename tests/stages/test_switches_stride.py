@@ -230,7 +230,8 @@ def listed(cases: dict[str, tuple[Case, ...]]) -> Any:
 
 
 # Stages whose numbers have tests of their own, as in `test_switches`; `test_spine_lean` is another.
-IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.")
+WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_narrow_ground`
+IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS)
 SLOPED = {
     preset: tuple(case for case in cases if has_slope(case, preset))
     for preset, cases in CASES.items()
