@@ -54,8 +54,8 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         faithful: whether feet stand and lock by the height of their ankles and the ankles alone are
             held, as the record's fields have it. Feet then also lock while they swing low over the
             ground. If not, they stand while their balls are low and slow, ball and heading are
-            held, and feet that locks bring together keep apart. `jaxik.record` reads and writes the
-            bytes of the faithful system.
+            held, feet that locks bring together keep apart, and steps of the ground are smoothed.
+            `jaxik.record` reads and writes the bytes of the faithful system.
     """
     ik = FootIK(
         root=KeepRoot(),
@@ -77,7 +77,13 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
             ik,
             probe=FootProbe(max_step_up=0.33),  # its root may stay on the animation's floor
             contact=SpeedContact(**STANDING, half_life=0.03),
-            target=SlopeTarget(max_ankle_height=1.0),
+            target=SlopeTarget(
+                max_ankle_height=1.0,
+                rise_half_life=0.04,
+                fall_half_life=0.04,
+                spring=True,
+                follow_slopes=True,
+            ),
             lock=OffsetLock(
                 hold_ball=True,
                 release_max_angle=math.pi,

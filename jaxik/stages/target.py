@@ -55,6 +55,8 @@ class TargetState:
     """m, along up."""
     velocity: Float[Array, " legs"]
     """m/s, over the ground; 0 unless it follows as a spring."""
+    point_ws: Float[Array, "legs 3"]
+    """m, the foothold before smoothing."""
 
 
 class SlopeTarget(AbstractTarget):
@@ -98,10 +100,13 @@ class SlopeTarget(AbstractTarget):
     spring: Leaf = switch(
         False, doc="Whether footholds follow the ground as a critically damped spring."
     )
+    follow_slopes: Leaf = switch(
+        False, doc="Whether footholds keep up with a slope on which they move, without delay."
+    )
 
     def init(self, rig: Rig) -> TargetState:
         zero = jnp.zeros_like(rig.side)
-        return TargetState(zero, zero)
+        return TargetState(zero, zero, jnp.zeros((*zero.shape, 3), zero.dtype))
 
     def sense(self, inputs: Inputs, ground: GroundHits, contact: Contact) -> Foothold:
         hit, up_ws = ground.ankle, inputs.terrain.leg_up_ws
@@ -116,7 +121,8 @@ class SlopeTarget(AbstractTarget):
         self, now: SensedMoment, state: TargetState
     ) -> tuple[TargetState, Float[Array, " legs"]]:
         foothold, gate, dt = now.sensed.foothold, now.gate, now.dt
-        before = state.height + now.sensed.ground_rise
+        climb = jnp.where(self.follow_slopes, self._climb(now, state), 0.0)
+        before = state.height + now.sensed.ground_rise + climb
         gap = foothold.height - before
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         fraction = gate.choose(
@@ -134,7 +140,16 @@ class SlopeTarget(AbstractTarget):
         rise = height - foothold.height
         ankle = foothold.ankle_height_ms + rise * foothold.climb
         kept = gate.clip(ankle, self.min_ankle_height, self.max_ankle_height, band=HEIGHT_BAND)
-        return TargetState(height, velocity), rise + (kept - ankle)
+        return TargetState(height, velocity, foothold.point_ws), rise + (kept - ankle)
+
+    def _climb(self, now: SensedMoment, state: TargetState) -> Float[Array, " legs"]:
+        """m, by which the slope rises over each foothold's way since the previous frame."""
+        sensed, up_ws = now.sensed, now.sensed.leg_up_ws
+        normal = sensed.ground.ankle.normal
+        way_ws = sensed.foothold.point_ws - sensed.carry.apply(state.point_ws)
+        level_ws = way_ws - vec.scale(up_ws, vec.dot(way_ws, up_ws))
+        climb = -vec.dot(normal, level_ws) / slope_cosine(self.max_slope, normal, up_ws, now.gate)
+        return jnp.where(now.started, climb, 0.0)
 
 
 class SoleTarget(AbstractInstantTarget):
@@ -228,9 +243,13 @@ def slope_height(
     Slopes steeper than `max_slope`, rad, count as that steep. ozz-animation's foot IK sample gets
     the same height from similar triangles.
     """
+    return foot_height / slope_cosine(max_slope, normal, up_ws, gate)
+
+
+def slope_cosine(max_slope: Array, normal: Array, up_ws: Array, gate: AbstractGate) -> Array:
+    """Cosine of a slope's angle; slopes steeper than `max_slope`, rad, count as that steep."""
     steepest = jnp.cos(max_slope)
-    cosine = gate.clip(vec.dot(normal, up_ws), steepest, jnp.ones_like(steepest), band=0.01)
-    return foot_height / cosine
+    return gate.clip(vec.dot(normal, up_ws), steepest, jnp.ones_like(steepest), band=0.01)
 
 
 def _below(ankle_ws: Array, up_ws: Array, lift: Array) -> Array:

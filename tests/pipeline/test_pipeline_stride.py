@@ -73,7 +73,7 @@ SUPPORT = {
     "pelvis.rise_half_life": 0.05,
     "pelvis.fall_half_life": 0.03,
 }
-SPRUNG = {"target.spring": True, "pelvis.spring": True}
+SPRUNG = {"target.spring": True, "target.follow_slopes": True, "pelvis.spring": True}
 CASES: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
     ("as it is", "stride", {}, {}),
     ("unknown footholds", "stride", LOCKS, {"footholds_known": False}),

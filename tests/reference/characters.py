@@ -27,6 +27,7 @@ DEFAULTS: dict[str, Any] = {
     "target.rise_half_life": 0.0,
     "target.fall_half_life": 0.0,
     "target.spring": False,
+    "target.follow_slopes": False,
     "lean.forward_rate": -0.30,
     "lean.side_rate": -0.10,
     "lean.forward_rate_slide": 0.80,
@@ -204,10 +205,18 @@ class Hold:
 
 
 @dataclass
+class Followed:
+    """Height of the ground as a foothold follows it, and the foothold where the ground is."""
+
+    height: Motion
+    foothold_ws: Array
+
+
+@dataclass
 class State:
     """Memory of the `record` system; lists have one entry per leg."""
 
-    ground: list[Motion]
+    ground: list[Followed]
     slope: list[Motion]  # ahead and to the right
     slide_weight: float
     pelvis_height: float

@@ -229,6 +229,15 @@ RULES = (  # switches of our rules that the record lacks; off by default
         NO_LOCK | {"target.rise_half_life": 0.2},
     ),
     Case(
+        "target.follow_slopes",
+        "goes forward",
+        RAMP_UP,
+        (False, True),
+        "target height",
+        1,
+        NO_LOCK | {"target.rise_half_life": 0.2},
+    ),
+    Case(
         "lean.spring",
         "goes forward",
         LATE,

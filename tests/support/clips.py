@@ -38,6 +38,7 @@ ODD: dict[str, Any] = {  # all parameters away from their defaults
     "target.rise_half_life": 0.03,
     "target.fall_half_life": 0.06,
     "target.spring": True,
+    "target.follow_slopes": True,
     "lean.forward_rate": 0.5,
     "lean.side_rate": -0.4,
     "lean.forward_rate_slide": -0.6,

@@ -9,6 +9,7 @@ import numpy as np
 
 from reference import maths
 from reference.characters import (
+    Followed,
     Foot,
     Frame,
     Ground,
@@ -141,18 +142,35 @@ def lean(
 
 
 def smooth_height(
-    parameters: Parameters, leg: int, foot: Foot, up: Array, before: Motion | None, frame: Frame
-) -> Motion:
-    """Smoothed height of the foothold along up, m."""
-    goal = float(up @ foot.foothold_ws)
-    if before is not None:
+    parameters: Parameters, leg: int, foot: Foot, up: Array, memory: Followed | None, frame: Frame
+) -> Followed:
+    """Smoothed height of the foothold along up, m.
+
+    With `follow_slopes` the height first moves as the plane of the ground does under the foothold.
+    """
+    goal, before = float(up @ foot.foothold_ws), None
+    if memory is not None:
         origin = carried(frame, foot.hit, np.zeros(3))
         turn = turned(frame, foot.hit, maths.IDENTITY)
         place_before = rotate(maths.inverse(turn), foot.foothold_ws - origin)
-        before = Motion(before.value + goal - float(up @ place_before), before.velocity)
+        height = memory.height.value + goal - float(up @ place_before)
+        if parameters.of_leg("target.follow_slopes", leg):
+            way = foot.foothold_ws - carried(frame, foot.hit, memory.foothold_ws)
+            height += slope_rise(parameters, leg, foot.hit.normal, way, up)
+        before = Motion(height, memory.height.velocity)
     rises = before is None or goal > before.value
     half_life = parameters.of_leg(f"target.{'rise' if rises else 'fall'}_half_life", leg)
-    return maths.follow(before, goal, half_life, frame.dt, parameters.of_leg("target.spring", leg))
+    spring = parameters.of_leg("target.spring", leg)
+    return Followed(maths.follow(before, goal, half_life, frame.dt, spring), foot.foothold_ws)
+
+
+def slope_rise(parameters: Parameters, leg: int, normal: Array, way: Array, up: Array) -> float:
+    """How far a plane with this normal rises along a way, m: as far as it is at most this steep."""
+    steepness = math.acos(clip(float(normal @ up), -1.0, 1.0))
+    uphill = across(-normal, up)
+    if steepness <= parameters.of_leg("target.max_slope", leg):
+        return float(way @ unit(uphill, up)) * math.tan(steepness)
+    return float(way @ uphill) / math.cos(parameters.of_leg("target.max_slope", leg))
 
 
 def clamped_target(

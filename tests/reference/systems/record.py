@@ -24,6 +24,10 @@ STANDS_BY_SPEED = contact_by_speed.DEFAULTS | {
     "contact.raised_speed": 0.35,
     "contact.half_life": 0.03,
     "target.max_ankle_height": 1.0,
+    "target.rise_half_life": 0.04,
+    "target.fall_half_life": 0.04,
+    "target.spring": True,
+    "target.follow_slopes": True,
     "lock.hold_ball": True,
     "lock.release_max_angle": math.pi,
     "lock.release_heading": 0.5,
@@ -65,14 +69,14 @@ def step(
         parameters, feet, forward, up, state, frame
     )
 
-    heights, footholds, targets = [], [], []
+    followed, footholds, targets = [], [], []
     for leg in legs:
         before = None if state is None else state.ground[leg]
-        height = ground.smooth_height(parameters, leg, feet[leg], up, before, frame)
+        memory = ground.smooth_height(parameters, leg, feet[leg], up, before, frame)
         foothold, target = ground.clamped_target(
-            parameters, leg, feet[leg], up, height.value, frame
+            parameters, leg, feet[leg], up, memory.height.value, frame
         )
-        heights.append(height)
+        followed.append(memory)
         footholds.append(foothold)
         targets.append(target)
 
@@ -104,7 +108,7 @@ def step(
         solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle), reached))
 
     state = State(
-        ground=heights,
+        ground=followed,
         slope=slope,
         slide_weight=slide,
         pelvis_height=pelvis,
@@ -123,7 +127,7 @@ def step(
         "target_ws": np.array(targets),
         "slope": np.array([eased.value for eased in slope]),
         "slide_weight": np.array(slide),
-        "ground_height": np.array([eased.value for eased in heights]),
+        "ground_height": np.array([memory.height.value for memory in followed]),
         "pelvis_height": np.array(pelvis),
         "pelvis_offset_ws": pelvis_offset_ws,
     }

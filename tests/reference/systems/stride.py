@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from reference import characters, maths
-from reference.characters import Foot, Frame, Ground, Hold, Parameters, Rig
+from reference.characters import Followed, Foot, Frame, Ground, Hold, Parameters, Rig
 from reference.maths import Array, Motion, Transform, apply, length, lerp
 from reference.stages import contact_by_speed, ground, heel, limb, stride_probe
 from reference.stages.contact_by_speed import Standing
@@ -86,7 +86,7 @@ class State:
     """Memory between frames; lists have one entry per leg."""
 
     standing: list[Standing]
-    ground: list[Motion]
+    ground: list[Followed]
     holds: list[Hold]
     pelvis: Motion
     pelvis_goal: float
@@ -106,7 +106,7 @@ def step(
     legs = range(len(frame.weight))
     ups = [characters.under(terrain, leg).up for leg in legs]
     offset_before = np.zeros(3) if state is None else state.pelvis_offset_ws
-    standing, feet, heights, holds, footholds, targets = [], [], [], [], [], []
+    standing, feet, followed, holds, footholds, targets = [], [], [], [], [], []
     swings, turns = [], []
     for leg, up in zip(legs, ups, strict=True):
         before = None if state is None else state.standing[leg]
@@ -118,10 +118,10 @@ def step(
         below = characters.under(terrain, leg)
         foot, swing = sense(parameters, rig, below, frame, leg, contact_of_leg)
 
-        eased = ground.smooth_height(
-            parameters, leg, foot, up, None if state is None else state.ground[leg], frame
-        )
-        foothold, target = ground.clamped_target(parameters, leg, foot, up, eased.value, frame)
+        memory = None if state is None else state.ground[leg]
+        memory = ground.smooth_height(parameters, leg, foot, up, memory, frame)
+        height = memory.height.value
+        foothold, target = ground.clamped_target(parameters, leg, foot, up, height, frame)
         hold = None if state is None else state.holds[leg]
         hold, offset, turn = ground.lock(
             parameters, leg, foot, foothold, up, hold, offset_before, frame
@@ -129,7 +129,7 @@ def step(
         standing.append(contact_of_leg)
         feet.append(foot)
         swings.append(swing)
-        heights.append(eased)
+        followed.append(memory)
         holds.append(hold)
         turns.append(turn)
         footholds.append(foothold)
@@ -166,8 +166,8 @@ def step(
         "fraction": np.array([swing.fraction for swing in swings]),
         "hit_ws": np.array([foot.hit.point for foot in feet]),
         "normal": np.array([foot.hit.normal for foot in feet]),
-        "ground_height": np.array([eased.value for eased in heights]),
-        "ground_velocity": np.array([eased.velocity for eased in heights]),
+        "ground_height": np.array([memory.height.value for memory in followed]),
+        "ground_velocity": np.array([memory.height.velocity for memory in followed]),
         "foothold_ws": np.array(footholds),
         "locked": np.array([hold.locked for hold in holds]),
         "factor": np.array([hold.factor for hold in holds]),
@@ -180,7 +180,7 @@ def step(
         "reached": np.array(reached),
         "stretch": np.array(stretches),  # by how much the target is farther than animated
     }
-    after = State(standing, heights, holds, eased, goal, offset_ws)
+    after = State(standing, followed, holds, eased, goal, offset_ws)
     return after, output | characters.joints(solved)
 
 
