@@ -3,6 +3,7 @@
 NumPy; lengths in metres, y up.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +62,9 @@ class FootStates:
     """1 or 0; NaN where there is no target."""
 
 
-def measure(motion: Motion, animated: Motion, feet: FootStates, fps: float) -> Measures:
+def measure(
+    motion: Motion, animated: Motion, feet: FootStates, fps: float, cuts: Sequence[int] = ()
+) -> Measures:
     """All measures of a motion.
 
     Args:
@@ -69,19 +72,20 @@ def measure(motion: Motion, animated: Motion, feet: FootStates, fps: float) -> M
         animated: before it.
         feet: of the motion.
         fps: frames per second.
+        cuts: frames at which the motion starts anew, as in a teleport; see `Clip.cuts`.
     """
     depth = np.maximum(-feet.gap, 0.0)
     correction = np.asarray(motion.ankle) - np.asarray(animated.ankle)
-    speed = correction_speed(correction, fps)
+    speed = correction_speed(correction, fps, cuts)
     return Measures(
         penetration_mean=_mean(depth),
         penetration_max=_largest(depth),
         clearance=_mean(np.maximum(feet.gap, 0.0)[feet.stance]),
-        slide=slide_per_stance(np.asarray(motion.toe), feet.stance),
+        slide=slide_per_stance(np.asarray(motion.toe), feet.stance, cuts),
         pop_max=_largest(speed),
         pops=float(sum(len(contacts.runs(leg_speed > POP)) for leg_speed in speed.T)),
-        knee_jerk=jerk(motion.knee_angle, fps),
-        pelvis_jerk=jerk(np.asarray(motion.pelvis)[:, 1], fps),
+        knee_jerk=jerk(motion.knee_angle, fps, cuts),
+        pelvis_jerk=jerk(np.asarray(motion.pelvis)[:, 1], fps, cuts),
         reached=_mean(feet.reached),
         straight=_mean((motion.knee_angle > STRAIGHT_KNEE).astype(float)),
     )
@@ -115,13 +119,15 @@ def gaps(
 
 
 def slide_per_stance(
-    ball_ws: Float[np.ndarray, "frames legs 3"], stance: Bool[np.ndarray, "frames legs"]
+    ball_ws: Float[np.ndarray, "frames legs 3"],
+    stance: Bool[np.ndarray, "frames legs"],
+    cuts: Sequence[int] = (),
 ) -> float:
     """Length of the ball's horizontal path in a stance, m; median over the stances of all feet.
 
     Stances of a single frame are left out; NaN where there are no others.
     """
-    steps = np.linalg.norm(np.diff(ball_ws[..., [0, 2]], axis=0), axis=-1)
+    steps = horizontal_steps(ball_ws, cuts)
     travelled = np.concatenate([np.zeros((1, ball_ws.shape[1])), np.cumsum(steps, axis=0)])
     slides = [
         travelled[last, leg] - travelled[first, leg]
@@ -132,10 +138,19 @@ def slide_per_stance(
     return float(np.median(slides)) if slides else float("nan")
 
 
+def horizontal_steps(
+    points_ws: Float[np.ndarray, "frames legs 3"], cuts: Sequence[int] = ()
+) -> Float[np.ndarray, "steps legs"]:
+    """How far points move from frame to frame over the ground, m; not at all where a cut is."""
+    steps = np.linalg.norm(np.diff(points_ws[..., [0, 2]], axis=0), axis=-1)
+    steps[[cut - 1 for cut in cuts]] = 0.0
+    return steps
+
+
 def correction_speed(
-    correction_ws: Float[np.ndarray, "frames legs 3"], fps: float
+    correction_ws: Float[np.ndarray, "frames legs 3"], fps: float, cuts: Sequence[int] = ()
 ) -> Float[np.ndarray, "changes legs"]:
-    """How fast corrections change, m in a `TICK`.
+    """How fast corrections change, m in a `TICK`; NaN where a cut lies between.
 
     The change is taken over a tick, or over a frame where frames are longer. A steady change gives
     the same number at every frame rate. A jump gives its size at 60 Hz and its multiples, and half
@@ -143,15 +158,20 @@ def correction_speed(
     """
     frames = max(1, round(fps * TICK))
     change = np.linalg.norm(correction_ws[frames:] - correction_ws[:-frames], axis=-1)
+    for cut in cuts:
+        change[max(cut - frames, 0) : cut] = np.nan
     return change * (fps * TICK / frames)
 
 
-def jerk(series: Float[np.ndarray, "*b"], fps: float) -> float:
+def jerk(series: Float[np.ndarray, "*b"], fps: float, cuts: Sequence[int] = ()) -> float:
     """Root mean square of the third derivative, per s³, of a series with frames on its first axis.
 
-    Taken by differences of four consecutive frames; NaN for shorter series.
+    Taken by differences of four consecutive frames, none of which starts anew (`cuts`); NaN for
+    shorter series.
     """
     third = np.diff(series, n=3, axis=0) * fps**3
+    across = [first for cut in cuts for first in range(max(cut - 3, 0), min(cut, len(third)))]
+    third = np.delete(third, across, axis=0)
     return float(np.sqrt(np.mean(third**2))) if third.size else float("nan")
 
 

@@ -145,7 +145,7 @@ def _slides(
     clip: Clip, stance: Bool[np.ndarray, "frames legs"]
 ) -> Float64[np.ndarray, "frames legs"]:
     """Length of the ball's horizontal path in each stance, m, at its first frame; NaN elsewhere."""
-    steps = np.linalg.norm(np.diff(clip.joints_ws(3)[..., [0, 2]], axis=0), axis=-1)
+    steps = measures.horizontal_steps(clip.joints_ws(3), clip.cuts)
     slides = np.full(stance.shape, np.nan)
     for leg in range(stance.shape[1]):
         for first, last in contacts.runs(stance[:, leg]):
@@ -160,7 +160,7 @@ def _pops(solved: Clip, animated: Clip) -> Float64[np.ndarray, "frames legs"]:
         clip.joints_ws(2) - clip.positions_ws[:, clip.rig.pelvis][:, None]
         for clip in (animated, solved)
     )
-    speeds = measures.correction_speed(after - before, solved.fps)
+    speeds = measures.correction_speed(after - before, solved.fps, solved.cuts)
     pops = np.full(before.shape[:2], np.nan)
     pops[len(pops) - len(speeds) :] = speeds
     return pops

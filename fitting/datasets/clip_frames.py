@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float64
+from jaxtyping import Array, Bool, Float64
 from scipy.spatial.transform import Rotation
 
 import jaxik
@@ -31,7 +31,8 @@ def frames_from_clip(
     """The clip as the pipeline's input: one `Frame` whose leaves have a leading frames axis.
 
     Foot IK is at full weight, there are no platforms, and the character slides where the clip
-    says so. Strides follow from the clip's contact labels. Numbers are in JAX's default precision.
+    says so. Strides follow from the clip's contact labels. After a teleport (`Clip.cuts`) memory,
+    speeds and strides start anew. Numbers are in JAX's default precision.
 
     Args:
         clip: with legs.
@@ -52,7 +53,7 @@ def frames_from_clip(
     balls = clip.joints_ws(3)
     moved = _scaled_strides(np.asarray(world.pos), balls, up_ws, stride_scale)
     root_velocity, ankle_velocity, toe_velocity = (
-        _velocity(positions, clip.fps)
+        np.concatenate([_velocity(positions[piece], clip.fps) for piece in clip.pieces])
         for positions in (np.asarray(world.pos), clip.joints_ws(2) + moved, balls + moved)
     )
     slide = np.zeros(clip.frame_count) if clip.slide is None else clip.slide
@@ -61,6 +62,7 @@ def frames_from_clip(
     def array(values: np.ndarray) -> Array:
         return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
 
+    strides = [_stride(clip.stance_labels()[at], (balls + moved)[at]) for at in clip.pieces]
     none = jaxik.Transform(*(array(np.zeros((clip.frame_count, 0, size))) for size in (3, 4)))
     frames = jaxik.Frame(
         world_from_model=world,
@@ -71,13 +73,16 @@ def frames_from_clip(
         velocity_ws=array(root_velocity),
         foot_speed=array(np.linalg.norm(ankle_velocity, axis=-1)),
         toe_speed=array(np.linalg.norm(toe_velocity, axis=-1)),
-        stride=Stride(*map(array, _stride(clip, balls + moved))),
+        stride=Stride(*(array(np.concatenate(parts)) for parts in zip(*strides, strict=True))),
         dt=array(np.full(clip.frame_count, 1.0 / clip.fps)),
         platforms=none,
         platforms_before=none,
         stride_scale=None
         if stride_scale is None
         else array(np.full(clip.frame_count, float(stride_scale))),
+        restart=jax.device_put(np.isin(np.arange(clip.frame_count), clip.cuts))
+        if clip.cuts.size
+        else None,
     )
     return frames if rise is None else frames.translated(array(_along(up_ws, rise)))
 
@@ -130,9 +135,10 @@ def _scaled_strides(
     return (scale - 1.0) * (offset - (offset @ up)[..., None] * up)
 
 
-def _stride(clip: Clip, balls: Float64[np.ndarray, "frames legs 3"]) -> tuple[np.ndarray, ...]:
+def _stride(
+    stance: Bool[np.ndarray, "frames legs"], balls: Float64[np.ndarray, "frames legs 3"]
+) -> tuple[np.ndarray, ...]:
     """The fields of a `Stride`, in order; a foot that never stands has an unknown stride."""
-    stance = clip.stance_labels()
     known = np.broadcast_to(stance.any(axis=0), stance.shape)
     last_ws, next_ws = np.zeros(balls.shape), np.zeros(balls.shape)
     fraction = np.zeros(stance.shape)

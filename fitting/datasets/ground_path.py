@@ -75,7 +75,8 @@ def place_root(
         if root == "ground":
             raise ValueError(f"{clip.source}: {MISSING}, on which to put the root")
         return clip, RootChoice(None, f"as animated: {MISSING}")
-    rise = smooth(path, stride_seconds(clip) * clip.fps) - floor
+    window = stride_seconds(clip) * clip.fps
+    rise = np.concatenate([smooth(path[piece], window) for piece in clip.pieces]) - floor
     if root == "auto" and (above := _ground_under_stances(clip, terrain, path, floor)).size:
         heights, soles = above
         if np.mean(np.abs(heights) > REACH * body.ratio(clip.rig)) <= STRAY:
@@ -93,7 +94,7 @@ def path_heights(
 
     The path starts on the ground that is next below `STEP` above the floor, or else on the highest
     one, and goes on from there: it passes under ceilings, and over gaps and holes at the height
-    that it had before them.
+    that it had before them. Where the clip has a cut, it starts anew.
 
     Args:
         clip: y up.
@@ -106,10 +107,13 @@ def path_heights(
         return None
     step = step_height(clip)
     near = heights_under(terrain, points, floor + step)
-    start = near if not np.isnan(near).all() else highest
-    first = jnp.asarray(start[~np.isnan(start)][0])
+    starts = np.full(len(points), np.nan)
+    for piece in clip.pieces:
+        start = near[piece] if not np.isnan(near[piece]).all() else highest[piece]
+        starts[piece.start] = next(iter(start[~np.isnan(start)]), np.nan)
+    starts[0] = next(iter(starts[~np.isnan(starts)]))
     fall = FALL * body.ratio(clip.rig) ** 0.5 / clip.fps
-    return np.asarray(_followed(terrain, jnp.asarray(points), first, step, fall))
+    return np.asarray(_followed(terrain, jnp.asarray(points), jnp.asarray(starts), step, fall))
 
 
 def step_height(clip: Clip) -> float:
@@ -137,23 +141,26 @@ def heights_under(
 def _followed(
     terrain: Terrain,
     points_ws: Float[Array, "frames 3"],
-    first: Array,
+    starts: Float[Array, " frames"],
     step: ArrayLike,
     fall: ArrayLike,
 ) -> Float[Array, " frames"]:
     """Heights of the ground along a path, m.
 
-    It starts at the height `first`; ground more than `step` below is fallen to, by `fall` a frame.
+    It starts at the heights `starts`, where they are not NaN; ground more than `step` below is
+    fallen to, by `fall` a frame.
     """
 
-    def advance(height: Array, point: Array) -> tuple[Array, Array]:
+    def advance(height: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        point, start = now
+        height = jnp.where(jnp.isnan(start), height, start)
         hit = cast(terrain, point.at[1].set(height + step), jnp.inf)
         falling = jnp.maximum(hit.point[1], height - fall)
         below = jnp.where(height - hit.point[1] > step, falling, hit.point[1])
         height = jnp.where(hit.found > 0, below, height)
         return height, height
 
-    return jax.lax.scan(advance, first, points_ws)[1]
+    return jax.lax.scan(advance, starts[0], (points_ws, starts))[1]
 
 
 def smooth(

@@ -115,7 +115,9 @@ def compare(
     for index, name in enumerate(clips):
         gaps = measures.gaps(soles_ws[index], ground[index])
         feet = FootStates(gaps, clip.stance_labels(), reached[name])
-        measured[name] = measures.measure(motions[name], motions[ANIMATED], feet, clip.fps)
+        measured[name] = measures.measure(
+            motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
+        )
     return Comparison(
         title=title,
         legs=clip.rig.names,

@@ -22,7 +22,7 @@ from jaxik.world.frame import Contact, Sensed, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
-from .system import Advanced, Corrections, FootIK, Result, State, Trace
+from .system import Advanced, Corrections, FootIK, Result, State, Trace, restarted
 from .tracks import Tracks, system_at
 
 
@@ -44,6 +44,7 @@ def sense_first(
         The stage's memory after each frame, and what it returns for each.
     """
     frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
+    fresh = getattr(ik, stage).init(inputs.rig), jnp.zeros_like(state.started)
 
     def rule_at(at: Tracks) -> AbstractContact | AbstractRoot:
         return getattr(system_at(ik, at), stage)
@@ -60,10 +61,11 @@ def sense_first(
         return memory, jax.vmap(lambda *now: advanced(memory, state.started, *now)[1])(*now)
 
     def scanned(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        after, output = advanced(*carry, *now)
+        now, restart = now
+        after, output = advanced(*restarted(carry, fresh, restart), *now)
         return (after, jnp.ones_like(state.started)), (after, output)
 
-    return jax.lax.scan(scanned, (memory, state.started), now)[1]
+    return jax.lax.scan(scanned, (memory, state.started), (now, frames.restart))[1]
 
 
 def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) -> Sensed:

@@ -7,7 +7,7 @@ from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.stages.inputs import Inputs, Moment, SensedMoment
@@ -17,7 +17,7 @@ from jaxik.world.terrain import LegTerrains, Terrain
 
 from .phases import advance, pose, sense, sense_first
 from .shapes import check_inputs, check_state
-from .system import Advanced, FootIK, Result, State, init
+from .system import Advanced, FootIK, Result, State, init, restarted
 from .tracks import Tracks, read_tracks, system_at
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -61,6 +61,7 @@ def step(
     check_inputs(ik, Inputs(rig, terrain, frame, gate), clip=False)
     inputs = Inputs(rig, terrain, frame, gate).at(frame)
     check_state(state, jax.eval_shape(init, ik, rig))
+    state = restarted(state, init(ik, rig), frame.restart)
     now = Moment(frame.dt, state.started, gate)
     with jax.named_scope("contact"):
         contact_state, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
@@ -102,6 +103,7 @@ def resume(
     check_inputs(ik, inputs, clip=True)
     check_state(state, jax.eval_shape(init, ik, rig))
 
+    fresh = init(ik, rig)
     values = read_tracks(ik, tracks, frames.dt.shape[0], rig.side.shape[0])
     with jax.named_scope("contact"):
         contact_states, contacts = sense_first("contact", ik, state, inputs, values)
@@ -112,15 +114,17 @@ def resume(
     )
 
     def scanned(
-        state: State, frame: tuple[Sensed, tuple[PyTree, PyTree], Transform, Tracks]
+        state: State, frame: tuple[Sensed, tuple[PyTree, PyTree], Transform, Tracks, Array | None]
     ) -> tuple[State, Advanced]:
-        sensed, first, platforms, at = frame
+        sensed, first, platforms, at, restart = frame
+        state = restarted(state, fresh, restart)
         now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain.at(platforms))
         advanced = advance(system_at(ik, at), now, state, first)
         return advanced.state, advanced
 
+    first = (contact_states, root_states)
     after, advanced = jax.lax.scan(
-        scanned, state, (sensed, (contact_states, root_states), frames.platforms, values)
+        scanned, state, (sensed, first, frames.platforms, values, frames.restart)
     )
     result = jax.vmap(lambda frame, s, a, at: pose(system_at(ik, at), inputs.at(frame), s, a))(
         frames, sensed, advanced, values

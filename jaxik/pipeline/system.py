@@ -1,6 +1,9 @@
 """What a foot-IK system is, what it remembers, and what it returns."""
 
+from typing import TypeVar
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -23,6 +26,8 @@ from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import LegPose, Rig, Transform
 
 from .shapes import check_system
+
+Tree = TypeVar("Tree")
 
 
 class FootIK(Rule):
@@ -150,3 +155,16 @@ def init(ik: FootIK, rig: Rig) -> State:
         ik.effector.init(rig),
         ik.fade.init(rig),
     )
+
+
+def restarted(memory: Tree, fresh: Tree, restart: Bool[Array, ""] | None) -> Tree:
+    """What a frame starts with: the memory of the frame before or, where it restarts, a fresh one.
+
+    Args:
+        memory: all of a system, or a part of it.
+        fresh: the same before the first frame.
+        restart: see `Frame.restart`.
+    """
+    if restart is None:
+        return memory
+    return jax.tree.map(lambda kept, new: jnp.where(restart, new, kept), memory, fresh)

@@ -71,6 +71,9 @@ class Frame:
     stride_scale: Float[Array, "*b"] | None = None
     """Speed of the character over that of its animation, by which its strides are to be scaled.
     None leaves them as animated and costs nothing."""
+    restart: Bool[Array, "*b"] | None = None
+    """True where nothing leads here from the previous frame, as after a teleport: memory starts
+    anew. Speeds and strides are then those after it. None never restarts and costs nothing."""
 
     @property
     def speed(self) -> Float[Array, "*b"]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts
+from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import gait, speed_profile, walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
@@ -202,3 +203,39 @@ def test_a_raised_clip_keeps_its_contact_labels(clip):
     raised = clip_frames.raised(unlabelled, np.linspace(0.0, 2.0, clip.frame_count))
     np.testing.assert_array_equal(raised.stance_labels(), unlabelled.stance_labels())
     assert clip_frames.raised(clip, None) is clip
+
+
+# Teleports
+
+
+def teleported(clip: Clip, frame: int) -> Clip:
+    """The clip with all frames from this one on eight metres to the side."""
+    positions = clip.positions_ws.copy()
+    positions[frame:, :, 0] += 8.0
+    return clip.with_motion(positions, clip.rotations_ws)
+
+
+def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
+    jumped = teleported(clip, 70)
+    assert clip.cuts.size == 0
+    assert jumped.cuts.tolist() == [70]
+    frames = clip_frames.frames_from_clip(jumped)
+    np.testing.assert_array_equal(np.flatnonzero(frames.restart), [70])
+    assert clip_frames.frames_from_clip(clip).restart is None
+    parts = [clip_frames.frames_from_clip(jumped.select(piece)) for piece in jumped.pieces]
+    for name in ("velocity_ws", "foot_speed", "toe_speed"):
+        expected = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_allclose(getattr(frames, name), expected, atol=1e-6)
+    for name in ("last_ws", "next_ws", "fraction", "known"):
+        expected = np.concatenate([getattr(part.stride, name) for part in parts])
+        np.testing.assert_allclose(getattr(frames.stride, name), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("fps", [10.0, 60.0])
+def test_neither_a_sprint_nor_a_stray_frame_is_a_teleport(fps):
+    clip = walker.walk(2.0, fps)
+    fast = clip.positions_ws + 12.0 * np.arange(clip.frame_count)[:, None, None] / fps * [0, 0, 1]
+    assert clip.with_motion(fast, clip.rotations_ws).cuts.size == 0
+    stray = clip.positions_ws.copy()
+    stray[clip.frame_count // 2] += [5.0, 0.0, 0.0]
+    assert clip.with_motion(stray, clip.rotations_ws).cuts.size == 0

@@ -1,12 +1,13 @@
 """`Clip`: an animation as joints in world space over frames, with its legs identified."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from jaxik.world import body
@@ -14,7 +15,7 @@ from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts
 from .joint_roles import find_roles
-from .kinematics import continuous
+from .kinematics import continuous, cuts
 from .rigs import left_directions
 
 TRACKS = ("stance", "mask", "slide", "grounded", "weight")  # optional fields with frames
@@ -91,6 +92,20 @@ class Clip:
     def body_height(self) -> float:
         """Median height of the highest joint above the lowest, m."""
         return float(np.median(np.ptp(self.positions_ws[..., 1], axis=1)))
+
+    @cached_property
+    def cuts(self) -> Int64[np.ndarray, " cuts"]:
+        """Frames at which the motion starts anew, as after a teleport; see `kinematics.cuts`."""
+        if self.measured_rig is None:
+            return np.zeros(0, np.int64)
+        leg = float(np.mean(np.asarray(self.measured_rig.thigh + self.measured_rig.shin)))
+        return cuts(self.positions_ws[:, self.measured_rig.pelvis], leg)
+
+    @property
+    def pieces(self) -> list[slice]:
+        """The frames between cuts."""
+        edges = [0, *self.cuts.tolist(), self.frame_count]
+        return [slice(first, end) for first, end in itertools.pairwise(edges)]
 
     @property
     def rig(self) -> Rig:

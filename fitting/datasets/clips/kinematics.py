@@ -7,11 +7,13 @@ eagerly it compiles its operations again for every new number of frames: 1.5 s o
 """
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 Positions = Float64[np.ndarray, "frames joints 3"]
 Rotations = Float64[np.ndarray, "frames joints 4"]  # wxyz
+JUMP = 0.5  # of a leg's length
+JUMP_RATIO = 4.0  # a runner filmed at 5 Hz moves as far in each frame, but evenly
 
 
 def world_from_local(
@@ -54,6 +56,21 @@ def local_from_world(
             positions_ls[:, joint] = parent_from_world.apply(offset_ws)
             rotations_ls[:, joint] = (parent_from_world * rot).as_quat(scalar_first=True)
     return positions_ls, continuous(rotations_ls)
+
+
+def cuts(root_ws: Float64[np.ndarray, "frames 3"], leg: float) -> Int64[np.ndarray, " cuts"]:
+    """Frames to which the root has not moved but jumped, as in a teleport.
+
+    It jumps by more than half a leg, and by several times what it moves in the frames beside.
+
+    Args:
+        root_ws: its positions, m.
+        leg: length of a leg, m.
+    """
+    steps = np.linalg.norm(np.diff(root_ws, axis=0), axis=-1)
+    beside = np.concatenate([[0.0], steps, [0.0]])
+    beside = np.maximum(beside[:-2], beside[2:])
+    return np.flatnonzero((steps > JUMP * leg) & (steps > JUMP_RATIO * beside)) + 1
 
 
 def continuous(rotations: Float64[np.ndarray, "frames *b 4"]) -> np.ndarray:

@@ -97,7 +97,7 @@ def bounds_of(animation: Animation, *, is_flat: bool) -> dict[str, float]:
 
 def pelvis_jerk(clip: Clip) -> float:
     """Jerk of the height of a clip's pelvis, m/s³."""
-    return measures.jerk(clip.positions_ws[:, clip.rig.pelvis, 1], clip.fps)
+    return measures.jerk(clip.positions_ws[:, clip.rig.pelvis, 1], clip.fps, clip.cuts)
 
 
 def swing_speed(animation: Animation) -> float:
