@@ -1,10 +1,14 @@
 """Shared fixtures: 64-bit floats, and the reference material beside the project.
 
 Programs are compiled without optimisations, which take longer than the programs run; set
-JAX_DISABLE_MOST_OPTIMIZATIONS=0 to compile them as for users, as notebooks do in any case.
+JAX_DISABLE_MOST_OPTIMIZATIONS=0 to compile them as for users, as notebooks do in any case. All
+processes of a run keep their programs in one folder, so that none compiles what another has.
 """
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -16,6 +20,11 @@ xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
 UNOPTIMIZED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # for child processes
 jax.config.update("jax_disable_most_optimizations", UNOPTIMIZED != "0")
+PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
+if PROGRAMS not in os.environ:
+    os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxik-tests-")
+    atexit.register(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True)
+jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -43,13 +43,9 @@ SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A folder for compiled programs, so that the commands leave the user's alone."""
-    folder = tmp_path_factory.mktemp("compiled")
-    jax.clear_caches()  # what other tests compiled rounds differently from a child process
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    yield folder
-    jax.config.update("jax_compilation_cache_dir", None)
+def fresh():
+    """Forgets what other tests compiled, which rounds differently from a child process."""
+    jax.clear_caches()
 
 
 @pytest.fixture
@@ -168,14 +164,14 @@ def chain_of(run: Path) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_sampling_that_was_killed_ends_with_the_chain_of_an_unbroken_one(
-    quick_residuals, run, tmp_path, cache
+    quick_residuals, run, tmp_path
 ):
     killed, whole = (Path(shutil.copytree(run, tmp_path / name)) for name in ("killed", "whole"))
     paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     process = subprocess.Popen(
         [sys.executable, "-m", "support.quick", "sample", str(killed)]
         + ["--max-steps", "1000000"],
-        env=os.environ | {"PYTHONPATH": paths, "JAX_COMPILATION_CACHE_DIR": str(cache)},
+        env=os.environ | {"PYTHONPATH": paths},
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     journal = journal_path(killed / run_folder.CHAIN)

@@ -129,7 +129,6 @@ def run_each(
     [
         *((preset, np.float64) for preset in SMOOTHED),
         ("record", np.float32),
-        ("stride", np.float32),
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )

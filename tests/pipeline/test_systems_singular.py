@@ -154,10 +154,15 @@ def tangents_of(inputs: Inputs) -> Any:
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
-def reverse_gradients(inputs: Inputs) -> Any:
-    """Gradient of a weighted sum of all outputs with respect to all floats."""
-    floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
-    return jax.grad(lambda floats: read(floats, rest, HARD)[0]["everything"])(floats)
+def reverse_gradients(inputs: Inputs, rig: jaxik.Rig) -> tuple[Any, Any]:
+    """Gradients of a weighted sum of all outputs by all floats of the inputs and of the rig."""
+    floats, rest = eqx.partition((inputs, rig), eqx.is_inexact_array)
+
+    def everything(floats: Any) -> jax.Array:
+        (inputs, rig), (others, rest_of_rig) = floats, rest
+        return read(inputs, others, HARD, eqx.combine(rig, rest_of_rig))[0]["everything"]
+
+    return jax.grad(everything)(floats)
 
 
 @pytest.mark.parametrize(("preset", "name"), BOTH)
@@ -175,7 +180,7 @@ def test_gradients_are_finite_and_equal_in_forward_and_reverse_mode(preset: str,
     inputs = inputs_of(preset, name)
     tangents = tangents_of(inputs)
     forward = measured(inputs, tangents, HARD)[1]["everything"]
-    backward = jax.tree.map(np.asarray, reverse_gradients(inputs))
+    backward = jax.tree.map(np.asarray, reverse_gradients(inputs, to_rig(RIG))[0])
     for path, slope in jax.tree_util.tree_leaves_with_path(backward):
         assert np.isfinite(slope).all(), jax.tree_util.keystr(path)
     pairs = zip(jax.tree.leaves(backward), jax.tree.leaves(tangents), strict=True)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import jaxik
-from jaxik import presets
 from jaxik.maths import parameter_tree
-from jaxik.stages import contact, effector, target
+from jaxik.stages import target
 from jaxik.world.skeleton import bone_lengths
 from reference import sample_poses
 from support.cases import QUICK, RIG
@@ -22,7 +21,6 @@ from support.clips import (
     animate,
     assert_close,
     at,
-    by_speed,
     to_frames,
     to_rig,
     to_terrain,
@@ -62,28 +60,7 @@ def draw() -> dict[str, jaxik.FootIK]:
     }
 
 
-def blend(base: jaxik.FootIK, other: jaxik.FootIK, *stages: str) -> jaxik.FootIK:
-    """The first system with some stages of another."""
-    return dataclasses.replace(base, **{stage: getattr(other, stage) for stage in stages})
-
-
-RECORD, OZZ, UNREAL, MEC = (
-    presets.record(),
-    presets.ozz(),
-    presets.unreal(),
-    presets.mec(faithful=True),
-)
-BLENDS = {
-    "record on unreal's pelvis": blend(RECORD, UNREAL, "pelvis"),
-    "mec's plant with ozz's aim": blend(MEC, OZZ, "foot"),
-    "ozz with mec's fade and unreal's idling": dataclasses.replace(
-        OZZ, contact=contact.IdleContact(), effector=effector.FadeEffector()
-    ),
-    "stride by speed, with springs": parameter_tree.replace(
-        by_speed(), {"target.spring": True, "pelvis.spring": True, "contact.half_life": 0.03}
-    ),
-    **draw(),
-}
+BLENDS = draw()
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
@@ -125,7 +102,7 @@ def results(name: str) -> tuple[jaxik.Result, jaxik.Result]:
 def test_all_rules_of_all_stages_occur_in_the_random_systems():
     for stage, rules in STAGES.items():
         assert len(rules) > 1
-        used = {type(getattr(blend, stage)) for blend in draw().values()}
+        used = {type(getattr(blend, stage)) for blend in BLENDS.values()}
         assert used == set(rules), stage
 
 

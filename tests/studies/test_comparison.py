@@ -4,7 +4,6 @@ import json
 import struct
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -32,14 +31,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings(SHOWN)]
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
 STILL = "lock.enabled = false\n[leg]\nweight = 0.0\n"  # changes nothing in the animation
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A folder for compiled programs."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    yield
-    jax.config.update("jax_compilation_cache_dir", None)
 
 
 @pytest.fixture(scope="module")

@@ -28,14 +28,6 @@ def plan(*names: str, seconds: float = BRIEF) -> situations.Plan:
     return situations.choose(",".join(names))._replace(seconds=seconds)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A folder for compiled programs."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    yield
-    jax.config.update("jax_compilation_cache_dir", None)
-
-
 @pytest.fixture(scope="module")
 def still():
     """The record's system, without any effect."""

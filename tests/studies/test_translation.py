@@ -5,7 +5,6 @@ import math
 import signal
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -34,14 +33,6 @@ TRUTH = {"pelvis.on_gain": 0.45, "pelvis.limit": 0.17}
 SOFT = {"leg.soften": 0.96}  # of the source, but not free, so that a difference remains
 FREE = ",".join(TRUTH)
 QUANTITIES = ("ankle", "knee", "pelvis", "foot", "body")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    """Compiles each program once for all tests."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    yield
-    jax.config.update("jax_compilation_cache_dir", None)
 
 
 @pytest.fixture(scope="module")

@@ -82,10 +82,13 @@ def total(tree: Any) -> jax.Array:
 Inputs = tuple[jaxik.FootIK, jaxik.Frame, Any, jaxik.State]  # system, clip, terrain, memory
 
 
-def read(floats: Any, rest: Any, gate: Any) -> tuple[dict[str, jax.Array], jaxik.State]:
+def read(
+    floats: Any, rest: Any, gate: Any, rig: jaxik.Rig | None = None
+) -> tuple[dict[str, jax.Array], jaxik.State]:
     """The measures of a clip, and the memory after it."""
     ik, frames, ground, state = eqx.combine(floats, rest)
-    after, result = jaxik.resume(ik, to_rig(RIG), ground, state, frames, gate)
+    rig = to_rig(RIG) if rig is None else rig
+    after, result = jaxik.resume(ik, rig, ground, state, frames, gate)
     return measures(result, frames), after
 
 
