@@ -27,6 +27,18 @@ if PROGRAMS not in os.environ:
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 
 ROOT = Path(__file__).resolve().parents[1]
+LONGEST = ("test_notebooks.py", "test_translation.py", "test_documents.py")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Lets workers take files in their order, not those with most tests first."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begins with the longest files, so that at the end no worker waits for one of them."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.fixture(scope="session")

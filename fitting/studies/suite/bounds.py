@@ -33,7 +33,7 @@ REASONS = {
     "swing from one foothold to the next needs on this ground",
     "jerk": f"the pelvis may have the animation's jerk and {WALK_JERK:.0f} m/s³ more, as much as a "
     "walk over a level floor has itself",
-    "reach": f"at most {MISSED:.0%} of the targets of standing feet may be missed",
+    "reach": f"at most {MISSED:.0%} of the targets of standing feet may be missed, by 5 mm or more",
 }
 """What each bound is and why, by measure."""
 

@@ -118,7 +118,7 @@ def _outcome(animation: Animation, ik: jaxik.FootIK, bounds: Mapping[str, float]
     result, solved = animation.solve(ik)
     placed, cause = animation.assess(solved)
     soles = placement.soles(solved, animation.clip, animation.terrain, animation.floor)
-    reached = reached_targets(result)[animation.clip.stance_labels()]
+    reached = reached_targets(animation, result)[animation.clip.stance_labels()]
     share = float(np.nanmean(reached)) if not np.isnan(reached).all() else float("nan")
     measured = cells(placed, pelvis_jerk(solved), share, bounds)
     return Outcome(solved, soles, placed, cause, measured)
