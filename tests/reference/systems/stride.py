@@ -31,9 +31,9 @@ PELVISES: dict[str, dict[str, Any]] = {
         "pelvis.highest_share": 0.75,
         "pelvis.extension": 0.958,
         "pelvis.softness": 0.025,
-        "pelvis.rise_half_life": 0.0,
-        "pelvis.fall_half_life": 0.0,
-        "pelvis.spring": False,
+        "pelvis.rise_half_life": 0.04,
+        "pelvis.fall_half_life": 0.04,
+        "pelvis.spring": True,
     },
     "support": {
         "pelvis.lowest_share": 0.3,
