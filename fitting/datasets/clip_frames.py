@@ -138,11 +138,11 @@ def _scaled_strides(
 def _stride(
     stance: Bool[np.ndarray, "frames legs"], balls: Float64[np.ndarray, "frames legs 3"]
 ) -> tuple[np.ndarray, ...]:
-    """The fields of a `Stride`, in order; a foot that never stands has an unknown stride."""
-    known = np.broadcast_to(stance.any(axis=0), stance.shape)
+    """The fields of a `Stride`, in order; unknown where a foot will not stand any more."""
+    known = np.cumsum(stance[::-1], axis=0)[::-1] > 0
     last_ws, next_ws = np.zeros(balls.shape), np.zeros(balls.shape)
     fraction = np.zeros(stance.shape)
-    for leg in np.flatnonzero(known[0]):
+    for leg in np.flatnonzero(stance.any(axis=0)):
         falls = contacts.footfalls(balls[:, leg], stance[:, leg])
         last_ws[:, leg] = falls.positions_ws[falls.last]
         next_ws[:, leg] = falls.positions_ws[falls.next]
