@@ -59,7 +59,7 @@ def test_a_step_restarts_as_a_clip_does():
 
 
 def test_gradients_through_a_restart_are_finite_and_stop_there():
-    ik = jaxik.presets.record()
+    ik = jaxik.presets.record(faithful=True)
 
     @functools.partial(jax.jit, compiler_options=QUICK)
     @jax.grad

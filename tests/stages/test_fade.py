@@ -182,6 +182,7 @@ def falling() -> jaxik.Frame:
     return dataclasses.replace(frames, world_from_model=root, grounded=grounded)
 
 
+@pytest.mark.slow
 def test_feet_land_at_the_speed_of_the_fall():
     frames, ground = falling(), to_terrain(planes((0.0, 0.0, -0.12)))
     rig = to_rig(make_rig())
@@ -195,6 +196,7 @@ def test_feet_land_at_the_speed_of_the_fall():
     assert heights[29] > 0.1 and abs(heights[35]) < 1e-3, "the ground is met within 0.1 s"
 
 
+@pytest.mark.slow
 def test_a_leg_that_is_not_there_changes_no_landing():
     ik, ground = jaxik.presets.record(), to_terrain(planes((0.2, 0.1, -0.12)))
     rig, frames = to_rig(make_rig()), falling()
@@ -205,6 +207,7 @@ def test_a_leg_that_is_not_there_changes_no_landing():
     np.testing.assert_allclose(padded.pose.ankle.pos[:, :2], alone.pose.ankle.pos, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_through_a_fade_are_finite_where_nothing_has_to_be_corrected():
     def height(speed: jax.Array, rise: jax.Array) -> jax.Array:
         fade = SpeedFade(speed=speed)
