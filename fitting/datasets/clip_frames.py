@@ -81,7 +81,7 @@ def frames_from_clip(
         if stride_scale is None
         else array(np.full(clip.frame_count, float(stride_scale))),
         restart=jax.device_put(np.isin(np.arange(clip.frame_count), clip.cuts))
-        if clip.cuts.size
+        if clip.cuts
         else None,
     )
     return frames if rise is None else frames.translated(array(_along(up_ws, rise)))

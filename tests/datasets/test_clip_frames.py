@@ -218,10 +218,10 @@ def teleported(clip: Clip, frame: int) -> Clip:
 
 def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
     jumped = teleported(clip, 70)
-    assert clip.cuts.size == 0
-    assert jumped.cuts.tolist() == [70]
+    assert clip.cuts == ()
+    assert jumped.cuts == (70,)
     frames = clip_frames.frames_from_clip(jumped)
-    np.testing.assert_array_equal(np.flatnonzero(frames.restart), [70])
+    np.testing.assert_array_equal(np.flatnonzero(np.asarray(frames.restart)), [70])
     assert clip_frames.frames_from_clip(clip).restart is None
     parts = [clip_frames.frames_from_clip(jumped.select(piece)) for piece in jumped.pieces]
     for name in ("velocity_ws", "foot_speed", "toe_speed"):
@@ -236,7 +236,7 @@ def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
 def test_neither_a_sprint_nor_a_stray_frame_is_a_teleport(fps):
     clip = walker.walk(2.0, fps)
     fast = clip.positions_ws + 12.0 * np.arange(clip.frame_count)[:, None, None] / fps * [0, 0, 1]
-    assert clip.with_motion(fast, clip.rotations_ws).cuts.size == 0
+    assert clip.with_motion(fast, clip.rotations_ws).cuts == ()
     stray = clip.positions_ws.copy()
     stray[clip.frame_count // 2] += [5.0, 0.0, 0.0]
-    assert clip.with_motion(stray, clip.rotations_ws).cuts.size == 0
+    assert clip.with_motion(stray, clip.rotations_ws).cuts == ()

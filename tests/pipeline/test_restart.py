@@ -23,9 +23,10 @@ run = jax.jit(jaxik.run, compiler_options=QUICK)
 @functools.cache
 def parts() -> tuple[jaxik.Frame, jaxik.Frame]:
     """A clip, and another that has nothing to do with it."""
-    return tuple(
+    first, second = (
         to_frames(wandering(make_rig(), np.random.default_rng(seed), COUNT)) for seed in (2, 5)
     )
+    return first, second
 
 
 def joined(restart: bool = True) -> jaxik.Frame:
@@ -69,7 +70,7 @@ def test_gradients_through_a_restart_are_finite_and_stop_there():
         frames = dataclasses.replace(frames, world_from_model=moved)
         result = jaxik.run(ik, RIG, GROUND, frames, jaxik.Smooth(1.0))
         leaves = jax.tree.leaves(eqx.filter((result.pose, result.body), eqx.is_inexact_array))
-        return sum(jnp.sum(leaf[COUNT:]) for leaf in leaves)
+        return jnp.sum(jnp.stack([jnp.sum(leaf[COUNT:]) for leaf in leaves]))
 
     gradient = np.asarray(slopes(joined().world_from_model.pos))
     assert np.isfinite(gradient).all()

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from jaxik.world import body
@@ -94,17 +94,17 @@ class Clip:
         return float(np.median(np.ptp(self.positions_ws[..., 1], axis=1)))
 
     @cached_property
-    def cuts(self) -> Int64[np.ndarray, " cuts"]:
+    def cuts(self) -> tuple[int, ...]:
         """Frames at which the motion starts anew, as after a teleport; see `kinematics.cuts`."""
         if self.measured_rig is None:
-            return np.zeros(0, np.int64)
+            return ()
         leg = float(np.mean(np.asarray(self.measured_rig.thigh + self.measured_rig.shin)))
         return cuts(self.positions_ws[:, self.measured_rig.pelvis], leg)
 
     @property
     def pieces(self) -> list[slice]:
         """The frames between cuts."""
-        edges = [0, *self.cuts.tolist(), self.frame_count]
+        edges = [0, *self.cuts, self.frame_count]
         return [slice(first, end) for first, end in itertools.pairwise(edges)]
 
     @property

@@ -26,7 +26,7 @@ def grounded_track(clip: Clip) -> Float64[np.ndarray, " frames"]:
     """
     if clip.grounded is not None:
         return clip.grounded
-    if clip.cuts.size:
+    if clip.cuts:
         return np.concatenate([grounded_track(clip.select(piece)) for piece in clip.pieces])
     grounded = np.ones(clip.frame_count)
     stances = clip.stance_labels().any(axis=1)

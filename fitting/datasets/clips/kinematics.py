@@ -7,7 +7,7 @@ eagerly it compiles its operations again for every new number of frames: 1.5 s o
 """
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 Positions = Float64[np.ndarray, "frames joints 3"]
@@ -58,7 +58,7 @@ def local_from_world(
     return positions_ls, continuous(rotations_ls)
 
 
-def cuts(root_ws: Float64[np.ndarray, "frames 3"], leg: float) -> Int64[np.ndarray, " cuts"]:
+def cuts(root_ws: Float64[np.ndarray, "frames 3"], leg: float) -> tuple[int, ...]:
     """Frames to which the root has not moved but jumped, as in a teleport.
 
     It jumps by more than half a leg, and by several times what it moves in the frames beside.
@@ -70,7 +70,8 @@ def cuts(root_ws: Float64[np.ndarray, "frames 3"], leg: float) -> Int64[np.ndarr
     steps = np.linalg.norm(np.diff(root_ws, axis=0), axis=-1)
     beside = np.concatenate([[0.0], steps, [0.0]])
     beside = np.maximum(beside[:-2], beside[2:])
-    return np.flatnonzero((steps > JUMP * leg) & (steps > JUMP_RATIO * beside)) + 1
+    jumps = (steps > JUMP * leg) & (steps > JUMP_RATIO * beside)
+    return tuple((np.flatnonzero(jumps) + 1).tolist())
 
 
 def continuous(rotations: Float64[np.ndarray, "frames *b 4"]) -> np.ndarray:
