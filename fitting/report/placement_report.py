@@ -147,7 +147,7 @@ def _share(fraction: float) -> str:
 
 
 def _cm(length: float) -> str:
-    return "–" if math.isnan(length) else f"{100 * length:.1f} cm"
+    return "–" if math.isnan(length) else f"{100 * length:z.1f} cm"
 
 
 def _place(extreme: Extreme) -> str:
