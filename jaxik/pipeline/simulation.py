@@ -60,8 +60,9 @@ def step(
     """
     check_inputs(ik, Inputs(rig, terrain, frame, gate), clip=False)
     inputs = Inputs(rig, terrain, frame, gate).at(frame)
-    check_state(state, jax.eval_shape(init, ik, rig))
-    state = restarted(state, init(ik, rig), frame.restart)
+    fresh = init(ik, rig)
+    check_state(state, fresh)
+    state = restarted(state, fresh, frame.restart)
     now = Moment(frame.dt, state.started, gate)
     with jax.named_scope("contact"):
         contact_state, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
@@ -101,9 +102,9 @@ def resume(
     """
     inputs = Inputs(rig, terrain, frames, gate)
     check_inputs(ik, inputs, clip=True)
-    check_state(state, jax.eval_shape(init, ik, rig))
-
     fresh = init(ik, rig)
+    check_state(state, fresh)
+
     values = read_tracks(ik, tracks, frames.dt.shape[0], rig.side.shape[0])
     with jax.named_scope("contact"):
         contact_states, contacts = sense_first("contact", ik, state, inputs, values)
