@@ -149,7 +149,7 @@ def solve(
     placement, cause = loaded.assess(solved)
     if path is not None:
         save_clip(path, solved, joints=placement_report.arrays(solved, placement))
-    log(placement_report.solved_text(result, seconds, path))
+    log(placement_report.solved_text(loaded.reached(result), seconds, path))
     where = [
         f"root: {loaded.root.reason}",
         flight.describe(loaded.clip),

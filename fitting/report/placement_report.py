@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 import jaxik
 from fitting.analysis.misplacement import Cause
@@ -18,7 +19,6 @@ from fitting.analysis.placement import (
     Extreme,
     Placement,
 )
-from fitting.analysis.playback import stage_outputs
 from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.joint_roles import find_trunk
@@ -60,12 +60,21 @@ def text(placement: Placement) -> str:
     return aligned(table(placement))
 
 
-def solved_text(result: jaxik.Result, seconds: float, path: Path | None) -> str:
-    """How long a clip took, how much ground it found and reached, and where it is written."""
-    found, reached = stage_outputs(result).sensed.foothold.found, result.reached
+def solved_text(
+    reached: Float64[np.ndarray, "frames legs"], seconds: float, path: Path | None
+) -> str:
+    """How long a clip took, how much ground it found and reached, and where it is written.
+
+    Args:
+        reached: as `Animation.reached` gives it.
+        seconds: which it took.
+        path: of the solved clip; None if it was not written.
+    """
+    found = ~np.isnan(reached)
+    share = f"{np.mean(reached[found]):.1%}" if found.any() else "none"
     return (
-        f"{len(reached)} frames in {seconds:.1f} s: ground under {float(np.mean(found)):.1%} of "
-        f"the feet, {float(np.mean(reached)):.1%} of the targets reached"
+        f"{len(reached)} frames in {seconds:.1f} s: ground under {np.mean(found):.1%} of "
+        f"the feet, {share} of the targets reached"
         + ("" if path is None else f"; written to {path}")
     )
 

@@ -13,6 +13,7 @@ import jaxik
 from fitting.analysis import placement
 from fitting.analysis.misplacement import Cause, likely_cause
 from fitting.analysis.placement import Placement
+from fitting.analysis.playback import stage_outputs
 from fitting.datasets.clip_frames import clip_from_result, frames_from_clip, raised
 from fitting.datasets.clips import Clip
 from fitting.datasets.clips.edit import at_speed
@@ -21,8 +22,11 @@ from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.experiments import systems, track_files
 from fitting.runtime import program_cache
-from jaxik.maths import parameter_tree
+from jaxik.maths import parameter_tree, quat, vec
+from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
+
+NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,19 @@ class Animation:
         if not np.isfinite(solved.positions_ws).all():
             raise ValueError("these parameters give poses that are not finite; nothing was written")
         return result, solved
+
+    def reached(self, result: jaxik.Result) -> Float64[np.ndarray, "frames legs"]:
+        """Which ankles are where the system wants them, 1 or 0; NaN without ground under the foot.
+
+        A foot may be there with part of its weight: `Result.reached` is about whole ones.
+        """
+        trace, root = stage_outputs(result), self.frames.world_from_model
+        offset_ws = trace.advanced.effector.target_ws - root.pos[:, None]
+        target_ms = quat.unrotate(root.rot[:, None], offset_ws)
+        distance = vec.length(result.pose.ankle.pos - target_ms)
+        near = np.asarray(distance) < NEAR * body.ratio(self.clip.rig)
+        grounded = np.asarray(trace.sensed.foothold.found) > 0
+        return np.where(grounded, near.astype(np.float64), np.nan)
 
     def assess(self, solved: Clip) -> tuple[Placement, Cause | None]:
         """How the feet of a solved clip are placed; why, if they are off the ground."""

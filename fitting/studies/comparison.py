@@ -14,21 +14,19 @@ from fitting.analysis import measures
 from fitting.analysis.measures import FootStates, Measures
 from fitting.analysis.misplacement import Cause
 from fitting.analysis.placement import Placement
-from fitting.analysis.playback import RAY_START, Motion, stage_outputs
+from fitting.analysis.playback import RAY_START, Motion
 from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
 from fitting.experiments.parameter_files import load_system
 from fitting.experiments.systems import preset_system
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from jaxik.maths import quat, vec
-from jaxik.world import body
+from jaxik.maths import vec
 from jaxik.world.terrain import Terrain, cast
 
 from .animations import Animation
 
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
-NEAR = 0.005  # m, of an adult: a target that the ankle misses by less is reached
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def compare(
     for name, ik in systems.items():
         with error_context(name), during(name):
             result, clips[name] = animation.solve(ik)
-        reached[name] = reached_targets(animation, result)
+        reached[name] = animation.reached(result)
 
     soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
     ground = ground_heights(animation.terrain, soles_ws)
@@ -130,22 +128,6 @@ def compare(
         measures=measured,
         placements={name: animation.assess(clips[name]) for name in systems},
     )
-
-
-def reached_targets(
-    animation: Animation, result: jaxik.Result
-) -> Float64[np.ndarray, "frames legs"]:
-    """Which ankles are where the system wants them, 1 or 0; NaN without ground under the foot.
-
-    A foot may be there with part of its weight: `Result.reached` is about whole ones.
-    """
-    trace, root = stage_outputs(result), animation.frames.world_from_model
-    offset_ws = trace.advanced.effector.target_ws - root.pos[:, None]
-    target_ms = quat.unrotate(root.rot[:, None], offset_ws)
-    distance = vec.length(result.pose.ankle.pos - target_ms)
-    near = np.asarray(distance) < NEAR * body.ratio(animation.clip.rig)
-    grounded = np.asarray(trace.sensed.foothold.found) > 0
-    return np.where(grounded, near.astype(np.float64), np.nan)
 
 
 def ground_heights(

@@ -13,7 +13,6 @@ from fitting.analysis.misplacement import Cause
 from fitting.analysis.placement import Placement, Soles
 from fitting.datasets.clips.clip import Clip
 from fitting.studies.animations import Animation
-from fitting.studies.comparison import reached_targets
 
 from .bounds import Cell, bounds_of, cells, pelvis_jerk
 from .situations import Plan, Situation
@@ -118,7 +117,7 @@ def _outcome(animation: Animation, ik: jaxik.FootIK, bounds: Mapping[str, float]
     result, solved = animation.solve(ik)
     placed, cause = animation.assess(solved)
     soles = placement.soles(solved, animation.clip, animation.terrain, animation.floor)
-    reached = reached_targets(animation, result)[animation.clip.stance_labels()]
+    reached = animation.reached(result)[animation.clip.stance_labels()]
     share = float(np.nanmean(reached)) if not np.isnan(reached).all() else float("nan")
     measured = cells(placed, pelvis_jerk(solved), share, bounds)
     return Outcome(solved, soles, placed, cause, measured)
