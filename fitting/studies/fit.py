@@ -147,7 +147,7 @@ def search(
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
     solution, space, known = fitted.solution, fitted.problem.space, fitted.identifiability
     declared = parameter_tree.declarations(space.system)
-    before = np.asarray(space.values(space.u0))
+    before = np.asarray(space.values(space.pack({})))
     rows = []
     for i, parameter in enumerate(space.parameters):
         row: FittedParameter = {

@@ -195,6 +195,7 @@ def _check(chain: Chain, length: int) -> diagnostics.Check:
 
 def digest(problem: Problem) -> str:
     """64 characters that change with any number or name on which the log-probability depends."""
+    problem = eqx.tree_at(lambda problem: problem.space.start, problem, replace=None)
     digested = hashlib.sha256()
     function = problem.residual_function
     names = (function.__module__, function.__qualname__, problem.loss)
@@ -241,7 +242,7 @@ def _describe_progress(
 
 def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float) -> Posterior:
     u, check = chain.u, outcome.check
-    flat = jnp.asarray(u.reshape(-1, u.shape[-1]), problem.space.u0.dtype)
+    flat = jnp.asarray(u.reshape(-1, u.shape[-1]), problem.space.start.dtype)
     acceptance = chain.accepted / len(chain)
     stuck = check.isolated | diagnostics.lazy_walkers(acceptance)
     return Posterior(
