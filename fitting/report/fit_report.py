@@ -14,7 +14,7 @@ from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
-from . import fit_tables, worst_window_report
+from . import fit_tables, prior_report, worst_window_report
 from .formatting import aligned, bullets, markdown
 from .plots import fit_plots, style, worst_window_plots
 
@@ -61,6 +61,7 @@ def write_fit(
         *_result(fitted),
         *opening,
         *_parameters(fitted),
+        *prior_report.prior_section(fitted.summary["parameters"]),
         *_identifiability(fitted),
         *_limits(fitted),
         *worst,

@@ -19,9 +19,10 @@ from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior
 from fitting.inference.threshold_profile import Profile
 from fitting.problem import residuals
+from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
-from fitting.report import fit_report, posterior_report
+from fitting.report import fit_report, posterior_report, prior_report
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
 from jaxik.maths import parameter_tree
@@ -169,6 +170,25 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     assert text.endswith("1 of 2 determined parameters within 5 % of their range")
 
 
+def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
+    named = {"leg.soften": ParameterPrior("uniform")}
+    space = fitted.problem.space.with_prior(Priors(ParameterPrior(spread=0.5), named))
+    problem = Problem(space, fitted.problem.data, residuals.residuals_of_scenes)
+    rows = replace(fitted, problem=problem).summary["parameters"]
+    planted = rows[0]
+    centre = planted["prior"]["centre"]
+    assert centre == pytest.approx(planted["before"])
+    u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
+    np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
+    text = "\n".join(prior_report.prior_section(rows))
+    low, high = planted["prior"]["interval"]
+    assert line_of(text, "contact.planted_height") == (
+        f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "
+        "| 0.1 to 0.12 |"
+    )
+    assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
+
+
 def test_a_gain_is_shown_as_half_life_and_at_30_and_60_hz(fitted):
     text = fit_report.fit_text(replace(fitted, known_values=None))
     cells = text.split("gain at 60 Hz")[1].split()[-5:]
@@ -193,6 +213,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
         width, height = size_of_png(tmp_path / name)
         assert 1000 < width < 2000 and 400 < height < 2500, name
     assert "| contact.planted_height | 0.11 | m |" in text
+    assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
     assert "Undetermined: `leg.soften`." in text
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | 0.100 | undetermined |" in text
