@@ -14,9 +14,10 @@ from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
-from . import fit_tables, prior_report, worst_window_report
+from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, markdown
 from .plots import fit_plots, style, worst_window_plots
+from .uncertainty import priors
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
 Plots: TypeAlias = dict[str, str]  # captions by file name
@@ -61,7 +62,7 @@ def write_fit(
         *_result(fitted),
         *opening,
         *_parameters(fitted),
-        *prior_report.prior_section(fitted.summary["parameters"]),
+        *priors.prior_section(fitted.summary["parameters"]),
         *_identifiability(fitted),
         *_limits(fitted),
         *worst,

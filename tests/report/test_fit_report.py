@@ -22,7 +22,8 @@ from fitting.problem import residuals
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
-from fitting.report import fit_report, posterior_report, prior_report
+from fitting.report import fit_report, posterior_report
+from fitting.report.uncertainty import priors
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
 from jaxik.maths import parameter_tree
@@ -177,10 +178,10 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     rows = replace(fitted, problem=problem).summary["parameters"]
     planted = rows[0]
     centre = planted["prior"]["centre"]
-    assert centre == pytest.approx(planted["before"])
+    assert centre is not None and centre == pytest.approx(planted["before"])
     u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
     np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
-    text = "\n".join(prior_report.prior_section(rows))
+    text = "\n".join(priors.prior_section(rows))
     low, high = planted["prior"]["interval"]
     assert line_of(text, "contact.planted_height") == (
         f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "

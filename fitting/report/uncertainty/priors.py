@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 
+from fitting.report.formatting import Table, interval, markdown, number
 from fitting.studies.fit import FittedParameter
-
-from .formatting import Table, interval, markdown, number
 
 
 def prior_section(rows: Sequence[FittedParameter]) -> list[str]:
