@@ -84,7 +84,7 @@ class Prior(eqx.Module):
         """Standard deviation of u."""
         return self.spread * jnp.where(self.uniform, LOGISTIC_SD, 1.0).astype(self.spread.dtype)
 
-    def residuals(self, u: Float[Array, " free"]) -> Float[Array, " free"]:
+    def residuals(self, u: Float[Array, "*points free"]) -> Float[Array, "*points free"]:
         """Half of each square is minus the log density, above its minimum.
 
         For a normal prior that is the distance from its centre in standard deviations.
@@ -97,6 +97,15 @@ class Prior(eqx.Module):
         normal, logistic = special.ndtri(probability), special.logit(probability)
         z = np.where(np.asarray(self.uniform), logistic, normal)
         return np.asarray(self.centre) + np.asarray(self.spread) * z
+
+    def cumulative(self, u: Float[np.ndarray, "*points free"]) -> np.ndarray:
+        """The probability that each parameter lies below its `u`, (*points, free)."""
+        z = (u - np.asarray(self.centre)) / np.asarray(self.spread)
+        return np.where(np.asarray(self.uniform), special.expit(z), special.ndtr(z))
+
+    def widened(self, factor: float) -> "Prior":
+        """The prior with all spreads multiplied; one that was uniform is so no more."""
+        return eqx.tree_at(lambda prior: prior.spread, self, factor * self.spread)
 
     def draw(self, random: np.random.Generator, count: int) -> Float[np.ndarray, "count free"]:
         """Independent draws of `u`."""

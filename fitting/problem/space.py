@@ -78,6 +78,12 @@ class Space(eqx.Module, Generic[System]):
         """Which parameters only move hard decisions, so that their derivative is zero."""
         return tuple(parameter.kind == "threshold" for parameter in self.parameters)
 
+    @property
+    def dependent(self) -> tuple[int, ...]:
+        """Indices of the parameters that stay above another free one."""
+        leaves = {parameter.leaf for parameter in self.parameters}
+        return tuple(i for i, p in enumerate(self.parameters) if p.above in leaves)
+
     @in_float64
     def unpack(self, u: Vector) -> System:
         """The system with the parameters that `u` stands for."""
@@ -134,8 +140,7 @@ class Space(eqx.Module, Generic[System]):
         Exact, except for a parameter that stays above another free one: its prior is a mixture over
         the values of that one, of which many are drawn. Its ends are right to 0.3 % of the range.
         """
-        leaves = {parameter.leaf for parameter in self.parameters}
-        dependent = [i for i, p in enumerate(self.parameters) if p.above in leaves]
+        dependent = list(self.dependent)
         ends = self.prior.quantile(np.array(INTERVAL)[:, None])
         draws = self.prior.draw(np.random.default_rng(0), DRAWS if dependent else 1)
         u = jnp.asarray(np.concatenate([ends, draws]), self.start.dtype)

@@ -10,6 +10,7 @@ from scipy import stats
 
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import LOGISTIC_SD, SPREAD, ParameterPrior, Prior, Priors
+from fitting.problem.prior_probability import prior_probability
 from fitting.problem.space import Space, make_space
 from support import toy
 
@@ -95,6 +96,22 @@ def test_a_parameter_above_a_free_one_has_the_interval_of_the_mixture():
     expected = np.quantile(off, [0.025, 0.975])
     np.testing.assert_allclose(space.prior_interval()[0], expected, atol=0.003 * 0.18)
     np.testing.assert_allclose(space.prior_interval()[1], [0.01275, 0.11725])
+
+
+def test_the_probability_of_values_is_that_of_scipy_and_of_draws():
+    named = {"foot.share": ParameterPrior(centre=0.3, spread=0.4)}
+    priors = Priors(ParameterPrior("uniform"), named)
+    space = make("lock.height_off", "lock.height_on", "foot.share", priors=priors)
+    values = np.array([[0.0, 0.0, -1.0], [0.05, 0.065, 0.3], [0.15, 0.1, 0.5], [0.3, 0.2, 2.0]])
+    probability = prior_probability(space, values)
+    u = np.log(values[1:3, 2] / (1.2 - values[1:3, 2]))
+    share = stats.norm(np.log(0.25 / 0.75), 0.4).cdf(u)
+    np.testing.assert_allclose(probability[:, 2], [0, *share, 1], atol=1e-6)
+    np.testing.assert_allclose(probability[:, 1], [0, 0.5, 9 / 11, 1], atol=1e-6)
+    random = np.random.default_rng(1)
+    off = random.uniform(np.maximum(random.uniform(0.01, 0.12, 200_000), 0.02), 0.2)
+    expected = (off[:, None] <= values[:, 0]).mean(axis=0)
+    np.testing.assert_allclose(probability[:, 0], expected, atol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -84,12 +84,16 @@ class Posterior:
         return np.delete(self.values[self.burn_in :], self.isolated, axis=1)
 
     @property
+    def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
+        """`u` of the values that are kept."""
+        return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
+
+    @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
         """One row per parameter, of the values that are kept."""
-        u = np.delete(self.u[self.burn_in :], self.isolated, axis=1)
         times = self.autocorrelation_time / self.thin_by
         return diagnostics.summarise(
-            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(u)
+            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(self.kept_u)
         )
 
 
