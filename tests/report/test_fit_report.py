@@ -1,5 +1,6 @@
 """Reports of fits and posteriors: numbers in texts and tables, and the plots that they link."""
 
+import json
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from fitting.report import fit_report, posterior_report
 from fitting.report.uncertainty import priors
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
+from fitting.studies.sample import SampledFit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 
@@ -328,9 +330,10 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():
 
 
 def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> None:
-    posterior_report.write_posterior(
-        run, fitted.experiment, posterior, fitted.summary["parameters"], fitted.known_values
-    )
+    rows, space = fitted.summary["parameters"], fitted.problem.space
+    sampled = SampledFit(fitted.experiment, space, rows, posterior, fitted.known_values)
+    run_folder.save_posterior(run, sampled)
+    posterior_report.write_posterior(run, sampled)
 
 
 def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
@@ -346,6 +349,23 @@ def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
     for name in ("corner.png", "chain.png"):
         assert f"({name})" in text
         assert min(size_of_png(tmp_path / name)) > 400
+
+
+def test_a_posterior_stands_beside_its_prior(fitted, tmp_path):
+    posterior = invented_posterior()
+    write_posterior(tmp_path, fitted, posterior)
+    text = (tmp_path / run_folder.SUMMARY).read_text().split("### Prior and posterior")[1]
+    rows = json.loads((tmp_path / run_folder.POSTERIOR).read_text())["parameters"]
+    for row, summary in zip(rows, posterior.summary, strict=True):
+        low, high = row["prior"]["interval"]
+        both = f"| normal | {low:.4g} to {high:.4g} | {summary['low95']:.4g} to "
+        assert both in line_of(text, row["name"])
+        half, twice = row["prior_sensitivity"]
+        assert (half["factor"], twice["factor"]) == (0.5, 2.0)
+        assert f"| {half['median']:.4g}, " in line_of(text, row["name"])
+    moved = [row["name"] for row in rows if row["prior_sensitivity"][0]["sensitive"]]
+    assert moved
+    assert f"`{moved[0]}`" in text.split("Sensitive to their prior")[1]
 
 
 def test_a_posterior_starts_a_summary_where_there_is_none(fitted, tmp_path):
