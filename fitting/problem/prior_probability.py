@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 
-from .space import Space
+from .space import Space, values_of_rows
 
 MIXTURE = 200  # draws of the others, where a parameter stays above another free one
 
@@ -25,7 +25,7 @@ def prior_probability(
     probability = _probability(space, values)
     for i in space.dependent:
         draws = space.prior.draw(np.random.default_rng(0), MIXTURE)
-        rows = np.asarray(_values(space, jnp.asarray(draws, space.start.dtype)))
+        rows = np.asarray(values_of_rows(space, jnp.asarray(draws, space.start.dtype)))
         table = np.repeat(rows[:, None], len(values), axis=1)
         table[..., i] = values[:, i]
         mixed = _probability(space, table.reshape(-1, space.size))[:, i]
@@ -38,11 +38,6 @@ def _probability(space: Space, rows: np.ndarray) -> np.ndarray:
     u = np.asarray(_u(space, jnp.asarray(rows, space.start.dtype)))
     below, above = rows <= np.asarray(space.low), rows >= np.asarray(space.high)
     return np.where(below, 0.0, np.where(above, 1.0, space.prior.cumulative(u)))
-
-
-@cached
-def _values(space: Space, u: Array) -> Array:
-    return jax.vmap(space.values)(u)
 
 
 @cached

@@ -144,7 +144,7 @@ class Space(eqx.Module, Generic[System]):
         ends = self.prior.quantile(np.array(INTERVAL)[:, None])
         draws = self.prior.draw(np.random.default_rng(0), DRAWS if dependent else 1)
         u = jnp.asarray(np.concatenate([ends, draws]), self.start.dtype)
-        values = np.asarray(_values_of_rows(self, u))
+        values = np.asarray(values_of_rows(self, u))
         interval = values[:2].T.copy()
         interval[dependent] = np.quantile(values[2:, dependent], INTERVAL, axis=0).T
         return interval
@@ -251,7 +251,8 @@ def _with_value(leaf: Array, leg: int | None, value: Array) -> Array:
 
 
 @cached
-def _values_of_rows(space: Space, u: Float[Array, "rows free"]) -> Float[Array, "rows free"]:
+def values_of_rows(space: Space, u: Float[Array, "rows free"]) -> Float[Array, "rows free"]:
+    """The free parameters of many `u` in their own units, by one compiled program."""
     return jax.vmap(space.values)(u)
 
 

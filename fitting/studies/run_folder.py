@@ -4,6 +4,7 @@ experiment.toml   what was fitted; paths are absolute, except to files of the ru
 fit.json          the numbers of the fit
 parameters.toml   the fitted system
 chain.h5          the walkers; posterior.json is their summary
+posterior.nc      the kept draws for ArviZ, if it is installed
 summary.md, *.png to read
 """
 
@@ -16,6 +17,7 @@ from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Solution
+from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
 
@@ -24,6 +26,7 @@ from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
+INFERENCE_DATA = "posterior.nc"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
 
@@ -116,3 +119,5 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
     }
     write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))
+    if inference_data.is_available():
+        inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)

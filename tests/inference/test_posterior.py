@@ -25,7 +25,7 @@ from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import SPREAD, ParameterPrior, Priors
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
+from fitting.problem.space import make_space, values_of_rows
 from jaxik.maths import parameter_tree
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -182,7 +182,7 @@ def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
     axis = jnp.linspace(-7, 7, 281)
     grid = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     weight = np.exp(np.asarray(sampler._log_probabilities(problem, grid)))
-    values = np.asarray(posterior._values(problem, grid))
+    values = np.asarray(values_of_rows(problem.space, grid))
     mean = np.average(values, axis=0, weights=weight)
     sd = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
     for i, row in enumerate(sampled.summary):

@@ -17,6 +17,7 @@ from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.inference.sampling import inference_data
 from fitting.inference.sampling.posterior import Posterior
 from fitting.inference.threshold_profile import Profile
 from fitting.problem import residuals
@@ -354,6 +355,7 @@ def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
 def test_a_posterior_stands_beside_its_prior(fitted, tmp_path):
     posterior = invented_posterior()
     write_posterior(tmp_path, fitted, posterior)
+    assert (tmp_path / run_folder.INFERENCE_DATA).exists() == inference_data.is_available()
     text = (tmp_path / run_folder.SUMMARY).read_text().split("### Prior and posterior")[1]
     rows = json.loads((tmp_path / run_folder.POSTERIOR).read_text())["parameters"]
     for row, summary in zip(rows, posterior.summary, strict=True):

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
+from fitting.problem.space import Space, values_of_rows
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
@@ -87,6 +89,12 @@ class Posterior:
     def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
         """`u` of the values that are kept."""
         return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
+
+    def to_inference_data(self, space: Space) -> Any:
+        """The kept draws as ArviZ takes them; see `inference_data.to_inference_data`."""
+        from .inference_data import to_inference_data
+
+        return to_inference_data(self, space)
 
     @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
@@ -212,11 +220,6 @@ def digest(problem: Problem) -> str:
     return digested.hexdigest()
 
 
-@jax.jit
-def _values(problem: Problem, u: Float[Array, "samples free"]) -> Float[Array, "samples free"]:
-    return jax.vmap(problem.space.values)(u)
-
-
 def _check_start(size: int, start: WalkerStart) -> None:
     """Raises ValueError for a start that is not finite or has another size than the space."""
     for name, array in (("u", start.u), ("sd", start.sd)):
@@ -253,7 +256,7 @@ def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float
         names=problem.space.names,
         u=u,
         log_probability=chain.log_probability,
-        values=np.asarray(_values(problem, flat)).reshape(u.shape),
+        values=np.asarray(values_of_rows(problem.space, flat)).reshape(u.shape),
         thin_by=chain.identity.thin_by,
         burn_in=check.burn_in,
         autocorrelation_time=check.times * chain.identity.thin_by,
