@@ -54,6 +54,7 @@ FREE_KEYS: dict[str, validation.Constraint] = {
     **dict.fromkeys(("low", "high"), validation.NUMBER),
     **dict.fromkeys(("kind", "scale"), validation.TEXT),
 }
+MOVED_KEYS = {"prior_mean": "centre", "prior_sd": "spread"}  # from [free] to [prior]
 
 
 class Preset(NamedTuple):
@@ -198,9 +199,10 @@ def read_free_table(table: Table, where: str) -> FreeTable:
     """The entries of a [free] table by dotted name; ValueError for a wrong key or value."""
     named = flatten(table, 2)
     for name, entry in named.items():
-        if isinstance(entry, Mapping) and (old := sorted({"prior_mean", "prior_sd"} & set(entry))):
+        if isinstance(entry, Mapping) and (old := [key for key in MOVED_KEYS if key in entry]):
+            moved = ", ".join(f"{MOVED_KEYS[key]} = {entry[key]}" for key in old)
             raise ValueError(
-                f"{where} {name}: {old[0]} is no key of [free] any more; an experiment's table"
-                f" [prior] has priors, as {name} = {{ centre = 0.3, spread = 1.6 }}"
+                f"{where} {name}: {old[0]} is no key of [free] any more; write it in the table"
+                f" [prior] of the experiment, as {name} = {{ {moved} }}"
             )
     return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in named.items()}
