@@ -10,6 +10,8 @@ from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import FreeParameter, free_parameter
 from fitting.problem.loss import Loss
+from fitting.problem.prior import Priors
+from fitting.problem.space import Space, make_space
 from fitting.runtime import validation
 
 from .ablations import Ablation
@@ -87,6 +89,10 @@ class Experiment:
     """By stage, where not the preset's."""
     parameters: Mapping[str, object] = field(default_factory=dict)
     """Fixed values by dotted name."""
+    prior: Priors = Priors()
+    """Of the free parameters."""
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Where the search begins, by dotted name; left out: at the system's values."""
     sigmas: Mapping[str, float] = field(default_factory=dict)
     """Where not the default."""
     fit: FitOptions = FitOptions()
@@ -129,6 +135,26 @@ class Experiment:
         with validation.error_context(f"{self.path} [free]"):
             rig = rig if self.body == "clip" else None
             return [free_parameter(ik, name, rig, **given) for name, given in self.free.items()]
+
+    def space(self, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Space[jaxik.FootIK]:
+        """The space of the free parameters, with their prior and the start.
+
+        Args:
+            ik: the experiment's system.
+            rig: as for `free_parameters`.
+
+        Raises:
+            ValueError: as `free_parameters`; the parameters leave each other no room; the centre of
+                a prior or the start is outside the range.
+        """
+        parameters = self.free_parameters(ik, rig)
+        with validation.error_context(f"{self.path} [free]"):
+            space = make_space(ik, parameters)
+        with validation.error_context(f"{self.path} [prior]"):
+            space = space.with_prior(self.prior)
+        with validation.error_context(f"{self.path} [start]"):
+            own = {name: value for name, value in self.start.items() if name in self.free}
+            return space.with_start(own)
 
     def with_max_sample_steps(self, max_steps: int) -> "Experiment":
         """The experiment with another limit to the steps of the sampler."""

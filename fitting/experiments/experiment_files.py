@@ -10,9 +10,11 @@ base = "walk_base.npz"               # the flat animation; left out, one is made
 terrain = "course.ply"
 [parameters]                         # fixed values that differ from the preset's
 lock.enabled = true
-[free]                               # {} takes range, prior and scale from the rule
+[free]                               # {} takes range and scale from the rule
 pelvis.on_gain = {}
 contact.planted_height = { low = 0.05, high = 0.2 }
+[prior]                              # see `prior_tables`, also for [start]
+spread = 1.6
 [sigmas]
 ankle = 0.02
 [fit.search]                         # overrides settings of the search, see `SearchSettings`
@@ -39,6 +41,7 @@ from fitting.runtime.validation import Constraint, Content, Table, check_table, 
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
+from .prior_tables import priors_to_table, read_priors, read_start
 from .systems import BODY, DEFAULT_PRESET, preset_system, read_free_table, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
@@ -86,7 +89,7 @@ SAMPLE_KEYS: dict[str, Constraint] = {
     **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
     "stop_at": validation.POSITIVE,
 }
-TABLES = ("free", "rules", "parameters", "sigmas", "fit", "sample")
+TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "fit", "sample")
 TOP_KEYS: dict[str, Constraint] = {
     "name": validation.TEXT,
     "preset": validation.TEXT,
@@ -126,11 +129,15 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
     check_table(content.get("sigmas", {}), SIGMA_KEYS, f"{path} [sigmas]")
     free = read_free_table(content["free"], f"{path} [free]")
+    without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
+    known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
     tables = {
         "clips": tuple(_clip_entry(entry, path) for entry in content["clips"]),
         "free": free,
+        "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
+        "start": read_start(content.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(content.get("parameters", {}), 2),
-        "without": read_ablations(content.get("without", []), ik, f"{path} [[without]]"),
+        "without": without,
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
@@ -182,7 +189,8 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     usual = {key: sampler[key] for key in USUAL_SAMPLE_KEYS}
     content = dataclasses.asdict(experiment)
     content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
-    for name in ("free", "parameters"):
+    content["prior"] = priors_to_table(experiment.prior)
+    for name in ("free", "start", "parameters"):
         content[name] = nest(content[name])
     del content["path"]
     return tomli_w.dumps(_plain(content, folder and folder.resolve()))

@@ -21,7 +21,6 @@ from fitting.datasets.terrain import mesh_files
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Reference, Scene, Sigmas
-from fitting.problem.space import make_space
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
@@ -81,12 +80,10 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     ik = experiment.starting_system(rig)
     if any(clip.root.rise is not None for clip in data):
         ik = without_own_root(ik)
-    parameters = experiment.free_parameters(ik, rig)
-    with error_context(f"{experiment.path} [free]"):
-        space = make_space(ik, parameters)
+    space = experiment.space(ik, rig)
     scenes = []
     for clip in data:
-        if both := sorted({p.name for p in parameters if p.leaf in clip.tracks}):
+        if both := sorted({p.name for p in space.parameters if p.leaf in clip.tracks}):
             raise ValueError(
                 f"{experiment.path} [free]: {both} cannot be free: a track of {clip.base.source} "
                 "sets it in every frame"

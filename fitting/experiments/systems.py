@@ -1,5 +1,6 @@
 """Systems by name: presets, other rules for some stages, parameters fixed or free."""
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from inspect import signature
 from typing import NamedTuple, TypeVar
@@ -50,10 +51,10 @@ def register_rule(rule: type[Rule]) -> type[Rule]:
 
 BODY = validation.one_of(("clip", "adult"))  # whose defaults are meant
 FREE_KEYS: dict[str, validation.Constraint] = {
-    **dict.fromkeys(("low", "high", "prior_mean"), validation.NUMBER),
-    "prior_sd": validation.POSITIVE,
+    **dict.fromkeys(("low", "high"), validation.NUMBER),
     **dict.fromkeys(("kind", "scale"), validation.TEXT),
 }
+MOVED_KEYS = {"prior_mean": "centre", "prior_sd": "spread"}  # from [free] to [prior]
 
 
 class Preset(NamedTuple):
@@ -197,4 +198,11 @@ def leaf_names(ik: jaxik.FootIK) -> list[str]:
 def read_free_table(table: Table, where: str) -> FreeTable:
     """The entries of a [free] table by dotted name; ValueError for a wrong key or value."""
     named = flatten(table, 2)
+    for name, entry in named.items():
+        if isinstance(entry, Mapping) and (old := [key for key in MOVED_KEYS if key in entry]):
+            moved = ", ".join(f"{MOVED_KEYS[key]} = {entry[key]}" for key in old)
+            raise ValueError(
+                f"{where} {name}: {old[0]} is no key of [free] any more; write it in the table"
+                f" [prior] of the experiment, as {name} = {{ {moved} }}"
+            )
     return {name: check_table(entry, FREE_KEYS, f"{where} {name}") for name, entry in named.items()}

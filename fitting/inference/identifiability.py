@@ -16,14 +16,13 @@ from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 
 from .optimisation.solution import Solution
-from .threshold_profile import Profile, profile
+from .threshold_profile import MAX_RISE, Profile, profile
 
 UNDETERMINED = 0.5  # contraction below which a parameter counts as undetermined
 CORRELATED = 0.9  # posterior correlation from which on a pair is named
 AT_BOUND = 0.01  # fraction of the range that counts as being at its end
 WEAK = 0.3  # component of the weakest direction from which on a parameter is named
 NORMAL = 1.96  # standard deviations in half a 95 % interval
-PRIOR_WIDTH = 0.95  # fraction of the range within the prior's 95 % interval, which is nearly flat
 
 Bound = Literal["", "low", "high"]
 
@@ -63,7 +62,8 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
     """What the data of a problem determine around its solution.
 
     The contraction of a smooth parameter is `1 - (posterior sd / prior sd)²` in `u`, with the
-    thresholds fixed. That of a threshold is the same of its interval's fraction of the range.
+    thresholds fixed. That of a threshold compares intervals instead: its own with the one that it
+    would have if it had no effect, by the same rule from the prior alone.
 
     Raises:
         ValueError: if the Jacobian at the solution is not finite.
@@ -83,12 +83,14 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
     contraction = np.zeros(space.size)
     contraction[laplace.smooth] = 1 - np.diag(laplace.covariance)
     sd = laplace.sd(problem)
-    interval = _interval(problem, solution, sd)
+    u = np.asarray(solution.u)
+    interval = _interval(problem, u, u + np.nan_to_num(np.outer([-NORMAL, NORMAL], sd)))
+    prior_interval = _interval(problem, u, space.prior.ends(MAX_RISE))
     for i, name in enumerate(space.names):
         if name in profiles:
             interval[i] = profiles[name].interval
-            width = (interval[i, 1] - interval[i, 0]) / float(space.high[i] - space.low[i])
-            contraction[i] = max(0.0, 1 - (width / PRIOR_WIDTH) ** 2)
+            width, prior_width = np.diff(interval[i])[0], np.diff(prior_interval[i])[0]
+            contraction[i] = max(0.0, 1 - (width / prior_width) ** 2)
     names = [space.names[i] for i in laplace.smooth]
     fractions = jax.nn.sigmoid(jnp.asarray(solution.u))
     return Identifiability(
@@ -107,9 +109,13 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
 
 @dataclasses.dataclass(frozen=True)
 class _Laplace:
-    """The normal approximation of the smooth parameters' posterior, in prior units."""
+    """The normal approximation of the smooth parameters' posterior, in prior units.
+
+    The prior is approximated likewise: by a normal with the slope of its residual at the solution.
+    """
 
     smooth: np.ndarray  # indices among the free parameters
+    prior_sd: np.ndarray  # of u
     covariance: np.ndarray  # in prior variances
     eigenvalues: np.ndarray  # of the information, rising
     weakest: np.ndarray  # eigenvector of the smallest one
@@ -118,26 +124,25 @@ class _Laplace:
     def around(cls, problem: Problem, solution: Solution) -> "_Laplace":
         space = problem.space
         smooth = np.flatnonzero(space.smooth)
-        scaled = solution.jacobian[: -space.size, smooth] * np.asarray(space.prior_sd)[smooth]
+        prior_sd = 1 / np.diag(solution.jacobian[-space.size :])[smooth]
+        scaled = solution.jacobian[: -space.size, smooth] * prior_sd
         information = scaled.T @ scaled
         eigenvalues, directions = np.linalg.eigh(information)
         covariance = np.linalg.inv(information + np.eye(smooth.size))
-        return cls(smooth, covariance, eigenvalues, directions[:, :1].ravel())
+        return cls(smooth, prior_sd, covariance, eigenvalues, directions[:, :1].ravel())
 
     def sd(self, problem: Problem) -> np.ndarray:
         """Standard deviation of `u`, NaN for thresholds."""
         sd = np.full(problem.space.size, np.nan)
-        prior_sd = np.asarray(problem.space.prior_sd)[self.smooth]
-        sd[self.smooth] = np.sqrt(np.diag(self.covariance)) * prior_sd
+        sd[self.smooth] = np.sqrt(np.diag(self.covariance)) * self.prior_sd
         return sd
 
 
-def _interval(problem: Problem, solution: Solution, sd: np.ndarray) -> np.ndarray:
-    """Values at either end of the 95 % interval of `u`, (free, 2); no width where `sd` is NaN."""
-    half_widths = jnp.diag(jnp.nan_to_num(jnp.asarray(NORMAL * sd)))
-    u = jnp.asarray(solution.u)
-    ends = [jax.vmap(problem.space.values)(u + sign * half_widths) for sign in (-1, 1)]
-    return np.stack([np.diag(end) for end in ends], axis=1)
+def _interval(problem: Problem, u: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Values, (free, 2), as each parameter alone moves from its `u` to either of its ends."""
+    moved = [np.where(np.eye(u.size, dtype=bool), end, u) for end in ends]
+    values = [jax.vmap(problem.space.values)(jnp.asarray(rows, u.dtype)) for rows in moved]
+    return np.stack([np.diag(rows) for rows in values], axis=1)
 
 
 def _bound(fraction: float) -> Bound:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxik
-from fitting.problem.free_parameters import PRIOR_SD, free_parameter
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.prior import SPREAD
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
 from fitting.problem.space import Space, make_space
@@ -52,7 +53,7 @@ def measure_sensitivity(
     Ranges are those for the body of the first clip.
 
     Each parameter in turn is swept over its range while the others stay where they are: at the
-    system's values, then at draws from the prior.
+    system's values, then at draws from a normal prior in the middle of the ranges.
 
     Args:
         ik: the system.
@@ -63,7 +64,7 @@ def measure_sensitivity(
     rig = scenes[0].rig
     space = make_space(ik, [free_parameter(ik, name, rig, **given) for name, given in free.items()])
     random = np.random.default_rng(seed)
-    draws = PRIOR_SD * random.normal(size=(DRAWS, space.size))
+    draws = SPREAD * random.normal(size=(DRAWS, space.size))
     points = [np.asarray(space.pack({})), *draws]
     reach = np.max([_reach(space, scenes, u) for u in points], axis=0)
     return {name: float(r) for name, r in zip(free, reach, strict=True) if r > NEGLIGIBLE}
@@ -73,7 +74,7 @@ def _reach(
     space: Space, scenes: tuple[Scene, ...], u: Float[np.ndarray, " free"]
 ) -> Float[np.ndarray, " free"]:
     """How far each parameter alone can move any residual from where it is at `u`, in sigmas."""
-    dtype = space.u0.dtype
+    dtype = space.start.dtype
     present = np.asarray(space.values(jnp.asarray(u, dtype)))
     log_odds = np.log(FRACTIONS / (1 - FRACTIONS))
     grid = np.stack([space.values(jnp.full(space.size, x, dtype)) for x in log_odds])
@@ -92,7 +93,7 @@ def _reach(
 
 def _residuals(space: Space, scenes: tuple[Scene, ...], candidates: np.ndarray) -> np.ndarray:
     """Residuals of at most a batch of candidates, filled up so that there is one program."""
-    filled = jnp.asarray(np.resize(candidates, (BATCH, space.size)), space.u0.dtype)
+    filled = jnp.asarray(np.resize(candidates, (BATCH, space.size)), space.start.dtype)
     return np.asarray(_residuals_of_batch(space, scenes, filled))[: len(candidates)]
 
 

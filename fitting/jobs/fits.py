@@ -16,7 +16,7 @@ from fitting.report import ablation_report, fit_report, posterior_report, transl
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, run_folder, translation
 from fitting.studies.fit import Fit, search
-from fitting.studies.sample import sample_around
+from fitting.studies.sample import SampledFit, sample_around
 from fitting.studies.translation import TranslationRequest
 
 from .output import Log, checked_folder, log_output, silent
@@ -97,8 +97,9 @@ def sample(
     chain = None if run is None else run / run_folder.CHAIN
     posterior = sample_around(parameters, problem, experiment, chain, progress)
     if run is not None:
-        run_folder.save_posterior(run, posterior)
-        posterior_report.write_posterior(run, experiment, posterior, parameters, known_values)
+        sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values)
+        run_folder.save_posterior(run, sampled)
+        posterior_report.write_posterior(run, sampled)
     log(f"\n{posterior_report.posterior_text(posterior, known_values)}")
     log_output(log, run, run_folder.SUMMARY)
     return posterior

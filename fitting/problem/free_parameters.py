@@ -1,4 +1,4 @@
-"""Which numbers of a system a fit may change: range, scale and prior of each."""
+"""Which numbers of a system a fit may change: range, kind and scale of each."""
 
 import dataclasses
 import difflib
@@ -7,14 +7,12 @@ from typing import cast, get_args
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
 from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
 from jaxik.world.skeleton import Rig
 
-PRIOR_SD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
-OVERRIDES = ("low", "high", "prior_mean", "prior_sd", "kind", "scale")
+OVERRIDES = ("low", "high", "kind", "scale")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +23,6 @@ class FreeParameter:
     """Dotted, with [leg] for one element."""
     low: float
     high: float
-    prior_mean: float
-    """In the parameter's unit."""
-    prior_sd: float
-    """In u."""
     kind: parameter_tree.ParameterKind
     scale: parameter_tree.Scale
     above: str | None
@@ -52,14 +46,13 @@ def free_parameter(
     """The parameter of this name as its rule declares it, with overrides.
 
     A name like `foot.max_pitch[0]` frees one leg's element; the bare name of a leaf with one value
-    per leg frees a single value that all legs share. The prior is centred at the present value,
-    clipped to the bounds.
+    per leg frees a single value that all legs share.
 
     Args:
         ik: system, a tree of rules.
         name: dotted name.
         rig: whose body the declared range is for; None is the adult.
-        overrides: any of `low`, `high`, `prior_mean`, `prior_sd`, `kind`, `scale`.
+        overrides: any of `low`, `high`, `kind`, `scale`.
 
     Raises:
         ValueError: for an unknown name or override, a leg that does not exist, or bounds that are
@@ -78,15 +71,11 @@ def free_parameter(
     scale = overrides.get("scale", declaration.scale)
     _check_choice(name, "kind", kind, get_args(parameter_tree.ParameterKind))
     _check_choice(name, "scale", scale, get_args(parameter_tree.Scale))
-    low = float(overrides.get("low", declaration.low))
-    high = float(overrides.get("high", declaration.high))
-    present = float(np.asarray(_value(ik, name)).mean())
+    present_value(ik, name)  # raises for a leg that does not exist
     parameter = FreeParameter(
         name=name,
-        low=low,
-        high=high,
-        prior_mean=float(overrides.get("prior_mean", min(max(present, low), high))),
-        prior_sd=float(overrides.get("prior_sd", PRIOR_SD)),
+        low=float(overrides.get("low", declaration.low)),
+        high=float(overrides.get("high", declaration.high)),
         kind=cast(parameter_tree.ParameterKind, kind),
         scale=cast(parameter_tree.Scale, scale),
         above=_absolute(declaration.above, leaf),
@@ -95,17 +84,21 @@ def free_parameter(
     return parameter
 
 
-def _value(ik: eqx.Module, name: str) -> Array:
-    """The present value of a leaf, or of one leg's element of it."""
+def present_value(ik: eqx.Module, name: str) -> float:
+    """The value that a system has now: of one leg's element, or the mean over a leaf's elements.
+
+    Raises:
+        ValueError: for an element that does not exist.
+    """
     leaf, bracket, rest = name.partition("[")
-    value = parameter_tree.get(ik, leaf)
+    value = np.asarray(parameter_tree.get(ik, leaf))
     if not bracket:
-        return value
+        return float(value.mean())
     elements = [f"{leaf}[{i}]" for i in range(value.shape[0])] if value.ndim else []
     if name not in elements:
         hint = f"there are {elements}" if elements else "it is shared by the legs"
         raise ValueError(f"no element {name!r}: {hint}")
-    return value[int(rest[:-1])]
+    return float(value[int(rest[:-1])])
 
 
 def _absolute(above: str | None, leaf: str) -> str | None:
@@ -121,7 +114,7 @@ def _check_choice(name: str, key: str, value: float | str, choices: tuple[str, .
 
 
 def _check(parameter: FreeParameter) -> None:
-    """Raises ValueError for bounds or a prior that make no sense."""
+    """Raises ValueError for bounds that make no sense."""
     domains = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (0.0, 1.0)}
     minimum, maximum = domains[parameter.scale]
     if not minimum < parameter.low < parameter.high < maximum:
@@ -129,10 +122,3 @@ def _check(parameter: FreeParameter) -> None:
             f"{parameter.name}: bounds are {parameter.low} to {parameter.high}, wanted low < high"
             f" strictly between {minimum} and {maximum} for the scale {parameter.scale!r}"
         )
-    if not parameter.low <= parameter.prior_mean <= parameter.high:
-        raise ValueError(
-            f"{parameter.name}: prior_mean is {parameter.prior_mean},"
-            f" wanted from {parameter.low} to {parameter.high}"
-        )
-    if not 0 < parameter.prior_sd < math.inf:
-        raise ValueError(f"{parameter.name}: prior_sd is {parameter.prior_sd}, wanted more than 0")

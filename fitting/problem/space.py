@@ -9,10 +9,10 @@ logarithm of its half-life up to a constant, so that the tick rate cancels. `flo
 bound, or, for a parameter declared above another one, the larger of that bound and the other one's
 value: the order holds for every `u`.
 
-The prior is a normal in `u`, not in the value: the solver's prior residuals and the sampler's
-log-probability are then the same function, and no Jacobian of the transform enters. With its
-default width and centre it is nearly flat over the range (within a factor of two between 7 % and
-93 % of it).
+What is known of `u` before any data is its `prior`, and `start` is where a search begins. Both are
+the values of the system as it is, unless told otherwise: the normal priors are centred there. A
+uniform prior of a parameter declared above another one is uniform between that one's value and the
+upper bound, whatever that value is.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,10 +28,15 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
-from .free_parameters import FreeParameter
+from .free_parameters import FreeParameter, present_value
+from .prior import SPREAD, Prior, Priors
 
-CENTRE_LIMIT = 3.0  # of u: a prior centred at a bound would hide the rest of the range
+CENTRE_LIMIT = (
+    3.0  # of u: a prior centred at a bound, or a start there, would hide the other values
+)
 EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
+INTERVAL = (0.025, 0.975)  # the probabilities at the ends of a 95 % interval
+DRAWS = 20_000  # from the prior, for the interval of a parameter that depends on another one
 
 System = TypeVar("System", bound=eqx.Module)
 Vector: TypeAlias = Float[Array | np.ndarray, " free"]
@@ -42,10 +47,10 @@ class Space(eqx.Module, Generic[System]):
 
     system: System
     """What is not free keeps the values it has here."""
-    u0: Float[Array, " free"]
-    """Centre of the prior, and where a fit starts."""
-    prior_sd: Float[Array, " free"]
-    """In u."""
+    prior: Prior
+    """Of u."""
+    start: Float[Array, " free"]
+    """Where a search begins, in u."""
     low: Float[Array, " free"]
     """In the parameters' units, like high."""
     high: Float[Array, " free"]
@@ -72,6 +77,12 @@ class Space(eqx.Module, Generic[System]):
     def thresholds(self) -> tuple[bool, ...]:
         """Which parameters only move hard decisions, so that their derivative is zero."""
         return tuple(parameter.kind == "threshold" for parameter in self.parameters)
+
+    @property
+    def dependent(self) -> tuple[int, ...]:
+        """Indices of the parameters that stay above another free one."""
+        leaves = {parameter.leaf for parameter in self.parameters}
+        return tuple(i for i, p in enumerate(self.parameters) if p.above in leaves)
 
     @in_float64
     def unpack(self, u: Vector) -> System:
@@ -119,8 +130,65 @@ class Space(eqx.Module, Generic[System]):
 
     @in_float64
     def prior_residuals(self, u: Vector) -> Float[Array, " free"]:
-        """Distance from the prior's centre in prior standard deviations."""
-        return (jnp.asarray(u) - self.u0) / self.prior_sd
+        """Half of their squares' sum is minus the log density of the prior, up to a constant."""
+        return self.prior.residuals(jnp.asarray(u))
+
+    @in_float64
+    def prior_interval(self) -> Float[np.ndarray, "free 2"]:
+        """The central 95 % of the prior, in the parameters' units.
+
+        Exact, except for a parameter that stays above another free one: its prior is a mixture over
+        the values of that one, of which many are drawn. Its ends are right to 0.3 % of the range.
+        """
+        dependent = list(self.dependent)
+        ends = self.prior.quantile(np.array(INTERVAL)[:, None])
+        draws = self.prior.draw(np.random.default_rng(0), DRAWS if dependent else 1)
+        u = jnp.asarray(np.concatenate([ends, draws]), self.start.dtype)
+        values = np.asarray(values_of_rows(self, u))
+        interval = values[:2].T.copy()
+        interval[dependent] = np.quantile(values[2:, dependent], INTERVAL, axis=0).T
+        return interval
+
+    @in_float64
+    def with_prior(self, priors: Priors) -> "Space[System]":
+        """The space with these priors of its parameters.
+
+        Raises:
+            ValueError: for a centre outside the bounds of its parameter.
+        """
+        chosen = {name: priors.of(name) for name in self.names}
+        given = {name: p.centre for name, p in chosen.items() if p.centre is not None}
+        uniform = np.array([p.shape == "uniform" for p in chosen.values()])
+        spread = [SPREAD if p.spread is None else p.spread for p in chosen.values()]
+        dtype = self.start.dtype
+        prior = Prior(
+            centre=jax.device_put(np.where(uniform, 0, self._inside("centre", given))),
+            spread=jax.device_put(np.where(uniform, 1, np.asarray(spread)).astype(dtype)),
+            uniform=jax.device_put(uniform),
+        )
+        return eqx.tree_at(lambda space: space.prior, self, prior)
+
+    @in_float64
+    def with_start(self, values: Mapping[str, float]) -> "Space[System]":
+        """The space with a start at these values, and at the system's where they are left out.
+
+        Raises:
+            ValueError: for a name that is not free, or a value outside the bounds.
+        """
+        start = jax.device_put(self._inside("start", values))
+        return eqx.tree_at(lambda space: space.start, self, start)
+
+    def _inside(self, what: str, values: Mapping[str, float]) -> Float[np.ndarray, " free"]:
+        """`u` of values, the system's where left out, and not too near a bound."""
+        present = {}
+        for p in self.parameters:
+            value = values.get(p.name)
+            if value is not None and not p.low <= value <= p.high:
+                raise ValueError(
+                    f"{p.name}: {what} is {value:g}, wanted from {p.low:g} to {p.high:g}"
+                )
+            present[p.name] = min(max(present_value(self.system, p.name), p.low), p.high)
+        return np.clip(np.asarray(self.pack({**present, **values})), -CENTRE_LIMIT, CENTRE_LIMIT)
 
     def _leaves(self, system: eqx.Module) -> dict[str, Array]:
         """The leaves that are free, and those that a free one stays above."""
@@ -182,8 +250,14 @@ def _with_value(leaf: Array, leg: int | None, value: Array) -> Array:
     return jnp.broadcast_to(value, leaf.shape) if leg is None else leaf.at[leg].set(value)
 
 
+@cached
+def values_of_rows(space: Space, u: Float[Array, "rows free"]) -> Float[Array, "rows free"]:
+    """The free parameters of many `u` in their own units, by one compiled program."""
+    return jax.vmap(space.values)(u)
+
+
 def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]:
-    """The space of these free parameters of a system.
+    """The space of these free parameters of a system, with the default prior and start.
 
     Raises:
         ValueError: for no parameter, one named twice, or one that has no room left above another.
@@ -194,18 +268,17 @@ def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]
         _check_free_once(parameter, parameters)
         _check_room(ik, parameter, parameters)
     dtype = parameter_tree.get(ik, parameters[0].leaf).dtype
+    zeros = jax.device_put(np.zeros(len(parameters), dtype))
     space = Space(
         system=ik,
-        u0=jax.device_put(np.zeros(len(parameters), dtype)),
-        prior_sd=jax.device_put(np.asarray([p.prior_sd for p in parameters], dtype)),
+        prior=Prior(zeros, zeros, jax.device_put(np.zeros(len(parameters), bool))),
+        start=zeros,
         low=jax.device_put(np.asarray([p.low for p in parameters], dtype)),
         high=jax.device_put(np.asarray([p.high for p in parameters], dtype)),
         parameters=tuple(parameters),
         order=_order(parameters),
     )
-    centre = np.asarray(space.pack({p.name: p.prior_mean for p in parameters}))
-    limited = jax.device_put(np.clip(centre, -CENTRE_LIMIT, CENTRE_LIMIT))
-    return eqx.tree_at(lambda space: space.u0, space, limited)
+    return space.with_prior(Priors()).with_start({})
 
 
 def _check_free_once(parameter: FreeParameter, parameters: Sequence[FreeParameter]) -> None:

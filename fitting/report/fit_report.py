@@ -17,6 +17,7 @@ from fitting.studies.run_folder import SUMMARY
 from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, markdown
 from .plots import fit_plots, style, worst_window_plots
+from .uncertainty import priors
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
 Plots: TypeAlias = dict[str, str]  # captions by file name
@@ -61,6 +62,7 @@ def write_fit(
         *_result(fitted),
         *opening,
         *_parameters(fitted),
+        *priors.prior_section(fitted.summary["parameters"]),
         *_identifiability(fitted),
         *_limits(fitted),
         *worst,

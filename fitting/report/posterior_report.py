@@ -3,17 +3,17 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fitting.experiments.experiment import Experiment
 from fitting.inference.sampling.diagnostics import ParameterSummary
 from fitting.inference.sampling.posterior import Posterior
 from fitting.runtime import files
-from fitting.studies.fit import FittedParameter
 from fitting.studies.run_folder import SUMMARY
+from fitting.studies.sample import SampledFit
 
 from .fit_report import gallery, save_plot
 from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .plots import posterior_plots
+from .uncertainty.priors import posterior_prior_section
 
 HEADING = "## Posterior"  # what follows it in summary.md is replaced
 
@@ -28,28 +28,23 @@ def posterior_text(posterior: Posterior, known_values: Mapping[str, float] | Non
     return "\n".join(parts)
 
 
-def write_posterior(
-    run: Path,
-    experiment: Experiment,
-    posterior: Posterior,
-    fitted: Sequence[FittedParameter],
-    known_values: Mapping[str, float] | None,
-) -> None:
+def write_posterior(run: Path, sampled: SampledFit) -> None:
     """Writes the plots of a posterior and its section of summary.md, in place of an older one.
 
     Args:
         run: the folder of the run.
-        experiment: what was fitted.
-        posterior: the samples.
-        fitted: the parameters of the fit around which it was sampled.
-        known_values: parameters that made a synthetic reference, by name.
+        sampled: the posterior and the fit.
     """
-    rows = {row["name"]: row for row in fitted}
+    experiment, posterior = sampled.experiment, sampled.posterior
+    known_values = sampled.known_values
+    rows = {row["name"]: row for row in sampled.parameters}
     units = {name: row["unit"] for name, row in rows.items()}
     labels = [f"{name}, {units[name]}" if units[name] != "1" else name for name in posterior.names]
     values = {name: row["value"] for name, row in rows.items()}
     title = f"{experiment.name}: posterior of the parameters"
-    figure = posterior_plots.corner(posterior, labels, values, known_values, title)
+    figure = posterior_plots.corner(
+        posterior, labels, values, known_values, title, space=sampled.space
+    )
     plots = save_plot(run, "corner.png", title, figure)
     title = f"{experiment.name}: walkers"
     figure = posterior_plots.chain(posterior, labels, known_values, title)
@@ -65,6 +60,7 @@ def write_posterior(
             f"The 95 % intervals contain the true values of {all_count} parameters; among those "
             f"that the fit calls determined, of {determined_count}."
         )
+    parts += posterior_prior_section(sampled, units)
     parts.append(gallery(plots))
     summary = run / SUMMARY
     text = summary.read_text(encoding="utf-8") if summary.is_file() else f"# {experiment.name}\n"

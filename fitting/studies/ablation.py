@@ -28,7 +28,6 @@ from fitting.experiments.problems import ClipData, load_clip_data, problem_from_
 from fitting.experiments.systems import leaf_names
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
-from fitting.problem.space import make_space
 from fitting.runtime import files
 from fitting.runtime.validation import Table, error_context
 
@@ -127,8 +126,8 @@ def ablate(
 def _check(variant: Experiment) -> None:
     """Raises ValueError where a variant does not fit its preset."""
     ik = variant.starting_system()
-    if parameters := variant.free_parameters(ik):
-        make_space(ik, parameters)
+    if variant.free:
+        variant.space(ik)
 
 
 def without(experiment: Experiment, ablation: Ablation) -> Experiment:

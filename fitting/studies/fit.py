@@ -21,6 +21,8 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
+from .prior_summary import PriorSummary, summarise_priors
+
 # Walkers start in a ball around the fit. Its width, in u, is the Laplace standard deviation, which
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
 THRESHOLD_SD = 0.05
@@ -43,6 +45,7 @@ class FittedParameter(TypedDict):
     """The value before the fit."""
     low: float
     high: float
+    prior: PriorSummary
     interval: list[float]
     """95 %."""
     contraction: float
@@ -147,7 +150,8 @@ def search(
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
     solution, space, known = fitted.solution, fitted.problem.space, fitted.identifiability
     declared = parameter_tree.declarations(space.system)
-    before = np.asarray(space.values(space.u0))
+    before = np.asarray(space.values(space.pack({})))
+    priors = summarise_priors(space)
     rows = []
     for i, parameter in enumerate(space.parameters):
         row: FittedParameter = {
@@ -160,6 +164,7 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             "before": float(before[i]),
             "low": parameter.low,
             "high": parameter.high,
+            "prior": priors[parameter.name],
             "interval": [float(end) for end in known.interval[i]],
             "contraction": float(known.contraction[i]),
             "at_bound": known.at_bound[i],

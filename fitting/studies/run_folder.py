@@ -4,6 +4,7 @@ experiment.toml   what was fitted; paths are absolute, except to files of the ru
 fit.json          the numbers of the fit
 parameters.toml   the fitted system
 chain.h5          the walkers; posterior.json is their summary
+posterior.nc      the kept draws for ArviZ, if it is installed
 summary.md, *.png to read
 """
 
@@ -16,14 +17,16 @@ from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Solution
-from fitting.inference.sampling.posterior import Posterior
+from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
 
 from .fit import Fit, FitSummary
+from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
+INFERENCE_DATA = "posterior.nc"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
 
@@ -96,8 +99,13 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
     return experiment_files.load_experiment(run / EXPERIMENT), summary
 
 
-def save_posterior(run: Path, posterior: Posterior) -> None:
-    """Writes the summary of a posterior beside its chain."""
+def save_posterior(run: Path, sampled: SampledFit) -> None:
+    """Writes the summary of a posterior, and of what it makes of the prior, beside its chain."""
+    posterior = sampled.posterior
+    of_prior = {
+        name: {"prior": prior, "prior_sensitivity": sampled.prior_sensitivity[name]}
+        for name, prior in sampled.priors.items()
+    }
     numbers = {
         "converged": posterior.converged,
         "message": posterior.message,
@@ -108,6 +116,8 @@ def save_posterior(run: Path, posterior: Posterior) -> None:
         "acceptance": float(posterior.acceptance.mean()),
         "stuck": posterior.stuck,
         "seconds": posterior.seconds,
-        "parameters": posterior.summary,
+        "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
     }
     write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))
+    if inference_data.is_available():
+        inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)

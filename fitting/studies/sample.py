@@ -1,6 +1,8 @@
-"""Sampling the posterior around a fit."""
+"""Sampling the posterior around a fit, and what it makes of the prior."""
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,35 @@ from fitting.inference.sampling.posterior import (
     WalkerStart,
     sample_posterior,
 )
+from fitting.inference.sampling.prior_sensitivity import Reweighted, prior_sensitivity
 from fitting.problem.problem import Problem
+from fitting.problem.space import Space
 
 from .fit import FittedParameter
+from .prior_summary import PriorSummary, summarise_priors
+
+
+@dataclasses.dataclass(frozen=True)
+class SampledFit:
+    """A fit with its posterior."""
+
+    experiment: Experiment
+    space: Space[jaxik.FootIK]
+    parameters: Sequence[FittedParameter]
+    """Of the fit, around which the posterior was sampled."""
+    posterior: Posterior
+    known_values: Mapping[str, float] | None = None
+    """What made a synthetic reference, by name."""
+
+    @cached_property
+    def priors(self) -> dict[str, PriorSummary]:
+        """By name of the parameter."""
+        return summarise_priors(self.space)
+
+    @cached_property
+    def prior_sensitivity(self) -> dict[str, list[Reweighted]]:
+        """By name of the parameter, under priors half and twice as wide."""
+        return prior_sensitivity(self.posterior, self.space.prior)
 
 
 def sample_around(

@@ -46,7 +46,7 @@ def crowd_program(function, terrain):
 def fit_program(function):
     def program():
         problem = workloads.problem(30, workloads.parameter_names(20))
-        jax.make_jaxpr(lambda u: function(problem, u))(problem.space.u0)
+        jax.make_jaxpr(lambda u: function(problem, u))(problem.space.start)
 
     return program
 

@@ -12,6 +12,8 @@ from fitting.experiments import experiment_files, problems
 from fitting.experiments.experiment import FitOptions
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
+from fitting.problem.prior import ParameterPrior
+from fitting.studies import ablation
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, ROOT, SECOND, UNEVEN_WALK, write
 
@@ -42,7 +44,23 @@ MISTAKES = [
     ({"free": "pelvis.on_gain = { lo = 1 }"}, "unknown key 'lo'; nearest is 'low'"),
     ({"free": "pelvis.on_gain = { low = 'x' }"}, "low is 'x'; wanted a number"),
     ({"free": "pelvis.on_gain = { low = nan }"}, "low is nan; wanted a number"),
-    ({"free": "pelvis.on_gain = { prior_sd = 0 }"}, "prior_sd is 0; wanted a number above 0"),
+    ({"free": "pelvis.on_gain = { prior_sd = 1 }"}, r"prior_sd is no key .*.prior.*{ spread = 1 }"),
+    ({"rest": "[prior]\nshpae = 'normal'"}, r"\[prior\]: unknown key 'shpae'; nearest is 'shape'"),
+    ({"rest": "[prior]\nshape = 'flat'"}, "shape is 'flat'; wanted one of .'normal', 'uniform'."),
+    ({"rest": "[prior]\nspread = 0"}, "spread is 0; wanted a finite number above 0"),
+    ({"rest": "[prior]\nshape = 'uniform'\nspread = 1"}, "prior.: spread is given, but a uniform"),
+    ({"rest": "[prior.pelvis]\non_gian = {}"}, "'pelvis.on_gian'; nearest is 'pelvis.on_gain'"),
+    ({"rest": "[prior.pelvis]\non_gain = 3"}, r"\[prior\] pelvis.on_gain is 3; wanted a table"),
+    (
+        {"rest": "[prior.pelvis]\non_gain = { center = 1 }"},
+        "unknown key 'center'; nearest is 'centre'",
+    ),
+    (
+        {"rest": "[prior.pelvis]\non_gain = { shape = 'uniform', centre = 0.1 }"},
+        "prior. pelvis.on_gain: centre is given, but a uniform prior has none",
+    ),
+    ({"rest": "[start]\nfoot.max_ptich = 1"}, r"\[start\].*nearest is 'foot.max_pitch'"),
+    ({"rest": "[start]\nfoot.max_pitch = 'x'"}, "foot.max_pitch is 'x'; wanted a number"),
     ({"rest": "[sigmas]\nankel = 1"}, "unknown key 'ankel'; nearest is 'ankle'"),
     ({"rest": "[sigmas]\nankle = nan"}, "ankle is nan; wanted a number above 0"),
     ({"rest": "[sigmas]\nankle = true"}, "ankle is True; wanted a number above 0"),
@@ -69,6 +87,14 @@ MISFITS = [  # noticed only when the problem is made
     ({"free": "pelvis.on_gain = { kind = 'rough' }"}, "kind is 'rough', wanted one of"),
     ({"free": "pelvis.on_gain = { low = 0.5, high = 0.1 }"}, "bounds are 0.5 to 0.1"),
     ({"free": "contact.raised_height = { high = 0.05 }"}, r"\[free\]: contact.raised_height stays"),
+    (
+        {"rest": "[prior.pelvis]\non_gain = { centre = 2 }"},
+        r"\[prior\]: pelvis.on_gain: centre is 2",
+    ),
+    (
+        {"rest": "[start]\npelvis.on_gain = 2"},
+        r"\[start\]: pelvis.on_gain: start is 2, wanted from",
+    ),
     ({"rest": "[parameters]\nlock.speed = 1.0"}, r"\[parameters\]: unknown key 'lock.speed'"),
     ({"rest": "[parameters]\nlean.gain = [0.1, 0.2]"}, r"lean.gain has shape \(2,\), wanted \(\)"),
     (
@@ -142,7 +168,7 @@ def test_free_parameters_start_at_the_values_of_the_system_with_its_fixed_ones(t
     base = problem.space.system
     assert not parameter_tree.get(base, "lock.enabled")
     np.testing.assert_array_equal(parameter_tree.get(base, "foot.max_pitch"), [0.3, 0.5])
-    start = dict(zip(problem.space.names, problem.space.values(problem.space.u0), strict=True))
+    start = dict(zip(problem.space.names, problem.space.values(problem.space.start), strict=True))
     preset = jaxik.presets.record()
     assert float(start["pelvis.on_gain"]) == pytest.approx(
         float(parameter_tree.get(preset, "pelvis.on_gain"))
@@ -253,6 +279,54 @@ def test_settings_of_the_search_and_the_sampler_can_be_overridden(tmp_path):
     again.write_text(experiment_files.experiment_to_toml(loaded))
     reloaded = experiment_files.load_experiment(again)
     assert (reloaded.fit, reloaded.sample) == (loaded.fit, loaded.sample)
+
+
+PRIOR = """
+[prior]
+shape = "uniform"
+[prior.pelvis]
+on_gain = { shape = "normal", centre = 0.3, spread = 1.0 }
+[start]
+foot.max_pitch = 0.5
+"""
+
+
+def test_prior_and_start_are_those_of_the_file_and_are_written_back(tmp_path):
+    loaded = experiment_files.load_experiment(write(tmp_path, rest=PRIOR))
+    space = problems.make_problem(loaded).space
+    np.testing.assert_array_equal(space.prior.uniform, [False, True])
+    np.testing.assert_allclose(space.prior.spread, 1.0)
+    assert float(space.values(space.prior.centre)[0]) == pytest.approx(0.3)
+    preset = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
+    np.testing.assert_allclose(space.values(space.start), [preset, 0.5])
+    again = tmp_path / "again.toml"
+    again.write_text(experiment_files.experiment_to_toml(loaded))
+    reloaded = experiment_files.load_experiment(again)
+    assert (reloaded.prior, reloaded.start) == (loaded.prior, loaded.start)
+
+
+def test_a_parameter_has_the_spread_of_the_table_unless_it_is_uniform(tmp_path):
+    rest = "[prior]\nspread = 0.7\n[prior.pelvis]\non_gain = { shape = 'uniform' }"
+    prior = experiment_files.load_experiment(write(tmp_path, rest=rest)).prior
+    assert prior.of("foot.max_pitch") == ParameterPrior(spread=0.7)
+    assert prior.of("pelvis.on_gain") == ParameterPrior("uniform")
+    rest = "[prior]\nspread = 0.7\n[prior.pelvis]\non_gain = { centre = 0.1 }"
+    prior = experiment_files.load_experiment(write(tmp_path, rest=rest)).prior
+    assert prior.of("pelvis.on_gain") == ParameterPrior(centre=0.1, spread=0.7)
+
+
+def test_a_parameter_that_only_a_variant_frees_may_have_a_prior(tmp_path):
+    variant = "[[without]]\nname = 'x'\nfree = { pelvis.limit = {} }"
+    rest = (
+        f"{variant}\n[prior.pelvis]\nlimit = {{ shape = 'uniform' }}\n[start]\npelvis.limit = 0.2"
+    )
+    loaded = experiment_files.load_experiment(write(tmp_path, rest=rest))
+    assert not problems.make_problem(loaded).space.prior.uniform.any()
+    without = ablation.without(loaded, loaded.without[0])
+    space = without.space(without.starting_system())
+    limit = space.names.index("pelvis.limit")
+    assert space.prior.uniform[limit]
+    assert float(space.values(space.start)[limit]) == pytest.approx(0.2)
 
 
 def test_only_settings_that_are_not_the_default_are_written(tmp_path):

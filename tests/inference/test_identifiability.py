@@ -10,7 +10,9 @@ from fitting.inference import identifiability, threshold_profile
 from fitting.inference.optimisation import population, search
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.problem import free_parameters
+from fitting.problem.prior import SPREAD, ParameterPrior, Priors
 from fitting.problem.problem import Problem
+from fitting.problem.space import make_space
 from support import toy
 
 SEED = 5  # a toy clip that determines every threshold
@@ -34,9 +36,34 @@ def test_a_parameter_without_effect_is_undetermined(report):
     assert report.undetermined == ("foot.idle",)
     idle = report.names.index("foot.idle")
     assert report.contraction[idle] == pytest.approx(0, abs=1e-9)
-    assert report.sd[idle] == pytest.approx(free_parameters.PRIOR_SD)
+    assert report.sd[idle] == pytest.approx(SPREAD)
     assert report.eigenvalues[0] == pytest.approx(0, abs=1e-6)
     assert report.weakest == ("foot.idle",)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        ParameterPrior("uniform"),
+        ParameterPrior(),
+        ParameterPrior(centre=0.2, spread=0.3),
+        ParameterPrior(centre=0.9, spread=3.0),
+    ],
+)
+@pytest.mark.parametrize("kind", ["smooth", "threshold"])
+def test_a_parameter_without_effect_has_contraction_0_whatever_its_prior(prior, kind):
+    ik = toy.Toy()
+    parameters = [
+        free_parameters.free_parameter(ik, "foot.idle", kind=kind),
+        free_parameters.free_parameter(ik, "foot.share"),
+    ]
+    space = make_space(ik, parameters).with_prior(Priors(named={"foot.idle": prior}))
+    problem = Problem(space, toy.make_data(ik, frames=60), toy.residuals)
+    solution = search.find_best_fit(problem, SearchSettings(max_steps=24))
+    report = identifiability.assess_identifiability(problem, solution)
+    assert report.contraction[0] == pytest.approx(0, abs=1e-6)
+    assert report.undetermined == ("foot.idle",)
+    assert report.contraction[1] > 0.9
 
 
 def test_intervals_contain_the_truth_of_nearly_all_parameters(report):

@@ -16,14 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from scipy import stats
 
 from fitting.inference.sampling import diagnostics, posterior, sampler
 from fitting.inference.sampling.chain import Chain, Identity, RandomState, journal_path
 from fitting.inference.sampling.posterior import Posterior, WalkerStart
 from fitting.inference.sampling.settings import SamplerSettings
-from fitting.problem.free_parameters import PRIOR_SD, free_parameter
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.prior import SPREAD, ParameterPrior, Priors
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
+from fitting.problem.space import make_space, values_of_rows
 from jaxik.maths import parameter_tree
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -85,7 +87,7 @@ def normal(size, seed=0):
     random = np.random.default_rng(seed)
     factor = random.normal(size=(size, size)) / np.sqrt(size) + np.diag(random.uniform(1, 3, size))
     centre = random.normal(size=size)
-    covariance = np.linalg.inv(factor.T @ factor + np.eye(size) / PRIOR_SD**2)
+    covariance = np.linalg.inv(factor.T @ factor + np.eye(size) / SPREAD**2)
     mean = covariance @ factor.T @ factor @ centre
     return toy(size, linear_in_u, (jnp.asarray(factor), jnp.asarray(centre))), mean, covariance
 
@@ -148,7 +150,7 @@ def test_intervals_have_their_nominal_coverage():
     random = np.random.default_rng(1)
     inside = {68: 0, 95: 0}
     for seed in range(runs):
-        truth = PRIOR_SD * random.normal(size=size)
+        truth = SPREAD * random.normal(size=size)
         observed = truth + np.linalg.solve(factor, random.normal(size=size))
         replica = eqx.tree_at(lambda p: p.data[1], problem, jnp.asarray(observed))
         mean = covariance @ factor.T @ factor @ observed
@@ -180,12 +182,28 @@ def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
     axis = jnp.linspace(-7, 7, 281)
     grid = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     weight = np.exp(np.asarray(sampler._log_probabilities(problem, grid)))
-    values = np.asarray(posterior._values(problem, grid))
+    values = np.asarray(values_of_rows(problem.space, grid))
     mean = np.average(values, axis=0, weights=weight)
     sd = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
     for i, row in enumerate(sampled.summary):
         assert abs(row["mean"] - mean[i]) < 4 * sd[i] / np.sqrt(row["ess"])
         assert row["sd"] == pytest.approx(sd[i], rel=0.1)
+
+
+def no_residuals(ik, data):
+    return jnp.zeros(1, ik.x.dtype) * data
+
+
+def test_without_data_a_uniform_prior_gives_uniform_values():
+    problem = toy(2, no_residuals, jnp.asarray(0.0))
+    space = problem.space.with_prior(Priors(ParameterPrior("uniform")))
+    problem = eqx.tree_at(lambda p: p.space, problem, space)
+    sampled = sample(problem, np.zeros(2), np.full(2, 1.5), walkers=64, max_steps=4000, stop_at=1e9)
+    spacing = 2 * int(np.ceil(sampled.autocorrelation_time.max()))  # nearly independent
+    for i in range(2):
+        values = sampled.kept[::spacing, :, i].ravel()
+        assert values.size > 2000
+        assert stats.kstest(values, stats.uniform(0, 1).cdf).pvalue > 0.01
 
 
 def test_a_step_into_nan_is_never_taken():
@@ -529,11 +547,13 @@ def test_the_digest_changes_with_the_data_the_prior_the_loss_and_the_residuals()
     problem, _, _ = normal(2)
     others = [
         normal(2, seed=1)[0],
-        eqx.tree_at(lambda p: p.space.u0, problem, problem.space.u0 + 1e-12),
+        eqx.tree_at(lambda p: p.space.prior.centre, problem, problem.space.start + 1e-12),
         Problem(problem.space, problem.data, linear_in_u, "cauchy"),
         Problem(problem.space, problem.data, nan_above),
     ]
+    elsewhere = eqx.tree_at(lambda p: p.space.start, problem, problem.space.start + 1.0)
     assert posterior.digest(problem) == posterior.digest(normal(2)[0])
+    assert posterior.digest(problem) == posterior.digest(elsewhere)
     assert len({posterior.digest(each) for each in [problem, *others]}) == 5
 
 

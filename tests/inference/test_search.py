@@ -98,7 +98,7 @@ def test_thresholds_and_smooth_parameters_are_recovered(seed):
     truth = np.asarray(problem.space.pack(toy.TRUTH))
     assert solution.cost <= cost_of(problem, truth)
     assert solution.cost == pytest.approx(cost_of(problem, solution.u))
-    assert solution.cost_before == pytest.approx(cost_of(problem, np.asarray(problem.space.u0)))
+    assert solution.cost_before == pytest.approx(cost_of(problem, np.asarray(problem.space.start)))
 
 
 @pytest.mark.slow
@@ -118,6 +118,17 @@ def test_the_jacobian_agrees_with_finite_differences(seed):
             np.testing.assert_allclose(
                 solution.jacobian[:, i], differences[:, i], atol=1e-5 * size, rtol=1e-4
             )
+
+
+def test_another_start_finds_the_same_optimum_of_the_same_cost():
+    problem = curve_problem()
+    moved = eqx.tree_at(
+        lambda p: p.space, problem, problem.space.with_start({"height": 0.4, "rate": 5.0})
+    )
+    first, second = search.find_best_fit(problem), search.find_best_fit(moved)
+    assert first.history[0].cost != pytest.approx(second.history[0].cost, rel=0.01)
+    assert first.cost == pytest.approx(second.cost, rel=1e-8)
+    np.testing.assert_allclose(first.values, second.values, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -247,7 +258,7 @@ def test_steps_are_those_of_optimistix_in_a_valley(steps):
 
 def test_steps_on_the_compressed_rows_are_those_of_optimistix_on_all_rows():
     problem = curve_problem()
-    u = problem.space.u0
+    u = problem.space.start
     state = march(models.HardModel(problem, u), u, 20)[-1]
     np.testing.assert_allclose(state.u, optimum(problem.residuals, u, 20), rtol=1e-9)
     assert float(state.cost) < 1e-2 * float(problem.cost(u))
@@ -298,8 +309,8 @@ def test_a_search_may_keep_its_state_in_any_form(monkeypatch):
 def test_all_steps_of_a_descent_are_one_program():
     """A weak type in the state, say, would compile the second step anew."""
     problem = curve_problem()
-    model = models.HardModel(problem, problem.space.u0)
-    before = levenberg_marquardt.begin(model, problem.space.u0)
+    model = models.HardModel(problem, problem.space.start)
+    before = levenberg_marquardt.begin(model, problem.space.start)
     after = levenberg_marquardt.step(model, before)
     assert jax.tree.structure(before) == jax.tree.structure(after)
     assert jax.tree.map(jax.typeof, before) == jax.tree.map(jax.typeof, after)
@@ -307,7 +318,7 @@ def test_all_steps_of_a_descent_are_one_program():
 
 def test_a_jacobian_is_computed_only_where_the_cost_is_low_enough():
     problem = curve_problem()
-    u, cost = problem.space.u0, problem.cost(problem.space.u0)
+    u, cost = problem.space.start, problem.cost(problem.space.start)
     jacobian = eqx.filter_jit(lambda max_cost: problem.residuals_and_jacobian(u, max_cost)[1])
     np.testing.assert_allclose(jacobian(cost), problem.jacobian(u), rtol=1e-12)
     assert np.abs(jacobian(cost)).max() > 1
@@ -359,7 +370,7 @@ def test_no_starting_point_is_refused():
 def threshold_search(**settings) -> tuple[Search, SearchState]:
     """A search of a curve with a threshold, and its state at a wrong point."""
     problem = curve_problem(("turn", "height", "rate"))
-    u = np.asarray(problem.space.u0)
+    u = np.asarray(problem.space.start)
     return Search(problem, SearchSettings(**settings)), SearchState.at(u, cost_of(problem, u))
 
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from fitting.problem.free_parameters import free_parameter
+from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
 from support import toy
@@ -33,7 +34,8 @@ def coverage(independent_fraction: float) -> float:
     Jacobian.
     """
     ik = toy.Toy()
-    space = make_space(ik, [free_parameter(ik, "foot.share", prior_sd=50.0)])
+    space = make_space(ik, [free_parameter(ik, "foot.share")])
+    space = space.with_prior(Priors(ParameterPrior(spread=50.0)))
     problem = Problem(
         space,
         jnp.zeros(RESIDUALS),

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.loss import CAUCHY, HUBER, apply_loss
+from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import CENTRE_LIMIT, Space, make_space
 from jaxik.maths import smoothing
@@ -83,20 +84,41 @@ def test_a_value_stays_above_one_that_is_fixed():
     assert space.values(jnp.full(1, -30.0))[0] == pytest.approx(0.06)
 
 
-def test_the_prior_is_centred_at_the_present_values():
+def test_start_and_prior_are_at_the_present_values():
     space = make(*NAMES)
-    np.testing.assert_allclose(space.pack({}), space.u0, rtol=TOLERANCE)
-    np.testing.assert_array_equal(space.prior_residuals(space.u0), 0)
-    np.testing.assert_allclose(space.prior_residuals(space.u0 + 1.6), 1, rtol=TOLERANCE)
+    np.testing.assert_allclose(space.pack({}), space.start, rtol=TOLERANCE)
+    np.testing.assert_array_equal(space.prior_residuals(space.start), 0)
+    np.testing.assert_allclose(space.prior_residuals(space.start + 1.6), 1, rtol=TOLERANCE)
 
 
-def test_a_prior_at_a_bound_is_moved_inside_where_u_is_finite():
-    space = make("body.rise", prior_mean=0.0)
-    assert space.u0[0] == -CENTRE_LIMIT
+def test_the_start_is_apart_from_the_centre_of_the_prior():
+    space = make("body.rise", "foot.share").with_start({"foot.share": 0.3})
+    named = {"body.rise": ParameterPrior(centre=0.12)}
+    space = space.with_prior(Priors(ParameterPrior(spread=0.5), named))
+    np.testing.assert_allclose(space.values(space.start), [0.05, 0.3], rtol=TOLERANCE)
+    np.testing.assert_allclose(space.values(space.prior.centre), [0.12, 0.6], rtol=TOLERANCE)
+    np.testing.assert_allclose(space.prior.spread, [1.6, 0.5])
 
 
-def test_a_default_outside_the_bounds_is_clipped():
-    assert free_parameter(toy.Toy(), "body.rise", low=0.1).prior_mean == 0.1
+def test_a_centre_or_start_at_a_bound_is_moved_inside_where_u_is_finite():
+    space = make("body.rise").with_start({"body.rise": 0.2})
+    space = space.with_prior(Priors(named={"body.rise": ParameterPrior(centre=0.0)}))
+    assert (space.prior.centre[0], space.start[0]) == (-CENTRE_LIMIT, CENTRE_LIMIT)
+
+
+def test_a_present_value_outside_the_bounds_is_clipped():
+    space = make("body.rise", low=0.1)
+    assert space.start[0] == space.prior.centre[0] == -CENTRE_LIMIT
+
+
+def test_a_centre_or_start_outside_the_bounds_is_refused():
+    space = make("foot.share")
+    with pytest.raises(ValueError, match="foot.share: centre is 1.5, wanted from 0 to 1.2"):
+        space.with_prior(Priors(named={"foot.share": ParameterPrior(centre=1.5)}))
+    with pytest.raises(ValueError, match="foot.share: start is -1, wanted from 0 to 1.2"):
+        space.with_start({"foot.share": -1.0})
+    with pytest.raises(ValueError, match=r"not free: \['body.rise'\]; free are \['foot.share'\]"):
+        space.with_start({"body.rise": 0.1})
 
 
 def test_a_parameter_is_either_smooth_or_a_threshold():
@@ -117,8 +139,7 @@ def test_a_parameter_is_either_smooth_or_a_threshold():
         ("foot.share", {"low": float("nan")}, "bounds are nan"),
         ("lock.release", {"low": 0.0}, "strictly between 0.0"),
         ("body.gain", {"high": 1.0}, "and 1.0 for the scale 'gain'"),
-        ("foot.share", {"prior_mean": 1.5}, "prior_mean is 1.5"),
-        ("foot.share", {"prior_sd": 0.0}, "prior_sd is 0.0"),
+        ("foot.share", {"prior_sd": 1.0}, "unknown.*prior_sd.*takes"),
         ("foot.share", {"scale": "square"}, "scale is 'square'"),
         ("foot.share", {"kind": "soft"}, "kind is 'soft'"),
     ],
@@ -220,7 +241,7 @@ def test_the_log_probability_of_residuals_that_are_not_finite_is_minus_infinity(
     assert problem.log_probability(jnp.asarray([-3.0])) == -jnp.inf
 
 
-def test_other_data_bounds_and_centres_do_not_compile_again():
+def test_other_data_bounds_starts_and_priors_do_not_compile_again():
     traces = []
 
     @eqx.filter_jit
@@ -228,8 +249,9 @@ def test_other_data_bounds_and_centres_do_not_compile_again():
         traces.append(1)
         return problem.cost(u)
 
-    for value in (0.1, 0.2):
-        space = make("foot.share")
-        space = eqx.tree_at(lambda s: (s.low, s.u0), space, (space.low - value, space.u0 + value))
+    for value, prior in ((0.1, ParameterPrior(spread=0.5)), (0.2, ParameterPrior("uniform"))):
+        space = make("foot.share").with_start({"foot.share": value})
+        space = space.with_prior(Priors(prior))
+        space = eqx.tree_at(lambda s: s.low, space, space.low - value)
         cost(Problem(space, jnp.asarray([value]), residuals), jnp.asarray([value]))
     assert len(traces) == 1

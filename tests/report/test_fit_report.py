@@ -1,5 +1,6 @@
 """Reports of fits and posteriors: numbers in texts and tables, and the plots that they link."""
 
+import json
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -16,14 +17,18 @@ from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.inference.sampling import inference_data
 from fitting.inference.sampling.posterior import Posterior
 from fitting.inference.threshold_profile import Profile
 from fitting.problem import residuals
+from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
 from fitting.report import fit_report, posterior_report
+from fitting.report.uncertainty import priors
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
+from fitting.studies.sample import SampledFit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 
@@ -169,6 +174,25 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     assert text.endswith("1 of 2 determined parameters within 5 % of their range")
 
 
+def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
+    named = {"leg.soften": ParameterPrior("uniform")}
+    space = fitted.problem.space.with_prior(Priors(ParameterPrior(spread=0.5), named))
+    problem = Problem(space, fitted.problem.data, residuals.residuals_of_scenes)
+    rows = replace(fitted, problem=problem).summary["parameters"]
+    planted = rows[0]
+    centre = planted["prior"]["centre"]
+    assert centre is not None and centre == pytest.approx(planted["before"])
+    u = np.log(centre / (0.4 - centre)) + 0.98 * np.array([-1, 1])  # 1.96 spreads of 0.5
+    np.testing.assert_allclose(planted["prior"]["interval"], 0.4 / (1 + np.exp(-u)), 1e-4)
+    text = "\n".join(priors.prior_section(rows))
+    low, high = planted["prior"]["interval"]
+    assert line_of(text, "contact.planted_height") == (
+        f"| contact.planted_height | m | normal | {centre:.4g} | 0.5 | {low:.4g} to {high:.4g} "
+        "| 0.1 to 0.12 |"
+    )
+    assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
+
+
 def test_a_gain_is_shown_as_half_life_and_at_30_and_60_hz(fitted):
     text = fit_report.fit_text(replace(fitted, known_values=None))
     cells = text.split("gain at 60 Hz")[1].split()[-5:]
@@ -193,6 +217,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
         width, height = size_of_png(tmp_path / name)
         assert 1000 < width < 2000 and 400 < height < 2500, name
     assert "| contact.planted_height | 0.11 | m |" in text
+    assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
     assert "Undetermined: `leg.soften`." in text
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | 0.100 | undetermined |" in text
@@ -306,9 +331,10 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():
 
 
 def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> None:
-    posterior_report.write_posterior(
-        run, fitted.experiment, posterior, fitted.summary["parameters"], fitted.known_values
-    )
+    rows, space = fitted.summary["parameters"], fitted.problem.space
+    sampled = SampledFit(fitted.experiment, space, rows, posterior, fitted.known_values)
+    run_folder.save_posterior(run, sampled)
+    posterior_report.write_posterior(run, sampled)
 
 
 def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
@@ -324,6 +350,24 @@ def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
     for name in ("corner.png", "chain.png"):
         assert f"({name})" in text
         assert min(size_of_png(tmp_path / name)) > 400
+
+
+def test_a_posterior_stands_beside_its_prior(fitted, tmp_path):
+    posterior = invented_posterior()
+    write_posterior(tmp_path, fitted, posterior)
+    assert (tmp_path / run_folder.INFERENCE_DATA).exists() == inference_data.is_available()
+    text = (tmp_path / run_folder.SUMMARY).read_text().split("### Prior and posterior")[1]
+    rows = json.loads((tmp_path / run_folder.POSTERIOR).read_text())["parameters"]
+    for row, summary in zip(rows, posterior.summary, strict=True):
+        low, high = row["prior"]["interval"]
+        both = f"| normal | {low:.4g} to {high:.4g} | {summary['low95']:.4g} to "
+        assert both in line_of(text, row["name"])
+        half, twice = row["prior_sensitivity"]
+        assert (half["factor"], twice["factor"]) == (0.5, 2.0)
+        assert f"| {half['median']:.4g}, " in line_of(text, row["name"])
+    moved = [row["name"] for row in rows if row["prior_sensitivity"][0]["sensitive"]]
+    assert moved
+    assert f"`{moved[0]}`" in text.split("Sensitive to their prior")[1]
 
 
 def test_a_posterior_starts_a_summary_where_there_is_none(fitted, tmp_path):

@@ -274,7 +274,7 @@ traced = []
 real = program_cache._trace
 program_cache._trace = lambda *args: traced.append(args[0].__name__) or real(*args)
 problem = workloads.problem(60)
-at = evaluate(HardModel(problem, problem.space.u0), problem.space.u0)
+at = evaluate(HardModel(problem, problem.space.start), problem.space.start)
 print(float(at.cost), *traced)
 """
     outputs = [

@@ -153,7 +153,7 @@ def test_an_experiment_can_exchange_rules_and_free_their_parameters(tmp_path):
     read = experiment_files.load_experiment(write(tmp_path, top=RULES, free=FREE, rest=rest))
     assert read.rules == {"pelvis": "CapsulePelvis", "contact": "IdleContact"}
     problem = problems.make_problem(read)
-    base = problem.space.unpack(problem.space.u0)
+    base = problem.space.unpack(problem.space.start)
     assert type(base.pelvis) is pelvis.CapsulePelvis
     assert type(base.contact) is contact.IdleContact
     assert float(parameter_tree.get(base, "contact.idle_speed")) == 0.5
@@ -192,7 +192,7 @@ def test_rules_are_kept_through_a_run(tmp_path):
     )
     problem = problems.make_problem(read)
     u = np.array([0.4, -0.3])
-    values = np.asarray(problem.space.values(problem.space.u0 * 0 + u))
+    values = np.asarray(problem.space.values(problem.space.start * 0 + u))
     names = problem.space.names
     solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
     identifiability = Identifiability(
@@ -232,7 +232,7 @@ def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):
     assert prepared.experiment.clips[0].truth is None, "its parameters are others"
     again = prepared.experiment.starting_system()
     assert systems.rule_names(again) == systems.rule_names(target.ik)
-    fitted = prepared.problem.space.unpack(prepared.problem.space.u0)
+    fitted = prepared.problem.space.unpack(prepared.problem.space.start)
     assert systems.rule_names(fitted) == systems.rule_names(target.ik)
 
 

@@ -69,6 +69,9 @@ def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path)
     assert [row["name"] for row in summary["parameters"]] == list(NAMES)
     assert [row["u"] for row in summary["parameters"]] == [0.3, -0.2]
     assert [row["start_sd"] for row in summary["parameters"]] == [0.01, THRESHOLD_SD]
+    assert [(row["prior"]["shape"], row["prior"]["spread"]) for row in summary["parameters"]] == [
+        ("normal", 1.6)
+    ] * 2
     assert [row["determined"] for row in summary["parameters"]] == [True, False]
     assert [row["at_bound"] for row in summary["parameters"]] == ["", "high"]
     assert summary["correlated"] == [[*NAMES, 0.95]] and summary["history"][0]["stage"] == "start"

@@ -120,11 +120,11 @@ class Descent(NamedTuple):
 
 
 def least_squares_with_scipy(problem: Problem, *, our_jacobian: bool) -> Callable[[], Descent]:
-    """SciPy's `least_squares` from the prior's centre, with our Jacobian or finite differences.
+    """SciPy's `least_squares` from the space's start, with our Jacobian or finite differences.
 
     The residuals are ours and compiled in both cases. It stops at our solver's tolerance.
     """
-    start = np.asarray(problem.space.u0, float)
+    start = np.asarray(problem.space.start, float)
     residuals = jax.jit(lambda problem, u: problem.residuals(u))
     jacobian = jax.jit(lambda problem, u: problem.jacobian(u))
 

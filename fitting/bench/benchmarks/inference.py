@@ -40,7 +40,7 @@ def jacobian(measurement: Measurement, sizes: Sizes) -> None:
     calls = {}
     for floats in sizes.floats:
         problem = problem64 if floats == "float64" else workloads.single(problem64)
-        u = problem.space.u0
+        u = problem.space.start
         rows, slopes = f"rows, {floats}", f"slopes, {floats}"
         calls[rows] = measurement.compile_call(rows, _residuals, problem, u)
         calls[slopes] = measurement.compile_call(slopes, residuals_and_jacobian, problem, u)
@@ -75,8 +75,8 @@ def fit(measurement: Measurement, sizes: Sizes) -> None:
         descend = baselines.least_squares_with_scipy(problem, our_jacobian=SCIPY[name])
         return lambda: descents.update({name: descend()})
 
-    u0 = problem.space.u0
-    measurement.compile("rows and slopes", residuals_and_jacobian, problem, u0)
+    start = problem.space.start
+    measurement.compile("rows and slopes", residuals_and_jacobian, problem, start)
     calls: dict[str, Call] = {"ours": ours}
     calls |= {name: scipy(name) for name in list(SCIPY)[: 2 if sizes.cold else 1]}
     measurement.time_in_turns(calls, sizes.fits)
@@ -130,7 +130,7 @@ def posterior(measurement: Measurement, sizes: Sizes) -> None:
     start = time.perf_counter()
     sample(1)
     measurement.compile_s["log-probability, and one step"] = time.perf_counter() - start
-    measurement.compile("rows", _residuals, problem, problem.space.u0)
+    measurement.compile("rows", _residuals, problem, problem.space.start)
     calls = {"chain": lambda: sample(sizes.steps)}
     measurement.time_in_turns(calls, sizes.chains, warm_up=False)
     evaluations = sizes.steps * sizes.walkers

@@ -50,7 +50,7 @@ def scaling(measurement: Measurement, sizes: Sizes) -> None:
         with jax.enable_x64(True):
             problem = workloads.problem(sizes.frames, names)
             call = measurement.compile_call(
-                name, inference.residuals_and_jacobian, problem, problem.space.u0
+                name, inference.residuals_and_jacobian, problem, problem.space.start
             )
             return {"rows and slopes, float64": _median(measurement, name, call)}
 

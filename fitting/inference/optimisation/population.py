@@ -60,7 +60,7 @@ def _in_batches(
     parts = []
     for first in range(0, len(rows), BATCH):
         batch = rows[first : first + BATCH]
-        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), space.u0.dtype)
+        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), space.start.dtype)
         parts.append(np.asarray(convert(space, filled))[: len(batch)])
     return np.concatenate(parts)
 
@@ -82,7 +82,7 @@ def evaluate(
     Jacobian all do. Evaluated BATCH at a time, the last batch filled up, so that there is one
     program.
     """
-    dtype = problem.space.u0.dtype
+    dtype = problem.space.start.dtype
     # JAX multiplies: two threads of NumPy's library wait on each other, 0.3 s on a busy machine.
     matrix = None if jacobian is None else jnp.asarray(jacobian, dtype)
     costs, gradients = [], []

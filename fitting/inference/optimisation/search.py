@@ -54,8 +54,8 @@ def find_best_fit(
     Args:
         problem: what to fit.
         settings: how thoroughly to search.
-        starts: how many starting points, the first at the prior's centre and the others the best of
-            some draws from the prior; or the `u` to start from.
+        starts: how many starting points, the first at the space's start and the others the best of
+            some draws around it; or the `u` to start from.
         seed: of the random draws; the same seed gives the same solution.
         progress: called with every report.
 
@@ -64,7 +64,7 @@ def find_best_fit(
     """
     if (starts if isinstance(starts, int) else len(starts)) < 1:
         raise ValueError(f"starts is {starts}, wanted at least 1")
-    latest = SearchState.at(np.asarray(problem.space.u0), seed=seed)
+    latest = SearchState.at(np.asarray(problem.space.start), seed=seed)
 
     def observe(state: SearchState) -> None:
         nonlocal latest
@@ -124,15 +124,15 @@ def starting_points(
 ) -> tuple[list[Point], SearchState, float]:
     """Points of finite cost to start from, the state after choosing them, and the cost before.
 
-    The first is the prior's centre, or the first of those that are passed in; the others follow
+    The first is the space's start, or the first of those that are passed in; the others follow
     with rising cost. The cost before is that of the system's values as they are.
     """
     space, settings = search.problem.space, search.settings
-    u0, random = np.asarray(space.u0), state.generator()
+    start, random = np.asarray(space.start), state.generator()
     if isinstance(starts, int):
         draws = random.normal(size=(settings.population - 2, space.size))
-        drawn = u0 + settings.start_spread * np.asarray(space.prior_sd) * draws
-        count, candidates = starts, np.concatenate([u0[None], drawn]).astype(u0.dtype)
+        drawn = start + settings.start_spread * np.asarray(space.prior.sd) * draws
+        count, candidates = starts, np.concatenate([start[None], drawn]).astype(start.dtype)
     else:
         count, candidates = len(starts), starts
     first = search.array(candidates[0])

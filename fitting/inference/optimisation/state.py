@@ -96,7 +96,7 @@ class Search:
 
     def array(self, u: Float[np.ndarray, "*n free"]) -> Float[Array, "*n free"]:
         """`u` as the problem's programs take it."""
-        return jnp.asarray(u, self.problem.space.u0.dtype)
+        return jnp.asarray(u, self.problem.space.start.dtype)
 
     def spend_step(self, state: SearchState) -> SearchState:
         """The state with one more step of Levenberg–Marquardt counted.

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
+from fitting.problem.space import Space, values_of_rows
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
@@ -84,12 +86,22 @@ class Posterior:
         return np.delete(self.values[self.burn_in :], self.isolated, axis=1)
 
     @property
+    def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
+        """`u` of the values that are kept."""
+        return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
+
+    def to_inference_data(self, space: Space) -> Any:
+        """The kept draws as ArviZ takes them; see `inference_data.to_inference_data`."""
+        from .inference_data import to_inference_data
+
+        return to_inference_data(self, space)
+
+    @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
         """One row per parameter, of the values that are kept."""
-        u = np.delete(self.u[self.burn_in :], self.isolated, axis=1)
         times = self.autocorrelation_time / self.thin_by
         return diagnostics.summarise(
-            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(u)
+            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(self.kept_u)
         )
 
 
@@ -195,6 +207,7 @@ def _check(chain: Chain, length: int) -> diagnostics.Check:
 
 def digest(problem: Problem) -> str:
     """64 characters that change with any number or name on which the log-probability depends."""
+    problem = eqx.tree_at(lambda problem: problem.space.start, problem, replace=None)
     digested = hashlib.sha256()
     function = problem.residual_function
     names = (function.__module__, function.__qualname__, problem.loss)
@@ -205,11 +218,6 @@ def digest(problem: Problem) -> str:
         digested.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
         digested.update(array.tobytes())
     return digested.hexdigest()
-
-
-@jax.jit
-def _values(problem: Problem, u: Float[Array, "samples free"]) -> Float[Array, "samples free"]:
-    return jax.vmap(problem.space.values)(u)
 
 
 def _check_start(size: int, start: WalkerStart) -> None:
@@ -241,14 +249,14 @@ def _describe_progress(
 
 def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float) -> Posterior:
     u, check = chain.u, outcome.check
-    flat = jnp.asarray(u.reshape(-1, u.shape[-1]), problem.space.u0.dtype)
+    flat = jnp.asarray(u.reshape(-1, u.shape[-1]), problem.space.start.dtype)
     acceptance = chain.accepted / len(chain)
     stuck = check.isolated | diagnostics.lazy_walkers(acceptance)
     return Posterior(
         names=problem.space.names,
         u=u,
         log_probability=chain.log_probability,
-        values=np.asarray(_values(problem, flat)).reshape(u.shape),
+        values=np.asarray(values_of_rows(problem.space, flat)).reshape(u.shape),
         thin_by=chain.identity.thin_by,
         burn_in=check.burn_in,
         autocorrelation_time=check.times * chain.identity.thin_by,

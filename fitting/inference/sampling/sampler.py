@@ -55,7 +55,7 @@ def steps(
 ) -> Iterator[emcee.State]:
     """Continues the chain from its last step to `limit` stored steps, one at a time."""
     identity = chain.identity
-    dtype = problem.space.u0.dtype
+    dtype = problem.space.start.dtype
 
     def evaluate(u: np.ndarray) -> np.ndarray:
         """Half of the walkers at a time, as the moves need them: one program."""

@@ -8,12 +8,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from fitting.inference.sampling.posterior import Posterior
+from fitting.problem.prior_probability import prior_probability
+from fitting.problem.space import Space
 
-from .style import AFTER, BEFORE, CAPTURED, styled
+from .style import AFTER, BEFORE, CAPTURED, PRIOR, styled
 
 SAMPLES = 20_000  # at most, in the corner
 WALKERS = 40  # at most, in the picture of the chain
 POINTS = 1500  # at most, of each walker
+BINS = 30  # of a histogram
 MARGIN = 0.05  # fraction of a panel's width
 
 
@@ -24,20 +27,25 @@ def corner(
     fitted: Mapping[str, float],
     truth: Mapping[str, float] | None,
     title: str,
+    space: Space | None = None,
 ) -> Figure:
-    """Every parameter and every pair of them: samples, best fit, and truth if known."""
+    """Every parameter and every pair of them: samples, best fit, and truth if known.
+
+    With a space, its prior stands over the posterior of each parameter.
+    """
     size = len(posterior.names)
     samples = posterior.kept.reshape(-1, size)
     samples = samples[:: max(1, len(samples) // SAMPLES)]
     marks = [[values.get(name) for name in posterior.names] for values in (fitted, truth or {})]
+    ranges = [_range(samples[:, i], [values[i] for values in marks]) for i in range(size)]
     inches = 1.2 + max(size, 3) * (2.2 if size <= 6 else 1.75)
     font_size = 15 if size <= 6 else 11
     figure = Figure(figsize=(inches, inches), dpi=100)
     corner_library.corner(
         samples,
         fig=figure,
-        bins=30,
-        range=[_range(samples[:, i], [values[i] for values in marks]) for i in range(size)],
+        bins=BINS,
+        range=ranges,
         labels=[label.replace(".", ".\n", 1) for label in labels],
         label_kwargs={"fontsize": font_size},
         labelpad=0.12 if size <= 6 else 0.25,
@@ -55,11 +63,19 @@ def corner(
     for values, colour, dashes in zip(marks, (BEFORE, CAPTURED), ("--", "-"), strict=True):
         style = {"color": colour, "linestyle": dashes, "linewidth": 1.8}
         corner_library.overplot_lines(figure, values, **style)
+    if space is not None:
+        edges = np.stack([np.linspace(*ends, BINS + 1) for ends in ranges], axis=1)
+        expected = len(samples) * np.diff(prior_probability(space, edges), axis=0)
+        for i, axes in enumerate(figure.axes[:: size + 1]):  # the diagonal
+            axes.stairs(expected[:, i], edges[:, i], color=PRIOR, linewidth=1.8)
+            axes.set_ylim(0, max(axes.get_ylim()[1], 1.1 * expected[:, i].max()))
     entries = [
         Line2D([], [], color=AFTER, linewidth=4, label="posterior: contours hold 39 % and 86 %"),
         Line2D([], [], color=AFTER, linestyle="--", label="ends of the 95 % interval"),
         Line2D([], [], color=BEFORE, linestyle="--", linewidth=1.8, label="best fit"),
     ]
+    if space is not None:
+        entries.append(Line2D([], [], color=PRIOR, linewidth=1.8, label="prior"))
     if truth:
         entries.append(Line2D([], [], color=CAPTURED, linewidth=1.8, label="truth"))
     legend_size = np.clip(1.1 * inches, 12, 24)

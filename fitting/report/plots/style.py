@@ -14,6 +14,7 @@ from fitting.runtime import files
 # The palette of Okabe and Ito, which colour-blind readers can distinguish.
 BEFORE, AFTER, CAPTURED = "#8c8c8c", "#0072B2", "#D55E00"
 STANDING, LOCKED, SLIDING = "#56B4E9", "#009E73", "#CC79A7"
+PRIOR = "#009E73"
 STAGES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 GROUND, EARTH = "#5f5236", "#ece5d6"
 SPAN = 5.0  # s, length of the section that is also shown enlarged

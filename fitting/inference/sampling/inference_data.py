@@ -1,0 +1,85 @@
+"""A posterior as ArviZ's tools take it: for its plots, its diagnostics and NetCDF files.
+
+ArviZ is optional; `pip install "jaxik[posterior]"` brings what is used here.
+"""
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.problem.space import Space, values_of_rows
+from fitting.runtime import files
+from fitting.runtime.precision import in_float64
+from jaxik.maths import parameter_tree
+
+from .posterior import Posterior
+
+PACKAGES = ("arviz_base", "h5netcdf")
+PRIOR_DRAWS = 4000
+
+
+def is_available() -> bool:
+    """Whether the packages that this needs are installed."""
+    return all(importlib.util.find_spec(package) for package in PACKAGES)
+
+
+@in_float64
+def to_inference_data(posterior: Posterior, space: Space) -> Any:
+    """The kept draws and draws of the prior as ArviZ's `DataTree` (`InferenceData` in its 0.x).
+
+    Groups: `posterior` and `prior` hold a variable for each parameter under its dotted name, in its
+    unit, with `units` and `kind` as attributes; `sample_stats` holds the log-probability as `lp`.
+    Coordinates: `chain`, the walker's index, and `draw`, the step of the sampler, so that burn-in
+    and isolated walkers are seen to be missing. Walkers exchange proposals: ArviZ takes them for
+    independent chains, and its effective sample sizes are too large; ours are in the summary.
+
+    Args:
+        posterior: the samples.
+        space: of the problem that was sampled.
+
+    Raises:
+        ImportError: ArviZ is not installed.
+    """
+    if not is_available():
+        raise ImportError('this needs ArviZ: pip install "jaxik[posterior]"')
+    from arviz_base import from_dict
+
+    declared = parameter_tree.declarations(space.system)
+    attributes = {
+        p.name: {"units": declared[p.leaf].unit, "kind": p.kind} for p in space.parameters
+    }
+    u = space.prior.draw(np.random.default_rng(0), PRIOR_DRAWS)
+    drawn = np.asarray(values_of_rows(space, jnp.asarray(u, space.start.dtype)))
+    log_probability = np.delete(
+        posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1
+    )
+    names = posterior.names
+    tree = from_dict(
+        {
+            "posterior": {name: posterior.kept[..., i].T for i, name in enumerate(names)},
+            "sample_stats": {"lp": log_probability.T},
+            "prior": {name: drawn[None, :, i] for i, name in enumerate(names)},
+        },
+        attrs={"/": {"inference_library": "emcee", "message": posterior.message}},
+    )
+    walkers = np.delete(np.arange(posterior.u.shape[1]), posterior.isolated)
+    steps = posterior.thin_by * (1 + np.arange(posterior.burn_in, len(posterior.u)))
+    for group in ("posterior", "sample_stats"):
+        tree[group].dataset = tree[group].to_dataset().assign_coords(chain=walkers, draw=steps)
+    for group in ("posterior", "prior"):
+        for name in names:
+            tree[group][name].attrs.update(attributes[name])
+    return tree
+
+
+def write_inference_data(path: Path, posterior: Posterior, space: Space) -> None:
+    """Writes `to_inference_data` as a NetCDF file, which `arviz.from_netcdf` reads.
+
+    Raises:
+        ImportError: ArviZ is not installed.
+    """
+    tree = to_inference_data(posterior, space)
+    files.write(path, lambda temporary: tree.to_netcdf(temporary, engine="h5netcdf"))

@@ -1,0 +1,97 @@
+"""Posteriors as ArviZ takes them: its figures are ours, and a file holds all of it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from fitting.inference.sampling import inference_data
+from fitting.inference.sampling.posterior import Posterior
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.prior import ParameterPrior, Priors
+from fitting.problem.space import Space, make_space, values_of_rows
+from support import toy
+
+NAMES = ("foot.share", "foot.limit[0]", "lock.height_on")
+
+
+@pytest.fixture(scope="module")
+def space() -> Space:
+    ik = toy.Toy()
+    space = make_space(ik, [free_parameter(ik, name) for name in NAMES])
+    return space.with_prior(Priors(named={"foot.share": ParameterPrior("uniform")}))
+
+
+@pytest.fixture(scope="module")
+def posterior(space) -> Posterior:
+    """Normal draws, with an isolated walker."""
+    u = 0.4 + 0.3 * np.random.default_rng(0).normal(size=(300, 8, 3))
+    u[:, 5] += 9.0
+    return Posterior(
+        names=NAMES,
+        u=u,
+        log_probability=-0.5 * np.sum(u**2, axis=-1),
+        values=np.asarray(values_of_rows(space, jnp.asarray(u.reshape(-1, 3)))).reshape(u.shape),
+        thin_by=2,
+        burn_in=100,
+        autocorrelation_time=np.full(3, 2.0),
+        acceptance=np.full(8, 0.3),
+        isolated=[5],
+        stuck=[5],
+        converged=True,
+        message="Converged.",
+        seconds=1.0,
+    )
+
+
+def test_the_summary_of_arviz_has_our_figures(posterior, space):
+    arviz_stats = pytest.importorskip("arviz_stats")
+    tree = posterior.to_inference_data(space)
+    table = arviz_stats.summary(tree, kind="stats", ci_prob=0.95, ci_kind="eti", round_to="none")
+    medians = arviz_stats.summary(tree, kind="stats_median", round_to="none")["median"]
+    r_hat = arviz_stats.rhat(tree, method="split")
+    for row in posterior.summary:
+        theirs = table.loc[row["name"]]
+        for ours, key in (("mean", "mean"), ("low95", "eti95_lb"), ("high95", "eti95_ub")):
+            assert theirs[key] == pytest.approx(row[ours], rel=1e-9), (row["name"], key)
+        assert theirs["sd"] == pytest.approx(row["sd"], rel=1e-3)
+        assert medians[row["name"]] == pytest.approx(row["median"], rel=1e-9)
+        assert float(r_hat[row["name"]]) == pytest.approx(row["r_hat"], abs=0.01)
+
+
+def test_draws_have_their_walkers_steps_units_and_kinds(posterior, space):
+    pytest.importorskip("arviz_base")
+    tree = posterior.to_inference_data(space)
+    draws = tree["posterior"]
+    assert draws["chain"].values.tolist() == [0, 1, 2, 3, 4, 6, 7]
+    assert draws["draw"].values[[0, -1]].tolist() == [202, 600]
+    np.testing.assert_array_equal(draws["foot.limit[0]"].T, posterior.kept[..., 1])
+    assert draws["foot.limit[0]"].attrs["units"] == "rad"
+    assert draws["lock.height_on"].attrs["kind"] == "threshold"
+    lp = tree["sample_stats"]["lp"]
+    np.testing.assert_array_equal(lp.sel(chain=6), posterior.log_probability[100:, 6])
+
+
+def test_draws_of_the_prior_have_its_distribution(posterior, space):
+    pytest.importorskip("arviz_base")
+    share = posterior.to_inference_data(space)["prior"]["foot.share"].values.ravel()
+    assert stats.kstest(share, stats.uniform(0, 1.2).cdf).pvalue > 0.01
+
+
+def test_a_file_holds_what_was_written(posterior, space, tmp_path):
+    arviz_base = pytest.importorskip("arviz_base")
+    xarray = pytest.importorskip("xarray")
+    inference_data.write_inference_data(tmp_path / "posterior.nc", posterior, space)
+    read = xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf")
+    written = posterior.to_inference_data(space)
+    for group in ("posterior", "sample_stats", "prior"):
+        xarray.testing.assert_equal(read[group].to_dataset(), written[group].to_dataset())
+    assert read["posterior"]["foot.limit[0]"].attrs == {"units": "rad", "kind": "smooth"}
+    assert read.attrs["message"] == "Converged."
+    assert arviz_base.extract(read, group="prior").sizes["sample"] == inference_data.PRIOR_DRAWS
+
+
+def test_without_arviz_the_error_says_how_to_install_it(posterior, space, monkeypatch):
+    monkeypatch.setattr(inference_data, "PACKAGES", ("no_such_package",))
+    with pytest.raises(ImportError, match=r'pip install "jaxik\[posterior\]"'):
+        posterior.to_inference_data(space)
