@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import jaxik
-from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import FreeParameter, free_parameter
@@ -60,7 +60,8 @@ class ClipEntry:
 class FitOptions:
     """How the best fit is searched for."""
 
-    starts: int = 1
+    starts: int = MAX_STARTS
+    """At most."""
     search: SearchSettings = SearchSettings()
 
 

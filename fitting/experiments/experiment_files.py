@@ -32,7 +32,7 @@ from typing import Any, get_args
 import tomli_w
 
 from fitting.datasets.ground_path import ROOTS
-from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
@@ -150,7 +150,7 @@ def _fit_options(value: object, where: str) -> FitOptions:
     search = _values(changed, SearchSettings)
     search |= {"max_steps": table["max_steps"]} if "max_steps" in table else {}
     with validation.error_context(f"{where} [fit.search]"):
-        return FitOptions(table.get("starts", 1), SearchSettings(**search))
+        return FitOptions(table.get("starts", MAX_STARTS), SearchSettings(**search))
 
 
 def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSettings:

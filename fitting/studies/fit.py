@@ -67,6 +67,10 @@ class FitSummary(TypedDict):
     cost_before: float
     cost: float
     steps: int
+    starts: int
+    """Independent ones."""
+    agreeing: int
+    """Starts that ended at this cost, or hardly above it."""
     seconds: float
     parameters: list[FittedParameter]
     correlated: list[list[str | float]]
@@ -116,6 +120,8 @@ class Fit:
             "cost_before": solution.cost_before,
             "cost": solution.cost,
             "steps": solution.steps,
+            "starts": solution.starts,
+            "agreeing": solution.agreeing,
             "seconds": solution.seconds,
             "parameters": _fitted_parameters(self),
             "correlated": [list(pair) for pair in self.identifiability.correlated],
@@ -136,7 +142,7 @@ def search(
         problem: the problem of the experiment.
         experiment: its settings of the search.
         progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
-        starts: starting points in u, instead of those that the experiment asks for.
+        starts: how many, or from which u, instead of as many as the experiment allows.
     """
     return find_best_fit(
         problem,

@@ -73,7 +73,7 @@ MISTAKES = [
     ({"rest": "[fit.search]\nmax_steps = 3"}, r"\[fit.search\]: unknown key 'max_steps'"),
     ({"rest": "[fit.search]\nelite = 0"}, "elite is 0; wanted a whole number from 1"),
     ({"rest": "[fit.search]\nelite = 1.5"}, "elite is 1.5; wanted a whole number from 1"),
-    ({"rest": "[fit.search]\nensemble_spreads = 1"}, "is 1; wanted a list of numbers from 0"),
+    ({"rest": "[fit.search]\nagreement = -1"}, "agreement is -1; wanted a number from 0"),
     ({"rest": "[fit.search]\npopulation = 8"}, r"\[fit.search\]: gauss_newton_children is 16"),
     ({"rest": "[sample]\nwalkers = 5"}, "walkers is 5, wanted an even number from 4"),
     ({"rest": "[sample]\nwalkers = 2"}, "walkers is 2, wanted an even number from 4"),
@@ -269,10 +269,10 @@ def test_the_blocks_experiment_makes_a_problem(mocap):
 
 
 def test_settings_of_the_search_and_the_sampler_can_be_overridden(tmp_path):
-    rest = "[fit]\nstarts = 2\nmax_steps = 50\n[fit.search]\nelite = 4\nensemble_spreads = [1, 0.3]"
+    rest = "[fit]\nstarts = 2\nmax_steps = 50\n[fit.search]\nelite = 4\nagreement = 1"
     path = write(tmp_path, rest=f"{rest}\n[sample]\nmax_steps = 300\ncheck_every = 30")
     loaded = experiment_files.load_experiment(path)
-    search = SearchSettings(max_steps=50, elite=4, ensemble_spreads=(1.0, 0.3))
+    search = SearchSettings(max_steps=50, elite=4, agreement=1.0)
     assert loaded.fit == FitOptions(2, search)
     assert loaded.sample == SamplerSettings(max_steps=300, check_every=30)
     again = tmp_path / "again.toml"
@@ -332,6 +332,6 @@ def test_a_parameter_that_only_a_variant_frees_may_have_a_prior(tmp_path):
 def test_only_settings_that_are_not_the_default_are_written(tmp_path):
     loaded = experiment_files.load_experiment(write(tmp_path))
     text = experiment_files.experiment_to_toml(loaded)
-    assert "[fit]\nstarts = 1\nmax_steps = 1000\n" in text and "[fit.search]" not in text
+    assert "[fit]\nstarts = 6\nmax_steps = 1000\n" in text and "[fit.search]" not in text
     assert "[sample]\nmax_steps = 20000\nthin_by = 1\nstop_at = 50.0\n" in text
     assert "check_every" not in text

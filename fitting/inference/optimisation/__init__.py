@@ -5,5 +5,5 @@ itself. It is made for costs with plateaus and cliffs, not for smooth ones only:
 Levenberg–Marquardt alone is enough.
 
 Start with `search.py`, which puts the stages together. The stages are in `descent.py`,
-`population.py`, `sweep.py` and `thresholds.py`; what they share is in `state.py` and `settings.py`.
+`population.py`, `sweep.py` and `evolution.py`; what they share is in `state.py` and `settings.py`.
 """

@@ -6,11 +6,10 @@ Each raises `StepsUsedUp` before a step that would exceed the `max_steps` of a s
 import dataclasses
 
 import numpy as np
-from jaxtyping import Array, Float
 
 from . import levenberg_marquardt
 from .levenberg_marquardt import LMState
-from .models import EnsembleModel, HardModel, problem_jacobian
+from .models import HardModel, problem_jacobian
 from .settings import SearchSettings
 from .state import Point, Search, SearchState
 
@@ -48,26 +47,6 @@ def _descend(
         if finished:
             break
     return state
-
-
-def descend_ensemble(
-    search: Search, state: SearchState, shifts: Float[Array, "ensemble free"]
-) -> SearchState:
-    """A short descent of all parameters on the mean residuals over shifted thresholds.
-
-    The new point has no cost yet: that of the mean is not the hard program's.
-    """
-    model = EnsembleModel(search.problem, shifts)
-    lm = levenberg_marquardt.evaluate(model, search.array(state.point.u))
-    streaks = Streaks()
-    for _ in range(search.settings.descent_steps):
-        state = search.spend_step(state)
-        before, lm = lm, levenberg_marquardt.step(model, lm)
-        streaks = streaks.after(before, lm, search.settings)
-        state = search.report(state, "ensemble", float(lm.cost))
-        if streaks.finished(search.settings, search.settings.max_rejected_steps):
-            break
-    return dataclasses.replace(state, point=Point(np.asarray(lm.u)))
 
 
 def _point(lm: LMState) -> Point:

@@ -3,7 +3,6 @@
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -49,29 +48,6 @@ class HardModel(eqx.Module):
 def problem_jacobian(jacobian: Array) -> Float[np.ndarray, "residuals free"]:
     """The part of a `HardModel`'s Jacobian that belongs to the problem's own residuals."""
     return np.asarray(jacobian)[: -jacobian.shape[1]]
-
-
-class EnsembleModel(eqx.Module):
-    """Mean residuals over shifted thresholds, which have a derivative where one program has none.
-
-    The columns of the thresholds come from a regression on the shifts, those of the smooth
-    parameters from the unshifted program: the Jacobian steers a step, and the cost judges it.
-    """
-
-    problem: Problem
-    shifts: Float[Array, "ensemble free"]
-
-    def residuals_and_jacobian(
-        self, u: Float[Array, " free"], max_cost: Float[Array, ""]
-    ) -> tuple[Float[Array, " residuals"], Float[Array, "residuals free"]]:
-        """Both at `u`, whatever the cost."""
-        del max_cost
-        _, jacobian = self.problem.residuals_and_jacobian(u)
-        shifted = jax.vmap(self.problem.residuals)(u + self.shifts)
-        mean = jnp.mean(shifted, axis=0)
-        regressed = (jnp.linalg.pinv(self.shifts) @ (shifted - mean)).T
-        thresholds = jnp.asarray(self.problem.space.thresholds)
-        return mean, jnp.where(thresholds, regressed, jacobian)
 
 
 class Compressed(eqx.Module):

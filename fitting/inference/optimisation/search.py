@@ -1,38 +1,42 @@
 """The search for the best fit: derivatives where there are some, candidates where there are none.
 
-The pipeline stays hard. A threshold has no derivative through a hard decision, so thresholds are
-moved in two ways, and the lower cost is kept (see `thresholds`). The smooth parameters follow
-Levenberg–Marquardt (`descent`). A `sweep` of each parameter over its range frees those that a
-clamp leaves without a derivative. From each start:
+The pipeline stays hard, and its cost has many valleys. Each start is independent of the others:
 
-1. `thresholds.search_thresholds`, or without thresholds a descent;
-2. `sweep.sweep_and_descend`;
-3. `descent.polish`.
+1. The costs of some draws from the prior are computed; the best few descend by Levenberg–Marquardt
+   (`descent`), with a `sweep` of each parameter over its range in between, which frees those that a
+   clamp leaves without a derivative.
+2. Where their ends differ, `evolution` combines and varies them, thresholds included.
+3. The best point descends to the end (`descent.polish`).
 
-A search compiles three programs, whatever the number of starts and stages: a step of
-Levenberg–Marquardt on the hard problem, one on the ensemble's, and the population's costs.
+Starts are made until as many of them agree as the settings ask for: a valley that only one start
+has found may well not be the deepest.
+
+A search compiles two programs, whatever the number of starts and stages: a step of
+Levenberg–Marquardt, and the population's costs.
 """
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import for_other_thread, in_float64
 
 from . import levenberg_marquardt
 from .descent import descend, polish
+from .evolution import evolve
 from .models import HardModel, problem_jacobian
 from .population import evaluate
-from .settings import DEFAULTS, SearchSettings
+from .settings import DEFAULTS, MAX_STARTS, SearchSettings
 from .solution import Progress, Solution
 from .state import Point, Search, SearchState, StepsUsedUp
 from .sweep import sweep_and_descend
-from .thresholds import search_thresholds
+
+MIN_DESCENTS = 2  # of a start
 
 Starts = int | Float[np.ndarray, "starts free"]
 
@@ -42,7 +46,7 @@ def find_best_fit(
     problem: Problem,
     settings: SearchSettings = DEFAULTS,
     *,
-    starts: Starts = 1,
+    starts: Starts = MAX_STARTS,
     seed: int = 0,
     progress: Callable[[Progress], None] | None = None,
 ) -> Solution:
@@ -54,8 +58,8 @@ def find_best_fit(
     Args:
         problem: what to fit.
         settings: how thoroughly to search.
-        starts: how many starting points, the first at the space's start and the others the best of
-            some draws around it; or the `u` to start from.
+        starts: how many starts to make at most, the first with a descent from the space's start; or
+            the `u` from which each start makes its first descent.
         seed: of the random draws; the same seed gives the same solution.
         progress: called with every report.
 
@@ -73,20 +77,27 @@ def find_best_fit(
             progress(state.history[-1])
 
     search = Search(problem, settings, observe)
+    first = [problem.space.start] if isinstance(starts, int) else starts
+    limit = starts if isinstance(starts, int) else len(starts)
     cost_before, used_up, interrupted = np.inf, False, False
+    ends: list[float] = []
     try:
-        points, latest, cost_before = starting_points(search, latest, starts)
-        for number, point in enumerate(points):
-            beginning = dataclasses.replace(latest, start=number, start_steps=0)
+        cost_before, latest = _begin(search, latest, search.array(np.asarray(first[0])))
+        while len(ends) < limit and not agree(ends, settings):
+            number = len(ends)
+            state = dataclasses.replace(latest, start=number, start_steps=0)
             try:
-                latest = search_from(search, beginning, point)
+                latest = search_from(search, state, *first[number : number + 1])
             except StepsUsedUp as error:
                 latest, used_up = error.state, True
+            ends.append(latest.point.cost)
     except KeyboardInterrupt:
         if not np.isfinite(latest.best.cost):
             raise
         interrupted = True
-    converged = latest.converged and not interrupted
+    agreeing = count_agreeing(ends, settings)
+    end = _End(latest, len(ends), agreeing, interrupted=interrupted, used_up=used_up)
+    converged = latest.converged and agree(ends, settings) and not interrupted
     u = search.array(latest.best.u)
     return Solution(
         names=problem.space.names,
@@ -95,56 +106,89 @@ def find_best_fit(
         cost_before=cost_before,
         cost=latest.best.cost,
         converged=converged,
-        message=_message(settings, latest, interrupted=interrupted, used_up=used_up),
+        message=_message(settings, end, converged=converged),
         jacobian=_jacobian(search, latest.best),
         history=latest.history,
         steps=latest.steps,
+        starts=len(ends),
+        agreeing=agreeing,
         seconds=time.perf_counter() - search.began,
         interrupted=interrupted,
     )
 
 
-def search_from(search: Search, state: SearchState, point: Point) -> SearchState:
-    """All stages from one starting point.
+def count_agreeing(ends: Sequence[float], settings: SearchSettings) -> int:
+    """How many of the starts ended at the lowest of these costs, or hardly above it."""
+    return int(np.sum(np.asarray(ends) <= min(ends, default=np.inf) + settings.agreement))
+
+
+def agree(ends: Sequence[float], settings: SearchSettings) -> bool:
+    """Whether enough starts ended in the deepest valley: a number of them, and half of all."""
+    return count_agreeing(ends, settings) >= max(settings.agreeing_starts, len(ends) / 2)
+
+
+def search_from(
+    search: Search, state: SearchState, first: Float[Array | np.ndarray, " free"] | None = None
+) -> SearchState:
+    """All stages of one start; the state's point is its end.
+
+    Args:
+        search: the problem and the settings.
+        state: of the search so far; only its random generator and its records matter.
+        first: from where the first descent begins; None leaves all to the draws.
 
     Raises:
         StepsUsedUp: when the start has no steps left; carries the state it ended in.
     """
-    state = search.move(state, "start", point)
-    if search.thresholds.any():
-        state = search_thresholds(search, state)
-    else:
-        state = descend(search, state, "slopes")
-    state = sweep_and_descend(search, state, search.settings.final_sweeps)
+    settings = search.settings
+    points, state = starting_points(search, state, first)
+    ends = []
+    for point in points:
+        state = search.jump(state, "start", point)
+        state = descend(search, state, "descent")
+        state = sweep_and_descend(search, state, settings.sweeps)
+        ends.append(state.point)
+    ends = [end for end in ends if np.isfinite(end.cost)]
+    if not ends:
+        return state
+    state = dataclasses.replace(state, point=min(ends, key=lambda end: end.cost))
+    if any(end.cost > state.point.cost + settings.agreement for end in ends):
+        state = evolve(search, state, ends)
     return polish(search, state)
 
 
 def starting_points(
-    search: Search, state: SearchState, starts: Starts
-) -> tuple[list[Point], SearchState, float]:
-    """Points of finite cost to start from, the state after choosing them, and the cost before.
-
-    The first is the space's start, or the first of those that are passed in; the others follow
-    with rising cost. The cost before is that of the system's values as they are.
-    """
+    search: Search, state: SearchState, first: Float[Array | np.ndarray, " free"] | None = None
+) -> tuple[list[Point], SearchState]:
+    """Where the descents of a start begin, and the state after drawing: `first`, the best draws."""
     space, settings = search.problem.space, search.settings
-    start, random = np.asarray(space.start), state.generator()
-    if isinstance(starts, int):
-        draws = random.normal(size=(settings.population - 2, space.size))
-        drawn = start + settings.start_spread * np.asarray(space.prior.sd) * draws
-        count, candidates = starts, np.concatenate([start[None], drawn]).astype(start.dtype)
-    else:
-        count, candidates = len(starts), starts
-    first = search.array(candidates[0])
-    evaluate_first = for_other_thread(levenberg_marquardt.evaluate)
+    random = state.generator()
+    drawn = space.prior.draw(random, settings.draws)
+    candidates = drawn if first is None else np.concatenate([np.asarray(first)[None], drawn])
+    candidates = candidates.astype(space.start.dtype)
+    costs = evaluate(search.problem, candidates).cost
+    order = np.argsort(costs, kind="stable")
+    if first is not None:
+        order = np.concatenate([[0], order[order != 0]])
+    finite = [i for i in order if np.isfinite(costs[i])] or [order[0]]
+    points = [Point(candidates[i], float(costs[i])) for i in finite]
+    count = min(settings.descents, max(MIN_DESCENTS, space.size // 2))
+    return points[:count], dataclasses.replace(state, random=random)
+
+
+def _begin(
+    search: Search, state: SearchState, first: Float[Array, " free"]
+) -> tuple[float, SearchState]:
+    """Cost of the system as it is, and the state with the first point evaluated."""
+    problem = search.problem
+    present = search.array(np.asarray(problem.space.pack({})))
+    evaluate_present = for_other_thread(levenberg_marquardt.evaluate)
     with ThreadPoolExecutor(1) as thread:  # the two programs compile side by side
-        evaluated = thread.submit(evaluate_first, HardModel(search.problem, first), first)
-        present = np.asarray(space.pack({}))[None]
-        before, *costs = evaluate(search.problem, np.concatenate([present, candidates])).cost
-    state = dataclasses.replace(state, random=random, evaluated=evaluated.result())
-    order = [0, *(1 + np.argsort(costs[1:], kind="stable"))]
-    points = [Point(candidates[i], float(costs[i])) for i in order if np.isfinite(costs[i])]
-    return points[:count], state, float(before)
+        evaluated = thread.submit(evaluate_present, HardModel(problem, present), present)
+        evaluate(problem, np.asarray(present)[None])
+    before = float(evaluated.result().cost)
+    lm = levenberg_marquardt.evaluate(HardModel(problem, first), first)
+    return before if np.isfinite(before) else np.inf, dataclasses.replace(state, evaluated=lm)
 
 
 def _jacobian(search: Search, best: Point) -> Float[np.ndarray, "residuals free"]:
@@ -156,18 +200,37 @@ def _jacobian(search: Search, best: Point) -> Float[np.ndarray, "residuals free"
     return problem_jacobian(evaluated.jacobian)
 
 
-def _message(
-    settings: SearchSettings, end: SearchState, *, interrupted: bool, used_up: bool
-) -> str:
+@dataclasses.dataclass(frozen=True)
+class _End:
+    """How a search ended."""
+
+    state: SearchState
+    starts: int
+    agreeing: int
+    interrupted: bool
+    used_up: bool
+    """A start had no steps left."""
+
+
+def _message(settings: SearchSettings, end: _End, *, converged: bool) -> str:
     """How the search ended, in one sentence."""
-    if interrupted:
-        return f"Interrupted after {end.steps} steps; this is the best point so far."
-    if not np.isfinite(end.best.cost):
+    best, starts = end.state.best, "start" if end.starts == 1 else "starts"
+    agreement = f"{end.agreeing} of {end.starts} {starts} agree{'s' * (end.agreeing == 1)}"
+    if end.interrupted:
+        return f"Interrupted after {end.state.steps} steps; this is the best point so far."
+    if not np.isfinite(best.cost):
         return "Not converged: no residuals are finite at any starting point."
-    if end.converged:
+    if converged:
         gain = settings.min_step_gain
-        return f"Converged: no further step lowers the cost by more than {gain:g} of itself."
-    if used_up:
+        return (
+            f"Converged: {agreement}, and no further step lowers the cost by more than {gain:g} "
+            "of itself."
+        )
+    if end.state.converged and end.starts == 1:
+        return "Not converged: stopped in a valley, where the only start led."
+    if end.state.converged:
+        return f"Not converged: stopped in a valley; {agreement}."
+    if end.used_up:
         return f"Not converged: the {settings.max_steps} steps allowed for a start were used up."
     return (
         "Not converged: the steps ended in a region where residuals or derivatives are not finite."

@@ -11,7 +11,7 @@ class Progress:
     """One report of a running search."""
 
     stage: str
-    """Start, blocks, ensemble, sweep, slopes or polish."""
+    """Start, descent, sweep, evolution or polish."""
     start: int
     """Index of the starting point."""
     step: int
@@ -43,5 +43,9 @@ class Solution:
     history: tuple[Progress, ...]
     steps: int
     """Of Levenberg–Marquardt, all starts together."""
+    starts: int
+    """That were finished."""
+    agreeing: int
+    """Of them, those that ended at this cost, or hardly above it."""
     seconds: float
     interrupted: bool = False

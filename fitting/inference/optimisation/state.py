@@ -119,9 +119,13 @@ class Search:
     def move(
         self, state: SearchState, stage: str, point: Point, *, converged: bool = False
     ) -> SearchState:
-        """The state at another point, remembered if it is the best one, and reported."""
+        """The state at a point of a descent, remembered if it is the best one, and reported."""
         state = dataclasses.replace(state, point=point)
         as_good = converged and point.cost <= state.best.cost * (1 + ROUNDING)
         if point.cost < state.best.cost or as_good:
             state = dataclasses.replace(state, best=point, converged=converged)
         return self.report(state, stage, point.cost)
+
+    def jump(self, state: SearchState, stage: str, point: Point) -> SearchState:
+        """The state at a candidate, and reported; its cost is too rough to be called the best."""
+        return self.report(dataclasses.replace(state, point=point), stage, point.cost)

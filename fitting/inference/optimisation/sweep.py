@@ -41,7 +41,7 @@ def sweep(search: Search, state: SearchState) -> SearchState:
         state = dataclasses.replace(state, sweeps=state.sweeps + 1)
         swept = best_of_sweep(search.problem, point.u, fractions)
         if swept.cost <= point.cost * (1 - settings.min_sweep_gain):
-            return search.move(state, "sweep", swept)
+            return search.jump(state, "sweep", swept)
     return state
 
 

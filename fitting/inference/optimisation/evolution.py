@@ -1,0 +1,167 @@
+"""Evolution: a population that crosses the cliffs and the valleys where descents end.
+
+A hard decision makes the cost jump wherever it flips, whether a threshold or a smooth parameter
+flipped it. Candidates therefore vary all parameters, each in one or more of four ways:
+
+crossover  some values of another candidate, which may have got them right
+shift      thresholds a little or a lot further, on the scale of their ranges
+redrawn    one or two values from anywhere in their ranges
+jitter     smooth parameters as far as the data leave them uncertain, or up to 30 times as far
+
+The most promising come again after a Gauss-Newton step, since other decisions need other smooth
+parameters. After some generations the best one descends; rounds of both go on while they gain.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fitting.problem.space import EDGE, Space
+
+from .descent import descend
+from .population import ROUNDING, evaluate, from_values, to_values
+from .state import Point, Search, SearchState
+
+CROSSED = 0.6  # fraction of the candidates
+CROSSED_VALUES = (0.1, 0.3, 0.5)  # fraction of their values that come from the other candidate
+SHIFTED = 0.5
+SHIFTED_VALUES = 0.3  # of their thresholds; on average at least one
+SHIFTS = (-1.5, 0.2)  # of log10, spreads of the shifts in log-odds of the range
+REDRAWN = 0.33  # for each of two values
+JITTERED = 0.4
+JITTERS = (1.0, 3.0, 10.0, 30.0)  # standard deviations of Laplace's approximation
+PARENT_RANK = 0.35  # probability that the best is the parent; of the rest, that the next one is
+
+Candidates = Float[np.ndarray, "candidates free"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Elite:
+    """The best candidates so far, the best one first."""
+
+    u: Candidates
+    cost: Float[np.ndarray, " candidates"]
+
+    @classmethod
+    def best_of(cls, u: Candidates, cost: np.ndarray, size: int) -> "Elite":
+        """As many of them as it has room for."""
+        order = np.argsort(cost, kind="stable")[:size]
+        return cls(u[order], cost[order])
+
+    def joined(self, u: Candidates, cost: np.ndarray, size: int) -> "Elite":
+        """The best of these and others."""
+        return Elite.best_of(np.concatenate([self.u, u]), np.append(self.cost, cost), size)
+
+
+def evolve(search: Search, state: SearchState, ends: list[Point]) -> SearchState:
+    """The state at the best point that evolution reaches from the ends of several descents.
+
+    Args:
+        search: the problem and the settings.
+        state: at the best of the ends.
+        ends: points with costs and Jacobians; their values stay available to later generations.
+    """
+    settings = search.settings
+    donors = np.stack([end.u for end in ends])
+    elite = Elite.best_of(donors, np.array([end.cost for end in ends]), settings.elite)
+    idle = 0
+    for _ in range(settings.max_rounds):
+        before = state.point
+        state, elite = _breed(search, state, elite, donors)
+        if elite.cost[0] < before.cost * (1 - ROUNDING):
+            state = dataclasses.replace(state, point=Point(elite.u[0]))
+            state = descend(search, state, "evolution")
+            if state.point.cost > before.cost:  # the two precisions do not agree
+                state = dataclasses.replace(state, point=before)
+        else:
+            state = search.report(state, "evolution", before.cost)
+        elite = elite.joined(state.point.u[None], np.array([state.point.cost]), settings.elite)
+        idle = 0 if before.cost - state.point.cost > settings.min_round_gain else idle + 1
+        if idle >= settings.patience:
+            break
+    return state
+
+
+def _breed(
+    search: Search, state: SearchState, elite: Elite, donors: Candidates
+) -> tuple[SearchState, Elite]:
+    """The elite after some generations, bred around the state's point, which has a Jacobian."""
+    settings, jacobian = search.settings, state.point.jacobian
+    assert jacobian is not None  # of a descent
+    random = state.generator()
+    uncertainty = _uncertainty(search, jacobian)
+    stepped = np.empty((0, donors.shape[1]))
+    for _ in range(settings.generations):
+        count = settings.population - len(stepped)
+        children = _children(search, elite, donors, count, uncertainty, random)
+        candidates = np.concatenate([stepped, children])
+        evaluation = evaluate(search.problem, candidates, jacobian)
+        elite = elite.joined(candidates, evaluation.cost, settings.elite)
+        promising = np.argsort(evaluation.predicted, kind="stable")
+        stepped = evaluation.stepped[promising[: settings.gauss_newton_children]]
+    return dataclasses.replace(state, random=random), elite
+
+
+def _uncertainty(search: Search, jacobian: np.ndarray) -> Float[np.ndarray, "smooth smooth"]:
+    """A root of the smooth parameters' covariance, with the thresholds held."""
+    smooth = np.asarray(jacobian, float)[:, ~search.thresholds]
+    information = smooth.T @ smooth  # positive definite: the prior's rows are in it
+    return np.linalg.inv(np.linalg.cholesky(information)).T
+
+
+def _children(
+    search: Search,
+    elite: Elite,
+    donors: Candidates,
+    count: int,
+    uncertainty: np.ndarray,
+    random: np.random.Generator,
+) -> Candidates:
+    """Variations of the elite, better parents more often."""
+    space, thresholds = search.problem.space, search.thresholds
+    shape = (count, space.size)
+    parents = np.minimum(random.geometric(PARENT_RANK, count) - 1, len(elite.u) - 1)
+    values = to_values(space, np.concatenate([elite.u, donors]))
+    crossed = random.random(shape) < random.choice(CROSSED_VALUES, (count, 1))
+    crossed &= random.random((count, 1)) < CROSSED
+    others = random.integers(len(values), size=count)
+    child_values = np.where(crossed, values[others], values[parents])
+
+    rate = max(SHIFTED_VALUES, 1 / max(1, thresholds.sum()))
+    shifted = (random.random(shape) < rate) & thresholds & (random.random((count, 1)) < SHIFTED)
+    spreads = 10 ** random.uniform(*SHIFTS, (count, 1))
+    redrawn = np.zeros(shape, bool)
+    for _ in range(2):
+        chosen = np.flatnonzero(random.random(count) < REDRAWN)
+        redrawn[chosen, random.integers(space.size, size=chosen.size)] = True
+    shifts = shifted * spreads * random.normal(size=shape)
+    children = vary(space, child_values, shifts, redrawn, random)
+
+    jittered = np.flatnonzero(random.random(count) < JITTERED)
+    if uncertainty.size:
+        moves = random.normal(size=(len(jittered), len(uncertainty))) @ uncertainty.T
+        moves *= random.choice(JITTERS, (len(jittered), 1))
+        children[np.ix_(jittered, ~thresholds)] += moves
+    return children
+
+
+def vary(
+    space: Space,
+    values: Candidates,
+    shifts: Candidates,
+    redrawn: Bool[np.ndarray, "candidates free"],
+    random: np.random.Generator,
+) -> Candidates:
+    """`u` of values of which some are shifted and some drawn anew from their range.
+
+    Values are kept, not `u`: a threshold that stays above another one would move with it, off the
+    plateau it had reached. Shifts are in the log-odds of the fraction of the range; 0 keeps a
+    value.
+    """
+    low, high = np.asarray(space.low), np.asarray(space.high)
+    fraction = np.clip((values - low) / (high - low), EDGE, 1 - EDGE)
+    log_odds = np.log(fraction / (1 - fraction)) + shifts
+    log_odds[redrawn] = random.logistic(size=int(redrawn.sum()))
+    varied = low + (high - low) / (1 + np.exp(-log_odds))
+    return from_values(space, np.where((shifts != 0) | redrawn, varied, values))
