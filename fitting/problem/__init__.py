@@ -4,7 +4,7 @@ A `Problem` joins three things: the `Space` of free parameters, the data, and th
 gives residuals in standard deviations. It knows nothing of how the minimum is found or the
 posterior is sampled (`fitting.inference`), nor of files (`fitting.experiments`).
 
-Start with `problem.py`. `free_parameters.py` and `space.py` describe the parameters, `scene.py` and
-`residuals.py` the data of foot IK, `loss.py` the robust losses. `simulation.py` makes data whose
-truth is known.
+Start with `problem.py`. `free_parameters.py` and `space.py` describe the parameters, `prior.py`
+says what is known of them before any data. `scene.py` and `residuals.py` are the data of foot IK,
+`loss.py` the robust losses. `simulation.py` makes data whose truth is known.
 """

@@ -31,9 +31,7 @@ from jaxik.maths import parameter_tree
 from .free_parameters import FreeParameter, present_value
 from .prior import SPREAD, Prior, Priors
 
-CENTRE_LIMIT = (
-    3.0  # of u: a prior centred at a bound, or a start there, would hide the other values
-)
+CENTRE_LIMIT = 3.0  # of u, for priors and starts: at a bound they would hide the rest of the range
 EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
 INTERVAL = (0.025, 0.975)  # the probabilities at the ends of a 95 % interval
 DRAWS = 20_000  # from the prior, for the interval of a parameter that depends on another one

@@ -85,9 +85,9 @@ def test_a_prior_that_a_few_draws_would_decide_gets_no_figures():
 @pytest.mark.parametrize("shape", [-0.5, 0.3, 0.9])
 def test_the_pareto_shape_of_weights_is_found(shape):
     weights = stats.genpareto(shape).rvs(40_000, random_state=3)
-    assert prior_sensitivity.pareto_k(weights, 40_000) == pytest.approx(shape, abs=0.15)
+    assert prior_sensitivity.pareto_k(weights, 40_000.0) == pytest.approx(shape, abs=0.15)
 
 
 def test_equal_weights_are_reliable_and_a_handful_is_not():
-    assert prior_sensitivity.pareto_k(np.ones(1000), 1000) == -np.inf
-    assert prior_sensitivity.pareto_k(np.arange(10.0), 10) == np.inf
+    assert prior_sensitivity.pareto_k(np.ones(1000), 1000.0) == -np.inf
+    assert prior_sensitivity.pareto_k(np.arange(10.0), 10.0) == np.inf

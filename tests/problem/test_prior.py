@@ -117,7 +117,6 @@ def test_the_probability_of_values_is_that_of_scipy_and_of_draws():
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"shape": "flat"}, r"shape is 'flat', wanted one of \('normal', 'uniform'\)"),
         ({"spread": 0.0}, "spread is 0.0, wanted a finite number above 0"),
         ({"spread": np.inf}, "spread is inf, wanted a finite number above 0"),
         ({"shape": "uniform", "centre": 0.5}, "centre is given, but a uniform prior has none"),
@@ -127,6 +126,13 @@ def test_the_probability_of_values_is_that_of_scipy_and_of_draws():
 def test_a_prior_that_makes_no_sense_is_refused(entry, message):
     with pytest.raises(ValueError, match=message):
         ParameterPrior(**entry)
+
+
+def test_an_unknown_shape_is_refused():
+    prior = ParameterPrior()
+    object.__setattr__(prior, "shape", "flat")  # before any check of types
+    with pytest.raises(ValueError, match=r"'flat', wanted one of \('normal', 'uniform'\)"):
+        prior.__post_init__()
 
 
 def test_a_parameter_without_a_prior_of_its_own_has_the_default():

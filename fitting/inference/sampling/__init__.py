@@ -3,5 +3,6 @@
 It samples the hard program, which is not differentiable: no gradients are used.
 
 Start with `posterior.py`. `sampler.py` runs emcee, `chain.py` keeps the steps on disk,
-`diagnostics.py` decides when a chain is long enough.
+`diagnostics.py` decides when a chain is long enough, `prior_sensitivity.py` says what other priors
+would change, and `inference_data.py` gives the draws to ArviZ.
 """
