@@ -6,7 +6,8 @@ flipped it. Candidates therefore vary all parameters, each in one or more of fou
 crossover  some values of another candidate, which may have got them right
 shift      thresholds a little or a lot further, on the scale of their ranges
 redrawn    one or two values from anywhere in their ranges
-jitter     smooth parameters as far as the data leave them uncertain, or up to 30 times as far
+jitter     one or two smooth parameters, up to 30 times as far as the data leave them uncertain, the
+           others following so that the cost rises least
 
 The most promising come again after a Gauss-Newton step, since other decisions need other smooth
 parameters. After some generations the best one descends; rounds of both go on while they gain.
@@ -30,7 +31,7 @@ SHIFTED_VALUES = 0.3  # of their thresholds; on average at least one
 SHIFTS = (-1.5, 0.2)  # of log10, spreads of the shifts in log-odds of the range
 REDRAWN = 0.33  # for each of two values
 JITTERED = 0.4
-JITTERS = (1.0, 3.0, 10.0, 30.0)  # standard deviations of Laplace's approximation
+JITTERS = (0.3, 1.0, 3.0, 10.0, 30.0)  # standard deviations of Laplace's approximation
 PARENT_RANK = 0.35  # probability that the best is the parent; of the rest, that the next one is
 
 Candidates = Float[np.ndarray, "candidates free"]
@@ -104,10 +105,13 @@ def _breed(
 
 
 def _uncertainty(search: Search, jacobian: np.ndarray) -> Float[np.ndarray, "smooth smooth"]:
-    """A root of the smooth parameters' covariance, with the thresholds held."""
+    """How the smooth parameters move when one of them, a row each, moves by a standard deviation.
+
+    By Laplace's approximation, thresholds held: along these directions the cost rises least.
+    """
     smooth = np.asarray(jacobian, float)[:, ~search.thresholds]
-    information = smooth.T @ smooth  # positive definite: the prior's rows are in it
-    return np.linalg.inv(np.linalg.cholesky(information)).T
+    covariance = np.linalg.inv(smooth.T @ smooth)  # the prior's rows are in it
+    return covariance / np.sqrt(np.diag(covariance))[:, None]
 
 
 def _children(
@@ -140,7 +144,8 @@ def _children(
 
     jittered = np.flatnonzero(random.random(count) < JITTERED)
     if uncertainty.size:
-        moves = random.normal(size=(len(jittered), len(uncertainty))) @ uncertainty.T
+        directions = random.random((len(jittered), len(uncertainty))) < 1.5 / len(uncertainty)
+        moves = (directions * random.normal(size=directions.shape)) @ uncertainty
         moves *= random.choice(JITTERS, (len(jittered), 1))
         children[np.ix_(jittered, ~thresholds)] += moves
     return children
