@@ -180,11 +180,12 @@ def translate(
     if run is not None:
         translation.save_source(run, prepared)
         known_values = load_known_values(experiment)
-    fitted = _assess_and_save(run, experiment, problem, solution, known_values)
+    fitted = _assess_and_save(run, experiment, problem, solution, known_values, has_noise=False)
     differences = translation_report.differences(fitted)
     if run is not None:
         translation_report.write(run, prepared, fitted, differences)
-    log(f"\n{translation_report.translation_text(prepared, differences)}")
+    log(f"\n{solution.message} {fitted.verdict.sentence}\n")
+    log(translation_report.translation_text(prepared, differences))
     log_output(log, run, run_folder.SUMMARY)
     return fitted
 
@@ -195,12 +196,14 @@ def _assess_and_save(
     problem: Problem[jaxik.FootIK],
     solution: Solution,
     known_values: Mapping[str, float] | None,
+    *,
+    has_noise: bool = True,
 ) -> Fit:
     """The fit; its solution is on disk before the assessment, which may fail."""
     if run is not None:
         run_folder.save_solution(run, experiment, problem, solution)
     identifiability = assess_identifiability(problem, solution)
-    fitted = Fit(experiment, problem, solution, identifiability, known_values, run)
+    fitted = Fit(experiment, problem, solution, identifiability, known_values, run, has_noise)
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

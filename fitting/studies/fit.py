@@ -12,6 +12,10 @@ from jaxtyping import Float
 
 import jaxik
 from fitting.analysis import playback
+from fitting.analysis.goodness import groups, verdict
+from fitting.analysis.goodness.groups import Assumed, Group
+from fitting.analysis.goodness.verdict import Verdict
+from fitting.analysis.playback import Playback
 from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.search import Starts, find_best_fit
@@ -20,6 +24,8 @@ from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
+
+from .goodness import GoodnessSummary, summarise
 
 # Walkers start in a ball around the fit. Its width, in u, is the Laplace standard deviation, which
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
@@ -61,6 +67,7 @@ class FitSummary(TypedDict):
     experiment: str
     converged: bool
     message: str
+    goodness: GoodnessSummary
     cost_before: float
     cost: float
     steps: int
@@ -84,6 +91,8 @@ class Fit:
     """What made a synthetic reference."""
     run: Path | None = None
     """The folder where it is written."""
+    has_noise: bool = True
+    """False if the reference is the motion of another system: then sigmas are tolerances."""
 
     @cached_property
     def ik(self) -> jaxik.FootIK:
@@ -94,6 +103,31 @@ class Fit:
     def results(self) -> tuple[jaxik.Result, ...]:
         """What the fitted system makes of each clip."""
         return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
+
+    @cached_property
+    def playbacks(self) -> tuple[Playback, ...]:
+        """The clips with the fitted system."""
+        scenes = zip(self.problem.data, self.results, strict=True)
+        return tuple(playback.play(scene, result) for scene, result in scenes)
+
+    @cached_property
+    def assumed(self) -> Assumed:
+        """What the fit assumes of its residuals."""
+        fraction = float(self.problem.independent_fraction)
+        return Assumed(self.problem.loss, fraction, float(self.identifiability.contraction.sum()))
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """The residuals of each kind in each clip."""
+        correlations = [float(scene.sigmas.correlation) for scene in self.problem.data]
+        return groups.measure_groups(self.playbacks, correlations, self.assumed)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether it fits."""
+        if self.has_noise:
+            return verdict.judge(self.groups, self.assumed)
+        return verdict.judge_tolerances(self.groups)
 
     @property
     def start_sd(self) -> Float[np.ndarray, " free"]:
@@ -110,6 +144,7 @@ class Fit:
             "experiment": self.experiment.name,
             "converged": solution.converged,
             "message": solution.message,
+            "goodness": summarise(self.verdict, self.groups),
             "cost_before": solution.cost_before,
             "cost": solution.cost,
             "steps": solution.steps,
