@@ -5,5 +5,6 @@ gives residuals in standard deviations. It knows nothing of how the minimum is f
 posterior is sampled (`fitting.inference`), nor of files (`fitting.experiments`).
 
 Start with `problem.py`. `free_parameters.py` and `space.py` describe the parameters, `scene.py` and
-`residuals.py` the data of foot IK, `loss.py` the robust losses.
+`residuals.py` the data of foot IK, `loss.py` the robust losses. `simulation.py` makes data whose
+truth is known.
 """

@@ -1,0 +1,106 @@
+"""Problems whose truth is known: references made by a system itself, plus noise."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.signal import lfilter
+
+import jaxik
+from fitting.runtime.precision import in_float64
+from fitting.runtime.program_cache import cached
+from jaxik.maths import quat
+from jaxik.world.skeleton import Transform
+
+from .problem import Problem
+from .scene import Reference, Scene, legs_ws, pelvis_ws
+from .space import Vector
+
+Noise = Float[np.ndarray, "frames *shape"]
+
+
+@in_float64
+def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Problem[jaxik.FootIK]:
+    """The same problem with references that the system at `u` makes, plus the noise assumed.
+
+    The noise is normal and has the scenes' sigmas and correlation; kinds with an infinite sigma
+    get none. Where only a fraction of the residuals counts as independent, they are correlated so
+    that it does: a first-order autoregression has `(1 - rho) / (1 + rho)` independent values for
+    each one. Frames that were not observed stay so. With a robust loss the noise has no outliers.
+
+    Args:
+        problem: whose clips, sigmas and priors are used.
+        u: the truth.
+        seed: of the noise.
+
+    Raises:
+        ValueError: residuals of kind "smooth" are on; they follow from the ankles', so that no
+            noise has independent ones of both kinds.
+    """
+    random = np.random.default_rng(seed)
+    fraction = float(problem.independent_fraction)
+    between = (1 - fraction) / (1 + fraction)
+    ik = problem.space.unpack(u)
+    scenes = tuple(_simulated(ik, scene, between, random) for scene in problem.data)
+    return eqx.tree_at(lambda problem: problem.data, problem, scenes)
+
+
+def _simulated(
+    ik: jaxik.FootIK, scene: Scene, between: float, random: np.random.Generator
+) -> Scene:
+    """A scene whose reference is the system's motion plus noise; `between` innovations."""
+    sigmas, reference = scene.sigmas, scene.reference
+    if np.isfinite(sigmas.smooth):
+        raise ValueError(
+            f"sigmas.smooth is {float(sigmas.smooth):g}: residuals of accelerations follow from "
+            "those of the ankles, so there is no noise to simulate; wanted inf"
+        )
+
+    def noise(kind: str, shape: tuple[int, ...]) -> Noise:
+        sigma = float(getattr(sigmas, kind))
+        independent = random.normal(size=shape)
+        innovations = autoregression(independent, between)
+        errors = autoregression(innovations, float(sigmas.correlation))
+        return sigma * errors if np.isfinite(sigma) else np.zeros(shape)
+
+    pelvis, knee_ws, ankle, contact = _motion(ik, scene)
+    replaced = Reference(
+        pelvis=_displaced(
+            pelvis, noise("pelvis", pelvis.pos.shape), noise("body", pelvis.pos.shape)
+        ),
+        knee_ws=knee_ws + noise("knee", knee_ws.shape),
+        ankle=_displaced(ankle, noise("ankle", ankle.pos.shape), noise("foot", ankle.pos.shape)),
+        contact=contact + noise("contact", contact.shape),
+        observed=reference.observed,
+        label="simulated",
+    )
+    return eqx.tree_at(lambda scene: scene.reference, scene, replaced)
+
+
+@cached
+def _motion(ik: jaxik.FootIK, scene: Scene) -> tuple[Transform, Array, Transform, Array]:
+    """Pelvis, knees, ankles and contact weights of a system along a scene, world space."""
+    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
+    assert result.trace is not None  # `jaxik.run` always has one
+    legs = legs_ws(scene, result)
+    return pelvis_ws(scene, result), legs.knee.pos, legs.ankle, result.trace.sensed.contact.weight
+
+
+def autoregression(innovations: Noise, correlation: float) -> Noise:
+    """A stationary first-order autoregression over the first axis, with the innovations' variance.
+
+    `x_t = rho x_{t-1} + sqrt(1 - rho²) e_t`, begun with `x_0 = e_0`.
+    """
+    gain = np.sqrt(1 - correlation**2)
+    scaled = np.concatenate([innovations[:1], gain * innovations[1:]])
+    return lfilter([1.0], [1.0, -correlation], scaled, axis=0)
+
+
+def _displaced(joint: Transform, shift: Noise, turn: Noise) -> Transform:
+    """A joint moved by `shift` and turned so that its residual from the original is `-turn`."""
+    half = turn / 2  # the residual is twice the sine of half the angle
+    w = np.sqrt(np.maximum(1 - np.sum(half**2, axis=-1, keepdims=True), 0))
+    rotation = jnp.asarray(np.concatenate([w, half], axis=-1), joint.rot.dtype)
+    rotation = rotation / jnp.linalg.norm(rotation, axis=-1, keepdims=True)
+    return Transform(joint.pos + jax.device_put(shift), quat.multiply(joint.rot, rotation))
