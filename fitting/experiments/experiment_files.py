@@ -15,6 +15,8 @@ pelvis.on_gain = {}
 contact.planted_height = { low = 0.05, high = 0.2 }
 [sigmas]
 ankle = 0.02
+[noise]                              # which of its properties are estimated
+sigmas = "estimated"
 [fit.search]                         # overrides settings of the search, see `SearchSettings`
 final_sweeps = 12
 [[without]]                          # see `ablations`
@@ -30,10 +32,12 @@ from typing import Any, get_args
 import tomli_w
 
 from fitting.datasets.ground_path import ROOTS
+from fitting.inference.noise.settings import Correlation, NoiseOptions, Sigmas
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
+from fitting.problem.scene import WHITENED
 from fitting.runtime import validation
 from fitting.runtime.validation import Constraint, Content, Table, check_table, flatten, nest
 
@@ -51,7 +55,8 @@ CLIP_KEYS: dict[str, Constraint] = {
     "root": validation.one_of(ROOTS),
 }
 SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
-SIGMA_KEYS |= {"correlation": validation.FRACTION}
+CORRELATIONS = tuple(f"correlation.{kind}" for kind in WHITENED)  # instead of one for all
+SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.FRACTION)
 
 
 def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
@@ -86,7 +91,11 @@ SAMPLE_KEYS: dict[str, Constraint] = {
     **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
     "stop_at": validation.POSITIVE,
 }
-TABLES = ("free", "rules", "parameters", "sigmas", "fit", "sample")
+NOISE_KEYS = {
+    "sigmas": validation.one_of(get_args(Sigmas)),
+    "correlation": validation.one_of(get_args(Correlation)),
+}
+TABLES = ("free", "rules", "parameters", "sigmas", "noise", "fit", "sample")
 TOP_KEYS: dict[str, Constraint] = {
     "name": validation.TEXT,
     "preset": validation.TEXT,
@@ -124,17 +133,36 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
             content.get("preset", DEFAULT_PRESET.name), faithful=content.get("faithful", False)
         )
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
-    check_table(content.get("sigmas", {}), SIGMA_KEYS, f"{path} [sigmas]")
+    sigmas = flatten(content.get("sigmas", {}), 2)
+    check_table(sigmas, SIGMA_KEYS, f"{path} [sigmas]")
     free = read_free_table(content["free"], f"{path} [free]")
     tables = {
         "clips": tuple(_clip_entry(entry, path) for entry in content["clips"]),
         "free": free,
         "parameters": flatten(content.get("parameters", {}), 2),
+        "sigmas": sigmas,
+        "noise": _noise_options(content, f"{path}"),
         "without": read_ablations(content.get("without", []), ik, f"{path} [[without]]"),
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
     return Experiment(**{"path": path, "name": path.stem, **content, **tables})
+
+
+def _noise_options(content: Table, where: str) -> NoiseOptions:
+    options = NoiseOptions(**check_table(content.get("noise", {}), NOISE_KEYS, f"{where} [noise]"))
+    loss = content.get("loss", "squares")
+    if options.sigmas == "estimated" and loss not in ("squares", "student"):
+        raise ValueError(
+            f"{where}: [noise] sigmas cannot be estimated under the loss {loss!r}, which is not a "
+            "distribution of noise; take squares, or student for outliers"
+        )
+    if options.correlation != "given" and content.get("independent_every", 0.0):
+        raise ValueError(
+            f"{where}: independent_every and [noise] correlation = {options.correlation!r} would "
+            "account for the same correlation twice; leave one of them out"
+        )
+    return options
 
 
 def _fit_options(value: object, where: str) -> FitOptions:
@@ -184,6 +212,8 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
     for name in ("free", "parameters"):
         content[name] = nest(content[name])
+    each = {name: content["sigmas"].pop(name) for name in CORRELATIONS if name in content["sigmas"]}
+    content["sigmas"] |= nest(each)
     del content["path"]
     return tomli_w.dumps(_plain(content, folder and folder.resolve()))
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 
+from .noise import series
 from .optimisation.solution import Solution
 from .threshold_profile import Profile, profile
 
@@ -120,6 +121,7 @@ class _Laplace:
         smooth = np.flatnonzero(space.smooth)
         scaled = solution.jacobian[: -space.size, smooth] * np.asarray(space.prior_sd)[smooth]
         information = scaled.T @ scaled
+        information *= series.information_of_slopes(problem.loss, float(problem.tails))
         eigenvalues, directions = np.linalg.eigh(information)
         covariance = np.linalg.inv(information + np.eye(smooth.size))
         return cls(smooth, covariance, eigenvalues, directions[:, :1].ravel())

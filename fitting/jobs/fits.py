@@ -9,13 +9,14 @@ from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
 from fitting.experiments.problems import make_problem
 from fitting.inference.identifiability import assess_identifiability
+from fitting.inference.noise.model import NoiseModel, with_noise
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, run_folder, translation
-from fitting.studies.fit import Fit, search
+from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.sample import sample_around
 from fitting.studies.translation import TranslationRequest
 
@@ -53,7 +54,7 @@ def fit(
     problem = make_problem(experiment, roots.append)
     free, preset = len(experiment.free), experiment.preset
     log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
-    solution = search(problem, experiment, progress)
+    problem, solution = search_with_noise(problem, experiment, progress)
     fitted = _assess_and_save(run, experiment, problem, solution, known_values)
     if run is not None:
         fit_report.write_fit(run, fitted)
@@ -92,6 +93,8 @@ def sample(
         experiment, summary = run_folder.load_fit(run)
         parameters, known_values = summary["parameters"], load_known_values(experiment)
         problem = make_problem(experiment)
+        if "noise" in summary:
+            problem = with_noise(problem, NoiseModel(**summary["noise"]))
     if max_steps is not None:
         experiment = experiment.with_max_sample_steps(max_steps)
     chain = None if run is None else run / run_folder.CHAIN

@@ -18,9 +18,12 @@ from fitting.analysis.goodness.verdict import Verdict
 from fitting.analysis.playback import Playback
 from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
+from fitting.inference.noise.joint import fit_with_noise
+from fitting.inference.noise.model import NoiseModel, noise_of
 from fitting.inference.optimisation.search import Starts, find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
+from fitting.problem.scene import WHITENED
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
@@ -68,6 +71,8 @@ class FitSummary(TypedDict):
     converged: bool
     message: str
     goodness: GoodnessSummary
+    noise: NotRequired[Content]
+    """The noise that was estimated, as `NoiseModel` holds it."""
     cost_before: float
     cost: float
     steps: int
@@ -114,12 +119,26 @@ class Fit:
     def assumed(self) -> Assumed:
         """What the fit assumes of its residuals."""
         fraction = float(self.problem.independent_fraction)
-        return Assumed(self.problem.loss, fraction, float(self.identifiability.contraction.sum()))
+        return Assumed(
+            loss=self.problem.loss,
+            independent_fraction=fraction,
+            tails=float(self.problem.tails),
+            sigmas_estimated=self.experiment.noise.sigmas == "estimated",
+            parameters=float(self.identifiability.contraction.sum()),
+        )
+
+    @cached_property
+    def noise(self) -> NoiseModel:
+        """The noise that the fit assumes, or has estimated."""
+        return noise_of(self.problem)
 
     @cached_property
     def groups(self) -> list[Group]:
         """The residuals of each kind in each clip."""
-        correlations = [float(scene.sigmas.correlation) for scene in self.problem.data]
+        correlations = [
+            {kind: float(scene.sigmas.correlation_of(kind)) for kind in WHITENED}
+            for scene in self.problem.data
+        ]
         return groups.measure_groups(self.playbacks, correlations, self.assumed)
 
     @cached_property
@@ -140,7 +159,7 @@ class Fit:
     def summary(self) -> FitSummary:
         """The numbers of the fit as JSON holds them."""
         solution = self.solution
-        return {
+        summary: FitSummary = {
             "experiment": self.experiment.name,
             "converged": solution.converged,
             "message": solution.message,
@@ -154,6 +173,28 @@ class Fit:
             "weakest": list(self.identifiability.weakest),
             "history": [dataclasses.asdict(step) for step in solution.history],
         }
+        if self.experiment.noise.estimates_any:
+            summary["noise"] = dataclasses.asdict(self.noise)
+        return summary
+
+
+def search_with_noise(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[Problem[jaxik.FootIK], Solution]:
+    """The best fit with the noise that the experiment estimates, and the problem with this noise.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of noise and search.
+        progress: as for `search`.
+    """
+
+    def find(problem: Problem[jaxik.FootIK], starts: Starts | None) -> Solution:
+        return search(problem, experiment, progress, starts)
+
+    return fit_with_noise(problem, experiment.noise, find)
 
 
 def search(

@@ -11,6 +11,8 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
+
 import jaxik
 from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
@@ -109,5 +111,9 @@ def save_posterior(run: Path, posterior: Posterior) -> None:
         "stuck": posterior.stuck,
         "seconds": posterior.seconds,
         "parameters": posterior.summary,
+        "sigmas": {
+            kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()
+            for kind, draws in posterior.sigmas.items()
+        },
     }
     write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))

@@ -51,7 +51,7 @@ def whiten(play: Playback, rho: float) -> Playback:
 
 def judge(play: Playback, correlation: float = 0.0, **assumed) -> Verdict:
     assumptions = Assumed(**assumed)
-    groups = measure_groups([play], [correlation], assumptions)
+    groups = measure_groups([play], [dict.fromkeys(KINDS, correlation)], assumptions)
     return verdict.judge(groups, assumptions)
 
 
@@ -142,7 +142,7 @@ def test_a_small_misfit_is_none():
 
 def test_only_tolerances_count_without_noise():
     def tolerated(play: Playback) -> Verdict:
-        return verdict.judge_tolerances(measure_groups([play], [0.0], Assumed()))
+        return verdict.judge_tolerances(measure_groups([play], [{}], Assumed()))
 
     assert tolerated(playback()).fits
     assert tolerated(with_bump(playback(), "ankle", 0.9, slice(0, FRAMES))).fits
@@ -156,7 +156,11 @@ def test_only_tolerances_count_without_noise():
 def test_p_values_are_uniform_where_the_noise_is_as_assumed():
     for rho, given in ((0.0, 0.0), (RHO, RHO), (RHO, 0.0)):
         plays = [whiten(simulate(seed, rho=rho), given) for seed in range(150)]
-        groups = [g for play in plays for g in measure_groups([play], [given], Assumed())]
+        groups = [
+            g
+            for play in plays
+            for g in measure_groups([play], [dict.fromkeys(KINDS, given)], Assumed())
+        ]
         p = np.array([group.left.p for group in groups])
         assert stats.kstest(p, "uniform").pvalue > 1e-3, (rho, given)
         if rho == given:

@@ -1,6 +1,6 @@
 """The residuals of each kind in each clip: their size, correlation, outliers and worst seconds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,14 +9,12 @@ from scipy import special
 
 from fitting.analysis.playback import Playback
 from fitting.analysis.worst_window import PER_LEG, SECONDS, window_sums
-from fitting.problem.loss import Loss
+from fitting.problem.loss import TAILS, Loss
+from fitting.problem.scene import MEASURED
 
 from . import noise
 from .noise import Noise
 
-# Kinds that measure something anew. A contact label is 0 or 1, and `smooth` repeats the ankles:
-# neither has a normal noise, so that only their size is reported.
-MEASURED = ("ankle", "knee", "pelvis", "foot", "body")
 NEAR, FAR = 3.0, 5.0  # sigmas beyond which residuals are counted
 EXPECTED = {size: float(2 * special.ndtr(-size)) for size in (NEAR, FAR)}  # fraction, of a normal
 MANY_OUTLIERS = 0.005  # fraction beyond FAR; a normal has 6e-7, noise of Student's t with 4.4 this
@@ -31,8 +29,17 @@ class Assumed:
     loss: Loss = "squares"
     independent_fraction: float = 1.0
     """Of the residuals, as `Problem.independent_fraction`."""
+    tails: float = TAILS
+    """Degrees of freedom, under the loss `student`."""
+    sigmas_estimated: bool = False
+    """From the residuals themselves: then their size says nothing."""
     parameters: float = 0.0
     """How many parameters the data determine: the degrees of freedom that the fit has used."""
+
+    @property
+    def median(self) -> float:
+        """Median size that the residuals should have, in sigmas."""
+        return float(special.stdtrit(self.tails, 0.75)) if self.loss == "student" else noise.MEDIAN
 
 
 @dataclass(frozen=True)
@@ -82,18 +89,21 @@ class Group:
 
     @property
     def is_measured(self) -> bool:
-        """Whether its residuals should look like noise."""
+        """Whether its residuals should look like noise.
+
+        A contact label is 0 or 1, and `smooth` repeats the ankles: neither has a normal noise.
+        """
         return self.kind in MEASURED
 
 
 def measure_groups(
-    playbacks: Sequence[Playback], correlations: Sequence[float], assumed: Assumed
+    playbacks: Sequence[Playback], correlations: Sequence[Mapping[str, float]], assumed: Assumed
 ) -> list[Group]:
     """All groups of a fit: of each clip, the kinds with a finite sigma.
 
     Args:
         playbacks: the clips with the fitted system.
-        correlations: that were given, of each clip.
+        correlations: that were given, of each clip, by kind; 0 for those left out.
         assumed: by the fit.
     """
     counts = [
@@ -103,7 +113,7 @@ def measure_groups(
     ]
     used = min(assumed.parameters / max(sum(counts), 1), 0.5)
     return [
-        _measure_group(playback, kind, clip, correlation, used, assumed.loss != "squares")
+        _measure_group(playback, kind, clip, correlation.get(kind, 0.0), used, assumed)
         for clip, (playback, correlation) in enumerate(zip(playbacks, correlations, strict=True))
         for kind in playback.fitted_kinds
     ]
@@ -131,7 +141,7 @@ def _active(playback: Playback, kind: str) -> Bool[np.ndarray, "frames columns"]
 
 
 def _measure_group(
-    playback: Playback, kind: str, clip: int, correlation: float, used: float, robust: bool
+    playback: Playback, kind: str, clip: int, correlation: float, used: float, assumed: Assumed
 ) -> Group:
     plain, residuals, active = series(playback, kind)
     deviation = noise.scale_by_median(residuals[active])
@@ -139,9 +149,11 @@ def _measure_group(
     far = in_deviations > FAR
     isolated = _fraction(~_lasting(far, LONGEST_OUTLIER), far) > 0.5
     has_outliers = bool(_fraction(far, active) > MANY_OUTLIERS and isolated)
-    left = noise.measure(residuals, active, robust=robust, used=used)
+    robust = assumed.loss != "squares"
+    expected = assumed.median if robust else None
+    left = noise.measure(residuals, active, expected, used)
     robust = robust or has_outliers
-    size = noise.measure(plain, active, robust=robust, used=used)
+    size = noise.measure(plain, active, assumed.median if robust else None, used)
     if robust:
         plain, residuals = noise.tamed(plain, active), noise.tamed(residuals, active)
     swing_ratio, swing_p = _swing(playback, kind, residuals, active, left)
@@ -185,7 +197,7 @@ def _swing(
     """Size in swing over size in stance, and the p-value of this ratio (F test)."""
     labelled = bool(np.any(playback.stance))
     weight = np.asarray(playback.stance if labelled else playback.contact)
-    stands = np.asarray(weight > 0.5)
+    stands: np.ndarray = weight > 0.5
     if kind == "smooth":
         stands = stands[1:-1]
     if kind in PER_LEG:

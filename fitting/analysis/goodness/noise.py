@@ -60,8 +60,7 @@ class Noise:
 def measure(
     residuals: Float[np.ndarray, "frames columns"],
     active: Bool[np.ndarray, "frames columns"],
-    *,
-    robust: bool = False,
+    median: float | None = None,
     used: float = 0.0,
 ) -> Noise:
     """Size and autocorrelation of residuals.
@@ -72,25 +71,25 @@ def measure(
     Args:
         residuals: in sigmas.
         active: which of them count.
-        robust: takes the size from the median, and residuals beyond `FAR` as that large in the
-            autocorrelation, so that a few outliers do not matter.
+        median: takes the size from the median, which should be this large, and residuals beyond
+            `FAR` as that large in the autocorrelation, so that a few outliers do not matter.
         used: fraction of the degrees of freedom that the fit has used up.
     """
     count = int(active.sum())
     if not count:
         return Noise(0, 0.0, 0.0, 0.0, 0.0, 0, 1.0)
-    r, pairs = autocorrelations(tamed(residuals, active) if robust else residuals, active)
+    r, pairs = autocorrelations(tamed(residuals, active) if median else residuals, active)
     small = np.abs(r) < INSIGNIFICANT / np.sqrt(np.maximum(pairs, 1))
     end = int(np.argmax(small)) if small.any() else len(r)
     lags = min(LAGS, len(r))
     spread = 1.0 + 2.0 * float(np.sum(r[:end] ** 2))
     free = 1.0 - used
     shown = residuals[active]
-    mean_square = scale_by_median(shown) ** 2 if robust else float(np.mean(shown**2))
+    size = float(np.median(np.abs(shown)) / median if median else np.mean(shown**2) ** 0.5)
     return Noise(
         count=count,
-        degrees=count / spread * free * (MEDIAN_EFFICIENCY if robust else 1.0),
-        mean_square=mean_square / free,
+        degrees=count / spread * free * (MEDIAN_EFFICIENCY if median else 1.0),
+        mean_square=size**2 / free,
         autocorrelation=float(r[0]) if lags else 0.0,
         ljung_box=float(np.sum(pairs[:lags] * r[:lags] ** 2)),
         lags=lags,

@@ -56,6 +56,8 @@ def judge(groups: Sequence[Group], assumed: Assumed) -> Verdict:
     findings = _noise_findings(measured, assumed, level)
     if findings:
         return Verdict(True, f"Fits, but {findings}.")
+    if assumed.sigmas_estimated:
+        return Verdict(True, "Fits: the residuals are noise; its size is estimated from them.")
     size = noise.pooled([group.left for group in measured])
     p = f"p {size.p:.2g}" if size.p >= SMALL else f"p below {SMALL:g}"
     return Verdict(True, f"Fits: reduced chi-square {size.mean_square:.3f} ({p}).")
@@ -117,7 +119,9 @@ def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -
     correlated = significant and not SPARSE < frames < CROWDED
     width = left.mean_square * frames
     findings, remedies = [], []
-    if off := _wrong_sigmas(measured, level, correlated=correlated):
+    if not assumed.sigmas_estimated and (
+        off := _wrong_sigmas(measured, level, correlated=correlated)
+    ):
         findings.append(off)
         remedies.append("set the sigmas below")
     if correlated:

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import equinox as eqx
@@ -77,6 +77,13 @@ class Posterior:
     seconds: float
     """Of this call."""
     interrupted: bool = False
+    sigmas: Mapping[str, Float[np.ndarray, " draws"]] = dataclasses.field(default_factory=dict)
+    """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
+
+    @property
+    def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
+        """`u` after burn-in, without isolated walkers."""
+        return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
@@ -86,10 +93,9 @@ class Posterior:
     @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
         """One row per parameter, of the values that are kept."""
-        u = np.delete(self.u[self.burn_in :], self.isolated, axis=1)
         times = self.autocorrelation_time / self.thin_by
         return diagnostics.summarise(
-            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(u)
+            self.names, self.kept, np.maximum(times, 1.0), diagnostics.split_r_hat(self.kept_u)
         )
 
 

@@ -1,10 +1,10 @@
 """Goodness of fit: its text for the terminal, and its section of the run's summary.md."""
 
 from fitting.analysis.goodness import groups
-from fitting.report.formatting import aligned, markdown, percent
+from fitting.report.formatting import Table, aligned, markdown, percent
 from fitting.studies.fit import Fit
 
-from . import goodness_tables
+from . import goodness_tables, noise_report
 
 NOISE = (
     "Noise and found correlation are those of the errors themselves; left is the correlation from "
@@ -23,7 +23,7 @@ TOLERANCES = (
 
 def text(fitted: Fit) -> str:
     """The verdict and the sizes of the residuals, for the terminal."""
-    return f"{fitted.verdict.sentence}\n\n{aligned(goodness_tables.size_table(fitted.groups))}"
+    return f"{fitted.verdict.sentence}\n\n{aligned(_size_table(fitted))}"
 
 
 def section(fitted: Fit) -> list[str]:
@@ -31,8 +31,14 @@ def section(fitted: Fit) -> list[str]:
     parts = ["## Goodness of fit", f"**{fitted.verdict.sentence}**"]
     if not fitted.has_noise:
         return [*parts, TOLERANCES, markdown(goodness_tables.tolerance_table(fitted.groups))]
-    parts += [_describe_sizes(fitted), markdown(goodness_tables.size_table(fitted.groups))]
+    parts += [_describe_sizes(fitted), markdown(_size_table(fitted))]
+    parts += noise_report.section(fitted)
     return [*parts, NOISE, markdown(goodness_tables.noise_table(fitted.groups))]
+
+
+def _size_table(fitted: Fit) -> Table:
+    estimated = fitted.assumed.sigmas_estimated
+    return goodness_tables.size_table(fitted.groups, sigmas_estimated=estimated)
 
 
 def _describe_sizes(fitted: Fit) -> str:

@@ -8,13 +8,19 @@ from fitting.report.formatting import Table, number, percent
 from fitting.report.labels import RESIDUALS
 
 
-def size_table(groups: Sequence[Group]) -> Table:
-    """How large the residuals are, and with how many they are judged."""
+def size_table(groups: Sequence[Group], *, sigmas_estimated: bool = False) -> Table:
+    """How large the residuals are, and with how many they are judged.
+
+    Args:
+        groups: the rows.
+        sigmas_estimated: leaves out p, which says nothing then.
+    """
     heading = ["residuals", "active", "degrees of freedom", "reduced chi-square", "p"]
     table = [[*heading, "sigma", "noise", "noise / sigma"]]
     for group in groups:
         cells = [RESIDUALS[group.kind].name, str(group.left.count), f"{group.left.degrees:.0f}"]
-        cells += [number(group.left.mean_square), _p(group.left.p, group), *_sizes(group)]
+        p = "–" if sigmas_estimated else _p(group.left.p, group)
+        cells += [number(group.left.mean_square), p, *_sizes(group)]
         table.append(cells)
     return _with_clips(table, groups)
 

@@ -8,6 +8,7 @@ from matplotlib.lines import Line2D
 from fitting.analysis.goodness import groups
 from fitting.analysis.goodness.noise import autocorrelations, scale_by_median
 from fitting.analysis.playback import Playback
+from fitting.problem.scene import MEASURED
 from fitting.report.labels import RESIDUALS
 
 from .style import AFTER, BEFORE, legend, styled
@@ -19,7 +20,7 @@ WIDEST = 8.0  # standard deviations; what is beyond is shown there
 @styled
 def noise(playback: Playback, title: str) -> Figure:
     """Autocorrelation and distribution of the residuals of each measured kind."""
-    kinds = [kind for kind in playback.fitted_kinds if kind in groups.MEASURED]
+    kinds = [kind for kind in playback.fitted_kinds if kind in MEASURED]
     figure = Figure(figsize=(17, 2.6 * len(kinds) + 1.8), layout="constrained")
     figure.suptitle(title)
     grid = figure.subplots(max(len(kinds), 1), 2, squeeze=False, width_ratios=[1.6, 1])
