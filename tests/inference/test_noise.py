@@ -53,12 +53,12 @@ def test_sigma_and_correlation_are_those_of_the_exact_likelihood(errors):
 
     def minus_log_likelihood(x: np.ndarray) -> float:
         sigma, rho = math.exp(x[0]), math.tanh(x[1])
-        return -sum(
-            stats.multivariate_normal.logpdf(
-                run, cov=sigma**2 * linalg.toeplitz(rho ** np.arange(len(run)))
-            )
-            for run in runs
-        )
+        total = 0.0
+        for run in runs:
+            covariance = sigma**2 * linalg.toeplitz(rho ** np.arange(len(run)))
+            joint = stats.multivariate_normal(cov=covariance)  # type: ignore[arg-type]
+            total -= joint.logpdf(run)
+        return total
 
     best = optimize.minimize(minus_log_likelihood, [0.0, 0.0], method="Nelder-Mead").x
     found = series.likeliest([errors], "squares", 4.0, None)
@@ -75,7 +75,7 @@ def test_a_given_correlation_stays(errors):
 
 @pytest.mark.parametrize("nu", [2.5, 6.0])
 def test_scale_and_tails_are_those_of_scipys_t(nu):
-    values = 0.2 * stats.t.rvs(nu, size=4000, random_state=1)
+    values = 0.2 * np.asarray(stats.t.rvs(nu, size=4000, random_state=1))
     tails, sigma = 4.0, 1.0
     for _ in range(60):
         sigma = series.scale(values, "student", tails)
