@@ -7,5 +7,6 @@ Start with `playback`, which puts the animation, the solved and the captured mot
 by side; `worst_window` reads it. `accuracy` holds the figures of the blocks benchmark, `measures`
 says how well a motion stands on its ground, `placement` where its feet are, `misplacement` why
 they are not where they should be, `difference` compares two systems, and `limit_activity` says
-which limits and decisions a clip exercises.
+which limits and decisions a clip exercises. `goodness` tells whether residuals
+are the noise that was assumed.
 """

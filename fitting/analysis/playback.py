@@ -80,6 +80,8 @@ class Playback(eqx.Module):
     """Weight with which the character slides."""
     seen: Bool[Series, " frames"]
     """False in frames that the fit leaves out."""
+    present: Bool[Series, " legs"]
+    """False for legs that the rig only has in name."""
     errors: Mapping[str, Float[Series, "frames_of_kind ..."]]
     """After - captured, m, rad, ..."""
     residuals: Mapping[str, Float[Series, "frames_of_kind ..."]]
@@ -172,6 +174,7 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
         stance=reference.contact,
         slide=scene.frames.slide,
         seen=reference.observed,
+        present=scene.rig.present,
         errors=errors,
         residuals=residuals_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},

@@ -112,10 +112,10 @@ def _worst_start(
     """First frame of the worst window, its length in frames, and its mean squared residual."""
     seen = np.asarray(playback.seen)
     frames = min(len(seen), 1 + round(SECONDS / float(np.median(playback.dt))))
-    count = _window_sums(seen.astype(float), frames)
+    count = window_sums(seen.astype(float), frames)
     mean_square = np.where(
         count >= min(MIN_SEEN * frames, count.max()),
-        _window_sums(squares, frames) / (_per_frame_count(playback) * np.maximum(count, 1.0)),
+        window_sums(squares, frames) / (_per_frame_count(playback) * np.maximum(count, 1.0)),
         -1.0,
     )
     tied = np.flatnonzero(mean_square >= mean_square.max() * (1 - TIE))
@@ -152,9 +152,7 @@ def _sizes(playback: Playback, kind: str) -> Float[np.ndarray, "frames columns"]
     return np.linalg.norm(_by_frame(errors, kind), axis=-1) * np.asarray(playback.seen)[:, None]
 
 
-def _window_sums(
-    series: Float[np.ndarray, " frames"], length: int
-) -> Float[np.ndarray, " windows"]:
+def window_sums(series: Float[np.ndarray, " frames"], length: int) -> Float[np.ndarray, " windows"]:
     """Sums over all windows of `length` frames, by their first frame."""
     sums = np.concatenate([[0.0], np.cumsum(series)])
     return sums[length:] - sums[:-length]

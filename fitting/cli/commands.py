@@ -19,11 +19,14 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context, in_one_line
 from fitting.studies import comparison, translation
 from fitting.studies.animations import AnimationFiles
+from fitting.studies.fit import Fit
 from fitting.studies.suite import situations
 from fitting.studies.translation import TranslationRequest
 from jaxik import FootIK, Rig, record
 
 from . import progress
+
+NOT_CONVERGED, DOES_NOT_FIT = 3, 4  # exit statuses
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -31,7 +34,7 @@ def fit(options: argparse.Namespace) -> int:
     _prepare_jax()
     with progress.ProgressLine(progress.fit_line) as line:
         fitted = jobs.fit(options.experiment, options.output, progress=line, log=print)
-    return _status(interrupted=fitted.solution.interrupted)
+    return _fit_status(fitted)
 
 
 def ablate(options: argparse.Namespace) -> int:
@@ -106,7 +109,7 @@ def translate(options: argparse.Namespace) -> int:
     request = TranslationRequest(source, target, animations, free, options.fps)
     with progress.ProgressLine(progress.fit_line) as line:
         fitted = jobs.translate(request, options.output, progress=line, log=print)
-    return _status(interrupted=fitted.solution.interrupted)
+    return _fit_status(fitted)
 
 
 def inspect(options: argparse.Namespace) -> int:
@@ -277,6 +280,14 @@ def _status(*, interrupted: bool) -> int:
     if interrupted:
         raise KeyboardInterrupt
     return 0
+
+
+def _fit_status(fitted: Fit) -> int:
+    """The exit status of a search; what a translation leaves over is a result, and no failure."""
+    _status(interrupted=fitted.solution.interrupted)
+    if not fitted.solution.converged:
+        return NOT_CONVERGED
+    return DOES_NOT_FIT if fitted.has_noise and not fitted.verdict.fits else 0
 
 
 def _print_now(text: str) -> None:

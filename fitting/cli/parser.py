@@ -22,7 +22,8 @@ EXAMPLES = """examples:
   jaxik bench --quick
   jaxik cache                                                  where compiled programs are kept
 
-exit status: 0 when done, 2 for a mistake in the input (one line says which), 130 when
+exit status: 0 when done, 2 for a mistake in the input (one line says which), 3 when the search of
+`fit` or `translate` has not converged, 4 when `fit` has converged but does not fit, 130 when
 interrupted with Ctrl-C: `fit` then has written the best point so far, `sample` its chain,
 `ablate` each finished fit, and `compare --suite` each finished situation.
 `jaxik COMMAND --help` has more examples.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import jaxik
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.sensitivity import FreeTable
@@ -96,6 +97,8 @@ class Experiment:
     """Where the search begins, by dotted name; left out: at the system's values."""
     sigmas: Mapping[str, float] = field(default_factory=dict)
     """Where not the default."""
+    noise: NoiseOptions = NoiseOptions()
+    """Which properties of the noise are estimated."""
     fit: FitOptions = FitOptions()
     sample: SamplerSettings = SamplerSettings()
     without: tuple[Ablation, ...] = ()

@@ -17,6 +17,8 @@ contact.planted_height = { low = 0.05, high = 0.2 }
 spread = 1.6
 [sigmas]
 ankle = 0.02
+[noise]                              # which of its properties are estimated
+sigmas = "estimated"
 [fit.search]                         # overrides settings of the search, see `SearchSettings`
 final_sweeps = 12
 [[without]]                          # see `ablations`
@@ -32,10 +34,12 @@ from typing import Any, get_args
 import tomli_w
 
 from fitting.datasets.ground_path import ROOTS
+from fitting.inference.noise.settings import Correlation, NoiseOptions, Sigmas
 from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
+from fitting.problem.scene import WHITENED
 from fitting.runtime import validation
 from fitting.runtime.validation import Constraint, Content, Table, check_table, flatten, nest
 
@@ -54,7 +58,8 @@ CLIP_KEYS: dict[str, Constraint] = {
     "root": validation.one_of(ROOTS),
 }
 SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
-SIGMA_KEYS |= {"correlation": validation.FRACTION}
+CORRELATIONS = tuple(f"correlation.{kind}" for kind in WHITENED)  # instead of one for all
+SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.FRACTION)
 
 
 def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
@@ -89,7 +94,11 @@ SAMPLE_KEYS: dict[str, Constraint] = {
     **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
     "stop_at": validation.POSITIVE,
 }
-TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "fit", "sample")
+NOISE_KEYS = {
+    "sigmas": validation.one_of(get_args(Sigmas)),
+    "correlation": validation.one_of(get_args(Correlation)),
+}
+TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "noise", "fit", "sample")
 TOP_KEYS: dict[str, Constraint] = {
     "name": validation.TEXT,
     "preset": validation.TEXT,
@@ -127,7 +136,8 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
             content.get("preset", DEFAULT_PRESET.name), faithful=content.get("faithful", False)
         )
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
-    check_table(content.get("sigmas", {}), SIGMA_KEYS, f"{path} [sigmas]")
+    sigmas = flatten(content.get("sigmas", {}), 2)
+    check_table(sigmas, SIGMA_KEYS, f"{path} [sigmas]")
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
     known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
@@ -137,11 +147,29 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
         "start": read_start(content.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(content.get("parameters", {}), 2),
+        "sigmas": sigmas,
+        "noise": _noise_options(content, f"{path}"),
         "without": without,
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
     return Experiment(**{"path": path, "name": path.stem, **content, **tables})
+
+
+def _noise_options(content: Table, where: str) -> NoiseOptions:
+    options = NoiseOptions(**check_table(content.get("noise", {}), NOISE_KEYS, f"{where} [noise]"))
+    loss = content.get("loss", "squares")
+    if options.sigmas == "estimated" and loss not in ("squares", "student"):
+        raise ValueError(
+            f"{where}: [noise] sigmas cannot be estimated under the loss {loss!r}, which is not a "
+            "distribution of noise; take squares, or student for outliers"
+        )
+    if options.correlation != "given" and content.get("independent_every", 0.0):
+        raise ValueError(
+            f"{where}: independent_every and [noise] correlation = {options.correlation!r} would "
+            "account for the same correlation twice; leave one of them out"
+        )
+    return options
 
 
 def _fit_options(value: object, where: str) -> FitOptions:
@@ -192,6 +220,8 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     content["prior"] = priors_to_table(experiment.prior)
     for name in ("free", "start", "parameters"):
         content[name] = nest(content[name])
+    each = {name: content["sigmas"].pop(name) for name in CORRELATIONS if name in content["sigmas"]}
+    content["sigmas"] |= nest(each)
     del content["path"]
     return tomli_w.dumps(_plain(content, folder and folder.resolve()))
 

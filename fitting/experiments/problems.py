@@ -20,7 +20,7 @@ from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain import mesh_files
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
-from fitting.problem.scene import Reference, Scene, Sigmas
+from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
@@ -157,9 +157,19 @@ def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captur
             observed=jax.device_put(observed),
             label=label,
         ),
-        sigmas=Sigmas(**{kind: jax.device_put(np.float64(s)) for kind, s in all_sigmas.items()}),
+        sigmas=_sigmas(all_sigmas),
         tracks={name: jax.device_put(values) for name, values in tracks.items()},
     )
+
+
+def _sigmas(values: Mapping[str, float]) -> Sigmas:
+    """Sigmas with a correlation for each kind: its own, or else that of all."""
+    every = values["correlation"]
+    each = [values.get(f"correlation.{kind}", every) for kind in WHITENED]
+    sigmas = {
+        kind: np.float64(value) for kind, value in values.items() if "correlation" not in kind
+    }
+    return Sigmas(**jax.device_put(sigmas), correlation=jax.device_put(np.array(each)))
 
 
 def _joint_ws(clip: Clip, joint: int) -> Transform:

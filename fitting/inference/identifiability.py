@@ -15,6 +15,7 @@ from jaxtyping import Float
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 
+from .noise import series
 from .optimisation.solution import Solution
 from .threshold_profile import MAX_RISE, Profile, profile
 
@@ -127,6 +128,7 @@ class _Laplace:
         prior_sd = 1 / np.diag(solution.jacobian[-space.size :])[smooth]
         scaled = solution.jacobian[: -space.size, smooth] * prior_sd
         information = scaled.T @ scaled
+        information *= series.information_of_slopes(problem.loss, float(problem.tails))
         eigenvalues, directions = np.linalg.eigh(information)
         covariance = np.linalg.inv(information + np.eye(smooth.size))
         return cls(smooth, prior_sd, covariance, eigenvalues, directions[:, :1].ravel())

@@ -9,13 +9,14 @@ from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
 from fitting.experiments.problems import make_problem
 from fitting.inference.identifiability import assess_identifiability
+from fitting.inference.noise.model import NoiseModel, with_noise
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, run_folder, translation
-from fitting.studies.fit import Fit, search
+from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.sample import SampledFit, sample_around
 from fitting.studies.translation import TranslationRequest
 
@@ -53,7 +54,7 @@ def fit(
     problem = make_problem(experiment, roots.append)
     free, preset = len(experiment.free), experiment.preset
     log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
-    solution = search(problem, experiment, progress)
+    problem, solution = search_with_noise(problem, experiment, progress)
     fitted = _assess_and_save(run, experiment, problem, solution, known_values)
     if run is not None:
         fit_report.write_fit(run, fitted)
@@ -92,6 +93,8 @@ def sample(
         experiment, summary = run_folder.load_fit(run)
         parameters, known_values = summary["parameters"], load_known_values(experiment)
         problem = make_problem(experiment)
+        if "noise" in summary:
+            problem = with_noise(problem, NoiseModel(**summary["noise"]))
     if max_steps is not None:
         experiment = experiment.with_max_sample_steps(max_steps)
     chain = None if run is None else run / run_folder.CHAIN
@@ -181,11 +184,12 @@ def translate(
     if run is not None:
         translation.save_source(run, prepared)
         known_values = load_known_values(experiment)
-    fitted = _assess_and_save(run, experiment, problem, solution, known_values)
+    fitted = _assess_and_save(run, experiment, problem, solution, known_values, has_noise=False)
     differences = translation_report.differences(fitted)
     if run is not None:
         translation_report.write(run, prepared, fitted, differences)
-    log(f"\n{translation_report.translation_text(prepared, differences)}")
+    log(f"\n{solution.message} {fitted.verdict.sentence}\n")
+    log(translation_report.translation_text(prepared, differences))
     log_output(log, run, run_folder.SUMMARY)
     return fitted
 
@@ -196,12 +200,14 @@ def _assess_and_save(
     problem: Problem[jaxik.FootIK],
     solution: Solution,
     known_values: Mapping[str, float] | None,
+    *,
+    has_noise: bool = True,
 ) -> Fit:
     """The fit; its solution is on disk before the assessment, which may fail."""
     if run is not None:
         run_folder.save_solution(run, experiment, problem, solution)
     identifiability = assess_identifiability(problem, solution)
-    fitted = Fit(experiment, problem, solution, identifiability, known_values, run)
+    fitted = Fit(experiment, problem, solution, identifiability, known_values, run, has_noise)
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

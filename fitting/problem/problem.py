@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from fitting.runtime.precision import in_float64
 from jaxik import lanes
 
-from .loss import Loss, apply_loss
+from .loss import TAILS, Loss, apply_loss
 from .space import Space, System, Vector
 
 
@@ -33,6 +33,10 @@ class Problem(eqx.Module, Generic[System]):
     residual_function: Callable[[System, PyTree], Array] = eqx.field(static=True)
     loss: Loss = eqx.field(static=True, default="squares")
     independent_fraction: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    tails: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=TAILS)
+    """Degrees of freedom of Student's t, under this loss."""
+    unknown_sigmas: Float[Array, "sigmas residuals"] | None = None
+    """For each sigma that the posterior leaves open, 1 at its residuals and 0 at others."""
 
     @in_float64
     @eqx.filter_jit  # traced once for all programs around it
@@ -41,7 +45,8 @@ class Problem(eqx.Module, Generic[System]):
 
         The last `space.size` of them belong to the prior.
         """
-        residuals = apply_loss(self.residual_function(self.space.unpack(u), self.data), self.loss)
+        plain = self.residual_function(self.space.unpack(u), self.data)
+        residuals = apply_loss(plain, self.loss, self.tails)
         residuals *= jnp.sqrt(self.independent_fraction.astype(residuals.dtype))
         return jnp.concatenate([residuals, self.space.prior_residuals(u)])
 
@@ -76,6 +81,26 @@ class Problem(eqx.Module, Generic[System]):
 
     @in_float64
     def log_probability(self, u: Vector) -> Float[Array, ""]:
-        """Unnormalised log-density of the posterior in `u`; -inf where a residual is not finite."""
-        cost = self.cost(u)
-        return jnp.where(jnp.isfinite(cost), -cost, -jnp.inf)
+        """Unnormalised log-density of the posterior in `u`; -inf where a residual is not finite.
+
+        Unknown sigmas are integrated out.
+        """
+        if self.unknown_sigmas is None:
+            log_probability = -self.cost(u)
+        else:
+            log_probability = self._log_marginal(self.residuals(u), self.unknown_sigmas)
+        return jnp.where(jnp.isfinite(log_probability), log_probability, -jnp.inf)
+
+    def _log_marginal(
+        self, residuals: Float[Array, " all"], unknown: Float[Array, "sigmas residuals"]
+    ) -> Float[Array, ""]:
+        """Log-probability with the unknown sigmas integrated out, under a flat prior of their logs.
+
+        With `n` normal residuals of squares `S`, in units of any fixed sigma, the integral of
+        `sigma^-n exp(-S / (2 sigma²))` over log sigma is proportional to `S^(-n / 2)`.
+        """
+        squares, of_prior = jnp.split(residuals**2, [residuals.size - self.space.size])
+        known = squares * (1 - jnp.sum(unknown, axis=0))
+        counts = self.independent_fraction * jnp.sum(unknown, axis=1)
+        marginal = jnp.sum(counts * jnp.log(unknown @ squares))
+        return -0.5 * (jnp.sum(known) + jnp.sum(of_prior) + marginal)

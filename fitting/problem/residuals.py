@@ -50,7 +50,7 @@ def residuals_by_kind(scene: Scene, errors: dict[str, Array]) -> dict[str, Array
         if kind == "smooth":  # an acceleration takes three frames
             residuals[kind] = jnp.where(three_observed[:, None, None], scaled, 0.0)
         else:
-            residuals[kind] = whitened(scaled, observed, sigmas.correlation)
+            residuals[kind] = whitened(scaled, observed, sigmas.correlation_of(kind))
     return residuals
 
 

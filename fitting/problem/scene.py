@@ -1,11 +1,15 @@
 """The data of one clip: the animation a system runs on, and the motion it should reproduce."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 import jaxik
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
+
+MEASURED = ("ankle", "knee", "pelvis", "foot", "body")  # kinds that have a noise of their own
+WHITENED = (*MEASURED, "contact")  # kinds whose residuals have a correlation from frame to frame
 
 
 class Sigmas(eqx.Module):
@@ -25,8 +29,14 @@ class Sigmas(eqx.Module):
     """Of the contact weight, 0..1."""
     smooth: Float[Array, ""]
     """m/s², of the ankle's acceleration."""
-    correlation: Float[Array, ""]
-    """AR(1) coefficient between frames, 0 if they are independent."""
+    correlation: Float[Array, "*#kinds"]
+    """AR(1) coefficient between frames, 0 if they are independent: one for all kinds, or one for
+    each of `WHITENED`."""
+
+    def correlation_of(self, kind: str) -> Float[Array, ""]:
+        """The correlation of the residuals of a kind."""
+        each = jnp.broadcast_to(self.correlation, len(WHITENED))
+        return each[WHITENED.index(kind)]
 
 
 class Reference(eqx.Module):

@@ -61,7 +61,7 @@ def _simulated(
         sigma = float(getattr(sigmas, kind))
         independent = random.normal(size=shape)
         innovations = autoregression(independent, between)
-        errors = autoregression(innovations, float(sigmas.correlation))
+        errors = autoregression(innovations, float(sigmas.correlation_of(kind)))
         return sigma * errors if np.isfinite(sigma) else np.zeros(shape)
 
     pelvis, knee_ws, ankle, contact = _motion(ik, scene)

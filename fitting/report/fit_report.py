@@ -16,7 +16,8 @@ from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, markdown
-from .plots import fit_plots, style, worst_window_plots
+from .goodness import goodness_report
+from .plots import fit_plots, goodness_plots, style, worst_window_plots
 from .uncertainty import priors
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
@@ -27,6 +28,7 @@ def fit_text(fitted: Fit) -> str:
     """The result of a fit, for the terminal."""
     rows, truth = fitted.summary["parameters"], fitted.known_values
     parts = [fitted.summary["message"], cost_sentence(fitted.summary), ""]
+    parts += [goodness_report.text(fitted), ""]
     parts.append(aligned(fit_tables.parameter_table(rows, truth)))
     if any("half_life" in row for row in rows):
         parts += ["", aligned(fit_tables.gain_table(rows))]
@@ -50,8 +52,7 @@ def write_fit(
     plots: Plots = {}
     worst = ["## The worst two seconds"]
     before = fitted.problem.space.unpack(fitted.problem.space.pack({}))
-    for index, (scene, result) in enumerate(zip(fitted.problem.data, fitted.results, strict=True)):
-        after = playback.play(scene, result)
+    for index, (scene, after) in enumerate(zip(fitted.problem.data, fitted.playbacks, strict=True)):
         first = playback.play(scene, playback.run(before, scene))
         plots |= _draw_clip(run, fitted, index, first, after)
         worst += _worst_window(run, fitted, index, after)
@@ -61,6 +62,7 @@ def write_fit(
     parts = [
         *_result(fitted),
         *opening,
+        *goodness_report.section(fitted),
         *_parameters(fitted),
         *priors.prior_section(fitted.summary["parameters"]),
         *_identifiability(fitted),
@@ -123,6 +125,7 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
         ("knees", "knee angles", lambda t: fit_plots.knees(after, legs, limits, t)),
         ("residuals", "residuals", lambda t: fit_plots.residuals(first, after, t)),
         ("locks", "contact and locks", lambda t: fit_plots.locks(after, legs, t)),
+        ("noise", "are the residuals noise?", lambda t: goodness_plots.noise(after, t)),
     ):
         title = f"{clip}: {subject}"
         plots |= save_plot(run, f"{name}{ending}", title, draw(title))
@@ -135,7 +138,7 @@ def _result(fitted: Fit) -> list[str]:
     original = ", faithful to its original" if experiment.faithful else ""
     return [
         f"# {experiment.name}",
-        f"{summary['message']} {cost_sentence(summary)}",
+        f"{summary['message']} {summary['goodness']['sentence']} {cost_sentence(summary)}",
         f"Preset `{experiment.preset}`{original}{rules}, loss `{experiment.loss}`, "
         f"seed {experiment.seed}.",
     ]

@@ -12,6 +12,7 @@ from fitting.studies.sample import SampledFit
 from .fit_report import gallery, save_plot
 from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
+from .goodness import noise_report
 from .plots import posterior_plots
 from .uncertainty.priors import posterior_prior_section
 
@@ -22,6 +23,8 @@ def posterior_text(posterior: Posterior, known_values: Mapping[str, float] | Non
     """The result of a sampling, for the terminal."""
     table = aligned(posterior_table(posterior, known_values, {}))
     parts = [*_health(posterior), "", table]
+    if posterior.sigmas:
+        parts += ["", aligned(noise_report.sigma_table(posterior.sigmas))]
     if known_values:
         count = covered(posterior, known_values, posterior.names)
         parts += ["", f"The 95 % intervals contain the true values of {count} parameters."]
@@ -52,6 +55,9 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
 
     parts = [HEADING, bullets(_health(posterior))]
     parts.append(markdown(posterior_table(posterior, known_values, units)))
+    if posterior.sigmas:
+        parts.append("Sigmas of the noise, which were sampled along:")
+        parts.append(markdown(noise_report.sigma_table(posterior.sigmas)))
     if known_values:
         determined = [name for name, row in rows.items() if row["determined"]]
         all_count = covered(posterior, known_values, posterior.names)

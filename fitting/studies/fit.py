@@ -12,15 +12,23 @@ from jaxtyping import Float
 
 import jaxik
 from fitting.analysis import playback
+from fitting.analysis.goodness import groups, verdict
+from fitting.analysis.goodness.groups import Assumed, Group
+from fitting.analysis.goodness.verdict import Verdict
+from fitting.analysis.playback import Playback
 from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
+from fitting.inference.noise.joint import fit_with_noise
+from fitting.inference.noise.model import NoiseModel, noise_of
 from fitting.inference.optimisation.search import Starts, find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
+from fitting.problem.scene import WHITENED
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
+from .goodness import GoodnessSummary, summarise
 from .prior_summary import PriorSummary, summarise_priors
 
 # Walkers start in a ball around the fit. Its width, in u, is the Laplace standard deviation, which
@@ -64,6 +72,9 @@ class FitSummary(TypedDict):
     experiment: str
     converged: bool
     message: str
+    goodness: GoodnessSummary
+    noise: NotRequired[Content]
+    """The noise that was estimated, as `NoiseModel` holds it."""
     cost_before: float
     cost: float
     steps: int
@@ -91,6 +102,8 @@ class Fit:
     """What made a synthetic reference."""
     run: Path | None = None
     """The folder where it is written."""
+    has_noise: bool = True
+    """False if the reference is the motion of another system: then sigmas are tolerances."""
 
     @cached_property
     def ik(self) -> jaxik.FootIK:
@@ -101,6 +114,45 @@ class Fit:
     def results(self) -> tuple[jaxik.Result, ...]:
         """What the fitted system makes of each clip."""
         return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
+
+    @cached_property
+    def playbacks(self) -> tuple[Playback, ...]:
+        """The clips with the fitted system."""
+        scenes = zip(self.problem.data, self.results, strict=True)
+        return tuple(playback.play(scene, result) for scene, result in scenes)
+
+    @cached_property
+    def assumed(self) -> Assumed:
+        """What the fit assumes of its residuals."""
+        fraction = float(self.problem.independent_fraction)
+        return Assumed(
+            loss=self.problem.loss,
+            independent_fraction=fraction,
+            tails=float(self.problem.tails),
+            sigmas_estimated=self.experiment.noise.sigmas == "estimated",
+            parameters=float(self.identifiability.contraction.sum()),
+        )
+
+    @cached_property
+    def noise(self) -> NoiseModel:
+        """The noise that the fit assumes, or has estimated."""
+        return noise_of(self.problem)
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """The residuals of each kind in each clip."""
+        correlations = [
+            {kind: float(scene.sigmas.correlation_of(kind)) for kind in WHITENED}
+            for scene in self.problem.data
+        ]
+        return groups.measure_groups(self.playbacks, correlations, self.assumed)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether it fits."""
+        if self.has_noise:
+            return verdict.judge(self.groups, self.assumed)
+        return verdict.judge_tolerances(self.groups)
 
     @property
     def start_sd(self) -> Float[np.ndarray, " free"]:
@@ -113,10 +165,11 @@ class Fit:
     def summary(self) -> FitSummary:
         """The numbers of the fit as JSON holds them."""
         solution = self.solution
-        return {
+        summary: FitSummary = {
             "experiment": self.experiment.name,
             "converged": solution.converged,
             "message": solution.message,
+            "goodness": summarise(self.verdict, self.groups),
             "cost_before": solution.cost_before,
             "cost": solution.cost,
             "steps": solution.steps,
@@ -128,6 +181,28 @@ class Fit:
             "weakest": list(self.identifiability.weakest),
             "history": [dataclasses.asdict(step) for step in solution.history],
         }
+        if self.experiment.noise.estimates_any:
+            summary["noise"] = dataclasses.asdict(self.noise)
+        return summary
+
+
+def search_with_noise(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[Problem[jaxik.FootIK], Solution]:
+    """The best fit with the noise that the experiment estimates, and the problem with this noise.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of noise and search.
+        progress: as for `search`.
+    """
+
+    def find(problem: Problem[jaxik.FootIK], starts: Starts | None) -> Solution:
+        return search(problem, experiment, progress, starts)
+
+    return fit_with_noise(problem, experiment.noise, find)
 
 
 def search(

@@ -12,6 +12,8 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
+
 import jaxik
 from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
@@ -117,6 +119,10 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "stuck": posterior.stuck,
         "seconds": posterior.seconds,
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
+        "sigmas": {
+            kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()
+            for kind, draws in posterior.sigmas.items()
+        },
     }
     write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))
     if inference_data.is_available():

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 import jaxik
 from fitting.experiments.experiment import Experiment
+from fitting.inference.noise.marginal import draw_sigmas, with_unknown_sigmas
 from fitting.inference.sampling.posterior import (
     Posterior,
     SamplingProgress,
@@ -57,7 +59,8 @@ def sample_around(
 
     Args:
         parameters: the fit, around which the walkers start.
-        problem: the problem of the experiment.
+        problem: the problem of the experiment. Sigmas that it has estimated are left open with
+            squares as loss; a robust loss, and correlations, keep the estimated ones.
         experiment: its settings of the sampler.
         chain: file that keeps the chain; one that is there is continued. None keeps it in memory.
         progress: called as the sampling goes on; KeyboardInterrupt keeps the chain so far.
@@ -74,6 +77,11 @@ def sample_around(
         np.array([row["u"] for row in parameters]),
         np.array([row["start_sd"] for row in parameters]),
     )
-    return sample_posterior(
+    if experiment.noise.sigmas == "estimated" and problem.loss == "squares":
+        problem = with_unknown_sigmas(problem)
+    posterior = sample_posterior(
         problem, start, experiment.sample, seed=experiment.seed, path=chain, progress=progress
     )
+    if problem.unknown_sigmas is None:
+        return posterior
+    return replace(posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed))

@@ -106,6 +106,7 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
     text = capsys.readouterr().out
     assert all(f"jaxik {name}" in text for name in COMMANDS if " " not in name)
     assert "exit status: 0 when done, 2 for a mistake" in text and "130 when" in text
+    assert "3 when the search" in text and "4 when `fit` has converged but does not fit" in text
 
 
 @pytest.mark.parametrize(
@@ -206,6 +207,26 @@ def test_an_interrupted_fit_writes_its_best_point(
     assert numbers["message"].startswith("Interrupted after 0 steps") and not numbers["converged"]
     assert np.isfinite(numbers["cost"]) and numbers["message"] in capsys.readouterr().out
     assert run_folder.SUMMARY in tree(tmp_path / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rest", "status", "sentence"),
+    [
+        ("[fit]\nmax_steps = 1", 3, "Not converged: the 1 steps"),
+        ("[sigmas]\nknee = 0.0001", 4, "Does not fit: knees "),
+    ],
+)
+def test_the_exit_status_says_what_is_wrong_with_a_fit(
+    quick_residuals, tmp_path, capsys, rest, status, sentence
+):
+    path = write(tmp_path, clips=CLIP, clip="start = 1.0\nend = 1.5", rest=rest)
+    assert main.main(["fit", str(path), "-o", str(tmp_path / "run")]) == status
+    assert sentence in capsys.readouterr().out
+    assert sentence in (tmp_path / "run" / run_folder.SUMMARY).read_text()
+    numbers = json.loads((tmp_path / "run" / run_folder.FIT).read_text())
+    assert numbers["converged"] == (status != 3)
+    assert status == 3 or numbers["goodness"]["fits"] is False
 
 
 def test_an_interrupt_swallowed_by_a_hook_is_raised_at_the_next_report(capsys):

@@ -31,7 +31,7 @@ foot = 0.1
 body = 0.2
 contact = 0.5
 smooth = 20.0
-correlation = 0.4
+correlation = { ankle = 0.4, knee = 0.3, pelvis = 0.9, foot = 0.2, body = 0.1 }
 """
 
 
@@ -116,10 +116,9 @@ def expected_residuals(scene) -> dict[str, np.ndarray]:
         "body": rotation_vector(rotation(reference.pelvis.rot), pelvis_rot),
         "contact": result.trace.sensed.contact.weight - reference.contact,
     }
-    rho = sigmas.correlation
     expected = {}
     for kind, error in errors.items():
-        scaled = error / getattr(sigmas, kind)
+        scaled, rho = error / getattr(sigmas, kind), sigmas.correlation_of(kind)
         whitened = np.zeros_like(scaled)
         for t in np.flatnonzero(reference.observed):
             follows = t > 0 and reference.observed[t - 1]

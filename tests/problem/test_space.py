@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fitting.problem.free_parameters import free_parameter
-from fitting.problem.loss import CAUCHY, HUBER, apply_loss
+from fitting.problem.loss import CAUCHY, HUBER, TAILS, apply_loss
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import CENTRE_LIMIT, Space, make_space
@@ -192,6 +192,7 @@ LOSSES = {
     "squares": lambda z: z,
     "huber": lambda z: np.where(z > HUBER**2, 2 * HUBER * np.sqrt(z) - HUBER**2, z),
     "cauchy": lambda z: CAUCHY**2 * np.log1p(z / CAUCHY**2),
+    "student": lambda z: (TAILS + 1) * np.log1p(z / TAILS),
 }
 RESIDUALS = jnp.asarray(
     [0.0, 1e-200, 1e-30, 1e-9, 1e-3, 0.5, 1.0, 1.345, 3.0, 1e3, 1e9, -1e-9, -2.0]
@@ -207,13 +208,14 @@ def test_the_square_of_a_robust_residual_is_the_loss(loss):
 
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_the_derivative_of_a_robust_residual_is_one_at_zero_and_finite_everywhere(loss, dtype):
+def test_the_derivative_of_a_robust_residual_at_zero_is_known_and_finite_everywhere(loss, dtype):
     residuals = RESIDUALS.astype(dtype)
     derivative = jax.grad(lambda residual: apply_loss(residual[None], loss)[0])
     derivatives = jax.vmap(derivative)(residuals)
     assert derivatives.dtype == dtype
     assert jnp.isfinite(derivatives).all()
-    np.testing.assert_allclose(derivatives[:4], 1, rtol=1e-6)
+    steepest = np.sqrt((TAILS + 1) / TAILS) if loss == "student" else 1
+    np.testing.assert_allclose(derivatives[:4], steepest, rtol=1e-6)
 
 
 def test_an_unknown_loss_is_refused():

@@ -1,6 +1,7 @@
 """Reports of fits and posteriors: numbers in texts and tables, and the plots that they link."""
 
 import json
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
 from fitting.report import fit_report, posterior_report
+from fitting.report.goodness import goodness_report
 from fitting.report.uncertainty import priors
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
@@ -210,7 +212,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     text = (tmp_path / run_folder.SUMMARY).read_text()
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     plots = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
-    plots |= {"worst.png"}
+    plots |= {"worst.png", "noise.png"}
     assert set(names) == plots
     assert {path.name for path in tmp_path.iterdir()} == plots | {run_folder.SUMMARY}
     for name in names:
@@ -219,6 +221,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     assert "| contact.planted_height | 0.11 | m |" in text
     assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
     assert "Undetermined: `leg.soften`." in text
+    assert f"**{fitted.verdict.sentence}**" in text.split("## Goodness of fit")[1]
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | 0.100 | undetermined |" in text
     assert "+7.5" in line_of(text.split("threshold moves")[1], "contact.planted_height")
@@ -226,6 +229,35 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     activity = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
+
+
+def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted):
+    text = fit_report.fit_text(fitted)
+    assert fitted.verdict.sentence in text
+    group = next(group for group in fitted.groups if group.kind == "knee")
+    cells = re.split(r"\s{2,}", line_of(text, "Knee position"))
+    assert cells[1] == str(30 * 2 * 3) and cells[5] == "3 cm"
+    assert float(cells[3]) == pytest.approx(group.left.mean_square, rel=1e-3)
+    assert float(cells[6].removesuffix(" cm")) == pytest.approx(3 * group.plain.scale, rel=1e-3)
+    assert re.split(r"\s{2,}", line_of(text, "Ankle acceleration"))[4] == "–", "is not tested"
+    problem = fitted.problem
+    twice = Problem(problem.space, problem.data * 2, problem.residual_function, problem.loss)
+    rows = [line for line in fit_report.fit_text(replace(fitted, problem=twice)).splitlines()]
+    assert sum("Knee position" in row and row[:1] in "12" for row in rows) == 2
+
+
+def test_what_a_translation_leaves_is_measured_in_tolerances(fitted):
+    (_, sentence, *texts) = goodness_report.section(replace(fitted, has_noise=False))
+    assert sentence.startswith(("**Not the same motion: ", "**The same motion"))
+    assert "tolerance | error, rms |" in texts[1] and len(texts) == 2
+
+
+def test_the_numbers_of_the_goodness_of_fit_are_plain_json(fitted):
+    goodness = json.loads(json.dumps(fitted.summary["goodness"], allow_nan=False))
+    assert goodness["sentence"] == fitted.verdict.sentence
+    by_kind = {row["kind"]: row for row in goodness["groups"]}
+    assert set(by_kind) == set(playback.RESIDUAL_KINDS)
+    assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
 
 
 def test_the_second_of_two_clips_has_its_own_plots(fitted, tmp_path, monkeypatch):
@@ -239,7 +271,8 @@ def test_the_second_of_two_clips_has_its_own_plots(fitted, tmp_path, monkeypatch
     after = playback.play(problem.data[0], playback.run(fitted.ik, problem.data[0]))
     plots = fit_report._draw_clip(tmp_path, double, 1, after, after)
     assert set(plots) == {
-        "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png"
+        "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png",
+        "noise_2.png",
     }  # fmt: skip
     assert all(caption.startswith("hill, clip 2: ") for caption in plots.values())
     for number in (1, 2):

@@ -1,5 +1,6 @@
 """Run folders: what they hold, and what is rejected."""
 
+import dataclasses
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import pytest
 
 from fitting.experiments import experiment_files, parameter_files, problems, systems
 from fitting.inference.identifiability import Identifiability
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.studies import run_folder
 from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
@@ -90,6 +92,18 @@ def test_the_experiment_in_a_run_does_not_need_its_original_file(fitted, tmp_pat
         assert getattr(again, name) == getattr(fitted.experiment, name), name
     assert again.sample == fitted.experiment.sample
     assert again.sigmas == {"body": math.inf, "correlation": 0.4}
+
+
+def test_estimated_noise_and_correlations_by_kind_survive_in_a_run(fitted, tmp_path):
+    sigmas = {"ankle": 0.01, "correlation.ankle": 0.9, "correlation.body": 0.5}
+    noise = NoiseOptions("estimated", "whitened")
+    changed = dataclasses.replace(fitted.experiment, sigmas=sigmas, noise=noise)
+    (tmp_path / "again.toml").write_text(experiment_files.experiment_to_toml(changed))
+    again = experiment_files.load_experiment(tmp_path / "again.toml")
+    assert again.sigmas == sigmas and again.noise == noise
+    (scene,) = problems.make_problem(again).data
+    found = {kind: float(scene.sigmas.correlation_of(kind)) for kind in ("ankle", "knee", "body")}
+    assert found == {"ankle": 0.9, "knee": 0.0, "body": 0.5}
 
 
 def test_a_run_is_unfinished_until_its_numbers_are_written(fitted, tmp_path):

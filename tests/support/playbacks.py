@@ -65,7 +65,8 @@ def playback(
         ground_ws=ground, grounded=per_foot, ball_ground_ws=ground, ball_grounded=per_foot,
         floor=np.zeros(FRAMES), dt=np.full(FRAMES, 1 / FPS),
         contact=per_foot, locked=0 * per_foot, reached=per_foot, stance=per_foot,
-        slide=np.zeros(FRAMES), seen=seen, errors=all_errors, residuals=residuals,
+        slide=np.zeros(FRAMES), seen=seen, present=np.ones(2, bool),
+        errors=all_errors, residuals=residuals,
         sigmas={kind: np.asarray(sigma) for kind, sigma in all_sigmas.items()}, label="captured",
     )  # fmt: skip
     return dataclasses.replace(play, **fields)

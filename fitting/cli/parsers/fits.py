@@ -12,7 +12,9 @@ def add_fit(commands: Commands) -> None:
         """
         jaxik fit data/experiments/uneven_walk.toml -o runs/walk
 
-        Ctrl-C ends the search; the best point so far is written as any other fit, with status 130.
+        Status 0: converged, and fits. 3: not converged. 4: converged, but what is left is no noise
+        of the given sigmas; the summary says where. Ctrl-C ends the search; the best point so far
+        is written as any other fit, with status 130.
         """,
     )  # fmt: skip
     fit.add_argument(
@@ -65,7 +67,8 @@ def add_translate(commands: Commands) -> None:
         jaxik translate --from mec.toml --to record --clip walk.bvh --terrain hill.obj -o runs/mec
         jaxik translate --from unreal --to record --fps 30 --clip a.npz --terrain a.obj -o runs/a
 
-        Ctrl-C ends the search; the best point so far is written as any other fit, with status 130.
+        Status 0: converged, however much of the motion is reproduced. 3: not converged. Ctrl-C ends
+        the search; the best point so far is written as any other fit, with status 130.
         The folder is a run: `jaxik sample` and `jaxik apply` take it.
         """,
     )  # fmt: skip

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,13 @@ class Posterior:
     seconds: float
     """Of this call."""
     interrupted: bool = False
+    sigmas: Mapping[str, Float[np.ndarray, " draws"]] = dataclasses.field(default_factory=dict)
+    """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
+
+    @property
+    def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
+        """`u` after burn-in, without isolated walkers."""
+        return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:

@@ -1,0 +1,1 @@
+"""Goodness of fit in words and tables. Start with `goodness_report.section`."""

@@ -1,0 +1,71 @@
+"""Tables of the goodness of fit, a row for each kind of residual in each clip."""
+
+from collections.abc import Sequence
+
+from fitting.analysis.goodness.groups import Group
+from fitting.analysis.goodness.verdict import SMALL
+from fitting.report.formatting import Table, number, percent
+from fitting.report.labels import RESIDUALS
+
+
+def size_table(groups: Sequence[Group], *, sigmas_estimated: bool = False) -> Table:
+    """How large the residuals are, and with how many they are judged.
+
+    Args:
+        groups: the rows.
+        sigmas_estimated: leaves out p, which says nothing then.
+    """
+    heading = ["residuals", "active", "degrees of freedom", "reduced chi-square", "p"]
+    table = [[*heading, "sigma", "noise", "noise / sigma"]]
+    for group in groups:
+        cells = [RESIDUALS[group.kind].name, str(group.left.count), f"{group.left.degrees:.0f}"]
+        p = "–" if sigmas_estimated else _p(group.left.p, group)
+        cells += [number(group.left.mean_square), p, *_sizes(group)]
+        table.append(cells)
+    return _with_clips(table, groups)
+
+
+def tolerance_table(groups: Sequence[Group]) -> Table:
+    """How large the errors are where there is no noise."""
+    table = [["residuals", "active", "tolerance", "error, rms", "error / tolerance"]]
+    for group in groups:
+        table.append([RESIDUALS[group.kind].name, str(group.plain.count), *_sizes(group)])
+    return _with_clips(table, groups)
+
+
+def noise_table(groups: Sequence[Group]) -> Table:
+    """Whether the residuals look like noise."""
+    measured = [group for group in groups if group.is_measured]
+    heading = ["residuals", "correlation given", "found", "left", "p", "independent every"]
+    table = [[*heading, "swing / stance", "p", "beyond 3", "beyond 5"]]
+    for group in measured:
+        left, ratio = group.left, group.swing_ratio
+        cells = [RESIDUALS[group.kind].name, f"{group.correlation:.2f}"]
+        cells += [f"{group.plain.autocorrelation:.3f}", f"{left.autocorrelation:.3f}"]
+        cells += [_p(left.autocorrelation_p, group), f"{left.spacing * group.dt:.3g} s"]
+        cells += ["–", "–"] if ratio is None else [f"{ratio:.2f}", _p(group.swing_p, group)]
+        cells += [percent(group.near, 2), percent(group.far, 2)]
+        table.append(cells)
+    return _with_clips(table, measured)
+
+
+def _sizes(group: Group) -> list[str]:
+    """The given sigma, the size of the errors, and their ratio."""
+    _, unit, factor = RESIDUALS[group.kind]
+    sizes = (group.sigma, group.sigma * group.plain.scale)
+    return [*(f"{number(factor * size)} {unit}" for size in sizes), f"{group.plain.scale:.2f}"]
+
+
+def _with_clips(table: Table, groups: Sequence[Group]) -> Table:
+    """The table with a column for the clip, where there are several."""
+    if not any(group.clip for group in groups):
+        return table
+    heading, *rows = table
+    numbered = zip(groups, rows, strict=True)
+    return [["clip", *heading], *([str(group.clip + 1), *row] for group, row in numbered)]
+
+
+def _p(value: float, group: Group) -> str:
+    if not group.is_measured:
+        return "–"
+    return f"< {SMALL:.4f}" if value < SMALL else f"{value:.4f}"

@@ -1,0 +1,168 @@
+"""Goodness of fit on playbacks whose errors are simulated noise, misfits and outliers."""
+
+import dataclasses
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from fitting.analysis.goodness import verdict
+from fitting.analysis.goodness.groups import Assumed, measure_groups
+from fitting.analysis.goodness.verdict import Verdict
+from fitting.analysis.playback import Playback
+from fitting.problem.residuals import whitened
+from support.playbacks import FPS, FRAMES, SHAPES, SIGMAS, playback
+
+KINDS = ("ankle", "knee", "pelvis")
+SEEDS = 20  # each violation must be found in all of them
+RHO = 0.95
+
+
+def autoregression(random: np.random.Generator, shape: tuple[int, ...], rho: float) -> np.ndarray:
+    """Noise of unit variance, correlated from frame to frame."""
+    values = random.normal(size=shape)
+    for t in range(1, len(values)):
+        values[t] = rho * values[t - 1] + np.sqrt(1 - rho**2) * values[t]
+    return values
+
+
+def simulate(seed: int, *, rho: float = 0.0, scale: float = 1.0, outliers: float = 0.0) -> Playback:
+    """A playback of noise, `scale` times as large as its sigmas."""
+    random = np.random.default_rng(seed)
+    errors = {}
+    for kind in KINDS:
+        values = scale * autoregression(random, (FRAMES, *SHAPES[kind]), rho)
+        values += 10 * random.normal(size=values.shape) * (random.random(values.shape) < outliers)
+        errors[kind] = SIGMAS[kind] * values
+    return playback(errors)
+
+
+def whiten(play: Playback, rho: float) -> Playback:
+    """The playback as a fit sees it to which this correlation was given."""
+    residuals = {
+        kind: np.asarray(whitened(jnp.asarray(values), jnp.asarray(play.seen), jnp.asarray(rho)))
+        for kind, values in play.residuals.items()
+        if kind != "smooth"
+    }
+    return dataclasses.replace(play, residuals={**play.residuals, **residuals})
+
+
+def judge(play: Playback, correlation: float = 0.0, **assumed) -> Verdict:
+    assumptions = Assumed(**assumed)
+    groups = measure_groups([play], [dict.fromkeys(KINDS, correlation)], assumptions)
+    return verdict.judge(groups, assumptions)
+
+
+# The verdict on simulated noise
+
+
+@pytest.mark.parametrize(
+    ("made", "given"),
+    [
+        ({}, {}),
+        ({"rho": RHO}, {"correlation": RHO}),
+        ({"rho": RHO}, {"independent_fraction": (1 - RHO) / (1 + RHO)}),
+        ({"outliers": 0.03}, {"loss": "cauchy"}),
+    ],
+)
+def test_noise_as_assumed_fits(made, given):
+    plays = [whiten(simulate(s, **made), given.get("correlation", 0.0)) for s in range(100)]
+    verdicts = [judge(play, **given) for play in plays]
+    assert sum(verdict.sentence.startswith("Fits: ") for verdict in verdicts) >= 97
+    assert all(verdict.fits for verdict in verdicts)
+
+
+@pytest.mark.parametrize("scale", [1 / 3, 0.5, 2.0, 3.0])
+def test_wrong_sigmas_are_named(scale):
+    for seed in range(SEEDS):
+        found = judge(simulate(seed, scale=scale))
+        words = f"Fits, but the noise is about {scale:.2g}"
+        assert found.sentence.startswith(words[:-1]), found.sentence
+        assert f"too {'narrow' if scale > 1 else 'wide'}" in found.sentence
+        assert "correlated" not in found.sentence and found.fits
+
+
+def test_ignored_correlation_is_named():
+    for seed in range(SEEDS):
+        found = judge(simulate(seed, rho=RHO))
+        assert found.sentence.startswith("Fits, but the residuals are correlated (0.9"), seed
+        assert "too narrow; set `correlation = 0.9" in found.sentence
+
+
+def test_a_correlation_that_is_not_there_is_named():
+    for seed in range(SEEDS):
+        found = judge(whiten(simulate(seed), RHO), correlation=RHO)
+        assert "from one frame to the next, not by 0.95): the intervals" in found.sentence
+        assert "too wide" in found.sentence and "noise" not in found.sentence
+
+
+def test_outliers_under_squares_are_named():
+    for seed in range(SEEDS):
+        found = judge(simulate(seed, outliers=0.03))
+        assert "are outliers" in found.sentence and 'set `loss = "cauchy"`' in found.sentence
+        assert "the noise" not in found.sentence and found.fits
+        assert 1.5 < float(found.sentence.split("Fits, but ")[1].split(" %")[0]) < 4.5
+
+
+def with_bump(play: Playback, kind: str, size: float, frames: slice) -> Playback:
+    """A playback with a smooth misfit of so many sigmas, rms in these frames."""
+    errors = np.array(play.errors[kind])
+    arch = np.sin(np.linspace(0, np.pi, frames.stop - frames.start)) * np.sqrt(2)
+    errors[frames] += SIGMAS[kind] * size * arch.reshape(-1, *[1] * (errors.ndim - 1))
+    return dataclasses.replace(
+        play,
+        errors={**play.errors, kind: errors},
+        residuals={**play.residuals, kind: errors / SIGMAS[kind]},
+    )
+
+
+def test_a_misfit_is_named_with_its_kind_size_and_time():
+    for seed in range(SEEDS):
+        play = with_bump(simulate(seed), "knee", 3.0, slice(190, 250))
+        found = judge(play)
+        start, end = (float(time) for time in re.findall(r"(\d+\.\d) s", found.sentence))
+        assert not found.fits
+        assert "knees 1." in found.sentence and "worse than their sigma" in found.sentence
+        assert abs(start - 190 / FPS) < 0.3 and abs(end - 250 / FPS) < 0.3, found.sentence
+
+
+def test_a_misfit_over_the_whole_clip_is_no_noise():
+    for seed in range(SEEDS):
+        found = judge(with_bump(simulate(seed), "ankle", 2.0, slice(0, FRAMES)))
+        assert found.sentence.startswith("Does not fit: ankles 2."), found.sentence
+
+
+def test_a_small_misfit_is_none():
+    """Five per cent more than the noise: significant in ten thousand residuals, but small."""
+    found = judge(with_bump(simulate(0), "ankle", 0.32, slice(0, FRAMES)))
+    assert found.fits
+
+
+def test_only_tolerances_count_without_noise():
+    def tolerated(play: Playback) -> Verdict:
+        return verdict.judge_tolerances(measure_groups([play], [{}], Assumed()))
+
+    assert tolerated(playback()).fits
+    assert tolerated(with_bump(playback(), "ankle", 0.9, slice(0, FRAMES))).fits
+    found = tolerated(with_bump(playback(), "ankle", 4.0, slice(100, 160)))
+    assert not found.fits and "ankles" in found.sentence and "tolerance" in found.sentence
+
+
+# The numbers
+
+
+def test_p_values_are_uniform_where_the_noise_is_as_assumed():
+    for rho, given in ((0.0, 0.0), (RHO, RHO), (RHO, 0.0)):
+        plays = [whiten(simulate(seed, rho=rho), given) for seed in range(150)]
+        groups = [
+            g
+            for play in plays
+            for g in measure_groups([play], [dict.fromkeys(KINDS, given)], Assumed())
+        ]
+        p = np.array([group.left.p for group in groups])
+        assert stats.kstest(p, "uniform").pvalue > 1e-3, (rho, given)
+        if rho == given:
+            p = np.array([group.left.autocorrelation_p for group in groups])
+            assert stats.kstest(p, "uniform").pvalue > 1e-3

@@ -1,0 +1,286 @@
+"""Noise that is estimated with the parameters: against SciPy's optima, and against simulation."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import linalg, optimize, stats
+
+import fitting
+import jaxik
+from fitting.experiments import problems
+from fitting.experiments.experiment_files import load_experiment
+from fitting.inference.identifiability import assess_identifiability
+from fitting.inference.noise import marginal, model, series
+from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
+from fitting.inference.noise.settings import NoiseOptions
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.problem.loss import apply_loss
+from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.simulation import autoregression, simulate
+from fitting.studies import run_folder
+from fitting.studies.fit import search_with_noise
+from support.experiments import ROOT
+
+RHO = 0.95
+BOTH = NoiseOptions("estimated", "whitened")
+OZZ = ROOT / "data" / "experiments" / "ozz.toml"
+KINDS = ("ankle", "knee", "pelvis", "foot", "body")
+
+
+# The errors of one kind
+
+
+@pytest.fixture
+def errors() -> series.Errors:
+    """Two columns of an autoregression, with a gap."""
+    random = np.random.default_rng(0)
+    values = 0.3 * autoregression(random.normal(size=(120, 2)), 0.8)
+    active = np.ones((120, 2), bool)
+    active[40:50] = False
+    return series.Errors(np.where(active, values, 0.0), active)
+
+
+def test_sigma_and_correlation_are_those_of_the_exact_likelihood(errors):
+    """Of multivariate normal runs, whose covariance is `sigma² rho^|i - j|`."""
+    runs = [part for column in errors.values.T for part in (column[:40], column[50:])]
+
+    def minus_log_likelihood(x: np.ndarray) -> float:
+        sigma, rho = math.exp(x[0]), math.tanh(x[1])
+        total = 0.0
+        for run in runs:
+            covariance = sigma**2 * linalg.toeplitz(rho ** np.arange(len(run)))
+            joint = stats.multivariate_normal(cov=covariance)  # type: ignore[arg-type]
+            total -= joint.logpdf(run)
+        return total
+
+    best = optimize.minimize(minus_log_likelihood, [0.0, 0.0], method="Nelder-Mead").x
+    found = series.likeliest([errors], "squares", 4.0, None)
+    assert found.sigma == pytest.approx(math.exp(best[0]), rel=1e-3)
+    assert found.correlation == pytest.approx(math.tanh(best[1]), abs=1e-3)
+
+
+def test_a_given_correlation_stays(errors):
+    found = series.likeliest([errors], "squares", 4.0, 0.5)
+    values = series.innovations(errors, 0.5)
+    assert found.correlation == 0.5 and values.size == errors.active.sum()
+    assert found.sigma == pytest.approx(np.sqrt(np.mean(values**2)))
+
+
+@pytest.mark.parametrize("nu", [2.5, 6.0])
+def test_scale_and_tails_are_those_of_scipys_t(nu):
+    values = 0.2 * np.asarray(stats.t.rvs(nu, size=4000, random_state=1))
+    tails, sigma = 4.0, 1.0
+    for _ in range(60):
+        sigma = series.scale(values, "student", tails)
+        tails = series.likeliest_tails(values / sigma)
+    expected = stats.t.fit(values, floc=0)
+    assert tails == pytest.approx(expected[0], rel=0.01)
+    assert sigma == pytest.approx(expected[2], rel=0.01)
+
+
+@pytest.mark.parametrize("nu", [2.0, 5.0])
+def test_students_slopes_tell_less_than_they_say(nu):
+    """Against draws: the score's square, over the slope's of the transformed residual."""
+    draws = stats.t.rvs(nu, size=200_000, random_state=2)
+    score = (nu + 1) * draws / (nu + draws**2)
+    transformed = jax.vmap(jax.grad(lambda r: apply_loss(r[None], "student", nu)[0]))
+    ratio = np.mean(score**2) / np.mean(np.asarray(transformed(jnp.asarray(draws))) ** 2)
+    assert series.information_of_slopes("student", nu) == pytest.approx(ratio, rel=0.01)
+    assert series.information_of_slopes("squares", nu) == 1.0
+
+
+# A problem
+
+
+@pytest.fixture(scope="module")
+def short() -> Problem[jaxik.FootIK]:
+    """A second of the walk of `ozz`, with two free parameters and simulated correlated noise."""
+    experiment = load_experiment(OZZ)
+    clip = dataclasses.replace(experiment.clips[0], start=2.0, end=3.0)
+    free = {name: {} for name in ("target.foot_height", "foot.weight")}
+    short = dataclasses.replace(experiment, clips=(clip,), free=free)
+    problem = problems.make_problem(short)
+    noise = noise_of(problem)
+    correlated = dataclasses.replace(noise, correlations=dict.fromkeys(KINDS, 0.6))
+    return simulate(with_noise(problem, correlated), problem.space.u0, seed=3)
+
+
+def test_noise_is_replaced_without_a_new_program(short):
+    noise = NoiseModel(dict.fromkeys(KINDS, 0.1), dict.fromkeys(KINDS, 0.3), 7.0, 0.5)
+    changed = with_noise(short, noise)
+    assert noise_of(changed) == noise
+    before, after = (
+        jax.tree.map(jax.typeof, eqx.filter(p, eqx.is_array)) for p in (short, changed)
+    )
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert jax.tree.leaves(before) == jax.tree.leaves(after)
+    assert changed.data[0].sigmas.contact == short.data[0].sigmas.contact
+
+
+@pytest.mark.slow
+def test_the_fit_with_noise_is_the_joint_optimum(short):
+    """Against a quasi-Newton search over parameters, log-sigmas and correlations together."""
+    experiment = dataclasses.replace(load_experiment(OZZ), noise=BOTH)
+    problem, solution = search_with_noise(short, experiment)
+    found = noise_of(problem)
+
+    def objective(x: np.ndarray) -> float:
+        u, sigmas, rhos = x[:2], np.exp(x[2:7]), np.tanh(x[7:])
+        ik = short.space.unpack(jnp.asarray(u))
+        errors = model._errors_of(ik, short.data[0])
+        total = 0.5 * float(np.sum(np.asarray(short.space.prior_residuals(jnp.asarray(u))) ** 2))
+        for kind, sigma, rho in zip(KINDS, sigmas, rhos, strict=True):
+            values = errors[kind].values
+            innovations = values[1:] - rho * values[:-1]
+            variance = sigma**2 * (1 - rho**2)
+            total -= stats.norm.logpdf(values[0], scale=sigma).sum()
+            total -= stats.norm.logpdf(innovations, scale=math.sqrt(variance)).sum()
+        return total
+
+    ours = np.concatenate(
+        [solution.u, [math.log(s) for s in found.sigmas.values()],
+         [math.atanh(rho) for rho in found.correlations.values()]]
+    )  # fmt: skip
+    start = ours + np.random.default_rng(0).normal(0, 0.05, ours.size)
+    best = optimize.minimize(objective, start, method="BFGS")
+    assert objective(ours) < best.fun + 1e-3
+    np.testing.assert_allclose(ours, best.x, atol=0.01)
+
+
+def test_open_sigmas_are_integrated_out(short):
+    """Against a sum over a grid of log-sigmas, of which one is open."""
+    only_ankles = dataclasses.replace(
+        short.data[0].sigmas, **{kind: jnp.asarray(jnp.inf) for kind in KINDS[1:]}
+    )
+    scene = dataclasses.replace(short.data[0], sigmas=only_ankles)
+    problem = dataclasses.replace(short, data=(scene,), independent_fraction=jnp.asarray(0.5))
+    opened = marginal.with_unknown_sigmas(problem)
+    assert opened.unknown_sigmas is not None and opened.unknown_sigmas.shape[0] == 1
+    points = np.asarray(short.space.u0) + np.array([[0.0, 0.0], [0.2, -0.1]])
+    log_sigmas = np.linspace(-4, 4, 4001)
+    expected = []
+    for u in points:
+        residuals = np.asarray(problem.residuals(jnp.asarray(u)))
+        squares, prior = np.sum(residuals[:-2] ** 2), np.sum(residuals[-2:] ** 2)
+        count = 0.5 * float(opened.unknown_sigmas.sum())
+        logs = -count * log_sigmas - 0.5 * squares * np.exp(-2 * log_sigmas)
+        expected.append(np.logaddexp.reduce(logs) - 0.5 * prior)
+    ours = [float(opened.log_probability(jnp.asarray(u))) for u in points]
+    assert ours[1] - ours[0] == pytest.approx(expected[1] - expected[0], rel=1e-6)
+
+
+def test_open_sigmas_are_drawn_around_the_residuals_own(short):
+    opened = marginal.with_unknown_sigmas(short)
+    u = np.tile(np.asarray(short.space.u0), (50, 30, 1))
+    draws = marginal.draw_sigmas(opened, u, seed=0)
+    residuals = np.asarray(short.residuals(short.space.u0))[:-2]
+    assert tuple(draws) == KINDS
+    for kind, row in zip(KINDS, np.asarray(opened.unknown_sigmas), strict=True):
+        squares, count = row @ residuals**2, row.sum()
+        sigma = getattr(short.data[0].sigmas, kind) * np.sqrt(squares / count)
+        assert np.median(draws[kind]) == pytest.approx(float(sigma), rel=0.02)
+        assert np.std(draws[kind]) / sigma == pytest.approx(1 / np.sqrt(2 * count), rel=0.15)
+
+
+def test_a_robust_loss_leaves_no_sigma_open(short):
+    robust = dataclasses.replace(short, loss="student")
+    with pytest.raises(ValueError, match="loss is 'student'; only with squares"):
+        marginal.with_unknown_sigmas(robust)
+
+
+# Whole fits
+
+
+@pytest.mark.slow
+def test_a_run_is_sampled_with_the_noise_that_its_fit_found(tmp_path):
+    experiment = load_experiment(OZZ)
+    clip = dataclasses.replace(experiment.clips[0], start=2.0, end=3.0)
+    sampled = dataclasses.replace(experiment.sample, max_steps=20, walkers=8)
+    experiment = dataclasses.replace(
+        experiment,
+        clips=(clip,),
+        free={"foot.weight": {}, "foot.twist": {}},
+        noise=BOTH,
+        sample=sampled,
+    )
+    fitted = fitting.fit(experiment, tmp_path / "run")
+    first = fitting.sample(fitted)
+    assert set(first.sigmas) == set(KINDS)
+    _, summary = run_folder.load_fit(tmp_path / "run")
+    assert NoiseModel(**summary["noise"]) == fitted.noise  # type: ignore[typeddict-item]
+    continued = fitting.sample(tmp_path / "run", max_steps=30)
+    assert (continued.u[:20] == first.u).all() and len(continued.u) == 30
+    text = (Path(tmp_path) / "run" / run_folder.SUMMARY).read_text()
+    assert "### Noise, estimated with the parameters" in text
+    assert "Sigmas of the noise, which were sampled along:" in text
+
+
+def with_outliers(problem: Problem[jaxik.FootIK], seed: int) -> Problem[jaxik.FootIK]:
+    """The problem with three per cent of its reference's positions ten sigmas off."""
+    random = np.random.default_rng(seed)
+
+    def gross(x: jax.Array) -> jax.Array:
+        far = random.random(x.shape) < 0.03
+        return x + jnp.asarray(0.02 * random.normal(size=x.shape) * far)
+
+    return eqx.tree_at(
+        lambda p: [
+            p.data[0].reference.knee_ws,
+            p.data[0].reference.ankle.pos,
+            p.data[0].reference.pelvis.pos,
+        ],
+        problem,
+        replace_fn=gross,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rho", "factor", "loss", "options"),
+    [
+        (RHO, 1.0, "squares", BOTH),
+        (0.0, 0.5, "squares", NoiseOptions("estimated")),
+        (0.0, 2.0, "squares", NoiseOptions("estimated")),
+        (0.0, 1.0, "student", NoiseOptions("estimated")),
+    ],
+)
+def test_intervals_with_estimated_noise_cover_the_truth(rho, factor, loss, options):
+    """Of eight truths and six parameters; 41 of 48 or more have a probability of 99.8 %."""
+    experiment = dataclasses.replace(load_experiment(OZZ), noise=options, loss=loss)
+    search = SearchSettings(final_sweeps=2)
+    experiment = dataclasses.replace(
+        experiment, fit=dataclasses.replace(experiment.fit, search=search)
+    )
+    problem = problems.make_problem(experiment)
+    assert problem.residual_function is residuals_of_scenes
+    space, true = problem.space, noise_of(problem)
+    made = with_noise(problem, dataclasses.replace(true, correlations=dict.fromkeys(KINDS, rho)))
+    assumed = dataclasses.replace(
+        true, sigmas={kind: factor * sigma for kind, sigma in true.sigmas.items()}
+    )
+    covered = 0
+    for seed in range(8):
+        draw = np.random.default_rng(seed).normal(size=space.size)
+        u = space.u0 + 0.5 * space.prior_sd * jnp.asarray(draw)
+        captured = simulate(made, u, seed)
+        if loss == "student":
+            captured = with_outliers(captured, seed)
+        fitted, solution = search_with_noise(with_noise(captured, assumed), experiment)
+        found = noise_of(fitted)
+        if loss == "squares":
+            ratios = [found.sigmas[kind] / true.sigmas[kind] for kind in KINDS]
+            np.testing.assert_allclose(ratios, 1.0, atol=0.45 if rho else 0.1)
+            np.testing.assert_allclose(list(found.correlations.values()), rho, atol=0.05)
+        else:
+            assert found.tails < 10
+        low, high = assess_identifiability(fitted, solution).interval.T
+        values = np.asarray(space.values(u))
+        covered += int(np.sum((low <= values) & (values <= high)))
+    assert covered >= 41
