@@ -11,7 +11,7 @@ from fitting.analysis import limit_activity, playback, worst_window
 from fitting.analysis.playback import Playback
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
-from fitting.studies.fit import Fit, FitSummary
+from fitting.studies.fit import MIN_IMPROVEMENT, Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report
@@ -84,10 +84,16 @@ def gallery(plots: Plots) -> str:
 
 def cost_sentence(summary: FitSummary) -> str:
     """Cost before and after, and the effort it took."""
-    return (
+    sentence = (
         f"Cost {summary['cost_before']:.6g} before, {summary['cost']:.6g} after: "
         f"{summary['steps']} steps in {summary['seconds']:.1f} s."
     )
+    if left := summary["left"]:
+        costs = ", ".join(f"{cost:.6g}" for cost in left)
+        sentence += f" Profiles led on to lower points from solutions of cost {costs}."
+    if (lower := summary["improvement"]) > MIN_IMPROVEMENT:
+        sentence += f" A profile still meets a point that is {lower:.3g} lower."
+    return sentence
 
 
 def _clip_names(fitted: Fit, index: int) -> tuple[str, str]:
@@ -154,9 +160,12 @@ def _identifiability(fitted: Fit) -> list[str]:
     names = ", ".join(f"`{name}`" for name in identifiability.undetermined)
     parts = [
         "## What these clips do not determine",
-        f"Undetermined: {names}." if names else "All free parameters are determined.",
-        "Contraction is 1 where the clips alone decide and 0 where only the prior is known.",
-        markdown(fit_tables.contraction_table(fitted.summary["parameters"])),
+        f"Not determined: {names}." if names else "All free parameters are determined.",
+        "A parameter is held at each value of its range while all others follow; the 95 % interval"
+        " is where the cost stays low. Determined: it ends on both sides because the clips say so,"
+        " and is less than 0.7 times as wide as that of the prior. Contraction is 1 where the clips"
+        " alone decide and 0 where only the prior is known.",
+        markdown(fit_tables.verdict_table(fitted.summary["parameters"])),
     ]
     if identifiability.correlated:
         parts.append("Pairs of which these clips mostly determine one combination (correlation):")
@@ -180,11 +189,10 @@ def _limits(fitted: Fit) -> list[str]:
         "Fraction of frames that would look different if the limit were out of the way:",
         markdown(fit_tables.limit_table(clips)),
     ]
-    if profiles := fitted.identifiability.profiles:
-        flips = limit_activity.flipped_decisions(fitted.problem, fitted.solution.u)
+    if nudges := limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u):
         parts.append(
             "Fraction of the feet's decisions (planted, lifted, locked, ground found) that flip "
             "when a threshold moves by 10 % of its range, and the rise in cost:"
         )
-        parts.append(markdown(fit_tables.flip_table(flips, profiles)))
+        parts.append(markdown(fit_tables.flip_table(nudges)))
     return parts

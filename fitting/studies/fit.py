@@ -16,6 +16,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.search import Starts, find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.inference.profiles.profile import Verdict
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import Content
@@ -25,7 +26,18 @@ from jaxik.maths import parameter_tree, smoothing
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
 THRESHOLD_SD = 0.05
 MIN_START_SD, MAX_START_SD = 1e-3, 0.5
+MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
+
+
+class FittedValley(TypedDict):
+    """A part of a parameter's range in which the cost is low."""
+
+    value: float
+    """Where it is lowest."""
+    rise: float
+    """There, above the lowest of all."""
+    interval: list[float]
 
 
 class FittedParameter(TypedDict):
@@ -45,6 +57,10 @@ class FittedParameter(TypedDict):
     high: float
     interval: list[float]
     """95 %."""
+    verdict: Verdict
+    """Which sides the clips bound."""
+    valleys: list[FittedValley]
+    """From low values to high ones; one unless the verdict says several."""
     contraction: float
     """0 where only the prior is known, 1 where the clips decide."""
     at_bound: Literal["", "low", "high"]
@@ -70,6 +86,10 @@ class FitSummary(TypedDict):
     """Two names and their correlation."""
     weakest: list[str]
     history: list[Content]
+    left: list[float]
+    """Costs of solutions that were left because their profiles met a lower point."""
+    improvement: float
+    """How far below the cost the lowest point of the last profiles is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +104,8 @@ class Fit:
     """What made a synthetic reference."""
     run: Path | None = None
     """The folder where it is written."""
+    left: tuple[float, ...] = ()
+    """Costs of solutions that were left because their profiles met a lower point."""
 
     @cached_property
     def ik(self) -> jaxik.FootIK:
@@ -118,6 +140,8 @@ class Fit:
             "correlated": [list(pair) for pair in self.identifiability.correlated],
             "weakest": list(self.identifiability.weakest),
             "history": [dataclasses.asdict(step) for step in solution.history],
+            "left": list(self.left),
+            "improvement": self.identifiability.improvement,
         }
 
 
@@ -144,12 +168,45 @@ def search(
     )
 
 
+def search_lower(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    before: Solution,
+    lower_u: Float[np.ndarray, " free"],
+    progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """The best fit from a point that is lower than a solution; steps and time add to its own.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of the search.
+        before: the solution that is left.
+        lower_u: the lower point, in u.
+        progress: called as the search goes on.
+    """
+    after = search(problem, experiment, progress, lower_u[None])
+    later = [
+        dataclasses.replace(
+            line, step=before.steps + line.step, seconds=before.seconds + line.seconds
+        )
+        for line in after.history
+    ]
+    return dataclasses.replace(
+        after,
+        cost_before=before.cost_before,
+        history=(*before.history, *later),
+        steps=before.steps + after.steps,
+        seconds=before.seconds + after.seconds,
+    )
+
+
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
     solution, space, known = fitted.solution, fitted.problem.space, fitted.identifiability
     declared = parameter_tree.declarations(space.system)
     before = np.asarray(space.values(space.u0))
     rows = []
     for i, parameter in enumerate(space.parameters):
+        profile = known.profiles[parameter.name]
         row: FittedParameter = {
             "name": parameter.name,
             "kind": parameter.kind,
@@ -160,10 +217,15 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             "before": float(before[i]),
             "low": parameter.low,
             "high": parameter.high,
-            "interval": [float(end) for end in known.interval[i]],
+            "interval": list(profile.interval),
+            "verdict": profile.verdict,
+            "valleys": [
+                {"value": v.value, "rise": v.rise, "interval": list(v.interval)}
+                for v in profile.valleys
+            ],
             "contraction": float(known.contraction[i]),
             "at_bound": known.at_bound[i],
-            "determined": parameter.name not in known.undetermined,
+            "determined": parameter.name in known.determined,
         }
         if parameter.scale == "gain":
             row |= gain_readings(row["value"])  # type: ignore[operator]
