@@ -35,6 +35,11 @@ class Curves:
         """Where the points of a curve lie in the parameter's range, 0..1, rising."""
         return to_fractions(self.space.parameters[i], self.curves[i].values[:, i])
 
+    def nearest(self, i: int, place: float) -> Points:
+        """The point of a curve that is nearest to a fraction of the range, alone."""
+        k = int(np.argmin(np.abs(self.fractions(i) - place)))
+        return self.curves[i][k : k + 1]
+
     def rises(self, i: int) -> Float[np.ndarray, " points"]:
         """Cost of a curve's points above its lowest."""
         return self.curves[i].cost - self.curves[i].cost.min()

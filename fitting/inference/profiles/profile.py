@@ -14,7 +14,8 @@ from fitting.problem.space import from_fractions, to_fractions
 # steps to either side: half of 7.35 (Hansen, Sample splitting and threshold estimation, 2000).
 RISE_OF_SMOOTH = 1.92
 RISE_OF_THRESHOLD = 3.68
-BARRIER = 2.0  # times that rise: what lies between two valleys, or they count as one
+BARRIER = 2.0  # times that rise, at least, lies between two valleys
+SEPARATION = 0.05  # fraction of the range, at least, likewise: hard decisions make small cliffs
 
 Verdict = Literal["two-sided", "at least", "at most", "flat", "several valleys"]
 
@@ -85,7 +86,7 @@ def make_profile(
     own, costs, data_costs = own[order], costs[order], (costs - own_prior)[order]
     rises, data_rises = costs - costs.min(), data_costs - data_costs.min()
     highest = max_rise(parameter)
-    parts = low_parts(rises, highest)
+    parts = low_parts(to_fractions(parameter, own), rises, highest)
     valleys = tuple(_valley(parameter, own, rises, part) for part in parts)
     free_below = bool((data_rises[: parts[0].start] <= highest).all())
     free_above = bool((data_rises[parts[-1].stop :] <= highest).all())
@@ -100,13 +101,25 @@ def make_profile(
     )
 
 
-def low_parts(rises: Float[np.ndarray, " points"], highest: float) -> list[slice]:
-    """The runs of points that rise no higher than this, joined where no barrier is between them."""
+def low_parts(
+    places: Float[np.ndarray, " points"], rises: Float[np.ndarray, " points"], highest: float
+) -> list[slice]:
+    """The valleys of a curve, as runs of points that rise no higher than this in between.
+
+    Args:
+        places: fractions of the range, rising.
+        rises: of the cost.
+        highest: rise up to which a point is low.
+    """
     low = rises <= highest
     edges = np.flatnonzero(np.diff(np.concatenate([[False], low, [False]])))
     parts: list[slice] = []
     for start, stop in edges.reshape(-1, 2):
-        if parts and rises[parts[-1].stop : start].max() < BARRIER * highest:
+        last = parts[-1].stop if parts else 0
+        if parts and (
+            rises[last:start].max() < BARRIER * highest
+            or places[start] - places[last - 1] < SEPARATION
+        ):
             parts[-1] = slice(parts[-1].start, int(stop))
         else:
             parts.append(slice(int(start), int(stop)))

@@ -7,6 +7,7 @@ kept: the best point goes back to the fit.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -19,15 +20,19 @@ from fitting.problem.space import from_fractions, to_fractions
 from .conditional import Conditional, Points, Targets, join
 from .curves import Curves
 from .profile import crossing, low_parts
-from .threshold_moves import other_plateaus, settle
+from .single_moves import other_plateaus, settle
 
 GRID = np.concatenate([[0.001], (np.arange(20) + 0.5) / 20, [0.999]])  # fractions of the range
+FOLLOWED = np.concatenate([GRID[:-1:2], GRID[-1:]])  # where curves are followed outwards
 FINE_GRID = (np.arange(population.BATCH) + 0.5) / population.BATCH  # for plateaus of thresholds
 LOW = 40.0  # rise by the data up to which a curve is followed outwards
 PROMISING = 400.0  # and up to which a minimum of the scan may become a valley
 MINIMA = 2  # of each curve from which descents begin
 FREE_STEPS = 12  # of these descents, at most
 ROUNDS = 8  # of refinement
+SPANS = (1.0, 0.2, 0.04)  # of moves of thresholds, fractions of the range
+CROSSINGS = 2  # rounds in which cliffs are crossed
+CLIFF = 1.5  # times the rise at the end of an interval: what lies behind it may be a cliff
 NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpolated
 NARROW = 0.05  # fraction of a valley's width that its ends are found to
 
@@ -59,6 +64,10 @@ def find_curves(problem: Problem, solution: Solution) -> Curves:
     refine(profiling)
     profiling.curves.share()
     refine(profiling)
+    for _ in range(CROSSINGS):
+        if not cross_cliffs(profiling):
+            break
+        refine(profiling)
     return profiling.curves
 
 
@@ -71,9 +80,11 @@ def scan(profiling: _Profiling) -> None:
         index += [i] * len(grid)
         value += list(from_fractions(parameter, grid))
     targets = Targets(np.asarray(index), np.asarray(value))
-    u = np.repeat(profiling.solution.u, len(index), axis=0)
-    for points in conditional.follow(conditional.carry(u, targets), targets):
-        profiling.curves.add(targets, points)
+    start = profiling.solution[np.zeros(len(index), int)]
+    for following in (True, False):
+        chosen = np.full(start.u.shape, following)
+        moved = conditional.move(start, np.zeros_like(start.u), targets, chosen)
+        profiling.curves.add(targets, conditional.points(moved))
 
 
 def follow_outwards(profiling: _Profiling) -> None:
@@ -82,22 +93,25 @@ def follow_outwards(profiling: _Profiling) -> None:
     sides: list[tuple[int, Float[np.ndarray, " values"]]] = []
     for i, parameter in enumerate(space.parameters):
         present = to_fractions(parameter, profiling.solution.values[0, i])
-        sides += [(i, GRID[GRID < present][::-1]), (i, GRID[GRID > present])]
-    last = [profiling.solution.u[0]] * len(sides)
+        sides += [(i, FOLLOWED[FOLLOWED < present][::-1]), (i, FOLLOWED[FOLLOWED > present])]
+    last = [profiling.solution] * len(sides)
     active, position = [s for s in range(len(sides)) if len(sides[s][1])], 0
     while active:
         index = np.asarray([sides[s][0] for s in active])
-        value = [
-            from_fractions(space.parameters[sides[s][0]], sides[s][1][position]) for s in active
+        places = [sides[s][1][position] for s in active]
+        targets = targets_at(profiling, index, places)
+        starts = [
+            join([last[s], curves.nearest(i, p)])
+            for s, i, p in zip(active, index, places, strict=True)
         ]
-        targets = Targets(index, np.asarray(value))
-        points = lowest(profiling, targets, [last[s][None] for s in active], settling=True)
+        points = lowest(profiling, targets, starts, settling=True)
         curves.add(targets, points)
         following = []
-        for s, i, u, cost in zip(active, index, points.u, points.cost, strict=True):
-            last[s] = u
-            own = population.prior_costs(space, np.stack([u, profiling.solution.u[0]]))[:, i]
-            rise = cost - own[0] - (curves.best.cost[0] - own[1])
+        for k, (s, i) in enumerate(zip(active, index, strict=True)):
+            last[s] = points[k : k + 1]
+            u = np.concatenate([last[s].u, profiling.solution.u])
+            own = population.prior_costs(space, u)[:, i]
+            rise = points.cost[k] - own[0] - (curves.best.cost[0] - own[1])
             if rise < LOW and position + 1 < len(sides[s][1]):
                 following.append(s)
         active, position = following, position + 1
@@ -123,47 +137,78 @@ def refine(profiling: _Profiling) -> None:
     """New points where valleys end and between valleys, until the ends are known well enough."""
     curves, tried = profiling.curves, set()
     for number in range(ROUNDS):
-        index, value, starts = [], [], []
+        index, places, starts = [], [], []
         for i, curve in enumerate(curves.curves):
             for inside, outside in open_ends(curves, i):
-                place = _next_place(curves, i, inside, outside, bisect=number % 3 == 2)
                 index.append(i)
-                value.append(
-                    float(from_fractions(profiling.space.parameters[i], np.asarray(place)))
-                )
-                starts.append(curve.u[[inside, outside]])
+                places.append(_next_place(curves, i, inside, outside, bisect=number % 3 == 2))
+                starts.append(curve[np.asarray([inside, outside])])
             for k in barrier(curves, i):
-                if (i, float(curve.values[k, i])) not in tried:
-                    tried.add((i, float(curve.values[k, i])))
+                if (i, place := float(curves.fractions(i)[k])) not in tried:
+                    tried.add((i, place))
                     index.append(i)
-                    value.append(curve.values[k, i])
-                    starts.append(curve.u[[k - 1, k + 1]])
+                    places.append(place)
+                    starts.append(curve[np.asarray([k - 1, k + 1])])
         if not index:
             return
-        targets = Targets(np.asarray(index), np.asarray(value))
+        targets = targets_at(profiling, np.asarray(index), places)
         curves.add(targets, lowest(profiling, targets, starts))
 
 
+def cross_cliffs(profiling: _Profiling) -> bool:
+    """Tries to go on beyond cliffs that end a valley; whether any was crossed."""
+    curves, conditional, space = profiling.curves, profiling.conditional, profiling.space
+    index, places, starts = [], [], []
+    for i in range(space.size):
+        rises, own = curves.rises(i), curves.fractions(i)
+        for part in low_parts(own, rises, curves.highest(i)):
+            for inside, outside in ((part.start, part.start - 1), (part.stop - 1, part.stop)):
+                if 0 <= outside < len(own) and rises[outside] > CLIFF * curves.highest(i):
+                    index.append(i)
+                    places.append(own[outside])
+                    starts.append(curves.curves[i][inside : inside + 1])
+    if not index:
+        return False
+    targets, start = targets_at(profiling, np.asarray(index), places), join(starts)
+    alone = np.zeros(start.u.shape, bool)
+    moved = conditional.move(start, np.zeros_like(start.u), targets, alone)
+    settled = conditional.points(settle(conditional, moved, targets, SPANS[-1:]))
+    points = conditional.lowest(targets, [settled[k : k + 1] for k in range(len(index))])
+    curves.add(targets, points)
+    highest = np.asarray([curves.highest(i) for i in index])
+    return bool((points.cost - curves.best.cost[0] < highest).any())
+
+
+def targets_at(profiling: _Profiling, index: np.ndarray, places: Sequence[float]) -> Targets:
+    """Targets at fractions of the parameters' ranges."""
+    parameters = [profiling.space.parameters[i] for i in index]
+    values = [
+        from_fractions(parameter, np.asarray(place))
+        for parameter, place in zip(parameters, places, strict=True)
+    ]
+    return Targets(index, np.asarray(values))
+
+
 def lowest(
-    profiling: _Profiling, targets: Targets, starts: list[np.ndarray], *, settling: bool = False
+    profiling: _Profiling, targets: Targets, starts: list[Points], *, settling: bool = False
 ) -> Points:
     """The lowest points at the targets, from these starts and from the other plateaus.
 
     When `settling`, where a threshold is held and the cost is not low, other thresholds may move.
     """
     conditional, space, curves = profiling.conditional, profiling.space, profiling.curves
-    starts = [np.concatenate([near, profiling.plateaus.u]) for near in starts]
-    promising = curves.best.cost[0] + PROMISING
-    points = conditional.lowest(targets, starts, promising)
+    starts = [join([near, profiling.plateaus]) for near in starts]
+    points = conditional.lowest(targets, starts)
     if not settling or sum(space.thresholds) < 2:
         return points
-    highest = curves.best.cost[0] + np.asarray([curves.highest(i) for i in targets.index])
-    stuck = (points.cost > highest) & (points.cost < promising)
+    rises = points.cost - curves.best.cost[0]
+    highest = np.asarray([curves.highest(i) for i in targets.index])
+    stuck = (rises > highest) & (rises < PROMISING)
     stuck = np.flatnonzero(stuck & np.asarray(space.thresholds)[targets.index])
     if not len(stuck):
         return points
-    settled = conditional.points(settle(conditional, points.u[stuck], targets[stuck]))
-    moved = conditional.descend_each(settled, targets[stuck])
+    settled = conditional.points(settle(conditional, points.u[stuck], targets[stuck], SPANS))
+    moved = conditional.lowest(targets[stuck], [settled[k : k + 1] for k in range(len(stuck))])
     lower = moved.cost < points.cost[stuck]
     order = np.arange(len(points.cost))
     order[stuck[lower]] = len(order) + np.flatnonzero(lower)
@@ -174,7 +219,7 @@ def open_ends(curves: Curves, i: int) -> list[tuple[int, int]]:
     """Indices of the points inside and outside each end that is not known well enough."""
     rises, own, ends = curves.rises(i), curves.fractions(i), []
     smooth = curves.space.smooth[i]
-    for part in low_parts(rises, curves.highest(i)):
+    for part in low_parts(own, rises, curves.highest(i)):
         last = part.stop - 1
         width = own[min(part.stop, len(own) - 1)] - own[max(part.start - 1, 0)]
         for inside, outside in ((part.start, part.start - 1), (last, last + 1)):
@@ -189,7 +234,7 @@ def open_ends(curves: Curves, i: int) -> list[tuple[int, int]]:
 
 def barrier(curves: Curves, i: int) -> list[int]:
     """Indices of the points between two valleys."""
-    parts = low_parts(curves.rises(i), curves.highest(i))
+    parts = low_parts(curves.fractions(i), curves.rises(i), curves.highest(i))
     return [k for a, b in zip(parts[:-1], parts[1:], strict=True) for k in range(a.stop, b.start)]
 
 
