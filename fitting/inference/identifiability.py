@@ -20,6 +20,7 @@ from fitting.runtime.precision import in_float64
 from .optimisation.solution import Solution
 from .profiles.profile import Profile
 from .profiles.profiling import find_curves
+from .profiles.ridges import Ridge, find_ridges
 
 UNDETERMINED = 0.5  # contraction below which a parameter counts as undetermined
 CORRELATED = 0.9  # posterior correlation from which on a pair is named
@@ -48,6 +49,8 @@ class Identifiability:
     """Parameters in the direction of the smallest eigenvalue."""
     correlated: tuple[tuple[str, str, float], ...]
     """Strongest first."""
+    ridges: tuple[Ridge, ...]
+    """Combinations that are determined, of parameters that are not."""
     best_u: Float[np.ndarray, " free"]
     """The lowest point that a profile met, the solution included."""
     best_cost: float
@@ -65,13 +68,18 @@ class Identifiability:
         return tuple(
             name
             for name, contraction in zip(self.names, self.contraction, strict=True)
-            if self.profiles[name].verdict == "two-sided" and contraction >= UNDETERMINED
+            if is_determined(self.profiles[name], contraction)
         )
 
     @property
     def undetermined(self) -> tuple[str, ...]:
         """The others."""
         return tuple(name for name in self.names if name not in self.determined)
+
+
+def is_determined(profile: Profile, contraction: float) -> bool:
+    """Whether the data bound a parameter on both sides, in one valley, and well enough."""
+    return profile.verdict == "two-sided" and contraction >= UNDETERMINED
 
 
 @in_float64
@@ -96,15 +104,22 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
     names = [space.names[i] for i in laplace.smooth]
     fractions = jax.nn.sigmoid(jnp.asarray(solution.u))
     best = curves.best
+    contraction = _contraction(problem, solution, profiles)
+    undetermined = [
+        name
+        for name, c in zip(space.names, contraction, strict=True)
+        if not is_determined(profiles[name], c)
+    ]
     return Identifiability(
         names=space.names,
         profiles=profiles,
-        contraction=_contraction(problem, solution, profiles),
+        contraction=contraction,
         sd=laplace.sd(problem),
         at_bound=tuple(_bound(float(fraction)) for fraction in fractions),
         eigenvalues=laplace.eigenvalues,
         weakest=tuple(n for n, x in zip(names, laplace.weakest, strict=True) if abs(x) > WEAK),
         correlated=_correlated(names, laplace.covariance),
+        ridges=find_ridges(space.parameters, profiles, undetermined),
         best_u=best.u[0],
         best_cost=float(best.cost[0]),
         improvement=float(solution.cost - best.cost[0]),

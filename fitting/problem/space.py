@@ -177,6 +177,13 @@ def _from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleTyp
             return coordinate
 
 
+def scale_width(parameter: FreeParameter) -> float:
+    """Width of a parameter's range on its scale."""
+    return float(
+        np.diff(_to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np))[0]
+    )
+
+
 def to_fractions(
     parameter: FreeParameter, values: Float[np.ndarray, "*n"]
 ) -> Float[np.ndarray, "*n"]:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fitting.analysis import limit_activity, playback, worst_window
+from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.playback import Playback
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
@@ -16,7 +17,8 @@ from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, markdown
-from .plots import fit_plots, style, worst_window_plots
+from .identifiability.sections import sections as identifiability_sections
+from .plots import fit_plots, profile_plots, style, worst_window_plots
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
 Plots: TypeAlias = dict[str, str]  # captions by file name
@@ -54,15 +56,20 @@ def write_fit(
         first = playback.play(scene, playback.run(before, scene))
         plots |= _draw_clip(run, fitted, index, first, after)
         worst += _worst_window(run, fitted, index, after)
+    plots |= _draw_profiles(run, fitted)
     title = f"{fitted.experiment.name}: cost of the fit over time"
     figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
     plots |= save_plot(run, "cost.png", title, figure)
+    clips = [
+        limit_activity.measure(fitted.ik, scene, result)
+        for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
+    ]
     parts = [
         *_result(fitted),
         *opening,
         *_parameters(fitted),
-        *_identifiability(fitted),
-        *_limits(fitted),
+        *identifiability_sections(fitted, clips),
+        *_limits(fitted, clips),
         *worst,
         *details,
         "## Pictures",
@@ -133,6 +140,15 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
     return plots
 
 
+def _draw_profiles(run: Path, fitted: Fit) -> Plots:
+    title = f"{fitted.experiment.name}: how the cost rises over the range of each parameter"
+    units = {row["name"]: row["unit"] for row in fitted.summary["parameters"]}
+    parameters = {parameter.name: parameter for parameter in fitted.problem.space.parameters}
+    profiles = fitted.identifiability.profiles
+    figure = profile_plots.profiles(parameters, profiles, units, fitted.known_values, title)
+    return save_plot(run, "profiles.png", title, figure)
+
+
 def _result(fitted: Fit) -> list[str]:
     experiment, summary = fitted.experiment, fitted.summary
     rules = "".join(f", `{stage}` by `{name}`" for stage, name in experiment.rules.items())
@@ -155,33 +171,7 @@ def _parameters(fitted: Fit) -> list[str]:
     return parts
 
 
-def _identifiability(fitted: Fit) -> list[str]:
-    identifiability = fitted.identifiability
-    names = ", ".join(f"`{name}`" for name in identifiability.undetermined)
-    parts = [
-        "## What these clips do not determine",
-        f"Not determined: {names}." if names else "All free parameters are determined.",
-        "A parameter is held at each value of its range while all others follow; the 95 % interval"
-        " is where the cost stays low. Determined: it ends on both sides because the clips say so,"
-        " and is less than 0.7 times as wide as that of the prior. Contraction is 1 where the clips"
-        " alone decide and 0 where only the prior is known.",
-        markdown(fit_tables.verdict_table(fitted.summary["parameters"])),
-    ]
-    if identifiability.correlated:
-        parts.append("Pairs of which these clips mostly determine one combination (correlation):")
-        pairs = [f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in identifiability.correlated]
-        parts.append(bullets(pairs))
-    if identifiability.weakest:
-        together = ", ".join(f"`{name}`" for name in identifiability.weakest)
-        parts.append(f"The least determined direction moves {together}.")
-    return parts
-
-
-def _limits(fitted: Fit) -> list[str]:
-    clips = [
-        limit_activity.measure(fitted.ik, scene, result)
-        for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
-    ]
+def _limits(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
     parts = [
         "## What the clips ask of the fitted system",
         "Fraction of all frames, for each foot:",

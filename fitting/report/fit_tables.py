@@ -72,21 +72,6 @@ def verdict(row: FittedParameter) -> str:
             return "determined" if row["determined"] else "undetermined by these clips"
 
 
-def verdict_table(rows: Sequence[FittedParameter]) -> Table:
-    """Free parameters by how well the clips determine them, the worst first."""
-    table = [["parameter", "kind", "verdict", "95 % interval", "contraction", "valleys"]]
-    for row in sorted(rows, key=lambda row: row["contraction"]):
-        valleys = [
-            f"{interval(*valley['interval'])}, lowest at {number(valley['value'])}"
-            f" ({valley['rise']:+.1f})"
-            for valley in row["valleys"]
-        ]
-        cells = [row["name"], row["kind"], verdict(row), interval(*row["interval"])]
-        several = "; ".join(valleys) if len(valleys) > 1 else ""
-        table.append([*cells, f"{row['contraction']:.3f}", several])
-    return table
-
-
 def activity_table(clips: Sequence[ClipActivity]) -> Table:
     """Ground, contact, reach and locks of each clip, a column for each clip and foot."""
     feet = [(clip, leg) for clip in range(len(clips)) for leg in range(len(clips[clip].legs))]

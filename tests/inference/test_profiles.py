@@ -172,7 +172,7 @@ def test_two_valleys_are_listed_with_their_intervals_and_heights():
 
 
 def test_an_exact_ridge_of_two_thresholds_leaves_both_undetermined():
-    report = bumps_assessed()[2]
+    problem, _, report = bumps_assessed()
     for name in ("first", "second"):
         curve = report.profiles[name]
         assert name in report.undetermined
@@ -180,3 +180,7 @@ def test_an_exact_ridge_of_two_thresholds_leaves_both_undetermined():
         along = curve.path[low]
         assert np.ptp(curve.values[low]) > 0.7
         assert along[:, 0] + along[:, 1] == pytest.approx(1.1, abs=0.05)
+    (ridge,) = report.ridges
+    assert ridge.names == ("first", "second")
+    assert ridge.coefficients == pytest.approx((1, 1), rel=0.1)
+    assert ridge.describe({p.name: p for p in problem.space.parameters}) == "`first` + `second`"

@@ -88,6 +88,7 @@ def fitted(experiment) -> Fit:
         eigenvalues=np.array([0.1, 20.0]),
         weakest=("leg.soften",),
         correlated=(("pelvis.on_gain", "leg.soften", -0.93),),
+        ridges=(),
         best_u=u,
         best_cost=99.75,
         improvement=0.25,
@@ -185,7 +186,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     text = (tmp_path / run_folder.SUMMARY).read_text()
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     plots = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
-    plots |= {"worst.png"}
+    plots |= {"worst.png", "profiles.png"}
     assert set(names) == plots
     assert {path.name for path in tmp_path.iterdir()} == plots | {run_folder.SUMMARY}
     for name in names:

@@ -198,7 +198,7 @@ def test_rules_are_kept_through_a_run(tmp_path):
     solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
     identifiability = Identifiability(
         names, parabolas(problem.space.parameters, [(0.1, 0.2)] * 2), np.ones(2), np.ones(2),
-        ("", ""), np.ones(2), (), (), u, 1.0, 0.0,
+        ("", ""), np.ones(2), (), (), (), u, 1.0, 0.0,
     )  # fmt: skip
     run = tmp_path / "run"
     run_folder.save_solution(run, read, problem, solution)

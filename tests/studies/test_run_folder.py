@@ -51,6 +51,7 @@ def fitted(tmp_path_factory) -> Fit:
         eigenvalues=np.array([0.1, 20.0]),
         weakest=("foot.max_pitch",),
         correlated=((*NAMES, 0.95),),
+        ridges=(),
         best_u=u,
         best_cost=10.0,
         improvement=0.0,

@@ -175,7 +175,7 @@ class Conditional:
         rows = np.concatenate(chosen)
         share = self.random.random((len(rows), 1))
         following = self.random.random((len(rows), self.smooth.size)) < share
-        sizes = np.exp(self.random.uniform(*np.log(MOVES), (len(rows), 1)))
+        sizes = np.exp(self.random.uniform(np.log(MOVES[0]), np.log(MOVES[1]), (len(rows), 1)))
         sizes[self.random.random(len(rows)) < 0.5] = 0
         besides = sizes * (self.random.normal(size=following.shape) @ self.spread.T)
         first = 0

@@ -46,6 +46,8 @@ class Profile:
     """Of the cost, above the lowest."""
     data_rises: Float[np.ndarray, " points"]
     """The same of the cost without the parameter's own prior."""
+    prior_rises: Float[np.ndarray, " points"]
+    """Of this prior's part of the cost, above its lowest."""
     path: Float[np.ndarray, "points free"]
     """Values of all parameters at these points, in their units."""
     max_rise: float
@@ -83,7 +85,8 @@ def make_profile(
         own_prior: this parameter's part of the cost.
     """
     order = np.argsort(own, kind="stable")
-    own, costs, data_costs = own[order], costs[order], (costs - own_prior)[order]
+    own, costs, own_prior = own[order], costs[order], own_prior[order]
+    data_costs = costs - own_prior
     rises, data_rises = costs - costs.min(), data_costs - data_costs.min()
     highest = max_rise(parameter)
     parts = low_parts(to_fractions(parameter, own), rises, highest)
@@ -94,6 +97,7 @@ def make_profile(
         values=own,
         rises=rises,
         data_rises=data_rises,
+        prior_rises=own_prior - own_prior.min(),
         path=path[order],
         max_rise=highest,
         valleys=valleys,
