@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxik
-from fitting.inference.threshold_profile import NUDGE
+from fitting.inference.optimisation import population
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 from fitting.runtime import program_cache
@@ -16,6 +16,7 @@ from jaxik.maths import parameter_tree
 
 from .playback import run, stage_outputs
 
+NUDGE = 0.1  # fraction of its range by which a threshold is moved to see what changes
 ROUNDING = 1e-7  # m, and in quaternions: smaller changes of a pose are rounding
 
 
@@ -95,10 +96,20 @@ def active_limits(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> dict[
     return fractions
 
 
-def flipped_decisions(
+@dataclasses.dataclass(frozen=True)
+class Nudge:
+    """What changes when one threshold moves by a tenth of its range."""
+
+    flipped: float
+    """Fraction of the feet's decisions."""
+    rise: float
+    """Of the cost."""
+
+
+def nudge_thresholds(
     problem: Problem, u: Float[np.ndarray, " free"]
-) -> dict[str, tuple[float, float]]:
-    """Fractions of the feet's decisions that flip when a threshold moves down and up, by name.
+) -> dict[str, tuple[Nudge, Nudge]]:
+    """What changes when a threshold moves down and up, by name.
 
     Each threshold moves by a tenth of its range, but not beyond it, and the other parameters keep
     their values. The decisions are those of every foot in every frame: planted, lifted, locked, and
@@ -107,22 +118,24 @@ def flipped_decisions(
     space = problem.space
     values = dict(zip(space.names, np.asarray(space.values(jnp.asarray(u))), strict=True))
 
-    def decisions(moved: dict[str, float]) -> Bool[np.ndarray, " decisions"]:
-        ik = space.unpack(space.pack(values | moved))
-        results = [run(ik, scene) for scene in problem.data]
+    def decisions(packed: Array) -> Bool[np.ndarray, " decisions"]:
+        results = [run(space.unpack(packed), scene) for scene in problem.data]
         return np.concatenate([_decisions(result) for result in results])
 
-    unmoved, fractions = decisions({}), {}
+    def nudge(name: str, value: float) -> Nudge:
+        moved = space.pack(values | {name: value})
+        flipped = float(np.mean(decisions(moved) != unmoved))
+        both = population.evaluate(problem, np.stack([u, np.asarray(moved)])).cost
+        return Nudge(flipped, float(both[1] - both[0]))
+
+    unmoved, nudges = decisions(space.pack(values)), {}
     for parameter in space.parameters:
         if parameter.kind == "threshold":
-            nudge = NUDGE * (parameter.high - parameter.low)
-            ends = values[parameter.name] + np.array([-nudge, nudge])
-            down, up = (
-                float(np.mean(decisions({parameter.name: value}) != unmoved))
-                for value in np.clip(ends, parameter.low, parameter.high)
-            )
-            fractions[parameter.name] = down, up
-    return fractions
+            distance = NUDGE * (parameter.high - parameter.low)
+            ends = values[parameter.name] + np.array([-distance, distance])
+            down, up = np.clip(ends, parameter.low, parameter.high)
+            nudges[parameter.name] = nudge(parameter.name, down), nudge(parameter.name, up)
+    return nudges
 
 
 def _decisions(result: jaxik.Result) -> Bool[np.ndarray, " decisions"]:

@@ -4,7 +4,6 @@ Everything here takes a `Problem` (`fitting.problem`) and returns numbers. Files
 reports are elsewhere: `fitting.experiments`, `fitting.studies`, `fitting.report`.
 
 Start with `optimisation/search.py`, the way to the best fit, and `sampling/posterior.py`. `noise/`
-estimates sigmas and correlations with the parameters. `identifiability.py` judges a solution,
-`threshold_profile.py` its thresholds, and `sensitivity.py` finds the parameters that matter before
-anything is fitted.
+estimates sigmas and correlations with the parameters. `identifiability.py` judges a solution by its
+`profiles`, and `sensitivity.py` finds the parameters that matter before anything is fitted.
 """

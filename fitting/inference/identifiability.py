@@ -1,10 +1,11 @@
 """What the data determine of a fit, and what they leave to the prior.
 
-Smooth parameters are judged by the Jacobian at the solution (Laplace's approximation), thresholds
-by their profile on the hard program.
+Every parameter is judged by its profile: the lowest cost for each of its values, all others
+following. The Jacobian at the solution tells how parameters depend on each other.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Literal
 
 import jax
@@ -13,11 +14,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.problem.problem import Problem
+from fitting.problem.space import to_fractions
 from fitting.runtime.precision import in_float64
 
 from .noise import series
 from .optimisation.solution import Solution
-from .threshold_profile import MAX_RISE, Profile, profile
+from .profiles.profile import Profile, max_rise
+from .profiles.profiling import find_curves
+from .profiles.ridges import Ridge, find_ridges
 
 UNDETERMINED = 0.5  # contraction below which a parameter counts as undetermined
 CORRELATED = 0.9  # posterior correlation from which on a pair is named
@@ -33,12 +37,12 @@ class Identifiability:
     """How well each free parameter is determined; arrays in the order of the names."""
 
     names: tuple[str, ...]
+    profiles: Mapping[str, Profile]
+    """Of every parameter, with its interval and verdict."""
     contraction: Float[np.ndarray, " free"]
     """0: only the prior is known, 1: the data decide."""
-    interval: Float[np.ndarray, "free 2"]
-    """95 %, in the parameter's unit."""
     sd: Float[np.ndarray, " free"]
-    """Of u; NaN for thresholds."""
+    """Of u, by Laplace's approximation with the thresholds held; NaN for thresholds."""
     at_bound: tuple[Bound, ...]
     eigenvalues: Float[np.ndarray, " smooth"]
     """Rising; information in units of the prior's."""
@@ -46,25 +50,45 @@ class Identifiability:
     """Parameters in the direction of the smallest eigenvalue."""
     correlated: tuple[tuple[str, str, float], ...]
     """Strongest first."""
-    profiles: dict[str, Profile]
-    """Of thresholds."""
+    ridges: tuple[Ridge, ...]
+    """Combinations that are determined, of parameters that are not."""
+    best_u: Float[np.ndarray, " free"]
+    """The lowest point that a profile met, the solution included."""
+    best_cost: float
     improvement: float
-    """How far a profile fell below the solution's cost; 0 at a minimum."""
+    """How far the cost there is below the solution's."""
+
+    @property
+    def interval(self) -> Float[np.ndarray, "free 2"]:
+        """95 %, in the parameters' units."""
+        return np.asarray([self.profiles[name].interval for name in self.names])
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Parameters that the data bound on both sides, in one valley, and well enough."""
+        return tuple(
+            name
+            for name, contraction in zip(self.names, self.contraction, strict=True)
+            if is_determined(self.profiles[name], contraction)
+        )
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Parameters that these data leave to the prior."""
-        pairs = zip(self.names, self.contraction, strict=True)
-        return tuple(name for name, contraction in pairs if contraction < UNDETERMINED)
+        """The others."""
+        return tuple(name for name in self.names if name not in self.determined)
+
+
+def is_determined(profile: Profile, contraction: float) -> bool:
+    """Whether the data bound a parameter on both sides, in one valley, and well enough."""
+    return profile.verdict == "two-sided" and contraction >= UNDETERMINED
 
 
 @in_float64
 def assess_identifiability(problem: Problem, solution: Solution) -> Identifiability:
     """What the data of a problem determine around its solution.
 
-    The contraction of a smooth parameter is `1 - (posterior sd / prior sd)²` in `u`, with the
-    thresholds fixed. That of a threshold compares intervals instead: its own with the one that it
-    would have if it had no effect, by the same rule from the prior alone.
+    The contraction of a parameter is `1 - (posterior width / prior width)²`, of 95 % intervals, on
+    the scale on which its range is divided evenly.
 
     Raises:
         ValueError: if the Jacobian at the solution is not finite.
@@ -76,35 +100,30 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
             f" parameters are determined: {solution.message}"
         )
     laplace = _Laplace.around(problem, solution)
-    profiles = {
-        name: profile(problem, solution, name)
-        for name, threshold in zip(space.names, space.thresholds, strict=True)
-        if threshold
-    }
-    contraction = np.zeros(space.size)
-    contraction[laplace.smooth] = 1 - np.diag(laplace.covariance)
-    sd = laplace.sd(problem)
-    u = np.asarray(solution.u)
-    interval = _interval(problem, u, u + np.nan_to_num(np.outer([-NORMAL, NORMAL], sd)))
-    prior_interval = _interval(problem, u, space.prior.ends(MAX_RISE))
-    for i, name in enumerate(space.names):
-        if name in profiles:
-            interval[i] = profiles[name].interval
-            width, prior_width = np.diff(interval[i])[0], np.diff(prior_interval[i])[0]
-            contraction[i] = max(0.0, 1 - (width / prior_width) ** 2)
+    curves = find_curves(problem, solution)
+    profiles = curves.profiles()
     names = [space.names[i] for i in laplace.smooth]
     fractions = jax.nn.sigmoid(jnp.asarray(solution.u))
+    best = curves.best
+    contraction = _contraction(problem, solution, profiles)
+    undetermined = [
+        name
+        for name, c in zip(space.names, contraction, strict=True)
+        if not is_determined(profiles[name], c)
+    ]
     return Identifiability(
         names=space.names,
+        profiles=profiles,
         contraction=contraction,
-        interval=interval,
-        sd=sd,
+        sd=laplace.sd(problem),
         at_bound=tuple(_bound(float(fraction)) for fraction in fractions),
         eigenvalues=laplace.eigenvalues,
         weakest=tuple(n for n, x in zip(names, laplace.weakest, strict=True) if abs(x) > WEAK),
         correlated=_correlated(names, laplace.covariance),
-        profiles=profiles,
-        improvement=-min([0.0, *(float(profile.rises.min()) for profile in profiles.values())]),
+        ridges=find_ridges(space.parameters, profiles, undetermined),
+        best_u=best.u[0],
+        best_cost=float(best.cost[0]),
+        improvement=float(solution.cost - best.cost[0]),
     )
 
 
@@ -140,11 +159,29 @@ class _Laplace:
         return sd
 
 
-def _interval(problem: Problem, u: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Values, (free, 2), as each parameter alone moves from its `u` to either of its ends."""
-    moved = [np.where(np.eye(u.size, dtype=bool), end, u) for end in ends]
-    values = [jax.vmap(problem.space.values)(jnp.asarray(rows, u.dtype)) for rows in moved]
-    return np.stack([np.diag(rows) for rows in values], axis=1)
+def _contraction(
+    problem: Problem, solution: Solution, profiles: Mapping[str, Profile]
+) -> np.ndarray:
+    """Of each parameter: 1 less the square of its interval's width over that of its prior's."""
+    contraction, prior = [], _prior_interval(problem, solution)
+    for parameter, ends in zip(problem.space.parameters, prior, strict=True):
+        interval = np.asarray(profiles[parameter.name].interval)
+        posterior_width, prior_width = (
+            np.ptp(to_fractions(parameter, values)) for values in (interval, ends)
+        )
+        contraction.append(max(0.0, 1 - float(posterior_width / prior_width) ** 2))
+    return np.asarray(contraction)
+
+
+def _prior_interval(problem: Problem, solution: Solution) -> np.ndarray:
+    """Values at the ends of each parameter's interval from its prior alone, (free, 2).
+
+    By the same rise of the cost as that of a profile; the other parameters are as fitted.
+    """
+    space, u = problem.space, jnp.asarray(solution.u)
+    rises = np.array([max_rise(parameter) for parameter in space.parameters])
+    moved = [jnp.where(jnp.eye(space.size, dtype=bool), end, u) for end in space.prior.ends(rises)]
+    return np.stack([np.diag(jax.vmap(space.values)(rows)) for rows in moved], axis=1)
 
 
 def _bound(fraction: float) -> Bound:

@@ -1,5 +1,6 @@
 """Jobs that search: a fit, its posterior, its ablations, and translations between systems."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, run_folder, translation
-from fitting.studies.fit import Fit, search, search_with_noise
+from fitting.studies.fit import MIN_IMPROVEMENT, Fit, search, search_lower, search_with_noise
 from fitting.studies.sample import SampledFit, sample_around
 from fitting.studies.translation import TranslationRequest
 
 from .output import Log, checked_folder, log_output, silent
+
+MAX_RETURNS = 3  # to the search from lower points
 
 
 @in_float64
@@ -55,7 +58,7 @@ def fit(
     free, preset = len(experiment.free), experiment.preset
     log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
     problem, solution = search_with_noise(problem, experiment, progress)
-    fitted = _assess_and_save(run, experiment, problem, solution, known_values)
+    fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress)
     if run is not None:
         fit_report.write_fit(run, fitted)
     log(f"\n{fit_report.fit_text(fitted)}")
@@ -184,7 +187,8 @@ def translate(
     if run is not None:
         translation.save_source(run, prepared)
         known_values = load_known_values(experiment)
-    fitted = _assess_and_save(run, experiment, problem, solution, known_values, has_noise=False)
+    fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress)
+    fitted = dataclasses.replace(fitted, has_noise=False)
     differences = translation_report.differences(fitted)
     if run is not None:
         translation_report.write(run, prepared, fitted, differences)
@@ -200,14 +204,23 @@ def _assess_and_save(
     problem: Problem[jaxik.FootIK],
     solution: Solution,
     known_values: Mapping[str, float] | None,
-    *,
-    has_noise: bool = True,
+    progress: Callable[[Progress], None] | None,
 ) -> Fit:
-    """The fit; its solution is on disk before the assessment, which may fail."""
-    if run is not None:
-        run_folder.save_solution(run, experiment, problem, solution)
-    identifiability = assess_identifiability(problem, solution)
-    fitted = Fit(experiment, problem, solution, identifiability, known_values, run, has_noise)
+    """The fit; its solution is on disk before the assessment, which may fail.
+
+    Where the assessment meets a point that is lower than the solution, the search goes on there.
+    """
+    left: list[float] = []
+    while True:
+        if run is not None:
+            run_folder.save_solution(run, experiment, problem, solution)
+        identifiability = assess_identifiability(problem, solution)
+        found_lower = identifiability.improvement > MIN_IMPROVEMENT
+        if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
+            break
+        left.append(solution.cost)
+        solution = search_lower(problem, experiment, solution, identifiability.best_u, progress)
+    fitted = Fit(experiment, problem, solution, identifiability, known_values, run, tuple(left))
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

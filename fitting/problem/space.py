@@ -16,7 +16,8 @@ upper bound, whatever that value is.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Generic, TypeAlias, TypeVar
+from types import ModuleType
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -220,26 +221,49 @@ class Space(eqx.Module, Generic[System]):
         return leaves, jnp.stack(values)
 
 
-def _to_scale(value: Array, scale: parameter_tree.Scale) -> Array:
+def _to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType = jnp) -> Any:
     """The coordinate in which a range is divided evenly: `g` of the module's docstring."""
     match scale:
         case "log":
-            return jnp.log(value)
+            return library.log(value)
         case "gain":
-            return jnp.log(-jnp.log1p(-value))
+            return library.log(-library.log1p(-value))
         case _:
             return value
 
 
-def _from_scale(coordinate: Array, scale: parameter_tree.Scale) -> Array:
+def _from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType = jnp) -> Any:
     """Inverse of `_to_scale`."""
     match scale:
         case "log":
-            return jnp.exp(coordinate)
+            return library.exp(coordinate)
         case "gain":
-            return -jnp.expm1(-jnp.exp(coordinate))
+            return -library.expm1(-library.exp(coordinate))
         case _:
             return coordinate
+
+
+def scale_width(parameter: FreeParameter) -> float:
+    """Width of a parameter's range on its scale."""
+    return float(
+        np.diff(_to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np))[0]
+    )
+
+
+def to_fractions(
+    parameter: FreeParameter, values: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Where values lie in a parameter's range, 0..1, evenly on its scale."""
+    start, end = _to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
+    return (_to_scale(np.asarray(values), parameter.scale, np) - start) / (end - start)
+
+
+def from_fractions(
+    parameter: FreeParameter, fractions: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Inverse of `to_fractions`."""
+    start, end = _to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
+    return _from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
 
 
 def _with_value(leaf: Array, leg: int | None, value: Array) -> Array:

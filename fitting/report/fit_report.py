@@ -8,16 +8,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fitting.analysis import limit_activity, playback, worst_window
+from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.playback import Playback
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
-from fitting.studies.fit import Fit, FitSummary
+from fitting.studies.fit import MIN_IMPROVEMENT, Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, markdown
 from .goodness import goodness_report
-from .plots import fit_plots, goodness_plots, style, worst_window_plots
+from .identifiability.sections import sections as identifiability_sections
+from .plots import fit_plots, goodness_plots, profile_plots, style, worst_window_plots
 from .uncertainty import priors
 
 KNEE_LIMITS = ("min_knee_angle", "max_knee_angle")
@@ -56,17 +58,22 @@ def write_fit(
         first = playback.play(scene, playback.run(before, scene))
         plots |= _draw_clip(run, fitted, index, first, after)
         worst += _worst_window(run, fitted, index, after)
+    plots |= _draw_profiles(run, fitted)
     title = f"{fitted.experiment.name}: cost of the fit over time"
     figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
     plots |= save_plot(run, "cost.png", title, figure)
+    clips = [
+        limit_activity.measure(fitted.ik, scene, result)
+        for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
+    ]
     parts = [
         *_result(fitted),
         *opening,
         *goodness_report.section(fitted),
         *_parameters(fitted),
         *priors.prior_section(fitted.summary["parameters"]),
-        *_identifiability(fitted),
-        *_limits(fitted),
+        *identifiability_sections(fitted, clips),
+        *_limits(fitted, clips),
         *worst,
         *details,
         "## Pictures",
@@ -88,10 +95,16 @@ def gallery(plots: Plots) -> str:
 
 def cost_sentence(summary: FitSummary) -> str:
     """Cost before and after, and the effort it took."""
-    return (
+    sentence = (
         f"Cost {summary['cost_before']:.6g} before, {summary['cost']:.6g} after: "
         f"{summary['steps']} steps in {summary['seconds']:.1f} s."
     )
+    if left := summary["left"]:
+        costs = ", ".join(f"{cost:.6g}" for cost in left)
+        sentence += f" Profiles led on to lower points from solutions of cost {costs}."
+    if (lower := summary["improvement"]) > MIN_IMPROVEMENT:
+        sentence += f" A profile still meets a point that is {lower:.3g} lower."
+    return sentence
 
 
 def _clip_names(fitted: Fit, index: int) -> tuple[str, str]:
@@ -132,6 +145,15 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
     return plots
 
 
+def _draw_profiles(run: Path, fitted: Fit) -> Plots:
+    title = f"{fitted.experiment.name}: how the cost rises over the range of each parameter"
+    units = {row["name"]: row["unit"] for row in fitted.summary["parameters"]}
+    parameters = {parameter.name: parameter for parameter in fitted.problem.space.parameters}
+    profiles = fitted.identifiability.profiles
+    figure = profile_plots.profiles(parameters, profiles, units, fitted.known_values, title)
+    return save_plot(run, "profiles.png", title, figure)
+
+
 def _result(fitted: Fit) -> list[str]:
     experiment, summary = fitted.experiment, fitted.summary
     rules = "".join(f", `{stage}` by `{name}`" for stage, name in experiment.rules.items())
@@ -154,30 +176,7 @@ def _parameters(fitted: Fit) -> list[str]:
     return parts
 
 
-def _identifiability(fitted: Fit) -> list[str]:
-    identifiability = fitted.identifiability
-    names = ", ".join(f"`{name}`" for name in identifiability.undetermined)
-    parts = [
-        "## What these clips do not determine",
-        f"Undetermined: {names}." if names else "All free parameters are determined.",
-        "Contraction is 1 where the clips alone decide and 0 where only the prior is known.",
-        markdown(fit_tables.contraction_table(fitted.summary["parameters"])),
-    ]
-    if identifiability.correlated:
-        parts.append("Pairs of which these clips mostly determine one combination (correlation):")
-        pairs = [f"`{a}` and `{b}`: {value:+.3f}" for a, b, value in identifiability.correlated]
-        parts.append(bullets(pairs))
-    if identifiability.weakest:
-        together = ", ".join(f"`{name}`" for name in identifiability.weakest)
-        parts.append(f"The least determined direction moves {together}.")
-    return parts
-
-
-def _limits(fitted: Fit) -> list[str]:
-    clips = [
-        limit_activity.measure(fitted.ik, scene, result)
-        for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
-    ]
+def _limits(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
     parts = [
         "## What the clips ask of the fitted system",
         "Fraction of all frames, for each foot:",
@@ -185,11 +184,10 @@ def _limits(fitted: Fit) -> list[str]:
         "Fraction of frames that would look different if the limit were out of the way:",
         markdown(fit_tables.limit_table(clips)),
     ]
-    if profiles := fitted.identifiability.profiles:
-        flips = limit_activity.flipped_decisions(fitted.problem, fitted.solution.u)
+    if nudges := limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u):
         parts.append(
             "Fraction of the feet's decisions (planted, lifted, locked, ground found) that flip "
             "when a threshold moves by 10 % of its range, and the rise in cost:"
         )
-        parts.append(markdown(fit_tables.flip_table(flips, profiles)))
+        parts.append(markdown(fit_tables.flip_table(nudges)))
     return parts

@@ -5,8 +5,7 @@ from dataclasses import astuple
 from typing import TypeAlias
 
 from fitting.analysis.accuracy import Accuracy
-from fitting.analysis.limit_activity import ClipActivity
-from fitting.inference.threshold_profile import Profile
+from fitting.analysis.limit_activity import ClipActivity, Nudge
 from fitting.studies.fit import FittedParameter
 
 from .formatting import Table, interval, number, percent
@@ -27,7 +26,7 @@ def parameter_table(rows: Sequence[FittedParameter], truth: Truth) -> Table:
             true = truth.get(row["name"])
             cells.append("unknown" if true is None else number(true))
             cells.append("" if true is None else f"{percent(error(row, true))} of range")
-        remarks = [] if row["determined"] else ["undetermined by these clips"]
+        remarks = [] if row["determined"] else [verdict(row)]
         if row["at_bound"]:
             remarks.append(f"at its {'lower' if row['at_bound'] == 'low' else 'upper'} bound")
         table.append([*cells, ", ".join(remarks)])
@@ -58,13 +57,19 @@ def error(row: FittedParameter, true: float) -> float:
     return abs(row["value"] - true) / (row["high"] - row["low"])
 
 
-def contraction_table(rows: Sequence[FittedParameter]) -> Table:
-    """Free parameters by how well the clips determine them, the worst first."""
-    table = [["parameter", "kind", "contraction", "verdict"]]
-    for row in sorted(rows, key=lambda row: row["contraction"]):
-        verdict = "determined" if row["determined"] else "undetermined"
-        table.append([row["name"], row["kind"], f"{row['contraction']:.3f}", verdict])
-    return table
+def verdict(row: FittedParameter) -> str:
+    """What the clips say of a parameter, in words."""
+    low, high = row["interval"]
+    unit = "" if row["unit"] == "1" else f" {row['unit']}"
+    match row["verdict"]:
+        case "at least":
+            return f"at least {number(low)}{unit}"
+        case "at most":
+            return f"at most {number(high)}{unit}"
+        case "several valleys":
+            return f"{len(row['valleys'])} valleys"
+        case _:
+            return "determined" if row["determined"] else "undetermined by these clips"
 
 
 def activity_table(clips: Sequence[ClipActivity]) -> Table:
@@ -94,18 +99,17 @@ def limit_table(clips: Sequence[ClipActivity]) -> Table:
     return table
 
 
-def flip_table(flips: Mapping[str, tuple[float, float]], profiles: Mapping[str, Profile]) -> Table:
+def flip_table(nudges: Mapping[str, tuple[Nudge, Nudge]]) -> Table:
     """Thresholds: decisions that flip, and the rise in cost, when one moves by 10 % of its range.
 
     Args:
-        flips: `limit_activity.flipped_decisions`.
-        profiles: of the same thresholds.
+        nudges: `limit_activity.nudge_thresholds`.
     """
     table = [["threshold", "flips, moved down", "cost", "flips, moved up", "cost"]]
-    for name, fractions in flips.items():
+    for name, both in nudges.items():
         cells = [name]
-        for fraction, rise in zip(fractions, profiles[name].nudged, strict=True):
-            cells += [percent(fraction, 2), f"{rise:+.1f}"]
+        for nudge in both:
+            cells += [percent(nudge.flipped, 2), f"{nudge.rise:+.1f}"]
         table.append(cells)
     return table
 

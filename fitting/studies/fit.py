@@ -20,8 +20,9 @@ from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.joint import fit_with_noise
 from fitting.inference.noise.model import NoiseModel, noise_of
-from fitting.inference.optimisation.search import Starts, find_best_fit
+from fitting.inference.optimisation.search import find_best_fit, refine
 from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.inference.profiles import profile
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED
 from fitting.runtime.precision import in_float64
@@ -35,7 +36,18 @@ from .prior_summary import PriorSummary, summarise_priors
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
 THRESHOLD_SD = 0.05
 MIN_START_SD, MAX_START_SD = 1e-3, 0.5
+MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
+
+
+class FittedValley(TypedDict):
+    """A part of a parameter's range in which the cost is low."""
+
+    value: float
+    """Where it is lowest."""
+    rise: float
+    """There, above the lowest of all."""
+    interval: list[float]
 
 
 class FittedParameter(TypedDict):
@@ -56,6 +68,10 @@ class FittedParameter(TypedDict):
     prior: PriorSummary
     interval: list[float]
     """95 %."""
+    verdict: profile.Verdict
+    """Which sides the clips bound."""
+    valleys: list[FittedValley]
+    """From low values to high ones; one unless the verdict says several."""
     contraction: float
     """0 where only the prior is known, 1 where the clips decide."""
     at_bound: Literal["", "low", "high"]
@@ -88,6 +104,10 @@ class FitSummary(TypedDict):
     """Two names and their correlation."""
     weakest: list[str]
     history: list[Content]
+    left: list[float]
+    """Costs of solutions that were left because their profiles met a lower point."""
+    improvement: float
+    """How far below the cost the lowest point of the last profiles is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +124,8 @@ class Fit:
     """The folder where it is written."""
     has_noise: bool = True
     """False if the reference is the motion of another system: then sigmas are tolerances."""
+    left: tuple[float, ...] = ()
+    """Costs of solutions that were left because their profiles met a lower point."""
 
     @cached_property
     def ik(self) -> jaxik.FootIK:
@@ -180,10 +202,36 @@ class Fit:
             "correlated": [list(pair) for pair in self.identifiability.correlated],
             "weakest": list(self.identifiability.weakest),
             "history": [dataclasses.asdict(step) for step in solution.history],
+            "left": list(self.left),
+            "improvement": self.identifiability.improvement,
         }
         if self.experiment.noise.estimates_any:
             summary["noise"] = dataclasses.asdict(self.noise)
         return summary
+
+
+def search(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+    first: Float[np.ndarray, " free"] | None = None,
+) -> Solution:
+    """The best fit, without any estimate of how certain it is.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of the search.
+        progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
+        first: the u from which the first descent begins; None is the experiment's.
+    """
+    return find_best_fit(
+        problem,
+        experiment.fit.search,
+        starts=experiment.fit.starts,
+        first=first,
+        seed=experiment.seed,
+        progress=progress,
+    )
 
 
 def search_with_noise(
@@ -198,34 +246,33 @@ def search_with_noise(
         experiment: its settings of noise and search.
         progress: as for `search`.
     """
-
-    def find(problem: Problem[jaxik.FootIK], starts: Starts | None) -> Solution:
-        return search(problem, experiment, progress, starts)
-
-    return fit_with_noise(problem, experiment.noise, find)
+    solution = search(problem, experiment, progress)
+    return fit_with_noise(problem, experiment.noise, solution, experiment.fit.search, progress)
 
 
-def search(
+def search_lower(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
+    before: Solution,
+    lower_u: Float[np.ndarray, " free"],
     progress: Callable[[Progress], None] | None = None,
-    starts: Starts | None = None,
 ) -> Solution:
-    """The best fit, without any estimate of how certain it is.
+    """The best fit from a point that is lower than a solution; steps and time add to its own.
+
+    Where it is lower than the starts' agreement allows, the search begins anew there.
 
     Args:
         problem: the problem of the experiment.
         experiment: its settings of the search.
-        progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
-        starts: how many, or from which u, instead of as many as the experiment allows.
+        before: the solution that is left.
+        lower_u: the lower point, in u.
+        progress: called as the search goes on.
     """
-    return find_best_fit(
-        problem,
-        experiment.fit.search,
-        starts=experiment.fit.starts if starts is None else starts,
-        seed=experiment.seed,
-        progress=progress,
-    )
+    settings = experiment.fit.search
+    after = refine(problem, before, lower_u, settings, progress)
+    if after.interrupted or before.cost - after.cost <= settings.agreement:
+        return after
+    return search(problem, experiment, progress, after.u).following(after)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
@@ -235,6 +282,7 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
     priors = summarise_priors(space)
     rows = []
     for i, parameter in enumerate(space.parameters):
+        curve = known.profiles[parameter.name]
         row: FittedParameter = {
             "name": parameter.name,
             "kind": parameter.kind,
@@ -246,10 +294,15 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             "low": parameter.low,
             "high": parameter.high,
             "prior": priors[parameter.name],
-            "interval": [float(end) for end in known.interval[i]],
+            "interval": list(curve.interval),
+            "verdict": curve.verdict,
+            "valleys": [
+                {"value": v.value, "rise": v.rise, "interval": list(v.interval)}
+                for v in curve.valleys
+            ],
             "contraction": float(known.contraction[i]),
             "at_bound": known.at_bound[i],
-            "determined": parameter.name not in known.undetermined,
+            "determined": parameter.name in known.determined,
         }
         if parameter.scale == "gain":
             row |= gain_readings(row["value"])  # type: ignore[operator]

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -84,4 +83,6 @@ def sample_around(
     )
     if problem.unknown_sigmas is None:
         return posterior
-    return replace(posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed))
+    return dataclasses.replace(
+        posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed)
+    )

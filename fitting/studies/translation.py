@@ -246,7 +246,7 @@ def _check_moves(source: NamedSystem, problem: Problem[jaxik.FootIK]) -> None:
 
 
 def starting_point(problem: Problem[jaxik.FootIK]) -> np.ndarray:
-    """Where the search starts, (1, free) in u: the target's values, improved one by one.
+    """Where the search starts, (free,) in u: the target's values, improved one by one.
 
     Far from the source, a descent makes each parameter do the work of another one. Moving single
     values over their ranges first does not.
@@ -260,7 +260,7 @@ def starting_point(problem: Problem[jaxik.FootIK]) -> np.ndarray:
         state = sweep(search, state)
         if state.point is before:
             break
-    return state.point.u[None]
+    return state.point.u
 
 
 def save_source(run: Path, translation: Translation) -> None:

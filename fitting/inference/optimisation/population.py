@@ -48,6 +48,18 @@ def to_values(
     return _in_batches(_to_values, space, candidates)
 
 
+def prior_costs(
+    space: Space, candidates: Float[np.ndarray, "candidates free"]
+) -> Float[np.ndarray, "candidates free"]:
+    """The part of the cost that the prior of each parameter contributes."""
+    return _in_batches(_prior_costs, space, candidates)
+
+
+@cached
+def _prior_costs(space: Space, candidates: Array) -> Array:
+    return 0.5 * jax.vmap(space.prior_residuals)(candidates) ** 2
+
+
 @cached
 def _from_values(space: Space, values: Array) -> Array:
     return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(values)

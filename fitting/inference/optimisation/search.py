@@ -38,15 +38,14 @@ from .sweep import sweep_and_descend
 
 MIN_DESCENTS = 2  # of a start
 
-Starts = int | Float[np.ndarray, "starts free"]
-
 
 @in_float64
 def find_best_fit(
     problem: Problem,
     settings: SearchSettings = DEFAULTS,
     *,
-    starts: Starts = MAX_STARTS,
+    starts: int = MAX_STARTS,
+    first: Float[Array | np.ndarray, " free"] | None = None,
     seed: int = 0,
     progress: Callable[[Progress], None] | None = None,
 ) -> Solution:
@@ -58,17 +57,18 @@ def find_best_fit(
     Args:
         problem: what to fit.
         settings: how thoroughly to search.
-        starts: how many starts to make at most, the first with a descent from the space's start; or
-            the `u` from which each start makes its first descent.
+        starts: how many starts to make at most.
+        first: the `u` from which the first start makes its first descent; None is the space's.
         seed: of the random draws; the same seed gives the same solution.
         progress: called with every report.
 
     Raises:
         ValueError: for no start.
     """
-    if (starts if isinstance(starts, int) else len(starts)) < 1:
+    if starts < 1:
         raise ValueError(f"starts is {starts}, wanted at least 1")
-    latest = SearchState.at(np.asarray(problem.space.start), seed=seed)
+    first = problem.space.start if first is None else first
+    latest = SearchState.at(np.asarray(first), seed=seed)
 
     def observe(state: SearchState) -> None:
         nonlocal latest
@@ -77,17 +77,14 @@ def find_best_fit(
             progress(state.history[-1])
 
     search = Search(problem, settings, observe)
-    first = [problem.space.start] if isinstance(starts, int) else starts
-    limit = starts if isinstance(starts, int) else len(starts)
     cost_before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
-        cost_before, latest = _begin(search, latest, search.array(np.asarray(first[0])))
-        while len(ends) < limit and not agree(ends, settings):
-            number = len(ends)
-            state = dataclasses.replace(latest, start=number, start_steps=0)
+        cost_before, latest = _begin(search, latest, search.array(np.asarray(first)))
+        while len(ends) < starts and not agree(ends, settings):
+            state = dataclasses.replace(latest, start=len(ends), start_steps=0)
             try:
-                latest = search_from(search, state, *first[number : number + 1])
+                latest = search_from(search, state, None if ends else first)
             except StepsUsedUp as error:
                 latest, used_up = error.state, True
             ends.append(latest.point.cost)
@@ -96,25 +93,49 @@ def find_best_fit(
             raise
         interrupted = True
     agreeing = count_agreeing(ends, settings)
-    end = _End(latest, len(ends), agreeing, interrupted=interrupted, used_up=used_up)
-    converged = latest.converged and agree(ends, settings) and not interrupted
-    u = search.array(latest.best.u)
-    return Solution(
-        names=problem.space.names,
-        u=latest.best.u,
-        values=np.asarray(problem.space.values(u)),
-        cost_before=cost_before,
-        cost=latest.best.cost,
-        converged=converged,
-        message=_message(settings, end, converged=converged),
-        jacobian=_jacobian(search, latest.best),
-        history=latest.history,
-        steps=latest.steps,
-        starts=len(ends),
-        agreeing=agreeing,
-        seconds=time.perf_counter() - search.began,
-        interrupted=interrupted,
-    )
+    end = _End(latest, len(ends), agreeing, agree(ends, settings), interrupted, used_up)
+    return _solution(search, end, cost_before)
+
+
+@in_float64
+def refine(
+    problem: Problem,
+    solution: Solution,
+    u: Float[np.ndarray, " free"],
+    settings: SearchSettings = DEFAULTS,
+    progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """A descent to the end from a point that is better than a solution, or for another noise.
+
+    What the starts of the solution said of their agreement stays; effort and history add up.
+
+    Args:
+        problem: what to fit.
+        solution: the solution so far.
+        u: where the descent begins.
+        settings: how thoroughly to search.
+        progress: called with every report.
+    """
+    latest = SearchState.at(np.asarray(u))
+
+    def observe(state: SearchState) -> None:
+        nonlocal latest
+        latest = state
+        if progress is not None:
+            progress(state.history[-1])
+
+    search = Search(problem, settings, observe)
+    used_up = interrupted = False
+    try:
+        latest = polish(search, latest)
+    except StepsUsedUp as error:
+        latest, used_up = error.state, True
+    except KeyboardInterrupt:
+        interrupted = True
+    if not np.isfinite(latest.best.cost):
+        return dataclasses.replace(solution, interrupted=interrupted)
+    end = _End(latest, solution.starts, solution.agreeing, solution.agreed, interrupted, used_up)
+    return _solution(search, end, solution.cost_before).following(solution)
 
 
 def count_agreeing(ends: Sequence[float], settings: SearchSettings) -> int:
@@ -207,12 +228,42 @@ class _End:
     state: SearchState
     starts: int
     agreeing: int
+    agreed: bool
+    """Enough of them."""
     interrupted: bool
     used_up: bool
     """A start had no steps left."""
 
+    @property
+    def converged(self) -> bool:
+        """Whether the best point is the end of a descent, and starts agree on it."""
+        return self.state.converged and self.agreed and not self.interrupted
 
-def _message(settings: SearchSettings, end: _End, *, converged: bool) -> str:
+
+def _solution(search: Search, end: _End, cost_before: float) -> Solution:
+    """The solution of a search that has ended."""
+    state = end.state
+    u = search.array(state.best.u)
+    return Solution(
+        names=search.problem.space.names,
+        u=state.best.u,
+        values=np.asarray(search.problem.space.values(u)),
+        cost_before=cost_before,
+        cost=state.best.cost,
+        converged=end.converged,
+        message=_message(search.settings, end),
+        jacobian=_jacobian(search, state.best),
+        history=state.history,
+        steps=state.steps,
+        starts=end.starts,
+        agreeing=end.agreeing,
+        agreed=end.agreed,
+        seconds=time.perf_counter() - search.began,
+        interrupted=end.interrupted,
+    )
+
+
+def _message(settings: SearchSettings, end: _End) -> str:
     """How the search ended, in one sentence."""
     best, starts = end.state.best, "start" if end.starts == 1 else "starts"
     agreement = f"{end.agreeing} of {end.starts} {starts} agree{'s' * (end.agreeing == 1)}"
@@ -220,7 +271,7 @@ def _message(settings: SearchSettings, end: _End, *, converged: bool) -> str:
         return f"Interrupted after {end.state.steps} steps; this is the best point so far."
     if not np.isfinite(best.cost):
         return "Not converged: no residuals are finite at any starting point."
-    if converged:
+    if end.converged:
         gain = settings.min_step_gain
         return (
             f"Converged: {agreement}, and no further step lowers the cost by more than {gain:g} "

@@ -47,5 +47,23 @@ class Solution:
     """That were finished."""
     agreeing: int
     """Of them, those that ended at this cost, or hardly above it."""
+    agreed: bool
+    """Whether these were enough."""
     seconds: float
     interrupted: bool = False
+
+    def following(self, before: "Solution") -> "Solution":
+        """The solution with the history and the effort of an earlier one added to its own."""
+        later = (
+            dataclasses.replace(
+                line, step=line.step + before.steps, seconds=line.seconds + before.seconds
+            )
+            for line in self.history
+        )
+        return dataclasses.replace(
+            self,
+            cost_before=before.cost_before,
+            history=(*before.history, *later),
+            steps=before.steps + self.steps,
+            seconds=before.seconds + self.seconds,
+        )

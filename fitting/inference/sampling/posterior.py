@@ -83,11 +83,6 @@ class Posterior:
     """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
 
     @property
-    def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
-        """`u` after burn-in, without isolated walkers."""
-        return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
-
-    @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
         """Values after burn-in, without isolated walkers."""
         return np.delete(self.values[self.burn_in :], self.isolated, axis=1)

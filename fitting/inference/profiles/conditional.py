@@ -1,0 +1,235 @@
+"""The lowest cost with one parameter held at a value, the others following.
+
+The cost has cliffs wherever a hard decision flips, along smooth parameters as well: a full
+Gauss-Newton step often falls off one. So many candidates compete for each value. In each of them a
+random subset of the smooth parameters takes a Gauss-Newton step with the Jacobian at the solution,
+some with a random move besides, since where a cliff is depends on all parameters; the best
+candidate is the base of the next ones. Far from the solution, where its Jacobian does not
+hold, a descent by Levenberg–Marquardt follows.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fitting.inference.optimisation import levenberg_marquardt, population
+from fitting.inference.optimisation.models import HardModel
+from fitting.inference.optimisation.solution import Solution
+from fitting.problem.problem import Problem
+from fitting.problem.space import to_fractions
+
+CANDIDATES = 12  # for each value in a generation
+GENERATIONS = 3  # of candidates
+STEPS = 3  # of Levenberg–Marquardt for each value, at most
+MIN_GAIN = 0.02  # of the cost; less ends a descent
+NEAR = 0.5  # of u: around the solution, its Jacobian still holds
+MOVES = (0.05, 0.5)  # size of random moves, in standard deviations of Laplace's approximation
+FURTHEST = 4.0  # of u: no parameter follows further than that in one step
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """Points of the search space, all arrays of the same length."""
+
+    u: Float[np.ndarray, "points free"]
+    values: Float[np.ndarray, "points free"]
+    """In the parameters' units."""
+    cost: Float[np.ndarray, " points"]
+
+    def __getitem__(self, chosen: np.ndarray | slice) -> "Points":
+        return Points(self.u[chosen], self.values[chosen], self.cost[chosen])
+
+
+@dataclasses.dataclass(frozen=True)
+class Targets:
+    """Values at which parameters are held, one parameter at a time."""
+
+    index: Int[np.ndarray, " targets"]
+    """Of the parameter that is held."""
+    value: Float[np.ndarray, " targets"]
+    """In its unit."""
+
+    def __getitem__(self, chosen: np.ndarray | slice) -> "Targets":
+        return Targets(self.index[chosen], self.value[chosen])
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditional:
+    """A problem, and the normal equations of its smooth parameters at a solution."""
+
+    problem: Problem
+    solution: Float[np.ndarray, " free"]
+    """Its u."""
+    jacobian: Float[np.ndarray, "residuals free"]
+    """There; 0 for thresholds."""
+    gram: Float[np.ndarray, "free free"]
+    """Of the Jacobian."""
+    spread: Float[np.ndarray, "free free"]
+    """Turns standard normal numbers into draws from Laplace's approximation; 0 for thresholds."""
+    random: np.random.Generator
+
+    @classmethod
+    def around(cls, problem: Problem, solution: Solution, seed: int = 0) -> "Conditional":
+        """The normal equations at a solution."""
+        jacobian = np.where(problem.space.smooth, solution.jacobian, 0.0)
+        gram = np.asarray(jnp.asarray(jacobian).T @ jnp.asarray(jacobian))
+        smooth = np.ix_(*[np.asarray(problem.space.smooth)] * 2)
+        spread = np.zeros_like(gram)
+        spread[smooth] = np.linalg.inv(np.linalg.cholesky(gram[smooth])).T
+        random = np.random.default_rng(seed)
+        return cls(problem, np.asarray(solution.u), jacobian, gram, spread, random)
+
+    @property
+    def smooth(self) -> Bool[np.ndarray, " free"]:
+        """Which parameters have a derivative."""
+        return np.asarray(self.problem.space.smooth)
+
+    def points(self, u: Float[np.ndarray, "points free"]) -> Points:
+        """Points with their values and costs."""
+        cost = population.evaluate(self.problem, u).cost
+        return Points(u, population.to_values(self.problem.space, u), cost)
+
+    def evaluate(self, u: Float[np.ndarray, "points free"]) -> tuple[Points, np.ndarray]:
+        """Points, and the gradients of their costs by the solution's Jacobian."""
+        evaluation = population.evaluate(self.problem, u, self.jacobian)
+        gradient = -(evaluation.stepped - u) @ self.gram
+        return Points(u, population.to_values(self.problem.space, u), evaluation.cost), gradient
+
+    def move(
+        self,
+        points: Points,
+        gradient: Float[np.ndarray, "points free"],
+        targets: Targets,
+        following: Bool[np.ndarray, "points free"],
+        besides: Float[np.ndarray, "points free"] | float = 0.0,
+    ) -> Float[np.ndarray, "points free"]:
+        """Points moved to a target each, some of the smooth parameters following.
+
+        Those that follow take the Gauss-Newton step that is best once the target is reached, and
+        the move `besides`.
+        """
+        space, rows = self.problem.space, np.arange(len(points.u))
+        fractions = [
+            float(to_fractions(space.parameters[i], value))
+            for i, value in zip(targets.index, targets.value, strict=True)
+        ]
+        fractions = np.clip(fractions, population.EDGE, 1 - population.EDGE)
+        distance = np.log(fractions / (1 - fractions)) - points.u[rows, targets.index]
+        following = following & self.smooth
+        following[rows, targets.index] = False
+        both = following[:, :, None] & following[:, None, :]
+        matrix = np.where(both, self.gram, np.eye(space.size))
+        force = gradient + distance[:, None] * self.gram[targets.index]
+        steps = np.linalg.solve(matrix, np.where(following, -force, 0.0)[..., None])[..., 0]
+        steps = np.clip(steps, -FURTHEST, FURTHEST) + besides
+        moved = population.to_values(space, points.u + steps)
+        values = np.where(following, moved, points.values)
+        values[rows, targets.index] = targets.value
+        return population.from_values(space, values)
+
+    def lowest(
+        self, targets: Targets, starts: Sequence[Points], *, descending: bool = True
+    ) -> Points:
+        """The lowest point found at each target; `starts` has some points to begin with for each.
+
+        Args:
+            targets: the values.
+            starts: for each target.
+            descending: whether a descent may follow, far from the solution.
+        """
+        base, owner = join(starts), np.repeat(np.arange(len(starts)), [len(s.cost) for s in starts])
+        gradient = np.zeros_like(base.u)  # near their own optimum, the targets apart
+        found: Points | None = None
+        for _ in range(GENERATIONS):
+            chosen, following, besides = self._choose(base.cost, owner, len(starts))
+            here = targets[owner[chosen]]
+            moved = self.move(base[chosen], gradient[chosen], here, following, besides)
+            evaluated, slopes = self.evaluate(moved)
+            # What is kept is at its target: the starts are not.
+            kept = slice(0, 0) if found is None else slice(None)
+            base, gradient = join([base[kept], evaluated]), np.concatenate([gradient[kept], slopes])
+            owner = np.concatenate([owner[kept], owner[chosen]])
+            best = _lowest_of(base.cost, owner, len(starts))
+            base, gradient, owner = base[best], gradient[best], owner[best]
+            found = base
+        assert found is not None
+        far = ~self._near(found.u) & np.isfinite(found.cost)
+        return self.descend_each(found, targets, far) if descending else found
+
+    def _choose(
+        self, cost: np.ndarray, owner: np.ndarray, targets: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Bases of the candidates of each target, which parameters follow, and their random moves.
+
+        In one candidate from each base all follow, in one none, in the others a random subset, half
+        of them with a random move.
+        """
+        chosen = []
+        for target in range(targets):
+            mine = np.flatnonzero(owner == target)
+            mine = mine[np.argsort(cost[mine], kind="stable")]
+            chosen.append(np.resize(mine, max(CANDIDATES, 2 * len(mine))))
+        rows = np.concatenate(chosen)
+        share = self.random.random((len(rows), 1))
+        following = self.random.random((len(rows), self.smooth.size)) < share
+        sizes = np.exp(self.random.uniform(np.log(MOVES[0]), np.log(MOVES[1]), (len(rows), 1)))
+        sizes[self.random.random(len(rows)) < 0.5] = 0
+        besides = sizes * (self.random.normal(size=following.shape) @ self.spread.T)
+        first = 0
+        for mine in chosen:
+            count = len(np.unique(mine))
+            following[first : first + count] = True
+            following[first + count : first + 2 * count] = False
+            besides[first : first + 2 * count] = 0
+            first += len(mine)
+        return rows, following, besides
+
+    def _near(self, u: Float[np.ndarray, "points free"]) -> Bool[np.ndarray, " points"]:
+        """Whether the smooth parameters are so near the solution that its Jacobian still holds."""
+        distance = np.abs(u - self.solution)[:, self.smooth]
+        return np.all(distance < NEAR, axis=1)
+
+    def descend_each(
+        self, points: Points, targets: Targets, chosen: Bool[np.ndarray, " points"]
+    ) -> Points:
+        """Points of which those chosen have descended, their targets held."""
+        ends = [
+            self.descend(u, int(i)) if descends else (u, cost)
+            for u, cost, i, descends in zip(
+                points.u, points.cost, targets.index, chosen, strict=True
+            )
+        ]
+        u, cost = map(np.asarray, zip(*ends, strict=True))
+        return Points(u, population.to_values(self.problem.space, u), cost)
+
+    def descend(
+        self, u: Float[np.ndarray, " free"], held: int | None, steps: int = STEPS
+    ) -> tuple[np.ndarray, float]:
+        """The end of a short descent with at most one parameter held, and its cost."""
+        start = jnp.asarray(u, self.problem.space.start.dtype)
+        model = HardModel(self.problem, start, np.arange(len(u)) == (-1 if held is None else held))
+        state = levenberg_marquardt.evaluate(model, start)
+        for _ in range(steps):
+            before, state = state, levenberg_marquardt.step(model, state)
+            if float(before.cost) - float(state.cost) < MIN_GAIN:
+                break
+        cost = float(state.cost)
+        return np.asarray(state.u), cost if np.isfinite(cost) else np.inf
+
+
+def _lowest_of(cost: np.ndarray, owner: np.ndarray, targets: int) -> np.ndarray:
+    """Index of the lowest candidate of each target."""
+    candidates = [np.flatnonzero(owner == target) for target in range(targets)]
+    return np.asarray([mine[np.argmin(cost[mine])] for mine in candidates])
+
+
+def join(parts: Sequence[Points]) -> Points:
+    """Several sets of points as one."""
+    return Points(
+        np.concatenate([part.u for part in parts]),
+        np.concatenate([part.values for part in parts]),
+        np.concatenate([part.cost for part in parts]),
+    )

@@ -1,0 +1,251 @@
+"""Finds the profiles of all parameters at once.
+
+The whole range is scanned in batches. From the solution, each curve is then followed outwards in
+both directions as long as the data allow, and its lowest points elsewhere descend, so that valleys
+are found. At last the ends of the intervals are refined. Whatever lies lower than the solution is
+kept: the best point goes back to the fit.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.inference.optimisation import population
+from fitting.inference.optimisation.solution import Solution
+from fitting.problem.problem import Problem
+from fitting.problem.space import from_fractions, to_fractions
+
+from .conditional import Conditional, Points, Targets, join
+from .curves import Curves
+from .profile import crossing, low_parts
+from .single_moves import other_plateaus, settle
+
+GRID = np.concatenate([[0.001], (np.arange(20) + 0.5) / 20, [0.999]])  # fractions of the range
+FOLLOWED = np.concatenate([GRID[:-1:2], GRID[-1:]])  # where curves are followed outwards
+FINE_GRID = (np.arange(population.BATCH) + 0.5) / population.BATCH  # for plateaus of thresholds
+LOW = 40.0  # rise by the data up to which a curve is followed outwards
+PROMISING = 400.0  # and up to which a minimum of the scan may become a valley
+MINIMA = 2  # of each curve from which descents begin
+FREE_STEPS = 12  # of these descents, at most
+ROUNDS = 8  # of refinement
+SPANS = (1.0, 0.2, 0.04)  # of moves of thresholds, fractions of the range
+CROSSINGS = 2  # rounds in which cliffs are crossed
+CLIFF = 1.5  # times the rise at the end of an interval: what lies behind it may be a cliff
+NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpolated
+NARROW = 0.05  # fraction of a valley's width that its ends are found to
+
+
+@dataclasses.dataclass
+class _Profiling:
+    """What the stages share; they add to the curves."""
+
+    conditional: Conditional
+    solution: Points
+    curves: Curves
+    plateaus: Points
+
+    @property
+    def space(self):
+        return self.conditional.problem.space
+
+
+def find_curves(problem: Problem, solution: Solution) -> Curves:
+    """The profiles' points around a solution."""
+    conditional = Conditional.around(problem, solution)
+    start = conditional.points(np.asarray(solution.u)[None])
+    profiling = _Profiling(conditional, start, Curves(problem, start), start[:0])
+    scan(profiling)
+    if any(problem.space.thresholds):
+        profiling.plateaus = other_plateaus(conditional, profiling.curves)
+    follow_outwards(profiling)
+    descend_elsewhere(profiling)
+    refine(profiling)
+    profiling.curves.share()
+    refine(profiling)
+    for _ in range(CROSSINGS):
+        if not cross_cliffs(profiling):
+            break
+        refine(profiling)
+    return profiling.curves
+
+
+def scan(profiling: _Profiling) -> None:
+    """Every parameter over its whole range, the others following by a Gauss-Newton step."""
+    conditional, space = profiling.conditional, profiling.space
+    index, value = [], []
+    for i, parameter in enumerate(space.parameters):
+        grid = FINE_GRID if parameter.kind == "threshold" else GRID
+        index += [i] * len(grid)
+        value += list(from_fractions(parameter, grid))
+    targets = Targets(np.asarray(index), np.asarray(value))
+    start = profiling.solution[np.zeros(len(index), int)]
+    for following in (True, False):
+        chosen = np.full(start.u.shape, following)
+        moved = conditional.move(start, np.zeros_like(start.u), targets, chosen)
+        profiling.curves.add(targets, conditional.points(moved))
+
+
+def follow_outwards(profiling: _Profiling) -> None:
+    """From the solution to either end of each range, as long as the data let the cost stay low."""
+    space, curves = profiling.space, profiling.curves
+    sides: list[tuple[int, Float[np.ndarray, " values"]]] = []
+    for i, parameter in enumerate(space.parameters):
+        present = to_fractions(parameter, profiling.solution.values[0, i])
+        sides += [(i, FOLLOWED[FOLLOWED < present][::-1]), (i, FOLLOWED[FOLLOWED > present])]
+    last = [profiling.solution] * len(sides)
+    active, position = [s for s in range(len(sides)) if len(sides[s][1])], 0
+    while active:
+        index = np.asarray([sides[s][0] for s in active])
+        places = [sides[s][1][position] for s in active]
+        targets = targets_at(profiling, index, places)
+        starts = [
+            join([last[s], curves.nearest(i, p)])
+            for s, i, p in zip(active, index, places, strict=True)
+        ]
+        points = lowest(profiling, targets, starts, settling=True)
+        curves.add(targets, points)
+        following = []
+        for k, (s, i) in enumerate(zip(active, index, strict=True)):
+            last[s] = points[k : k + 1]
+            u = np.concatenate([last[s].u, profiling.solution.u])
+            own = population.prior_costs(space, u)[:, i]
+            rise = points.cost[k] - own[0] - (curves.best.cost[0] - own[1])
+            if rise < LOW and position + 1 < len(sides[s][1]):
+                following.append(s)
+        active, position = following, position + 1
+
+
+def descend_elsewhere(profiling: _Profiling) -> None:
+    """From the lowest minima of each curve outside the valleys, with no parameter held."""
+    curves, conditional = profiling.curves, profiling.conditional
+    for i, curve in enumerate(curves.curves):
+        rises = curves.data_rises(i)
+        padded = np.concatenate([[np.inf], rises, [np.inf]])
+        minimum = (rises <= padded[:-2]) & (rises < padded[2:])
+        outside = (rises > curves.highest(i)) & (rises < PROMISING)
+        minima = np.flatnonzero(minimum & outside)
+        minima = minima[np.argsort(rises[minima], kind="stable")[:MINIMA]]
+        if len(minima):
+            ends = [conditional.descend(u, None, FREE_STEPS)[0] for u in curve.u[minima]]
+            points = conditional.points(np.asarray(ends))
+            curves.add(Targets(np.full(len(minima), i), points.values[:, i]), points)
+
+
+def refine(profiling: _Profiling) -> None:
+    """New points where valleys end and between valleys, until the ends are known well enough."""
+    curves, tried = profiling.curves, set()
+    for number in range(ROUNDS):
+        index, places, starts = [], [], []
+        for i, curve in enumerate(curves.curves):
+            for inside, outside in open_ends(curves, i):
+                index.append(i)
+                places.append(_next_place(curves, i, inside, outside, bisect=number % 3 == 2))
+                starts.append(curve[np.asarray([inside, outside])])
+            for k in barrier(curves, i):
+                if (i, place := float(curves.fractions(i)[k])) not in tried:
+                    tried.add((i, place))
+                    index.append(i)
+                    places.append(place)
+                    starts.append(curve[np.asarray([k - 1, k + 1])])
+        if not index:
+            return
+        targets = targets_at(profiling, np.asarray(index), places)
+        curves.add(targets, lowest(profiling, targets, starts))
+
+
+def cross_cliffs(profiling: _Profiling) -> bool:
+    """Tries to go on beyond cliffs that end a valley; whether any was crossed."""
+    curves, conditional, space = profiling.curves, profiling.conditional, profiling.space
+    index, places, starts = [], [], []
+    for i in range(space.size):
+        rises, own = curves.rises(i), curves.fractions(i)
+        for part in low_parts(own, rises, curves.highest(i)):
+            for inside, outside in ((part.start, part.start - 1), (part.stop - 1, part.stop)):
+                if 0 <= outside < len(own) and rises[outside] > CLIFF * curves.highest(i):
+                    index.append(i)
+                    places.append(own[outside])
+                    starts.append(curves.curves[i][inside : inside + 1])
+    if not index:
+        return False
+    targets, start = targets_at(profiling, np.asarray(index), places), join(starts)
+    alone = np.zeros(start.u.shape, bool)
+    moved = conditional.move(start, np.zeros_like(start.u), targets, alone)
+    settled = conditional.points(settle(conditional, moved, targets, SPANS[-1:]))
+    points = conditional.lowest(targets, [settled[k : k + 1] for k in range(len(index))])
+    curves.add(targets, points)
+    highest = np.asarray([curves.highest(i) for i in index])
+    return bool((points.cost - curves.best.cost[0] < highest).any())
+
+
+def targets_at(profiling: _Profiling, index: np.ndarray, places: Sequence[float]) -> Targets:
+    """Targets at fractions of the parameters' ranges."""
+    parameters = [profiling.space.parameters[i] for i in index]
+    values = [
+        from_fractions(parameter, np.asarray(place))
+        for parameter, place in zip(parameters, places, strict=True)
+    ]
+    return Targets(index, np.asarray(values))
+
+
+def lowest(
+    profiling: _Profiling, targets: Targets, starts: list[Points], *, settling: bool = False
+) -> Points:
+    """The lowest points at the targets, from these starts and from the other plateaus.
+
+    When `settling`, where a threshold is held and the cost is not low, other thresholds may move.
+    """
+    conditional, space, curves = profiling.conditional, profiling.space, profiling.curves
+    starts = [join([near, profiling.plateaus]) for near in starts]
+    points = conditional.lowest(targets, starts)
+    if not settling or sum(space.thresholds) < 2:
+        return points
+    rises = points.cost - curves.best.cost[0]
+    highest = np.asarray([curves.highest(i) for i in targets.index])
+    stuck = (rises > highest) & (rises < PROMISING)
+    stuck = np.flatnonzero(stuck & np.asarray(space.thresholds)[targets.index])
+    if not len(stuck):
+        return points
+    settled = conditional.points(settle(conditional, points.u[stuck], targets[stuck], SPANS))
+    moved = conditional.lowest(targets[stuck], [settled[k : k + 1] for k in range(len(stuck))])
+    lower = moved.cost < points.cost[stuck]
+    order = np.arange(len(points.cost))
+    order[stuck[lower]] = len(order) + np.flatnonzero(lower)
+    return join([points, moved])[order]
+
+
+def open_ends(curves: Curves, i: int) -> list[tuple[int, int]]:
+    """Indices of the points inside and outside each end that is not known well enough."""
+    rises, own, ends = curves.rises(i), curves.fractions(i), []
+    smooth = curves.space.smooth[i]
+    for part in low_parts(own, rises, curves.highest(i)):
+        last = part.stop - 1
+        width = own[min(part.stop, len(own) - 1)] - own[max(part.start - 1, 0)]
+        for inside, outside in ((part.start, part.start - 1), (last, last + 1)):
+            if not 0 <= outside < len(own):
+                continue
+            gap = np.sqrt(rises[outside]) - np.sqrt(rises[inside])
+            narrow = abs(own[outside] - own[inside]) < NARROW * width
+            if not narrow and not (smooth and gap < NEAR_PARABOLA):
+                ends.append((inside, outside))
+    return ends
+
+
+def barrier(curves: Curves, i: int) -> list[int]:
+    """Indices of the points between two valleys."""
+    parts = low_parts(curves.fractions(i), curves.rises(i), curves.highest(i))
+    return [k for a, b in zip(parts[:-1], parts[1:], strict=True) for k in range(a.stop, b.start)]
+
+
+def _next_place(curves: Curves, i: int, inside: int, outside: int, *, bisect: bool) -> float:
+    """Fraction of the range to try between two points."""
+    rises, own = curves.rises(i), curves.fractions(i)
+    middle = 0.5 * (own[inside] + own[outside])
+    if bisect or not curves.space.smooth[i]:
+        return float(middle)
+    place = crossing(
+        (own[inside], rises[inside]), (own[outside], rises[outside]), curves.highest(i)
+    )
+    low, high = (own[inside] + share * (own[outside] - own[inside]) for share in (0.02, 0.98))
+    return float(np.clip(place, min(low, high), max(low, high)))
