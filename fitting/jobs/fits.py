@@ -220,7 +220,9 @@ def _assess_and_save(
             break
         left.append(solution.cost)
         solution = search_lower(problem, experiment, solution, identifiability.best_u, progress)
-    fitted = Fit(experiment, problem, solution, identifiability, known_values, run, tuple(left))
+    fitted = Fit(
+        experiment, problem, solution, identifiability, known_values, run, left=tuple(left)
+    )
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

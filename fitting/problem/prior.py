@@ -111,7 +111,7 @@ class Prior(eqx.Module):
         """Independent draws of `u`."""
         return self.quantile(random.random((count, self.centre.size)))
 
-    def ends(self, rise: Float[np.ndarray, " free"]) -> Float[np.ndarray, "2 free"]:
+    def ends(self, rise: float | Float[np.ndarray, " free"]) -> Float[np.ndarray, "2 free"]:
         """The `u` on either side at which minus the log density exceeds its minimum by `rise`."""
         normal, logistic = np.sqrt(2 * rise), 2 * np.arccosh(np.exp(0.5 * rise))
         z = np.where(np.asarray(self.uniform), logistic, normal) * np.array([[-1.0], [1.0]])

@@ -94,7 +94,7 @@ def autoregression(innovations: Noise, correlation: float) -> Noise:
     """
     gain = np.sqrt(1 - correlation**2)
     scaled = np.concatenate([innovations[:1], gain * innovations[1:]])
-    return lfilter([1.0], [1.0, -correlation], scaled, axis=0)
+    return np.asarray(lfilter([1.0], [1.0, -correlation], scaled, axis=0))
 
 
 def _displaced(joint: Transform, shift: Noise, turn: Noise) -> Transform:

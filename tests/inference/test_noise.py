@@ -19,7 +19,6 @@ from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise import marginal, model, series
 from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.noise.settings import NoiseOptions
-from fitting.inference.optimisation.settings import SearchSettings
 from fitting.problem.loss import apply_loss
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
@@ -254,10 +253,6 @@ def with_outliers(problem: Problem[jaxik.FootIK], seed: int) -> Problem[jaxik.Fo
 def test_intervals_with_estimated_noise_cover_the_truth(rho, factor, loss, options):
     """Of eight truths and six parameters; 41 of 48 or more have a probability of 99.8 %."""
     experiment = dataclasses.replace(load_experiment(OZZ), noise=options, loss=loss)
-    search = SearchSettings(final_sweeps=2)
-    experiment = dataclasses.replace(
-        experiment, fit=dataclasses.replace(experiment.fit, search=search)
-    )
     problem = problems.make_problem(experiment)
     assert problem.residual_function is residuals_of_scenes
     space, true = problem.space, noise_of(problem)

@@ -101,7 +101,8 @@ def evaluate(
     program.
     """
     # JAX multiplies: two threads of NumPy's library wait on each other, 0.3 s on a busy machine.
-    matrix = None if jacobian is None else jnp.asarray(jacobian, jnp.float32)
+    full = None if jacobian is None else jnp.asarray(jacobian, float)
+    matrix = None if full is None else full.astype(jnp.float32)
     costs, gradients = [], []
     for first in range(0, len(candidates), BATCH):
         batch = candidates[first : first + BATCH]
@@ -113,9 +114,9 @@ def evaluate(
     cost = np.concatenate(costs)
     finite = np.isfinite(cost)
     cost = np.where(finite, cost, np.inf)
-    if matrix is None:
+    if full is None:
         return Evaluation(cost, candidates, cost)
-    gram = np.asarray(matrix.T @ matrix, float)
+    gram = np.asarray(full.T @ full)
     zero = np.diag(gram) == 0
     gradient = np.concatenate(gradients)
     steps = -np.linalg.solve(gram + np.diag(zero), gradient.T).T

@@ -43,13 +43,13 @@ class Solution:
     history: tuple[Progress, ...]
     steps: int
     """Of Levenberg–Marquardt, all starts together."""
-    starts: int
-    """That were finished."""
-    agreeing: int
-    """Of them, those that ended at this cost, or hardly above it."""
-    agreed: bool
-    """Whether these were enough."""
     seconds: float
+    starts: int = 1
+    """That were finished."""
+    agreeing: int = 1
+    """Of them, those that ended at this cost, or hardly above it."""
+    agreed: bool = False
+    """Whether these were enough."""
     interrupted: bool = False
 
     def following(self, before: "Solution") -> "Solution":

@@ -19,7 +19,7 @@ from fitting.inference.optimisation import levenberg_marquardt, population
 from fitting.inference.optimisation.models import HardModel
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
-from fitting.problem.space import to_fractions
+from fitting.problem.space import EDGE, to_fractions
 
 CANDIDATES = 12  # for each value in a generation
 GENERATIONS = 3  # of candidates
@@ -116,7 +116,7 @@ class Conditional:
             float(to_fractions(space.parameters[i], value))
             for i, value in zip(targets.index, targets.value, strict=True)
         ]
-        fractions = np.clip(fractions, population.EDGE, 1 - population.EDGE)
+        fractions = np.clip(fractions, EDGE, 1 - EDGE)
         distance = np.log(fractions / (1 - fractions)) - points.u[rows, targets.index]
         following = following & self.smooth
         following[rows, targets.index] = False
