@@ -9,7 +9,6 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
 from fitting.experiments.problems import make_problem
-from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise.model import NoiseModel, with_noise
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
@@ -17,13 +16,12 @@ from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, run_folder, translation
-from fitting.studies.fit import MIN_IMPROVEMENT, Fit, search, search_lower, search_with_noise
+from fitting.studies.assess import assess_solution
+from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.sample import SampledFit, sample_around
 from fitting.studies.translation import TranslationRequest
 
 from .output import Log, checked_folder, log_output, silent
-
-MAX_RETURNS = 3  # to the search from lower points
 
 
 @in_float64
@@ -206,23 +204,14 @@ def _assess_and_save(
     known_values: Mapping[str, float] | None,
     progress: Callable[[Progress], None] | None,
 ) -> Fit:
-    """The fit; its solution is on disk before the assessment, which may fail.
+    """The fit; each of its solutions is on disk before the assessment, which may fail."""
 
-    Where the assessment meets a point that is lower than the solution, the search goes on there.
-    """
-    left: list[float] = []
-    while True:
+    def save(solution: Solution) -> None:
         if run is not None:
             run_folder.save_solution(run, experiment, problem, solution)
-        identifiability = assess_identifiability(problem, solution)
-        found_lower = identifiability.improvement > MIN_IMPROVEMENT
-        if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
-            break
-        left.append(solution.cost)
-        solution = search_lower(problem, experiment, solution, identifiability.best_u, progress)
-    fitted = Fit(
-        experiment, problem, solution, identifiability, known_values, run, left=tuple(left)
-    )
+
+    fitted = assess_solution(experiment, problem, solution, progress, save)
+    fitted = dataclasses.replace(fitted, known_values=known_values, run=run)
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

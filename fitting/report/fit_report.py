@@ -12,7 +12,8 @@ from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.playback import Playback
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
-from fitting.studies.fit import MIN_IMPROVEMENT, Fit, FitSummary
+from fitting.studies.assess import MIN_IMPROVEMENT
+from fitting.studies.fit import Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report

@@ -20,7 +20,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.joint import fit_with_noise
 from fitting.inference.noise.model import NoiseModel, noise_of
-from fitting.inference.optimisation.search import find_best_fit, refine
+from fitting.inference.optimisation.search import find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.profiles import profile
 from fitting.problem.problem import Problem
@@ -36,7 +36,6 @@ from .prior_summary import PriorSummary, summarise_priors
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
 THRESHOLD_SD = 0.05
 MIN_START_SD, MAX_START_SD = 1e-3, 0.5
-MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 
 
@@ -184,6 +183,12 @@ class Fit:
 
     @cached_property
     @in_float64
+    def parameters(self) -> list[FittedParameter]:
+        """The free parameters in the order of `u`."""
+        return _fitted_parameters(self)
+
+    @cached_property
+    @in_float64
     def summary(self) -> FitSummary:
         """The numbers of the fit as JSON holds them."""
         solution = self.solution
@@ -198,7 +203,7 @@ class Fit:
             "starts": solution.starts,
             "agreeing": solution.agreeing,
             "seconds": solution.seconds,
-            "parameters": _fitted_parameters(self),
+            "parameters": self.parameters,
             "correlated": [list(pair) for pair in self.identifiability.correlated],
             "weakest": list(self.identifiability.weakest),
             "history": [dataclasses.asdict(step) for step in solution.history],
@@ -248,31 +253,6 @@ def search_with_noise(
     """
     solution = search(problem, experiment, progress)
     return fit_with_noise(problem, experiment.noise, solution, experiment.fit.search, progress)
-
-
-def search_lower(
-    problem: Problem[jaxik.FootIK],
-    experiment: Experiment,
-    before: Solution,
-    lower_u: Float[np.ndarray, " free"],
-    progress: Callable[[Progress], None] | None = None,
-) -> Solution:
-    """The best fit from a point that is lower than a solution; steps and time add to its own.
-
-    Where it is lower than the starts' agreement allows, the search begins anew there.
-
-    Args:
-        problem: the problem of the experiment.
-        experiment: its settings of the search.
-        before: the solution that is left.
-        lower_u: the lower point, in u.
-        progress: called as the search goes on.
-    """
-    settings = experiment.fit.search
-    after = refine(problem, before, lower_u, settings, progress)
-    if after.interrupted or before.cost - after.cost <= settings.agreement:
-        return after
-    return search(problem, experiment, progress, after.u).following(after)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:

@@ -76,8 +76,7 @@ def sample_around(
         np.array([row["u"] for row in parameters]),
         np.array([row["start_sd"] for row in parameters]),
     )
-    if experiment.noise.sigmas == "estimated" and problem.loss == "squares":
-        problem = with_unknown_sigmas(problem)
+    problem = with_open_noise(problem, experiment)
     posterior = sample_posterior(
         problem, start, experiment.sample, seed=experiment.seed, path=chain, progress=progress
     )
@@ -86,3 +85,12 @@ def sample_around(
     return dataclasses.replace(
         posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed)
     )
+
+
+def with_open_noise(
+    problem: Problem[jaxik.FootIK], experiment: Experiment
+) -> Problem[jaxik.FootIK]:
+    """The problem with sigmas that the experiment estimates left open, as far as they can be."""
+    if experiment.noise.sigmas == "estimated" and problem.loss == "squares":
+        return with_unknown_sigmas(problem)
+    return problem
