@@ -22,6 +22,8 @@ from . import diagnostics
 from .chain import Chain, Identity
 from .settings import DEFAULTS, SamplerSettings
 
+ROWS = 4096  # of u, whose values are computed at once
+
 
 @dataclasses.dataclass(frozen=True)
 class SamplingProgress:
@@ -249,16 +251,26 @@ def _describe_progress(
     )
 
 
+def _values(
+    space: Space, u: Float[np.ndarray, "steps walkers free"]
+) -> Float[np.ndarray, "steps walkers free"]:
+    """The parameters of all walkers in their units, by one program for chains of any length."""
+    rows = u.reshape(-1, u.shape[-1])
+    padded = np.concatenate([rows, np.zeros((-len(rows) % ROWS, u.shape[-1]))])
+    blocks = jnp.asarray(padded.reshape(-1, ROWS, u.shape[-1]), space.start.dtype)
+    values = np.concatenate([np.asarray(values_of_rows(space, block)) for block in blocks])
+    return values[: len(rows)].reshape(u.shape)
+
+
 def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float) -> Posterior:
     u, check = chain.u, outcome.check
-    flat = jnp.asarray(u.reshape(-1, u.shape[-1]), problem.space.start.dtype)
     acceptance = chain.accepted / len(chain)
     stuck = check.isolated | diagnostics.lazy_walkers(acceptance)
     return Posterior(
         names=problem.space.names,
         u=u,
         log_probability=chain.log_probability,
-        values=np.asarray(values_of_rows(problem.space, flat)).reshape(u.shape),
+        values=_values(problem.space, u),
         thin_by=chain.identity.thin_by,
         burn_in=check.burn_in,
         autocorrelation_time=check.times * chain.identity.thin_by,
