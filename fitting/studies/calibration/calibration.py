@@ -1,0 +1,212 @@
+"""Many replicates of an experiment, each kept on disk as soon as it is finished.
+
+identity.json        what is calibrated; another experiment is refused
+fits/0000.json       the fit of a replicate
+chains/0000.json     its posterior, where chains were wanted
+
+A call continues where an earlier one ended, also with more replicates, or with chains for fits that
+have none yet. All replicates share their compiled programs.
+"""
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+import jaxik
+from fitting.experiments.experiment import Experiment
+from fitting.inference.optimisation.solution import Progress
+from fitting.inference.sampling.posterior import SamplingProgress, digest
+from fitting.problem.problem import Problem
+from fitting.runtime import files
+from fitting.runtime.validation import error_context
+
+from .replicates import ReplicateChain, ReplicateFit, fit_replicate, sample_replicate
+
+IDENTITY, FITS, CHAINS = "identity.json", "fits", "chains"
+Result = TypeVar("Result", bound=Mapping[str, Any])
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationProgress:
+    """How far a calibration is."""
+
+    replicate: int
+    """That is being made, from 1."""
+    replicates: int
+    stage: str
+    """What is being done for it."""
+    elapsed: float
+    """s, of this call."""
+    remaining: float
+    """s, estimated; NaN before the first fit, or chain, of this call is finished."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """Finished replicates, in the order of their numbers."""
+
+    fits: list[ReplicateFit]
+    chains: list[ReplicateChain]
+    """None, or as many as there are fits."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Observers:
+    """What is called while a calibration goes on."""
+
+    progress: Callable[[CalibrationProgress], None] = lambda report: None
+    on_fit: Callable[[ReplicateFit], object] = lambda fitted: None
+    """With each new fit."""
+    on_chain: Callable[[ReplicateChain], object] = lambda chain: None
+    """With each new chain."""
+
+
+def calibrate(
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    folder: Path | None,
+    replicates: int,
+    *,
+    chains: bool = False,
+    observers: Observers = Observers(),  # noqa: B008
+) -> Calibration:
+    """Makes the replicates that a folder does not hold yet: first all fits, then all chains.
+
+    An interrupt (Ctrl-C) loses the fit or the chain that is running and no other.
+
+    Args:
+        experiment: its settings of the search and the sampler, and the seed.
+        problem: of the experiment; its references only say which frames count.
+        folder: where finished replicates are kept. None keeps them in memory.
+        replicates: number of truths.
+        chains: whether each posterior is sampled, too.
+        observers: what is called meanwhile.
+
+    Raises:
+        ValueError: there is not one replicate; the folder holds something else; a replicate cannot
+            be made.
+    """
+    if replicates < 1:
+        raise ValueError(f"replicates is {replicates}; wanted 1 or more")
+    if folder is not None:
+        _claim(folder, experiment, problem)
+
+    def fit_one(number: int, progress: Callable[[Progress], None]) -> ReplicateFit:
+        return fit_replicate(problem, experiment, number, progress)
+
+    fits = _Stage(folder, FITS, replicates, observers.progress).run(fit_one, observers.on_fit)
+    if not chains:
+        return Calibration(fits, [])
+
+    def sample_one(number: int, progress: Callable[[SamplingProgress], None]) -> ReplicateChain:
+        return sample_replicate(problem, experiment, fits[number], progress)
+
+    stage = _Stage(folder, CHAINS, replicates, observers.progress)
+    return Calibration(fits, stage.run(sample_one, observers.on_chain))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Stage:
+    """The fits, or the chains, of all replicates."""
+
+    folder: Path | None
+    name: str
+    replicates: int
+    progress: Callable[[CalibrationProgress], None]
+
+    def run(
+        self,
+        make: Callable[[int, Callable[[Any], None]], Result],
+        on_result: Callable[[Result], object],
+    ) -> list[Result]:
+        """The results of all replicates; those that the folder has are not made again."""
+        results: dict[int, Result] = {}
+        for number in range(self.replicates):
+            if self.folder is not None and self._path(number).exists():
+                results[number] = self._read(number)
+        began = time.monotonic()
+        missing = [number for number in range(self.replicates) if number not in results]
+        for done, number in enumerate(missing):
+            with error_context(f"replicate {number + 1}"):
+                result = make(number, self._reporter(number, done, len(missing), began))
+            if self.folder is not None:
+                self._path(number).parent.mkdir(parents=True, exist_ok=True)
+                files.write_text(self._path(number), json.dumps(result, indent=1) + "\n")
+            results[number] = result
+            on_result(result)
+        return [results[number] for number in range(self.replicates)]
+
+    def _reporter(
+        self, number: int, done: int, missing: int, began: float
+    ) -> Callable[[Progress | SamplingProgress], None]:
+        """Turns reports of a fit or a chain into reports of the calibration."""
+        finished = time.monotonic() - began
+        remaining = finished / done * (missing - done) if done else math.nan
+
+        def report(inner: Progress | SamplingProgress) -> None:
+            elapsed = time.monotonic() - began
+            left = remaining - (elapsed - finished)
+            stage = inner.stage if isinstance(inner, Progress) else f"chain, step {inner.step}"
+            self.progress(CalibrationProgress(number + 1, self.replicates, stage, elapsed, left))
+
+        return report
+
+    def _path(self, number: int) -> Path:
+        assert self.folder is not None
+        return self.folder / self.name / f"{number:04}.json"
+
+    def _read(self, number: int) -> Any:
+        path = self._path(number)
+        try:
+            result = json.loads(path.read_text(encoding="utf-8"))
+            if result["number"] != number:
+                raise ValueError(f"it is of replicate {result['number']}")
+            return result
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not written by `jaxik calibrate`: {error!r}") from None
+
+
+def _claim(folder: Path, experiment: Experiment, problem: Problem[jaxik.FootIK]) -> None:
+    """Writes into a folder what is calibrated there, or compares it with what is written there.
+
+    Raises:
+        ValueError: the folder is that of another calibration, or of something else.
+    """
+    path, own = folder / IDENTITY, _identity(experiment, problem)
+    if not path.exists():
+        if folder.is_dir() and any((folder / name).exists() for name in (FITS, CHAINS)):
+            raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        files.write_text(path, json.dumps(own, indent=2) + "\n")
+        return
+    try:
+        present = json.loads(path.read_text(encoding="utf-8"))
+        changed = [key for key in own if key != "name" and own[key] != present[key]]
+        name = present["name"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not written by `jaxik calibrate`: {error!r}") from None
+    if changed:
+        raise ValueError(
+            f"{folder}: holds the calibration of {name!r}, which differs from {own['name']!r} in: "
+            f"{', '.join(changed)}; name another folder"
+        )
+
+
+def _identity(experiment: Experiment, problem: Problem[jaxik.FootIK]) -> dict[str, Any]:
+    """Everything that a replicate follows from, except the program itself; as JSON reads it."""
+    identity = {
+        "name": experiment.name,
+        "problem": digest(problem),
+        "start": np.asarray(problem.space.start).tolist(),
+        "seed": experiment.seed,
+        "noise": dataclasses.asdict(experiment.noise),
+        "fit": dataclasses.asdict(experiment.fit),
+        "sample": dataclasses.asdict(experiment.sample),
+    }
+    return json.loads(json.dumps(identity))

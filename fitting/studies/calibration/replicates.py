@@ -1,0 +1,222 @@
+"""One replicate: a truth drawn from the prior, motion simulated from it, and its fit.
+
+Everything follows from the experiment and the number of the replicate. What a replicate was found
+to be is plain data, which JSON holds without loss.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple, NotRequired, TypedDict
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+import jaxik
+from fitting.experiments.experiment import Experiment
+from fitting.inference.noise.model import NoiseModel, with_noise
+from fitting.inference.optimisation import descent
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.optimisation.solution import Progress
+from fitting.inference.optimisation.state import Search, SearchState, StepsUsedUp
+from fitting.inference.profiles.profile import Profile
+from fitting.inference.sampling.posterior import Posterior, SamplingProgress
+from fitting.problem.free_parameters import FreeParameter
+from fitting.problem.problem import Problem
+from fitting.problem.simulation import simulate
+from fitting.problem.space import to_fractions
+from fitting.runtime.validation import Content
+from fitting.studies.assess import assess_solution
+from fitting.studies.fit import FittedParameter, search_with_noise
+from fitting.studies.sample import sample_around, with_open_noise
+
+DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99
+LEVELS = (0.5, 0.8, 0.95)  # of a posterior's central intervals
+LOG_PROBABILITY = "log-probability"  # ranked beside the parameters
+
+
+class Truth(NamedTuple):
+    """What a replicate is made from."""
+
+    u: Float[np.ndarray, " free"]
+    noise_seed: int
+    seed: int
+    """Of the search and the sampler."""
+
+
+class ReplicateFit(TypedDict):
+    """The fit of a replicate, as its file holds it."""
+
+    number: int
+    """From 0."""
+    truth_u: list[float]
+    truth: list[float]
+    """In the parameters' units."""
+    truth_rises: list[float]
+    """Of each parameter's profile, at its truth."""
+    truth_valley_cost: float
+    """Where a descent that begins at the truth ends."""
+    cost: float
+    converged: bool
+    message: str
+    starts: int
+    agreeing: int
+    seconds: float
+    """For the search."""
+    parameters: list[FittedParameter]
+    """As `fit.json` has them."""
+    noise: NotRequired[Content]
+    """Where the experiment estimates it."""
+
+
+class ReplicateChain(TypedDict):
+    """The posterior of a replicate, as its file holds it."""
+
+    number: int
+    ranks: dict[str, int]
+    """Number of independent draws, of `DRAWS`, below the truth: of each parameter, and of the
+    log-probability."""
+    intervals: dict[str, list[list[float]]]
+    """Of each parameter, in its unit: the central intervals with the `LEVELS`."""
+    draws: int
+    """Independent ones in the chain."""
+    converged: bool
+    message: str
+    seconds: float
+
+
+def draw_truth(problem: Problem[jaxik.FootIK], experiment: Experiment, number: int) -> Truth:
+    """The truth of a replicate, from the prior of the problem."""
+    random = np.random.default_rng([experiment.seed, number])
+    u = problem.space.prior.draw(random, 1)[0]
+    noise_seed, seed = random.integers(2**32, size=2)
+    return Truth(u, int(noise_seed), int(seed))
+
+
+def fit_replicate(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    number: int,
+    progress: Callable[[Progress], None] | None = None,
+) -> ReplicateFit:
+    """Fits a replicate as `jaxik fit` does, and descends from its truth.
+
+    Raises:
+        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
+        ValueError: the fit cannot be assessed.
+    """
+    truth = draw_truth(problem, experiment, number)
+    simulated = simulate(problem, truth.u, truth.noise_seed)
+    own = dataclasses.replace(experiment, seed=truth.seed)
+    simulated, solution = search_with_noise(simulated, own, progress)
+    if not solution.interrupted:
+        fitted = assess_solution(own, simulated, solution, progress)
+        solution = fitted.solution
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    values = np.asarray(problem.space.values(truth.u))
+    profiles = fitted.identifiability.profiles
+    rises = [
+        rise_at(profiles[parameter.name], parameter, value)
+        for parameter, value in zip(problem.space.parameters, values, strict=True)
+    ]
+    result: ReplicateFit = {
+        "number": number,
+        "truth_u": truth.u.tolist(),
+        "truth": values.tolist(),
+        "truth_rises": rises,
+        "truth_valley_cost": _polished_cost(simulated, own.fit.search, truth.u),
+        "cost": solution.cost,
+        "converged": solution.converged,
+        "message": solution.message,
+        "starts": solution.starts,
+        "agreeing": solution.agreeing,
+        "seconds": solution.seconds,
+        "parameters": fitted.parameters,
+    }
+    if experiment.noise.estimates_any:
+        result["noise"] = dataclasses.asdict(fitted.noise)
+    return result
+
+
+def sample_replicate(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    fitted: ReplicateFit,
+    progress: Callable[[SamplingProgress], None] | None = None,
+) -> ReplicateChain:
+    """Samples the posterior of a replicate as `jaxik sample` does, around its fit.
+
+    Raises:
+        KeyboardInterrupt: the sampling was interrupted; half a chain counts for nothing.
+        ValueError: walkers cannot start around the fit.
+    """
+    number = fitted["number"]
+    truth = draw_truth(problem, experiment, number)
+    simulated = simulate(problem, truth.u, truth.noise_seed)
+    own = dataclasses.replace(experiment, seed=truth.seed)
+    if "noise" in fitted:
+        simulated = with_noise(simulated, NoiseModel(**fitted["noise"]))
+    posterior = sample_around(fitted["parameters"], simulated, own, None, progress)
+    if posterior.interrupted:
+        raise KeyboardInterrupt
+    draws = independent_draws(posterior)
+    random = np.random.default_rng([experiment.seed, number, DRAWS])
+    log_probability = with_open_noise(simulated, own).log_probability(jnp.asarray(truth.u))
+    ranks = rank(np.append(fitted["truth"], log_probability), draws, random)
+    quantities = [*posterior.names, LOG_PROBABILITY]
+    ends = 0.5 + np.multiply.outer(LEVELS, [-0.5, 0.5])
+    intervals = np.quantile(posterior.kept.reshape(-1, len(posterior.names)), ends, axis=0)
+    return {
+        "number": number,
+        "ranks": dict(zip(quantities, ranks.tolist(), strict=True)),
+        "intervals": dict(zip(posterior.names, intervals.transpose(2, 0, 1).tolist(), strict=True)),
+        "draws": len(draws),
+        "converged": posterior.converged,
+        "message": posterior.message,
+        "seconds": posterior.seconds,
+    }
+
+
+def rise_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
+    """The rise of a profile at a value: between its points like a parabola at its minimum."""
+    places = to_fractions(parameter, profile.values)
+    place = to_fractions(parameter, np.asarray(value))
+    return float(np.interp(place, places, np.sqrt(np.maximum(profile.rises, 0.0))) ** 2)
+
+
+def independent_draws(posterior: Posterior) -> Float[np.ndarray, "draws quantities"]:
+    """Kept steps an autocorrelation time or more apart, all walkers: values, log-probability."""
+    kept = np.delete(posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1)
+    both = np.concatenate([posterior.kept, kept[..., None]], axis=-1)
+    slowest = float(posterior.autocorrelation_time.max()) / posterior.thin_by
+    apart = int(np.ceil(min(slowest, len(both))))  # infinite if nothing moves
+    return both[::-apart].reshape(-1, both.shape[-1])
+
+
+def rank(
+    truth: Float[np.ndarray, " quantities"],
+    draws: Float[np.ndarray, "draws quantities"],
+    random: np.random.Generator,
+) -> Int[np.ndarray, " quantities"]:
+    """Rank of a truth, quantity by quantity, among `DRAWS` of the draws.
+
+    Where there are fewer, their ranks are spread at random over the places that each stands for:
+    uniform ranks stay uniform.
+    """
+    chosen = random.permutation(draws)[:DRAWS]
+    below = np.sum(chosen < truth, axis=0)
+    if len(chosen) == DRAWS:
+        return below
+    places = (below + random.random(truth.size)) / (len(chosen) + 1)
+    return np.floor((DRAWS + 1) * places).astype(int)
+
+
+def _polished_cost(
+    problem: Problem[jaxik.FootIK], settings: SearchSettings, u: Float[np.ndarray, " free"]
+) -> float:
+    """The lowest cost of a descent that begins at the truth."""
+    try:
+        return descent.polish(Search(problem, settings), SearchState.at(u)).best.cost
+    except StepsUsedUp as error:
+        return error.state.best.cost
