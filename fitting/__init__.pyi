@@ -19,6 +19,7 @@ from .experiments.experiment import Experiment as Experiment
 from .experiments.experiment_files import load_experiment as load_experiment
 from .experiments.systems import register_rule as register_rule
 from .jobs import ablate as ablate
+from .jobs import calibrate as calibrate
 from .jobs import compare as compare
 from .jobs import fit as fit
 from .jobs import sample as sample

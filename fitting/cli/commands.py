@@ -26,7 +26,7 @@ from jaxik import FootIK, Rig, record
 
 from . import progress
 
-NOT_CONVERGED, DOES_NOT_FIT = 3, 4  # exit statuses
+NOT_CONVERGED, DOES_NOT_FIT, OUTSIDE = 3, 4, 5  # exit statuses
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -45,6 +45,21 @@ def ablate(options: argparse.Namespace) -> int:
             options.experiment, options.output, folds=options.folds, progress=line, log=_print_now
         )
     return 0
+
+
+def calibrate(options: argparse.Namespace) -> int:
+    """Fits an experiment to simulated motion; status 5 if something is outside."""
+    _prepare_jax()
+    with progress.ProgressLine(progress.calibration_line) as line:
+        assessment = jobs.calibrate(
+            options.experiment,
+            options.output,
+            replicates=options.replicates,
+            chains=options.chains,
+            progress=line,
+            log=_print_now,
+        )
+    return 0 if assessment.inside else OUTSIDE
 
 
 def sample(options: argparse.Namespace) -> int:
@@ -211,6 +226,7 @@ def cache(options: argparse.Namespace) -> int:
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "fit": fit,
     "ablate": ablate,
+    "calibrate": calibrate,
     "sample": sample,
     "apply": apply,
     "run": run,

@@ -15,6 +15,7 @@ import numpy as np
 
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress
+from fitting.studies.calibration.calibration import CalibrationProgress
 
 MARKED = re.compile(r"\S+!(?=\s|$)")
 Report = TypeVar("Report")
@@ -80,6 +81,16 @@ def sample_line(progress: SamplingProgress) -> str:
     return (
         f"{progress.elapsed:6.1f} s  step {progress.step} of at most {progress.max_steps}  "
         f"acceptance {progress.acceptance:.2f}  log p {progress.log_probability:.1f}{ending}"
+    )
+
+
+def calibration_line(progress: CalibrationProgress) -> str:
+    """The progress of a calibration in one line."""
+    minutes = progress.remaining / 60
+    left = "" if np.isnan(minutes) else f"  {max(minutes, 0.0):.1f} min left"
+    return (
+        f"{progress.elapsed:6.1f} s  replicate {progress.replicate} of {progress.replicates}  "
+        f"{progress.stage}{left}"
     )
 
 

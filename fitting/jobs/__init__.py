@@ -8,15 +8,15 @@ them, so `log=print` shows the same.
 Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
 bits; a system that was made in 32 bits is taken with the values it has there.
 
-`fits` searches: `fit`, `sample`, `ablate` and `translate`. `animations` runs finished systems:
-`solve`, `apply`, `compare` and
-`run_suite`.
+`fits` searches: `fit`, `sample`, `ablate` and `translate`. `calibrations` judges what they say:
+`calibrate`. `animations` runs finished systems: `solve`, `apply`, `compare` and `run_suite`.
 """
 
 from .animations import apply as apply
 from .animations import compare as compare
 from .animations import run_suite as run_suite
 from .animations import solve as solve
+from .calibrations import calibrate as calibrate
 from .fits import ablate as ablate
 from .fits import fit as fit
 from .fits import sample as sample

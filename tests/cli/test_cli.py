@@ -32,8 +32,8 @@ from support.sample_clips import BVH
 
 DATA = ROOT / "data"
 COMMANDS = [
-    "fit", "ablate", "sample", "apply", "run", "compare", "translate", "inspect", "terrain",
-    "bench", "cache", "record", "record show", "record to-toml", "record to-bytes",
+    "fit", "ablate", "calibrate", "sample", "apply", "run", "compare", "translate", "inspect",
+    "terrain", "bench", "cache", "record", "record show", "record to-toml", "record to-bytes",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
@@ -107,6 +107,7 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
     assert all(f"jaxik {name}" in text for name in COMMANDS if " " not in name)
     assert "exit status: 0 when done, 2 for a mistake" in text and "130 when" in text
     assert "3 when the search" in text and "4 when `fit` has converged but does not fit" in text
+    assert "5 when\n`calibrate` finds something outside its bounds" in text
 
 
 @pytest.mark.parametrize(

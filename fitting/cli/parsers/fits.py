@@ -1,5 +1,6 @@
 """Words and options of the commands that search."""
 
+import argparse
 from pathlib import Path
 
 from .options import Commands, add_command, add_output, finite
@@ -41,6 +42,32 @@ def add_ablate(commands: Commands) -> None:
         "--folds", type=int, default=2, metavar="N", help="parts of each clip (default: 2)"
     )
     add_output(ablate, "DIR")
+
+
+def add_calibrate(commands: Commands) -> None:
+    """`jaxik calibrate`."""
+    calibrate = add_command(
+        commands, "calibrate", "check what fits and posteriors say on motion with known truths",
+        """
+        jaxik calibrate data/experiments/ozz.toml -n 200 -o runs/calibration
+        jaxik calibrate data/experiments/ozz.toml -n 200 --chains -o runs/calibration
+
+        Truths are drawn from the experiment's prior. Each fit is written when it is done: after
+        Ctrl-C (status 130) the same command continues, also with a larger -n or with --chains. The
+        exit status is 0 if everything is inside its bounds, else 5.
+        """,
+    )  # fmt: skip
+    calibrate.add_argument(
+        "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
+    )
+    calibrate.add_argument(
+        "-n", "--replicates", type=int, default=200, metavar="N", help="truths (default: 200)"
+    )
+    calibrate.add_argument(
+        "--chains", action=argparse.BooleanOptionalAction, default=False,
+        help="sample each posterior too, which takes much longer than the fits (default: no)",
+    )  # fmt: skip
+    add_output(calibrate, "DIR")
 
 
 def add_sample(commands: Commands) -> None:
