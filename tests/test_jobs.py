@@ -17,10 +17,9 @@ from fitting import jobs
 from fitting.analysis import playback
 from fitting.experiments import problems
 from fitting.inference.identifiability import assess_identifiability
-from fitting.jobs import fits
 from fitting.report import fit_report
 from fitting.runtime.precision import with_floats
-from fitting.studies import run_folder
+from fitting.studies import assess, run_folder
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import CLIP, ROOT, write
@@ -66,7 +65,7 @@ def test_a_solution_is_on_disk_before_anything_else_is_computed(experiment_file,
         assert (run / run_folder.PARAMETERS).is_file()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fits, "assess_identifiability", interrupt)
+    monkeypatch.setattr(assess, "assess_identifiability", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fitting.fit(experiment_file, run)
     assert not (run / run_folder.FIT).exists()

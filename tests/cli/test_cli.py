@@ -25,7 +25,7 @@ from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.chain import journal_path
 from fitting.jobs import fits
-from fitting.studies import run_folder
+from fitting.studies import assess, run_folder
 from support import grounds, quick
 from support.experiments import CLIP, ROOT, write
 from support.sample_clips import BVH
@@ -282,7 +282,7 @@ def test_the_parameters_are_written_before_anything_can_fail_after_the_search(
     def fail(*_):
         raise ValueError("no slopes")
 
-    monkeypatch.setattr(fits, "assess_identifiability", fail)
+    monkeypatch.setattr(assess, "assess_identifiability", fail)
     assert "no slopes" in last_error_of(capsys, "fit", experiment_file, "-o", tmp_path / "run")
     assert tree(tmp_path / "run") == {run_folder.EXPERIMENT, run_folder.PARAMETERS}
 
