@@ -1,6 +1,7 @@
 """Heels that rise about the ball, compared with a numerical search and along whole walks."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,9 @@ def search_angle(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length:
 
     if distance(0.0) <= length or distance(1e-5) > distance(0.0):
         return 0.0
-    best = minimize_scalar(distance, bounds=(0.0, np.pi), method="bounded", options={"xatol": 1e-9})
+    best: Any = minimize_scalar(
+        distance, bounds=(0.0, np.pi), method="bounded", options={"xatol": 1e-9}
+    )
     if distance(best.x) >= length:
         return float(best.x)
     root = brentq(lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12)

@@ -204,7 +204,8 @@ def _swing(
         stands = np.repeat(stands, active.shape[1] // stands.shape[1], axis=1)
     else:
         absent = ~np.asarray(playback.present, bool)
-        stands = np.broadcast_to((stands | absent).all(axis=1)[:, None], active.shape)
+        every = np.all(stands | absent, axis=1, keepdims=True)
+        stands = np.broadcast_to(every, active.shape)
     swing, stance = active & ~stands, active & stands
     if not (residuals[swing].any() and residuals[stance].any()):
         return None, 1.0
