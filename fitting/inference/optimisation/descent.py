@@ -35,7 +35,7 @@ def _descend(
     lm = state.evaluated
     if lm is None or not np.array_equal(u, lm.u):
         lm = levenberg_marquardt.evaluate(model, u)
-    state = dataclasses.replace(state, point=_point(lm))
+    state = dataclasses.replace(state, point=point_of(lm))
     streaks = Streaks()
     for _ in range(max_steps):
         state = search.spend_step(state)
@@ -43,13 +43,13 @@ def _descend(
         streaks = streaks.after(before, lm, search.settings)
         finished = streaks.finished(search.settings, max_rejected)
         converged = stage == "polish" and finished
-        state = search.move(state, stage, _point(lm), converged=converged)
+        state = search.move(state, stage, point_of(lm), converged=converged)
         if finished:
             break
     return state
 
 
-def _point(lm: LMState) -> Point:
+def point_of(lm: LMState) -> Point:
     """Where a descent on the hard model stands."""
     cost = float(lm.cost)
     return Point(

@@ -27,7 +27,7 @@ from fitting.problem.problem import Problem
 from fitting.runtime.precision import for_other_thread, in_float64
 
 from . import levenberg_marquardt
-from .descent import descend, polish
+from .descent import descend, point_of, polish
 from .evolution import evolve
 from .models import HardModel, problem_jacobian
 from .population import evaluate
@@ -209,7 +209,8 @@ def _begin(
         evaluate(problem, np.asarray(present)[None])
     before = float(evaluated.result().cost)
     lm = levenberg_marquardt.evaluate(HardModel(problem, first), first)
-    return before if np.isfinite(before) else np.inf, dataclasses.replace(state, evaluated=lm)
+    before = before if np.isfinite(before) else np.inf
+    return before, dataclasses.replace(state, evaluated=lm, best=point_of(lm))
 
 
 def _jacobian(search: Search, best: Point) -> Float[np.ndarray, "residuals free"]:
