@@ -360,7 +360,7 @@ def test_one_start_alone_has_not_converged():
 
 
 def test_starts_that_disagree_have_not_converged():
-    """With one draw a start ends where it begins, and one in ten thousand agrees by chance."""
+    """Each stops after three steps from a draw of its own, so that no two costs are equal."""
     settings = SearchSettings(
         agreement=0.0, draws=2, descents=1, sweeps=0, max_steps=3, max_rounds=1
     )

@@ -69,14 +69,8 @@ def find_best_fit(
         raise ValueError(f"starts is {starts}, wanted at least 1")
     first = problem.space.start if first is None else first
     latest = SearchState.at(np.asarray(first), seed=seed)
-
-    def observe(state: SearchState) -> None:
-        nonlocal latest
-        latest = state
-        if progress is not None:
-            progress(state.history[-1])
-
-    search = Search(problem, settings, observe)
+    watch = _Watch(progress)
+    search = Search(problem, settings, watch)
     cost_before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
@@ -89,9 +83,9 @@ def find_best_fit(
                 latest, used_up = error.state, True
             ends.append(latest.point.cost)
     except KeyboardInterrupt:
+        latest, interrupted = watch.latest or latest, True
         if not np.isfinite(latest.best.cost):
             raise
-        interrupted = True
     agreeing = count_agreeing(ends, settings)
     end = _End(latest, len(ends), agreeing, agree(ends, settings), interrupted, used_up)
     return _solution(search, end, cost_before)
@@ -117,21 +111,15 @@ def refine(
         progress: called with every report.
     """
     latest = SearchState.at(np.asarray(u))
-
-    def observe(state: SearchState) -> None:
-        nonlocal latest
-        latest = state
-        if progress is not None:
-            progress(state.history[-1])
-
-    search = Search(problem, settings, observe)
+    watch = _Watch(progress)
+    search = Search(problem, settings, watch)
     used_up = interrupted = False
     try:
         latest = polish(search, latest)
     except StepsUsedUp as error:
         latest, used_up = error.state, True
     except KeyboardInterrupt:
-        interrupted = True
+        latest, interrupted = watch.latest or latest, True
     if not np.isfinite(latest.best.cost):
         return dataclasses.replace(solution, interrupted=interrupted)
     end = _End(latest, solution.starts, solution.agreeing, solution.agreed, interrupted, used_up)
@@ -220,6 +208,19 @@ def _jacobian(search: Search, best: Point) -> Float[np.ndarray, "residuals free"
     u = search.array(best.u)
     evaluated = levenberg_marquardt.evaluate(HardModel(search.problem, u), u)
     return problem_jacobian(evaluated.jacobian)
+
+
+@dataclasses.dataclass
+class _Watch:
+    """Reports the progress of a search, and keeps its latest state in case of an interrupt."""
+
+    progress: Callable[[Progress], None] | None
+    latest: SearchState | None = None
+
+    def __call__(self, state: SearchState) -> None:
+        self.latest = state
+        if self.progress is not None:
+            self.progress(state.history[-1])
 
 
 @dataclasses.dataclass(frozen=True)
