@@ -56,6 +56,8 @@ def calibrate(options: argparse.Namespace) -> int:
             options.output,
             replicates=options.replicates,
             chains=options.chains,
+            workers=options.workers,
+            scheduler=options.scheduler,
             progress=line,
             log=_print_now,
         )
