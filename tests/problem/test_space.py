@@ -15,7 +15,7 @@ from fitting.problem.free_parameters import free_parameter
 from fitting.problem.loss import Loss, rho
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
-from fitting.problem.space import CENTRE_LIMIT, Space, make_space
+from fitting.problem.space import CENTRE_LIMIT, OWN_CENTRE_LIMIT, Space, make_space
 from jaxik.maths import smoothing
 from support import toy
 
@@ -108,7 +108,7 @@ def test_a_centre_or_start_at_a_bound_is_moved_inside_where_u_is_finite():
 
 def test_a_present_value_outside_the_bounds_is_clipped():
     space = make("body.rise", low=0.1)
-    assert space.start[0] == space.prior.centre[0] == -CENTRE_LIMIT
+    assert (space.start[0], space.prior.centre[0]) == (-CENTRE_LIMIT, -OWN_CENTRE_LIMIT)
 
 
 def test_a_centre_or_start_outside_the_bounds_is_refused():
