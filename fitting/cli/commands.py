@@ -102,7 +102,10 @@ def compare(options: argparse.Namespace) -> int:
     _check_comparison(options)
     animation = _animation(options)
     requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
-    jobs.compare(requested, animation, options.output, during=progress.timed, log=print)
+    jobs.compare(
+        requested, animation, options.output,
+        rates=options.rates, during=progress.timed, log=print,
+    )  # fmt: skip
     return 0
 
 
@@ -245,6 +248,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 def _compare_in_suite(options: argparse.Namespace) -> int:
     """Runs systems, or else all presets, through made situations."""
     own = {"CLIP": None, "--terrain": None, "--file-up": "y", "--floor": 0.0, "--root": "auto"}
+    own["--rates"] = []
     for name, unused in own.items():
         given = getattr(options, name.strip("-").replace("-", "_").lower())
         if given != unused:
