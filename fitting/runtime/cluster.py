@@ -44,12 +44,8 @@ def connect(workers: int = 0, scheduler: str | None = None) -> "Iterator[Client 
             f"other processes need Dask ({error}); install it with: pip install 'jaxik[dask]'"
         ) from None
     if scheduler is None:
-        with (
-            LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=None
-            ) as cluster,
-            Client(cluster) as client,
-        ):
+        options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
+        with LocalCluster(n_workers=workers, **options) as local, Client(local) as client:
             yield _prepared(client)
         return
     try:
