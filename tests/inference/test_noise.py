@@ -241,27 +241,23 @@ def with_outliers(problem: Problem[jaxik.FootIK], seed: int) -> Problem[jaxik.Fo
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize(
-    ("rho", "factor", "loss", "options"),
-    [
-        (RHO, 1.0, "squares", BOTH),
-        (0.0, 0.5, "squares", NoiseOptions("estimated")),
-        (0.0, 2.0, "squares", NoiseOptions("estimated")),
-        (0.0, 1.0, "student", NoiseOptions("estimated")),
-    ],
+    ("rho", "loss", "options"),
+    [(RHO, "squares", BOTH), (0.0, "student", NoiseOptions("estimated"))],
 )
-def test_intervals_with_estimated_noise_cover_the_truth(rho, factor, loss, options):
-    """Of eight truths and six parameters; 41 of 48 or more have a probability of 99.8 %."""
+def test_intervals_with_estimated_noise_cover_the_truth(rho, loss, options):
+    """Of three truths and six parameters, assumed with twice their sigmas; 14 of 18 or more have
+    a probability of 99.8 %."""
     experiment = dataclasses.replace(load_experiment(OZZ), noise=options, loss=loss)
     problem = problems.make_problem(experiment)
-    assert problem.residual_function is residuals_of_scenes
     space, true = problem.space, noise_of(problem)
     made = with_noise(problem, dataclasses.replace(true, correlations=dict.fromkeys(KINDS, rho)))
     assumed = dataclasses.replace(
-        true, sigmas={kind: factor * sigma for kind, sigma in true.sigmas.items()}
+        true, sigmas={kind: 2 * sigma for kind, sigma in true.sigmas.items()}
     )
     covered = 0
-    for seed in range(8):
+    for seed in range(3):
         draw = np.random.default_rng(seed).normal(size=space.size)
         u = space.start + 0.5 * space.prior.sd * jnp.asarray(draw)
         captured = simulate(made, u, seed)
@@ -271,11 +267,11 @@ def test_intervals_with_estimated_noise_cover_the_truth(rho, factor, loss, optio
         found = noise_of(fitted)
         if loss == "squares":
             ratios = [found.sigmas[kind] / true.sigmas[kind] for kind in KINDS]
-            np.testing.assert_allclose(ratios, 1.0, atol=0.45 if rho else 0.1)
+            np.testing.assert_allclose(ratios, 1.0, atol=0.45)
             np.testing.assert_allclose(list(found.correlations.values()), rho, atol=0.05)
         else:
             assert found.tails < 10
         low, high = assess_identifiability(fitted, solution).interval.T
         values = np.asarray(space.values(u))
         covered += int(np.sum((low <= values) & (values <= high)))
-    assert covered >= 41
+    assert covered >= 14
