@@ -55,8 +55,12 @@ class AbstractFollowingPelvis(AbstractPelvis):
             smoothing.fraction_of_half_life(self.fall_half_life, now.dt),
         )
         fraction = now.progress(fraction)
-        height, velocity = smoothing.follow(
-            smoothing.Motion(state.height, state.velocity), goal, fraction, now.dt, self.spring
+        height, velocity = smoothing.follow_moving(
+            smoothing.Motion(state.height, state.velocity),
+            (jnp.where(now.started, state.goal, goal), goal),
+            fraction,
+            now.dt,
+            self.spring,
         )
         height = smoothing.lerp(state.height, height, now.awake)
         after = PelvisState.at(height, goal, sensed.up_ws)
