@@ -32,6 +32,9 @@ from .base import (
 class AbstractFollowingPelvis(AbstractPelvis):
     """Follows a goal, with one half-life up and one down, as an exponential or a spring.
 
+    The goal moves evenly from where it was in the frame before, so that the frame rate hardly
+    matters.
+
     A rule of this kind only has to say where to go: the three fields and `goal`.
     """
 
