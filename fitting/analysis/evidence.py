@@ -70,17 +70,21 @@ def _costs(problem: Problem[jaxik.FootIK], u: Array | np.ndarray) -> list[dict[s
     ik, fraction = problem.space.unpack(jnp.asarray(u)), float(problem.independent_fraction)
     return [
         {kind: fraction * np.asarray(cost) for kind, cost in costs.items()}
-        for costs in (_frame_costs(ik, scene, problem.loss) for scene in problem.data)
+        for costs in (
+            _frame_costs(ik, scene, problem.loss, problem.tails) for scene in problem.data
+        )
     ]
 
 
 @cached
-def _frame_costs(ik: jaxik.FootIK, scene: Scene, loss: Loss) -> dict[str, Array]:
+def _frame_costs(
+    ik: jaxik.FootIK, scene: Scene, loss: Loss, tails: Float[Array, ""]
+) -> dict[str, Array]:
     """The cost of every frame of a clip, (frames), by kind of residual."""
     result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
     frames, costs = len(scene.frames.dt), {}
     for kind, residuals in residuals_by_kind(scene, errors_by_kind(scene, result)).items():
-        squares = apply_loss(residuals.ravel(), loss).reshape(len(residuals), -1) ** 2
+        squares = apply_loss(residuals.ravel(), loss, tails).reshape(len(residuals), -1) ** 2
         missing = frames - len(residuals)  # an acceleration has no first and no last frame
         costs[kind] = jnp.pad(0.5 * squares.sum(axis=1), (missing // 2, missing - missing // 2))
     return costs

@@ -5,34 +5,35 @@ import math
 from fitting.inference.profiles.profile import Profile
 from fitting.problem.free_parameters import FreeParameter
 
-LIMITS = ("max_", "min_")
-AT_BOUNDS = {  # what goes beyond the values at which a limit does not act yet
-    "foot.max_pitch": "a slope steeper than {} that a foot points up",
-    "foot.min_pitch": "a slope steeper than {} that a foot points down",
-    "foot.max_roll": "a slope across a foot that is steeper than {}",
-    "foot.min_roll": "a slope across a foot that is steeper than {}, the other way",
-    "foot.max_angle": "a slope steeper than {}",
-    "pelvis.limit": "steps or drops that move the pelvis by more than {}",
-    "pelvis.max_length": "a leg stretched to more than {}, as on a step down",
-    "pelvis.min_length": "a leg shorter than {}, as in a crouch or on a high step",
-    "leg.max_knee_angle": "a leg stretched beyond a knee angle of {}, as on a step down",
-    "leg.min_knee_angle": "a knee bent beyond {}, as on a high step",
-    "lock.release_distance": "a locked foot that its animation carries away by more than {}",
-    "lock.max_speed": "feet near the ground at speeds around {}",
-    "probe.max_step_up": "steps up higher than {}",
-    "probe.max_step_down": "steps down deeper than {}",
-    "probe.max_slope": "ground steeper than {}",
+# What goes beyond a limit; in brackets by how much, where the clip shows to which value the limit
+# does not act yet. Angles of feet are against their shins, which lean as well as the ground.
+AT_LIMITS = {
+    "foot.max_pitch": "a foot turned toes up[ beyond {}] against its shin, as on a slope up",
+    "foot.min_pitch": "a foot turned toes down[ beyond {}] against its shin, as on a way down",
+    "foot.max_roll": "a foot turned outer edge up[ beyond {}], as on a slope across the way",
+    "foot.min_roll": "a foot turned outer edge down[ beyond {}], as on a slope across the way",
+    "foot.max_tilt": "ground[ steeper than {}] under a foot",
+    "pelvis.limit": "steps or slopes that move the pelvis up or down[ by more than {}]",
+    "pelvis.max_length": "a leg stretched[ beyond {}] from hip to ankle, as on a step down",
+    "pelvis.min_length": "a leg shortened[ below {}] from hip to ankle, as in a crouch",
+    "leg.max_knee_angle": "a leg stretched[ beyond a knee angle of {}], as at the end of a stride",
+    "leg.min_knee_angle": "a knee bent[ below {}], as on a high step or in a crouch",
+    "lock.release_distance": "a locked foot that its animation carries away[ by more than {}]",
+    "lock.max_speed": "a foot that comes down[ faster than {}]",
+    "probe.max_step_up": "steps up[ higher than {}]",
+    "probe.max_step_down": "steps down[ deeper than {}]",
+    "probe.max_slope": "slopes[ steeper than {}]",
 }
-WITHOUT_BOUND = {  # what must happen at all
-    "pelvis.off_gain": "a jump, or anything else without a foot on the ground",
-    "lock.lock_half_life": "feet that lock while they are not where they should stand",
-    "lock.unlock_half_life": "locked feet that are released away from their animation",
-    "target.rise_half_life": "steps up: ground that suddenly is higher",
-    "target.fall_half_life": "steps down: ground that suddenly is lower",
+EVENTS = {  # what must happen at all
+    "pelvis.off_gain": "a run: moments without a foot on the ground",
+    "lock.lock_half_life": "steps: feet that still move when they lock",
+    "lock.unlock_half_life": "steps: locked feet that are released away from their animation",
+    "target.rise_half_life": "steps or slopes up: ground that becomes higher",
+    "target.fall_half_life": "steps or slopes down: ground that becomes lower",
     "lean.forward_rate": "a slope along the way",
     "lean.side_rate": "a slope across the way",
-    "contact.planted_height": "feet that come down slowly, so that planting late shows",
-    "contact.raised_height": "feet that are lifted slowly, so that lifting late shows",
+    "contact.planted_height": "steps: feet that come down to the ground",
+    "contact.raised_height": "steps: feet that leave the ground",
 }
 
 
@@ -53,21 +54,24 @@ def describe_missing_motion(
     if profile.verdict == "several valleys":
         places = " or ".join(_with_unit(v.value, unit) for v in profile.valleys)
         return f"motion that differs between {places}; which one is not known"
-    if leaf in AT_BOUNDS:
-        # The limit acts once motion goes beyond it: what it is at least, motion has not passed.
-        upper = not leaf.rpartition(".")[2].startswith("min_")
-        beyond = low if upper else high
-        if profile.verdict == "flat":
-            beyond = parameter.low if upper else parameter.high
-        elif profile.verdict == "at most":
-            beyond = high
-        return AT_BOUNDS[leaf].format(_with_unit(beyond, unit))
-    if leaf in WITHOUT_BOUND:
-        return WITHOUT_BOUND[leaf]
+    if leaf in AT_LIMITS:
+        is_lowest = leaf.rpartition(".")[2].startswith("min_")
+        unpassed, unbounded = (high, "at most") if is_lowest else (low, "at least")
+        reached = profile.verdict == unbounded
+        return _filled(AT_LIMITS[leaf], _with_unit(abs(unpassed), unit) if reached else None)
+    if leaf in EVENTS:
+        return EVENTS[leaf]
     if active is not None:
         frames = f"it acts in {100 * active:.1f} % of the frames"
         return f"motion that reaches this limit ({frames}): {doc}"
     return f"not known; what it does: {doc}"
+
+
+def _filled(phrase: str, figure: str | None) -> str:
+    """The phrase with the figure in its brackets, or without them."""
+    before, _, rest = phrase.partition("[")
+    bound, _, after = rest.partition("]")
+    return before + ("" if figure is None else bound.format(figure)) + after
 
 
 def _with_unit(value: float, unit: str) -> str:

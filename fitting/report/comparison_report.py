@@ -19,10 +19,10 @@ TABLE, NUMBERS, FIGURE = "compare.md", "compare.json", "compare.png"
 
 RATES = (
     "How far joints are from where they are at the clip's own rate: rms over frames and legs, and "
-    "the largest distance. Labels and root are those of the clip; speeds are those between the "
-    "frames that are played. Pelvis and feet of `unreal` and the pelvis of `mec` follow by the "
-    "engine's interp-to, whose half-life depends on the frame rate, as in the originals: at a "
-    "speed of 15 it is 33 ms at 30 Hz and 40 ms at 60 Hz."
+    "the largest distance. Labels, strides, speeds and root stay those at the clip's own rate, as "
+    "a game keeps them with the animation. Pelvis and feet of `unreal` and the pelvis of `mec` "
+    "follow by the engine's interp-to, whose half-life depends on the frame rate, as in the "
+    "originals: at a speed of 15 it is 33 ms at 30 Hz and 40 ms at 60 Hz."
 )
 
 

@@ -78,10 +78,14 @@ class Animation:
     """Of the clip's root over that with which its feet step."""
     tracks: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Parameters that change along the clip, (frames, ...) by dotted name."""
+    given_frames: jaxik.Frame | None = None
+    """The clip as the pipeline's input, where that does not follow from the clip alone."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
         """The clip as the pipeline's input."""
+        if self.given_frames is not None:
+            return self.given_frames
         stride_scale = None if self.speed == 1.0 else self.speed
         frames = frames_from_clip(
             self.clip, floor=self.floor, rise=self.root.rise, stride_scale=stride_scale

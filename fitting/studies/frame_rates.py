@@ -1,21 +1,22 @@
 """How much the motion of a system depends on the frame rate at which it runs.
 
-An animation is played at other rates than its own, as games play it, and the motions are compared
-where their frames coincide or, for rates that are no divisor of the clip's, between its frames.
-What the animation says of itself, such as its contact labels, is made at its own rate, as a game
-keeps it with the asset; speeds are those between the frames that are played.
+Of an animation every second, third or so frame is played, as in a game that draws fewer frames, and
+the motion is compared with that of all frames where both have one. What the animation says of
+itself, its strides, contact labels and speeds, stays as it is at the animation's own rate: a game
+keeps it with the asset.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import jax
 import numpy as np
 
 import jaxik
 from fitting.datasets.clip_frames import positions_by_role
-from fitting.datasets.clips import Clip, edit
-from fitting.datasets.clips.flight import grounded_track
+from fitting.datasets.clips import Clip
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 
@@ -48,51 +49,57 @@ def measure(
     Args:
         systems: by name.
         animation: at the rate to which the others are compared.
-        rates: Hz, above 0 and not above the animation's.
+        rates: Hz, of which whole multiples are the animation's.
         during: makes a context for the runs of each system, from its name.
 
     Raises:
-        ValueError: for a rate outside that range, or a system that does not fit the animation.
+        ValueError: for another rate, or a system that does not fit the animation.
     """
-    own = animation.clip.fps
-    if wrong := [fps for fps in rates if not 0 < fps <= own]:
-        raise ValueError(
-            f"the rate {wrong[0]:g} Hz; wanted rates above 0 and up to the clip's, {own:g} Hz"
-        )
-    played = [at_rate(animation, fps) for fps in rates]
+    steps = [_step(animation.clip.fps, fps) for fps in rates]
     differences = []
     for name, ik in systems.items():
+        if not steps:
+            break
         with error_context(name), during(name):
             animation.check_shapes(ik)
             _, reference = animation.solve(ik)
-            for slower in played:
-                _, solved = slower.solve(ik)
-                differences.append(_difference(name, solved, edit.resample(reference, solved.fps)))
+            for step in steps:
+                _, solved = every_frame(animation, step).solve(ik)
+                differences.append(_difference(name, solved, reference, step))
     return differences
 
 
-def at_rate(animation: Animation, fps: float) -> Animation:
-    """The animation at another rate, with the labels and the root that it has at its own."""
-    clip = animation.clip
-    baked = replace(clip, stance=clip.stance_labels(), grounded=grounded_track(clip))
-    played = edit.resample(baked, fps)
-    frame = np.minimum(np.arange(played.frame_count) * (clip.fps / fps), clip.frame_count - 1)
-    nearest = np.round(frame).astype(int)
+def every_frame(animation: Animation, step: int) -> Animation:
+    """The animation of which only every so manyth frame is played."""
+    played, clip = slice(None, None, step), animation.clip
+    own = jax.tree.map(lambda leaf: leaf[played], animation.frames)
+    frames = dataclasses.replace(own, dt=own.dt * step)
+    if own.restart is not None:  # also where it was between the frames that are played
+        restarts = np.flatnonzero(np.asarray(animation.frames.restart))
+        at = np.isin(np.arange(len(own.dt)), -(-restarts // step))
+        frames = dataclasses.replace(frames, restart=jax.device_put(at))
     rise = animation.root.rise
-    if rise is not None:
-        rise = np.interp(frame, np.arange(clip.frame_count), rise)
-    return replace(
+    return dataclasses.replace(
         animation,
-        clip=played,
-        root=replace(animation.root, rise=rise),
-        tracks={name: values[nearest] for name, values in animation.tracks.items()},
+        clip=dataclasses.replace(clip.select(played), fps=clip.fps / step),
+        root=dataclasses.replace(animation.root, rise=None if rise is None else rise[played]),
+        tracks={name: values[played] for name, values in animation.tracks.items()},
+        given_frames=frames,
     )
 
 
-def _difference(system: str, solved: Clip, reference: Clip) -> RateDifference:
-    before, after = positions_by_role(reference), positions_by_role(solved)
+def _step(own: float, fps: float) -> int:
+    step = round(own / fps)
+    if step < 1 or abs(step * fps - own) > 1e-6 * own:
+        possible = ", ".join(f"{own / n:g}" for n in (1, 2, 3, 4))
+        raise ValueError(f"{fps:g} Hz; wanted a part of the clip's rate: {possible}, ... Hz")
+    return step
+
+
+def _difference(system: str, solved: Clip, reference: Clip, step: int) -> RateDifference:
+    after, before = positions_by_role(solved), positions_by_role(reference)
     distance = {
-        joint: np.linalg.norm(after[joint] - before[joint], axis=-1).ravel() for joint in JOINTS
+        joint: np.linalg.norm(after[joint] - before[joint][::step], axis=-1) for joint in JOINTS
     }
     return RateDifference(
         system,

@@ -1,0 +1,235 @@
+"""What is said to be missing in a clip: motion that shows it determines the parameter.
+
+Every phrase is checked on made motion of known systems: without what it asks for, the parameter is
+not bounded on both sides; with it, it is. All other parameters stay at their truth.
+"""
+
+import dataclasses
+import functools
+import re
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from fitting.analysis.evidence import find_evidence
+from fitting.analysis.missing_motion import AT_LIMITS, EVENTS, describe_missing_motion
+from fitting.datasets.clips import Clip
+from fitting.datasets.synthetic import actions, walker
+from fitting.datasets.synthetic.speed_profile import Slip
+from fitting.datasets.synthetic.walker import WalkStyle
+from fitting.experiments.problems import ClipData, make_scene
+from fitting.inference.profiles.profile import Profile, make_profile
+from fitting.problem.free_parameters import free_parameter, present_value
+from fitting.problem.loss import rho
+from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.scene import Scene
+from fitting.problem.simulation import _motion
+from fitting.problem.space import from_fractions, make_space
+from fitting.runtime.precision import in_float64, with_floats
+from jaxik import presets
+from jaxik.maths import parameter_tree
+from jaxik.stages.probe import FootProbe
+from jaxik.world import terrain
+
+pytestmark = pytest.mark.slow
+
+SECONDS, FPS = 3.0, 30.0
+FRAMES = round(SECONDS * FPS)
+SPACING, HALF_WIDTH, BEHIND, AHEAD = 0.05, 1.0, 1.5, 7.0  # m, of all grounds: one program
+POSITION, ROTATION = 0.002, 0.0087  # m and rad, sigmas
+SIGMAS = dict.fromkeys(("ankle", "knee", "pelvis"), POSITION)
+SIGMAS |= dict.fromkeys(("foot", "body"), ROTATION)
+PLACES = np.linspace(0.01, 0.99, 31)  # of a parameter's range, on its scale
+
+TRUTH = {  # limits that people reach
+    "record": {
+        "foot.max_pitch": 0.35, "foot.min_pitch": -0.4, "foot.max_roll": 0.15,
+        "foot.min_roll": -0.15, "pelvis.limit": 0.15, "leg.min_knee_angle": 1.45,
+        "lock.release_distance": 0.1, "lock.max_speed": 0.8,
+        "target.rise_half_life": 0.03, "target.fall_half_life": 0.03,
+        "probe.max_step_up": 0.35, "probe.max_step_down": 0.35, "probe.max_slope": 0.55,
+    },
+    "mec": {"pelvis.min_length": 0.6, "pelvis.max_length": 0.85, "foot.max_tilt": 0.2},
+}  # fmt: skip
+
+
+@functools.cache
+def clip_of(name: str) -> Clip:
+    """A walk, one whose feet slip, a body that stands, a jump or a crouch."""
+    style = WalkStyle(bend=0.0, knees=1.0)
+    walk = walker.walk(SECONDS, FPS, 0, (), style)
+    match name:
+        case "walks":
+            return walk
+        case "slips":
+            return walker.walk(SECONDS, FPS, 0, (Slip(0.2, 2.8, 0.25),), style)
+        case "stands":
+            return walk.select(np.full(FRAMES, 6))
+        case "jumps" | "runs" | "crouches":
+            action = {"jumps": actions.jump, "runs": actions.run, "crouches": actions.crouch}[name]
+            return action(SECONDS, FPS).select(slice(0, FRAMES))
+        case _:
+            raise ValueError(name)
+
+
+def ramp(degrees: float) -> Callable:
+    return lambda x, z: np.tan(np.radians(degrees)) * (np.clip(z, 0.7, 2.5) - 0.7)
+
+
+def across(degrees: float) -> Callable:
+    return lambda x, z: np.tan(np.radians(degrees)) * x + 0 * z
+
+
+def step(height: float) -> Callable:
+    return lambda x, z: height * (z > 1.5) + 0 * x
+
+
+def level(height: float) -> Callable:
+    return lambda x, z: height + 0 * x + 0 * z
+
+
+@functools.cache
+def ground_of(name: str) -> terrain.Terrain:
+    """The ground of a name such as `ramp 20`."""
+    shape, _, figure = name.partition(" ")
+    height = {"ramp": ramp, "across": across, "step": step, "level": level}[shape](float(figure))
+    x = np.arange(-HALF_WIDTH, HALF_WIDTH + SPACING / 2, SPACING)
+    z = np.arange(-BEHIND, AHEAD + SPACING / 2, SPACING)
+    heights = np.broadcast_to(height(x, z[:, None]), (len(z), len(x)))
+    return terrain.heightfield(heights, SPACING, origin=(-HALF_WIDTH, 0.0, -BEHIND))
+
+
+@in_float64
+def system_of(name: str) -> jaxik.FootIK:
+    """An original system, for the record with the limits of its probe."""
+    ik = presets.mec(faithful=True)
+    if name == "record":
+        ik = dataclasses.replace(presets.record(faithful=True), probe=FootProbe())
+    return with_floats(parameter_tree.replace(ik, TRUTH[name]), np.float64)
+
+
+@functools.cache
+@in_float64
+def scene_of(clip: str, ground: str) -> Scene:
+    """A clip on a ground, with itself as its reference."""
+    return make_scene(ClipData(clip_of(clip), clip_of(clip), ground_of(ground)), SIGMAS)
+
+
+@in_float64
+def motion(ik: jaxik.FootIK, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (frames, n, 3) and rotations (frames, n, 4) of pelvis, knees and ankles, sigmas."""
+    pelvis, knee_ws, ankle, _ = _motion(ik, scene)
+    positions = [pelvis.pos[:, None], knee_ws, ankle.pos]
+    rotations = np.concatenate([pelvis.rot[:, None], ankle.rot], axis=1)
+    return np.concatenate(positions, axis=1) / POSITION, rotations / (0.5 * ROTATION)
+
+
+def cost(motion: tuple[np.ndarray, ...], truth: tuple[np.ndarray, ...]) -> float:
+    """Half the squared distance; a small angle is twice that of its quaternions."""
+    (position, rotation), (true_position, true_rotation) = motion, truth
+    apart = [np.sum((rotation - sign * true_rotation) ** 2, axis=-1) for sign in (1, -1)]
+    return 0.5 * float(np.sum((position - true_position) ** 2) + np.minimum(*apart).sum())
+
+
+def profile_of(
+    system: str, name: str, clip: str, ground: str, cost: Callable[..., float] = cost
+) -> Profile:
+    """The profile of a parameter with all others at their truth, and without a prior."""
+    ik, scene = system_of(system), scene_of(clip, ground)
+    parameter, truth = free_parameter(ik, name), motion(ik, scene)
+    own = np.append(from_fractions(parameter, PLACES), present_value(ik, name))
+    moved = [with_floats(parameter_tree.replace(ik, {name: x}), np.float64) for x in own]
+    costs = np.array([cost(motion(each, scene), truth) for each in moved])
+    return make_profile(parameter, own[:, None], own, costs, np.zeros_like(costs))
+
+
+def words(system: str, name: str, profile: Profile) -> str:
+    """What the report says is missing."""
+    ik = system_of(system)
+    unit, doc = parameter_tree.declarations(ik)[name].unit, parameter_tree.docs(ik)[name]
+    return describe_missing_motion(free_parameter(ik, name), unit, doc, profile, 0.1)
+
+
+FLAT, CROSS = "step 0", "across 5"
+RECORD = {  # clip and ground without the motion, what is said, and with it
+    "foot.max_pitch": ("walks", FLAT, "a foot turned toes up against", "walks", "ramp 15"),
+    "foot.min_pitch": ("walks", "ramp -3", "toes down beyond 1.°", "walks", "ramp -25"),
+    "foot.max_roll": ("walks", CROSS, "outer edge up beyond [456]°", "walks", "across 12"),
+    "foot.min_roll": ("walks", CROSS, "outer edge down beyond [456]°", "walks", "across 12"),
+    "pelvis.limit": ("walks", "step 0.1", r"by more than 0.1\d* m", "walks", "step 0.25"),
+    "leg.max_knee_angle": ("crouches", FLAT, "end of a stride", "walks", FLAT),
+    "leg.min_knee_angle": ("walks", FLAT, "a knee bent", "walks", "step 0.3"),
+    "lock.release_distance": ("walks", FLAT, "by more than 0.0", "slips", FLAT),
+    "lock.max_speed": ("stands", FLAT, "a foot that comes down", "walks", FLAT),
+    "pelvis.off_gain": ("walks", "level -0.1", "a run", "runs", "level -0.1"),
+    "lock.lock_half_life": ("stands", FLAT, "still move", "walks", FLAT),
+    "lock.unlock_half_life": ("stands", FLAT, "released", "walks", FLAT),
+    "target.rise_half_life": ("walks", "step -0.1", "slopes up", "walks", "step 0.1"),
+    "target.fall_half_life": ("walks", "step 0.1", "slopes down", "walks", "step -0.1"),
+    "lean.forward_rate": ("walks", CROSS, "along the way", "walks", "ramp 5"),
+    "lean.side_rate": ("walks", "ramp 5", "across the way", "walks", CROSS),
+    "contact.planted_height": ("stands", FLAT, "come down", "walks", "step 0.1"),
+    "contact.raised_height": ("stands", FLAT, "leave the ground", "walks", "step 0.1"),
+    "probe.max_step_up": ("walks", "step 0.1", "steps up", "walks", "step 0.4"),
+    "probe.max_step_down": ("walks", "step -0.1", "steps down", "walks", "step -0.4"),
+    "probe.max_slope": ("walks", CROSS, "slopes", "walks", "across 35"),
+}
+MEC = {
+    "foot.max_tilt": ("walks", CROSS, "steeper than [567]°", "walks", "across 15"),
+    "pelvis.max_length": ("crouches", FLAT, "a leg stretched", "walks", "step -0.2"),
+    "pelvis.min_length": ("walks", FLAT, "a leg shortened", "crouches", FLAT),
+}
+CASES = {"record": RECORD, "mec": MEC}
+
+
+def test_every_phrase_is_checked():
+    assert {name for cases in CASES.values() for name in cases} == {*AT_LIMITS, *EVENTS}
+
+
+@pytest.mark.parametrize(
+    ("system", "name"), [(system, name) for system, cases in CASES.items() for name in cases]
+)
+def test_motion_that_is_said_to_be_missing_determines_the_parameter(system, name):
+    clip, ground, said, other_clip, other_ground = CASES[system][name]
+    profile = profile_of(system, name, clip, ground)
+    assert profile.verdict in ("flat", "at least", "at most")
+    assert re.search(said, words(system, name, profile))
+    found = profile_of(system, name, other_clip, other_ground)
+    assert found.verdict == "two-sided"
+    low, high = found.interval
+    assert low <= present_value(system_of(system), name) <= high
+
+
+def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
+    """A step up 1.5 m ahead; the rises are those of the loss, with the tails of the fit."""
+    clip, ground, tails = "walks", "step 0.25", 2.0
+
+    def student(motion: tuple[np.ndarray, ...], truth: tuple[np.ndarray, ...]) -> float:
+        return 0.5 * float(rho((motion[0] - truth[0]) ** 2, "student", tails, np).sum())
+
+    profile = profile_of("record", "pelvis.limit", clip, ground, student)
+    ik, scene = system_of("record"), scene_of(clip, ground)
+    with jax.enable_x64(True):
+        pelvis, knee_ws, ankle, _ = _motion(ik, scene)
+        exact = dataclasses.replace(scene.reference, pelvis=pelvis, knee_ws=knee_ws, ankle=ankle)
+        none = jnp.asarray(jnp.inf)
+        sigmas = dataclasses.replace(scene.sigmas, foot=none, body=none)
+        scene = dataclasses.replace(scene, reference=exact, sigmas=sigmas)
+        space = make_space(ik, [free_parameter(ik, "pelvis.limit")])
+        problem = Problem(space, (scene,), residuals_of_scenes, "student", tails=jnp.asarray(tails))
+    below, above = find_evidence(problem, np.asarray(space.pack({})), profile)
+    assert (below.side, above.side) == ("below", "above")
+    assert below.value < profile.interval[0] and above.value > profile.interval[1]
+    rises = dict(zip(profile.values, profile.data_rises, strict=True))
+    forward = np.asarray(pelvis.pos[:, 2])
+    for evidence in (below, above):
+        first = round(evidence.start * FPS)
+        assert forward[first : first + round(FPS)].max() > 1.5
+        assert evidence.kind in ("pelvis", "knee") and evidence.clip == 0
+        assert 0.3 < evidence.share <= 1.0
+        assert sum(evidence.rises) == pytest.approx(rises[evidence.value], rel=0.01)
