@@ -1,0 +1,238 @@
+"""The linear mixed model: quadratic likelihoods of several clips, tied by a population.
+
+Minus the log-likelihood of clip c is `½ u'A_c u - a_c'u`. A parameter of it is
+
+    u = centre                        where all clips share it
+    u = centre + spread z_g           where it varies: z_g is standard normal, one for each group
+
+which is the non-centred form: it has no singularity where the spread is 0 and all groups are alike.
+Given the spreads, centres and z are normal, and integrated out exactly. Centres have the prior of
+the parameters. Spreads have a half-normal prior with the standard deviation that the parameters'
+prior has: groups differ no more than the prior allows a parameter to vary. Its density is highest,
+and finite, at 0; with flat priors this is restricted maximum likelihood (REML).
+"""
+
+import dataclasses
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import linalg, optimize
+
+from .grouping import SHARED, Grouping
+
+GRID = 400  # spreads at which a density is computed
+WIDEST = 4.0  # scales of the half-normal prior, where the grid ends
+MAX_SWEEPS = 200  # over the spreads, each maximised for the others
+TOLERANCE = 1e-6  # of a spread, relative to its scale, that ends the sweeps
+BURN_IN = 50  # draws of the spreads that are dropped
+
+Spreads = Float[np.ndarray, " parameters"]
+
+
+class Estimate(NamedTuple):
+    """What the model says of centres and clips, given the spreads."""
+
+    centre: Float[np.ndarray, " parameters"]
+    clips: Float[np.ndarray, "clips parameters"]
+    centre_sd: Float[np.ndarray, " parameters"]
+    clip_sd: Float[np.ndarray, "clips parameters"]
+
+
+class Draws(NamedTuple):
+    """Draws of everything that is unknown, from its joint distribution."""
+
+    spread: Float[np.ndarray, "draws parameters"]
+    """0 where shared."""
+    centre: Float[np.ndarray, "draws parameters"]
+    clips: Float[np.ndarray, "draws clips parameters"]
+
+
+class _Conditional(NamedTuple):
+    """What the data say of the spread of one parameter, given the others: `log_density`."""
+
+    information: np.ndarray  # of the groups' deviations, along its eigenvectors
+    score: np.ndarray  # of them, at 0, squared
+    scale: float  # of the half-normal prior
+
+    def log_density(self, spread: np.ndarray) -> np.ndarray:
+        """Of spreads, up to a constant.
+
+        The integral of `exp(score'b - ½ b'S b)` over deviations b with variance `spread²` is a
+        product over the eigenvectors of S.
+        """
+        variance = np.square(spread)[..., None]
+        inflation = 1 + variance * self.information
+        gain = variance * self.score / inflation - np.log(inflation)
+        return 0.5 * gain.sum(axis=-1) - 0.5 * np.square(spread / self.scale)
+
+    def grid(self) -> np.ndarray:
+        """Spreads from 0 to the widest, densest at 0."""
+        return WIDEST * self.scale * np.linspace(0.0, 1.0, GRID + 1) ** 2
+
+    def most_probable(self) -> float:
+        """The spread with the highest density."""
+        grid = self.grid()
+        best = int(np.argmax(self.log_density(grid)))
+        bounds = grid[max(best - 1, 0)], grid[min(best + 1, GRID)]
+        found = optimize.minimize_scalar(
+            lambda spread: -float(self.log_density(np.asarray(spread))),
+            bounds=bounds,
+            method="bounded",
+            options={"xatol": 1e-9 * self.scale},
+        )
+        return 0.0 if self.log_density(np.zeros(())) >= -found.fun else float(found.x)
+
+    def draw(self, random: np.random.Generator) -> float:
+        """A draw from the density, taken as constant between points of the grid."""
+        grid = self.grid()
+        middle, width = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
+        density = self.log_density(middle)
+        weight = np.exp(density - density.max()) * width
+        cell = random.choice(GRID, p=weight / weight.sum())
+        return float(grid[cell] + width[cell] * random.random())
+
+
+@dataclasses.dataclass(frozen=True)
+class MixedModel:
+    """Clips with quadratic likelihoods, and the prior of what they share."""
+
+    grouping: Grouping
+    information: Float[np.ndarray, "clips parameters parameters"]
+    """A of each clip."""
+    vector: Float[np.ndarray, "clips parameters"]
+    """a of each clip: its information times where its likelihood is highest."""
+    prior_information: Float[np.ndarray, " parameters"]
+    """Of the centres."""
+    prior_vector: Float[np.ndarray, " parameters"]
+    """Likewise, times their prior means."""
+    spread_scale: Spreads
+    """Of the half-normal prior of the spreads."""
+
+    @cached_property
+    def most_probable_spreads(self) -> Spreads:
+        """The spreads of highest density, all else integrated out; 0 where shared."""
+        spreads = np.where(self.grouping.counts > 0, self.spread_scale, 0.0)
+        for _ in range(MAX_SWEEPS):
+            before = spreads.copy()
+            for k in self.grouping.varying:
+                spreads[k] = self._conditional(k, spreads).most_probable()
+            if np.all(np.abs(spreads - before) <= TOLERANCE * self.spread_scale):
+                break
+        return spreads
+
+    def log_volume(self, spreads: Spreads) -> float:
+        """Log of the integral over centres and z relative to its integrand at the mode.
+
+        Up to a constant, and with the prior of the spreads.
+        """
+        lower = linalg.cholesky(self._posterior(spreads)[0], lower=True)
+        prior = float(np.sum(np.square(spreads / self.spread_scale)))
+        return -float(np.sum(np.log(np.diag(lower)))) - 0.5 * prior
+
+    def log_marginal(self, spreads: Spreads) -> float:
+        """Log-probability of spreads, up to a constant, all else integrated out."""
+        precision, vector, _ = self._posterior(spreads)
+        at_mode = float(vector @ linalg.solve(precision, vector, assume_a="pos"))
+        return 0.5 * at_mode + self.log_volume(spreads)
+
+    def estimate(self, spreads: Spreads) -> Estimate:
+        """Means and standard deviations, given the spreads."""
+        precision, vector, scale = self._posterior(spreads)
+        covariance = linalg.inv(precision)
+        mean = covariance @ vector
+        to_clips = self._designs * scale
+        variance = np.einsum("cki,ij,ckj->ck", to_clips, covariance, to_clips)
+        centres = slice(0, self._size)
+        return Estimate(
+            centre=mean[centres],
+            clips=to_clips @ mean,
+            centre_sd=np.sqrt(np.diag(covariance)[centres]),
+            clip_sd=np.sqrt(variance),
+        )
+
+    def draw(self, random: np.random.Generator, count: int) -> Draws:
+        """Draws of spreads, centres and clips.
+
+        The spreads come from a Gibbs sampler in which all else is integrated out, so that they are
+        independent where only one parameter varies (Ritter and Tanner 1992).
+        """
+        spreads = self.most_probable_spreads.copy()
+        rows = []
+        for number in range(-BURN_IN if len(self.grouping.varying) > 1 else 0, count):
+            for k in self.grouping.varying:
+                spreads[k] = self._conditional(k, spreads).draw(random)
+            if number >= 0:
+                rows.append((spreads.copy(), *self._draw_given(spreads, random)))
+        return Draws(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+    def _draw_given(
+        self, spreads: Spreads, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A draw of centres and clips, given the spreads."""
+        precision, vector, scale = self._posterior(spreads)
+        lower = linalg.cholesky(precision, lower=True)
+        white = linalg.solve_triangular(lower, vector, lower=True) + random.normal(size=len(vector))
+        drawn = linalg.solve_triangular(lower, white, lower=True, trans=1)
+        return drawn[: self._size], (self._designs * scale) @ drawn
+
+    def _posterior(self, spreads: Spreads) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Precision and information vector of centres and z, and the scale of each column."""
+        scale = np.concatenate([np.ones(self._size), spreads[self._owners]])
+        information, vector = self._joint
+        precision = scale[:, None] * information * scale
+        precision[np.diag_indices_from(precision)] += self._prior_precision
+        shifted = scale * vector
+        shifted[: self._size] += self.prior_vector
+        return precision, shifted, scale
+
+    def _conditional(self, k: int, spreads: Spreads) -> _Conditional:
+        """What the data say of one spread, all deviations of others integrated out."""
+        own = np.concatenate([np.zeros(self._size, bool), self._owners == k])
+        as_deviations = np.where(np.arange(self._size) == k, 1.0, spreads)
+        precision, vector, _ = self._posterior(as_deviations)
+        within = precision[np.ix_(own, own)] - np.eye(int(own.sum()))
+        across = precision[np.ix_(~own, own)]
+        rest = linalg.cho_factor(precision[np.ix_(~own, ~own)])
+        eliminated = linalg.cho_solve(rest, np.column_stack([across, vector[~own]]))
+        schur = within - across.T @ eliminated[:, :-1]
+        score = vector[own] - across.T @ eliminated[:, -1]
+        information, directions = np.linalg.eigh(schur)
+        return _Conditional(
+            np.maximum(information, 0.0), np.square(directions.T @ score), self.spread_scale[k]
+        )
+
+    @property
+    def _size(self) -> int:
+        """Number of parameters."""
+        return self.grouping.group.shape[1]
+
+    @cached_property
+    def _owners(self) -> np.ndarray:
+        """The parameter that each z belongs to."""
+        return np.repeat(np.arange(self._size), self.grouping.counts)
+
+    @cached_property
+    def _prior_precision(self) -> np.ndarray:
+        """Of the centres, and of the z."""
+        return np.concatenate([self.prior_information, np.ones(len(self._owners))])
+
+    @cached_property
+    def _designs(self) -> Float[np.ndarray, "clips parameters columns"]:
+        """How each clip's parameters are made of the centres and of deviations."""
+        clips, size = self.grouping.group.shape
+        first = size + np.concatenate([[0], np.cumsum(self.grouping.counts)[:-1]])
+        designs = np.zeros((clips, size, size + len(self._owners)))
+        designs[:, np.arange(size), np.arange(size)] = 1.0
+        for clip, row in enumerate(self.grouping.group):
+            for k in np.flatnonzero(row != SHARED):
+                designs[clip, k, first[k] + row[k]] = 1.0
+        return designs
+
+    @cached_property
+    def _joint(self) -> tuple[np.ndarray, np.ndarray]:
+        """Information matrix and vector of centres and deviations, over all clips."""
+        designs = self._designs
+        information = np.einsum("cki,ckl,clj->ij", designs, self.information, designs)
+        return information, np.einsum("cki,ck->i", designs, self.vector)
