@@ -26,6 +26,7 @@ GRID = 400  # spreads at which a density is computed
 WIDEST = 4.0  # scales of the half-normal prior, where the grid ends
 MAX_SWEEPS = 200  # over the spreads, each maximised for the others
 TOLERANCE = 1e-6  # of a spread, relative to its scale, that ends the sweeps
+BLOCK = 200  # draws computed at once
 BURN_IN = 50  # draws of the spreads that are dropped
 
 Spreads = Float[np.ndarray, " parameters"]
@@ -84,14 +85,14 @@ class _Conditional(NamedTuple):
         )
         return 0.0 if self.log_density(np.zeros(())) >= -found.fun else float(found.x)
 
-    def draw(self, random: np.random.Generator) -> float:
-        """A draw from the density, taken as constant between points of the grid."""
+    def draw(self, random: np.random.Generator, count: int) -> np.ndarray:
+        """Draws from the density, taken as constant between points of the grid."""
         grid = self.grid()
         middle, width = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
         density = self.log_density(middle)
         weight = np.exp(density - density.max()) * width
-        cell = random.choice(GRID, p=weight / weight.sum())
-        return float(grid[cell] + width[cell] * random.random())
+        cells = random.choice(GRID, size=count, p=weight / weight.sum())
+        return grid[cells] + width[cells] * random.random(count)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,29 +154,45 @@ class MixedModel:
         )
 
     def draw(self, random: np.random.Generator, count: int) -> Draws:
-        """Draws of spreads, centres and clips.
+        """Draws of spreads, centres and clips."""
+        spreads = self._draw_spreads(random, count)
+        blocks = [
+            self._draw_given(part, random) for part in np.array_split(spreads, count // 200 + 1)
+        ]
+        centres, clips = (np.concatenate(column) for column in zip(*blocks, strict=True))
+        return Draws(spreads, centres, clips)
 
-        The spreads come from a Gibbs sampler in which all else is integrated out, so that they are
-        independent where only one parameter varies (Ritter and Tanner 1992).
+    def _draw_spreads(self, random: np.random.Generator, count: int) -> np.ndarray:
+        """Draws of the spreads by a Gibbs sampler in which all else is integrated out.
+
+        Each is drawn from its density on a grid (Ritter and Tanner 1992); where only one parameter
+        varies, that is its distribution, and the draws are independent.
         """
-        spreads = self.most_probable_spreads.copy()
-        rows = []
-        for number in range(-BURN_IN if len(self.grouping.varying) > 1 else 0, count):
-            for k in self.grouping.varying:
-                spreads[k] = self._conditional(k, spreads).draw(random)
-            if number >= 0:
-                rows.append((spreads.copy(), *self._draw_given(spreads, random)))
-        return Draws(*(np.stack(column) for column in zip(*rows, strict=True)))
+        varying = self.grouping.varying
+        spreads = np.zeros((count, self._size))
+        if len(varying) == 1:
+            conditional = self._conditional(varying[0], spreads[0])
+            spreads[:, varying[0]] = conditional.draw(random, count)
+        elif varying:
+            present = self.most_probable_spreads.copy()
+            for number in range(-BURN_IN, count):
+                for k in varying:
+                    present[k] = self._conditional(k, present).draw(random, 1)[0]
+                spreads[max(number, 0)] = present
+        return spreads
 
     def _draw_given(
-        self, spreads: Spreads, random: np.random.Generator
+        self, spreads: Float[np.ndarray, "draws parameters"], random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A draw of centres and clips, given the spreads."""
-        precision, vector, scale = self._posterior(spreads)
-        lower = linalg.cholesky(precision, lower=True)
-        white = linalg.solve_triangular(lower, vector, lower=True) + random.normal(size=len(vector))
-        drawn = linalg.solve_triangular(lower, white, lower=True, trans=1)
-        return drawn[: self._size], (self._designs * scale) @ drawn
+        """A draw of centres and clips for each draw of the spreads."""
+        each = [self._posterior(row) for row in spreads]
+        precision, vector, scale = (np.stack(part) for part in zip(*each, strict=True))
+        lower = np.linalg.cholesky(precision)
+        mean = np.linalg.solve(precision, vector[..., None])
+        white = random.normal(size=mean.shape)
+        drawn = (mean + np.linalg.solve(lower.transpose(0, 2, 1), white))[..., 0]
+        clips = np.einsum("cki,di->dck", self._designs, scale * drawn)
+        return drawn[:, : self._size], clips
 
     def _posterior(self, spreads: Spreads) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Precision and information vector of centres and z, and the scale of each column."""
