@@ -1,15 +1,20 @@
 """The table [hierarchy] and `leg_length` in files: what is read, written and refused."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.datasets.clips import load_clip
+from fitting.datasets.clips import load_clip, save_clip
 from fitting.experiments import parameter_files
 from fitting.experiments.experiment_files import experiment_to_toml, load_experiment
 from fitting.experiments.hierarchies import Hierarchy
-from fitting.experiments.problems import make_problem
+from fitting.experiments.problems import load_clip_data, make_problem
 from fitting.experiments.systems import Preset
+from fitting.jobs import animations
+from fitting.studies import ablation
+from fitting.studies.animations import AnimationFiles
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world import body
@@ -106,3 +111,36 @@ def test_a_parameter_file_with_a_leg_length_follows_the_body_that_it_is_read_for
     path.write_text('preset = "ozz"\nleg_length = 0.0\n')
     with pytest.raises(ValueError, match="leg_length is 0.0; wanted a finite number above 0"):
         parameter_files.load_system(path)
+
+
+def test_a_run_is_applied_to_the_body_of_the_animation(tmp_path, monkeypatch):
+    ik = parameter_tree.replace(presets.ozz(), {"target.foot_height": 0.1})
+    (tmp_path / "parameters.toml").write_text(
+        parameter_files.system_to_toml(ik, Preset("ozz"), 0.84)
+    )
+    save_clip(tmp_path / "giant.npz", scaled(load_clip(BASE), 2.0))
+    applied = []
+    monkeypatch.setattr(animations.run_folder, "load_fit", lambda run: None)
+    monkeypatch.setattr(animations, "solve", lambda ik, *_, **__: applied.append(ik))
+    files = AnimationFiles(tmp_path / "giant.npz", tmp_path / "unused.ply")
+    animations.apply(tmp_path, files)
+    ratio = body.leg_length(files.flat_clip.rig) / 0.84
+    height = float(parameter_tree.get(applied[0], "target.foot_height"))
+    assert height == pytest.approx(0.1 * ratio) and ratio > 1.9
+
+
+def test_an_ablation_measures_each_clip_with_its_body(tmp_path, monkeypatch):
+    experiment = load(tmp_path, "scale_with_body = true", None)
+    experiment = replace(experiment, free={})
+    clip = load_clip_data(experiment.clips[0], None)
+    giant = clip._replace(base=scaled(clip.base, 2.0))
+    rays = []
+
+    def errors(ik, data, frames):
+        rays.append(float(parameter_tree.get(ik, "probe.ray_up")))
+
+    monkeypatch.setattr(ablation, "_errors", errors)
+    monkeypatch.setattr(ablation, "summarise", lambda errors: None)
+    measured = [(clip, slice(None)), (giant, slice(None))]
+    ablation._fit(experiment, ablation.Split("", [], measured), None)
+    assert rays[1] == pytest.approx(2.0 * rays[0], rel=1e-4)
