@@ -292,10 +292,11 @@ def test_tables_have_each_clip_pooled_and_the_population(fitted):
     table = population_tables.parameter_table(fitted)
     assert [row[1] for row in table[1:7]] == [
         "uneven_walk from 0 s (ann)", "uneven_walk from 1 s (ann)", "uneven_walk from 2 s (ben)",
-        "pooled", "population", "spread",
+        "pooled", "population", "spread, of u",
     ]  # fmt: skip
     assert table[1][0] == "`pelvis.on_gain`, 1/tick, per clip" and table[7][1] == "95 % of clips"
     assert table[8][0] == "`foot.max_pitch`, rad, shared" and len(table) == 13
+    assert table[8][3] == "" != table[12][3]
     errors = population_tables.error_table(fitted)
     assert len(errors) == 5 and errors[-1][0] == "all"
     squares = [row.alone**2 for row in fitted.errors]

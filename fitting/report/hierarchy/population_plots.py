@@ -38,7 +38,7 @@ def overview(population: Population, title: str) -> Figure:
     grid[0, 0].set_ylim(len(labels) - 0.4, -0.6)
     legend(
         figure,
-        Line2D([], [], marker="o", color=BEFORE, label="by itself, 95 %"),
+        Line2D([], [], marker="o", color=BEFORE, label="fitted alone, 95 %"),
         Line2D([], [], marker="o", color=AFTER, label="in the population, 95 %"),
         Line2D([], [], color=PRIOR, label="centre of the population"),
         Patch(color=PRIOR, alpha=0.15, label="95 % of clips or subjects"),
@@ -53,7 +53,7 @@ def overview(population: Population, title: str) -> Figure:
 
 
 def _estimates(axes: Axes, row: ParameterEstimates) -> None:
-    """One parameter: each clip by itself and in the population."""
+    """One parameter: each clip alone and in the population."""
     assert row["range"] is not None  # of a parameter that varies
     axes.axvspan(*row["range"], color=PRIOR, alpha=0.15, linewidth=0)
     axes.axvline(row["centre"]["value"], color=PRIOR)

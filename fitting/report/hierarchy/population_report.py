@@ -39,8 +39,8 @@ def write(folder: Path, population: Population) -> None:
         *_remarks(population),
         "## Parameters",
         markdown(parameter_table(population)),
-        "Intervals are those of 95 %. *By itself* is a fit of this clip alone, and *pooled* one of "
-        "all clips with the same values. In the population, what clips or subjects differ in is "
+        "Intervals are those of 95 %. *Fitted alone* is a fit of this clip, and *pooled* one of all "
+        "clips with the same values. In the population, what clips or subjects differ in is "
         "normal in `u`, the coordinate of the prior, around the centre; the spread is its standard "
         "deviation. What a clip leaves open comes from the others.",
         f"![Clips and their population]({FIGURE})",

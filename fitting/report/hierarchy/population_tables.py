@@ -17,16 +17,20 @@ CM = 100.0  # in a metre
 
 
 def parameter_table(population: Population) -> Table:
-    """For each parameter a row per clip, one for all pooled, and one or two for the population."""
-    table = [["parameter", "", "by itself", "in the population"]]
+    """For each parameter a row per clip, one for all pooled, and one to three for the population.
+
+    What clips share has its value in the population's row only.
+    """
+    table = [["parameter", "", "fitted alone", "in the population"]]
     for row in population.parameters:
+        varies = row["spread"] is not None
         lines = [
-            [clip_label(population, c), shown(alone), shown(within)]
+            [clip_label(population, c), shown(alone), shown(within) if varies else ""]
             for c, (alone, within) in enumerate(zip(row["alone"], row["clips"], strict=True))
         ]
         lines += [["pooled", shown(row["pooled"]), ""], ["population", "", shown(row["centre"])]]
         if row["spread"] is not None and row["range"] is not None:
-            lines.append(["spread", "", shown(row["spread"])])
+            lines.append(["spread, of u", "", shown(row["spread"])])
             lines.append([f"95 % of {row['level']}s", "", interval(*row["range"])])
         heading = f"`{row['name']}`, {_unit(row)}{_level(row)}"
         table += [[heading, *lines[0]], *(["", *line] for line in lines[1:])]
