@@ -39,10 +39,10 @@ def write(folder: Path, population: Population) -> None:
         *_remarks(population),
         "## Parameters",
         markdown(parameter_table(population)),
-        "Intervals are those of 95 %. *Fitted alone* is a fit of this clip, and *pooled* one of all "
-        "clips with the same values. In the population, what clips or subjects differ in is "
-        "normal in `u`, the coordinate of the prior, around the centre; the spread is its standard "
-        "deviation. What a clip leaves open comes from the others.",
+        "Intervals are those of 95 %. *Fitted alone* is a fit of one clip, and *pooled* one of all "
+        "clips with the same values. In the population, what varies is normal around the centre, "
+        "in `u`, the coordinate of the prior; the spread is its standard deviation there. What a "
+        "clip leaves open comes from the others.",
         f"![Clips and their population]({FIGURE})",
         "## Errors",
         markdown(error_table(population)),
