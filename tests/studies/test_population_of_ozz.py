@@ -1,100 +1,123 @@
-"""Populations and bodies through the pipeline: short clips of `ozz` with known parameters."""
+"""Populations and bodies through the pipeline: short clips of `ozz` with known parameters.
 
-import dataclasses
+All clips have one shape, and so one program.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxik
 from fitting.datasets.clips import edit, load_clip, save_clip
-from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
-from fitting.inference.optimisation.search import find_best_fit
+from fitting.inference.hierarchy.grouping import Grouping
+from fitting.inference.hierarchy.population_fit import fit_population
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
-from fitting.studies.hierarchy.population import fit_clips_and_population
+from fitting.studies.hierarchy.estimates import summarise
+from fitting.studies.hierarchy.left_out import error_at, predict
 from support.bodies import scaled
 from support.experiments import ROOT
+
+pytestmark = pytest.mark.slow
 
 BASE = ROOT / "data" / "clips" / "stop_and_go_base.npz"
 TERRAIN = ROOT / "data" / "terrains" / "stop_and_go.ply"
 SIZE = 1.3
-SIGMAS = "[sigmas]\nankle = 0.002\nknee = 0.002\npelvis = 0.002\nfoot = 0.0087\n"
+STARTS = (1.0, 4.0, 8.0)  # s, of clips of half a second
+TRUTH = {"target.foot_height": 0.10, "root.half_life": 0.12, "leg.soften": 0.95}
+HEADER = """
+preset = "ozz"
+body = "adult"
+[free]
+target.foot_height = {}
+root.half_life = {}
+leg.soften = {}
+[sigmas]
+ankle = 0.002
+knee = 0.002
+pelvis = 0.002
+foot = 0.0087
+[hierarchy]
+scale_with_body = true
+"""
 
 
-def clip_table(base: Path, cut: str = "", subject: str = "") -> str:
-    files = f'reference = "{base}"\nbase = "{base}"\nterrain = "{TERRAIN}"\nroot = "animation"\n'
-    return f'[[clips]]\n{files}{cut}subject = "{subject}"\n'
+@pytest.fixture(scope="module")
+def problems(tmp_path_factory) -> list[Problem[jaxik.FootIK]]:
+    """Problems of one clip each: three of one body, and the first again of a larger one."""
+    folder, walk = tmp_path_factory.mktemp("ozz"), load_clip(BASE)
+    clips = [edit.trim(walk, start, start + 0.5) for start in STARTS]
+    clips.append(scaled(clips[0], SIZE, froude=True))
+    tables = []
+    for number, clip in enumerate(clips):
+        path: Path = folder / f"{number}.npz"
+        save_clip(path, clip)
+        files = f'reference = "{path}"\nbase = "{path}"\nterrain = "{TERRAIN}"\n'
+        tables.append(f'[[clips]]\n{files}root = "animation"\n')
+    (folder / "ozz.toml").write_text(HEADER + "".join(tables))
+    with jax.enable_x64(True):
+        problem = make_problem(load_experiment(folder / "ozz.toml"))
+    return [eqx.tree_at(lambda p: p.data, problem, (scene,)) for scene in problem.data]
 
 
-def load(folder: Path, clips: str, free: str, hierarchy: str) -> Experiment:
-    top = 'preset = "ozz"\nbody = "adult"\n'
-    path = folder / "ozz.toml"
-    path.write_text(f"{top}{clips}[free]\n{free}\n{SIGMAS}[hierarchy]\n{hierarchy}")
-    return load_experiment(path)
+def made(problem: Problem, values: Mapping[str, float], seed: int) -> Problem:
+    """The problem with motion that these values make, plus noise."""
+    return simulate(problem, jnp.asarray(problem.space.pack(values)), seed)
 
 
-@pytest.mark.slow
-def test_a_fit_across_two_bodies_needs_their_sizes(tmp_path):
-    walk = edit.trim(load_clip(BASE), 1.0, 2.0)
-    for name, size in (("one", 1.0), ("other", SIZE)):
-        save_clip(tmp_path / f"{name}.npz", scaled(walk, size, froude=True))
-    clips = clip_table(tmp_path / "one.npz") + clip_table(tmp_path / "other.npz")
-    free = "target.foot_height = {}\nroot.half_life = {}\n"
-    experiment = load(tmp_path, clips, free, "scale_with_body = true\n")
-    problem = make_problem(experiment)
-    sizes = [float(scene.size) for scene in problem.data]  # type: ignore[arg-type]
+def test_a_fit_across_two_bodies_needs_their_sizes(problems):
+    both = [made(problems[c], TRUTH, c) for c in (0, 3)]
+    sizes = [float(problem.data[0].size) for problem in both]
     assert sizes[1] / sizes[0] == pytest.approx(SIZE)
-    truth = {"target.foot_height": 0.10, "root.half_life": 0.12}
-    u = problem.space.pack(truth)
-    simulated = simulate(problem, u)
-    unsized = eqx.tree_at(
-        lambda p: p.data, simulated,
-        tuple(dataclasses.replace(scene, size=None) for scene in simulated.data),
-    )  # fmt: skip
-    with_sizes, without = (find_best_fit(p, starts=1) for p in (simulated, unsized))
-    expected = np.array(list(truth.values()))
-    np.testing.assert_allclose(with_sizes.values, expected, rtol=0.02)
-    assert (np.abs(without.values / expected - 1) > 0.04).all()
+    unsized = [eqx.tree_at(lambda p: p.data[0].size, problem, jnp.ones(())) for problem in both]
+    space = problems[0].space
+    start = np.tile(np.asarray(space.start), (2, 1))
+    grouping = Grouping.pooled(2, space.size)
+    with_sizes, without = (fit_population(p, grouping, [start]) for p in (both, unsized))
+    fitted, other = (np.asarray(space.values(fit.centre)) for fit in (with_sizes, without))
+    expected = np.array(list(TRUTH.values()))
+    np.testing.assert_allclose(fitted, expected, rtol=0.03)
+    assert with_sizes.converged and np.abs(other / expected - 1).max() > 0.1
     assert without.cost > 2 * with_sizes.cost
 
 
-@pytest.mark.slow
-def test_the_population_of_short_clips_is_recovered(tmp_path):
-    """One body that stands differently in each clip; all else is the same."""
-    clips = "".join(
-        clip_table(BASE, f"start = {start}\nend = {start + 0.5}\n", f"walk at {start}")
-        for start in (1.0, 4.0, 8.0)
-    )
-    free = "target.foot_height = {}\nleg.soften = {}\n"
-    experiment = load(tmp_path, clips, free, 'per_clip = ["target.foot_height"]\n')
+def test_the_population_of_short_clips_is_recovered(problems):
+    """One body whose ankles stand at another height in each clip; all else is the same."""
     heights = (0.07, 0.085, 0.10)
-    made = make_problem(experiment)
-    simulated = [
-        _of_clip(made, c, {"target.foot_height": height, "leg.soften": 0.95})
-        for c, height in enumerate(heights)
+    clips = [
+        made(problem, TRUTH | {"target.foot_height": height}, c)
+        for c, (problem, height) in enumerate(zip(problems[:3], heights, strict=True))
     ]
-    problem = eqx.tree_at(lambda p: p.data, made, tuple(s.data[0] for s in simulated))
-    fitted = fit_clips_and_population(experiment, problem)
-    height, soften = fitted.parameters
-    for estimate, truth in zip(height["clips"], heights, strict=True):
-        low, high = estimate["interval"]  # type: ignore[misc]
-        assert low - 0.001 < truth < high + 0.001
-    low, high = height["centre"]["interval"]  # type: ignore[misc]
+    space = clips[0].space
+    grouping = Grouping.of_labels([["a", "b", "c"], None, None])
+    starts = [np.tile(np.asarray(space.start), (3, 1))]
+    fit = fit_population(clips, grouping, starts)
+    assert fit.converged
+    levels = ("clip", "shared", "shared")
+    rows = summarise(clips, fit.clips, fit.centre, fit, levels)
+    for estimate, truth in zip(rows[0]["clips"], heights, strict=True):
+        assert estimate["value"] == pytest.approx(truth, abs=0.002)
+    low, high = rows[0]["centre"]["interval"]  # type: ignore[misc]
     assert low < 0.085 < high
-    assert height["spread"]["interval"][0] > 0  # type: ignore[index]
-    assert soften["centre"]["value"] == pytest.approx(0.95, abs=0.02)
-    for row in fitted.errors:
-        assert row.alone < 0.005 and row.population < 0.005
-        assert row.left_out_population > 1.5 * row.alone
-    assert fitted.fit.converged
+    assert rows[0]["spread"]["interval"][0] > 0  # type: ignore[index]
+    assert rows[2]["centre"]["value"] == pytest.approx(0.95, abs=0.02)
+    own = error_at(clips[0], fit.clips[0])
+    expected = predict(clips, grouping, fit, fit.centre, 0, lambda rounds, cost: None)
+    assert own < 0.004 < error_at(clips[0], expected)
 
 
-def _of_clip(problem: Problem[jaxik.FootIK], clip: int, truth: dict[str, float]):
-    """The problem of one clip, with motion that these values make."""
-    single = eqx.tree_at(lambda p: p.data, problem, (problem.data[clip],))
-    return simulate(single, jnp.asarray(single.space.pack(truth)), seed=clip)
+def test_clips_that_are_alike_have_a_spread_near_0(problems):
+    clips = [made(problem, TRUTH, 10 + c) for c, problem in enumerate(problems[:3])]
+    grouping = Grouping.of_labels([["a", "b", "c"], None, None])
+    starts = [np.tile(np.asarray(clips[0].space.start), (3, 1))]
+    fit = fit_population(clips, grouping, starts)
+    heights = [float(np.asarray(clips[0].space.values(u))[0]) for u in fit.clips]
+    assert fit.converged and fit.spread[0] < 0.05
+    np.testing.assert_allclose(heights, TRUTH["target.foot_height"], atol=0.002)
