@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 from fitting.inference.hierarchy.grouping import Grouping
-from fitting.inference.hierarchy.mixed_model import MixedModel
-from fitting.studies.hierarchy.estimates import shortest_interval
+from fitting.inference.hierarchy.mixed_model import MixedModel, SpreadDensity
 
 FLAT = 1e-9  # information of a prior that says nothing
 WIDE = 1e4  # scale of a prior of spreads that says nothing
@@ -171,7 +170,7 @@ def test_intervals_cover_the_truths_of_many_populations():
         draws = measured(values, 0.25, scale=1.0, prior=1.0).draw(random, 300)
         low, high = np.quantile(draws.centre[:, 0], [0.025, 0.975])
         hits[0] += low <= centre <= high
-        low, high = shortest_interval(draws.spread[:, 0])
+        low, high = draws.spread_density[0].interval()
         hits[1] += low <= spread <= high
         low, high = np.quantile(draws.clips, [0.025, 0.975], axis=0)
         clip_hits += ((low <= truth) & (truth <= high)).ravel().tolist()
@@ -180,12 +179,32 @@ def test_intervals_cover_the_truths_of_many_populations():
     assert 0.92 <= np.mean(clip_hits) <= 0.98
 
 
-def test_the_shortest_interval_begins_at_0_where_the_density_is_highest_there():
-    random = np.random.default_rng(5)
-    low, high = shortest_interval(abs(random.normal(size=20_000)))
-    assert low == 0.0 and high == pytest.approx(1.96, abs=0.06)
-    low, high = shortest_interval(random.normal(5.0, 1.0, 20_000))
-    assert low == pytest.approx(3.04, abs=0.15) and high == pytest.approx(6.96, abs=0.15)
+def test_the_shortest_interval_begins_at_0_where_the_density_is_high_there():
+    edges = np.linspace(0.0, 12.0, 2401)
+
+    def interval(centre: float) -> tuple[float, float]:
+        probability = np.diff(stats.norm(centre).cdf(edges))
+        return SpreadDensity(edges, probability / probability.sum()).interval()
+
+    assert interval(0.0) == pytest.approx((0.0, 1.96), abs=0.01)
+    assert interval(0.5)[0] == 0.0
+    assert interval(6.0) == pytest.approx((6 - 1.96, 6 + 1.96), abs=0.02)
+
+
+def test_densities_of_spreads_that_depend_on_each_other_are_their_marginals():
+    model = correlated(3)
+    grid = np.linspace(0.02, 6.0, 60)
+    joint = np.array(
+        [[model.log_marginal(np.array([0, one, other])) for other in grid] for one in grid]
+    )
+    joint = np.exp(joint - joint.max())
+    draws = model.draw(np.random.default_rng(0), 600)
+    for k, axis in ((1, 1), (2, 0)):
+        marginal = joint.sum(axis=axis) / joint.sum()
+        edges, probability = draws.spread_density[k]
+        found = np.interp([0.5, 1.0, 2.0], edges[1:], np.cumsum(probability))
+        exact = np.interp([0.5, 1.0, 2.0], grid + 0.05, np.cumsum(marginal))
+        np.testing.assert_allclose(found, exact, atol=0.03)
 
 
 def test_groups_are_those_of_equal_labels():

@@ -21,7 +21,7 @@ from fitting.inference.hierarchy.population_fit import fit_population
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
 from fitting.studies.hierarchy.estimates import summarise
-from fitting.studies.hierarchy.left_out import error_at, predict
+from fitting.studies.hierarchy.left_out import predict
 from support.bodies import scaled
 from support.experiments import ROOT
 
@@ -31,13 +31,14 @@ BASE = ROOT / "data" / "clips" / "stop_and_go_base.npz"
 TERRAIN = ROOT / "data" / "terrains" / "stop_and_go.ply"
 SIZE = 1.3
 STARTS = (1.0, 4.0, 8.0)  # s, of clips of half a second
-TRUTH = {"target.foot_height": 0.10, "root.half_life": 0.12, "leg.soften": 0.95}
+TRUTH = {"target.foot_height": 0.10, "pelvis.on_gain": 0.2, "leg.soften": 0.95}
 HEADER = """
 preset = "ozz"
+faithful = true
 body = "adult"
 [free]
 target.foot_height = {}
-root.half_life = {}
+pelvis.on_gain = {}
 leg.soften = {}
 [sigmas]
 ankle = 0.002
@@ -51,10 +52,10 @@ scale_with_body = true
 
 @pytest.fixture(scope="module")
 def problems(tmp_path_factory) -> list[Problem[jaxik.FootIK]]:
-    """Problems of one clip each: three of one body, and the first again of a larger one."""
+    """Problems of one clip each: three of one body, and the second again of a larger one."""
     folder, walk = tmp_path_factory.mktemp("ozz"), load_clip(BASE)
     clips = [edit.trim(walk, start, start + 0.5) for start in STARTS]
-    clips.append(scaled(clips[0], SIZE, froude=True))
+    clips.append(scaled(clips[1], SIZE, froude=True))
     tables = []
     for number, clip in enumerate(clips):
         path: Path = folder / f"{number}.npz"
@@ -73,7 +74,7 @@ def made(problem: Problem, values: Mapping[str, float], seed: int) -> Problem:
 
 
 def test_a_fit_across_two_bodies_needs_their_sizes(problems):
-    both = [made(problems[c], TRUTH, c) for c in (0, 3)]
+    both = [made(problems[c], TRUTH, c) for c in (1, 3)]
     sizes = [float(problem.data[0].size) for problem in both]
     assert sizes[1] / sizes[0] == pytest.approx(SIZE)
     unsized = [eqx.tree_at(lambda p: p.data[0].size, problem, jnp.ones(())) for problem in both]
@@ -108,9 +109,8 @@ def test_the_population_of_short_clips_is_recovered(problems):
     assert low < 0.085 < high
     assert rows[0]["spread"]["interval"][0] > 0  # type: ignore[index]
     assert rows[2]["centre"]["value"] == pytest.approx(0.95, abs=0.02)
-    own = error_at(clips[0], fit.clips[0])
     expected = predict(clips, grouping, fit, fit.centre, 0, lambda rounds, cost: None)
-    assert own < 0.004 < error_at(clips[0], expected)
+    assert expected[0] > fit.clips[0, 0] + 0.1, "the others' ankles are higher"
 
 
 def test_clips_that_are_alike_have_a_spread_near_0(problems):

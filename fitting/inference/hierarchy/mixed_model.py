@@ -22,7 +22,7 @@ from scipy import linalg, optimize
 
 from .grouping import SHARED, Grouping
 
-GRID = 400  # spreads at which a density is computed
+GRID = np.linspace(0.0, 1.0, 401) ** 2  # of the widest spread: where a density is computed
 WIDEST = 4.0  # scales of the half-normal prior, where the grid ends
 MAX_SWEEPS = 200  # over the spreads, each maximised for the others
 TOLERANCE = 1e-6  # of a spread, relative to its scale, that ends the sweeps
@@ -41,11 +41,34 @@ class Estimate(NamedTuple):
     clip_sd: Float[np.ndarray, "clips parameters"]
 
 
+class SpreadDensity(NamedTuple):
+    """The distribution of a spread, all else integrated out."""
+
+    edges: Float[np.ndarray, " edges"]
+    """Of cells, from 0 up."""
+    probability: Float[np.ndarray, " cells"]
+
+    def draw(self, random: np.random.Generator, count: int) -> np.ndarray:
+        """Independent draws, uniform in each cell."""
+        cells = random.choice(len(self.probability), size=count, p=self.probability)
+        return self.edges[cells] + np.diff(self.edges)[cells] * random.random(count)
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """The shortest interval with this probability; from 0 where the density is high there."""
+        density = self.probability / np.diff(self.edges)
+        order = np.argsort(-density, kind="stable")
+        enough = int(np.searchsorted(np.cumsum(self.probability[order]), level))
+        cells = order[: enough + 1]
+        return float(self.edges[cells.min()]), float(self.edges[cells.max() + 1])
+
+
 class Draws(NamedTuple):
     """Draws of everything that is unknown, from its joint distribution."""
 
     spread: Float[np.ndarray, "draws parameters"]
     """0 where shared."""
+    spread_density: dict[int, SpreadDensity]
+    """Of each parameter that varies: the mean of its conditional ones."""
     centre: Float[np.ndarray, "draws parameters"]
     clips: Float[np.ndarray, "draws clips parameters"]
 
@@ -69,14 +92,14 @@ class _Conditional(NamedTuple):
         return 0.5 * gain.sum(axis=-1) - 0.5 * np.square(spread / self.scale)
 
     def grid(self) -> np.ndarray:
-        """Spreads from 0 to the widest, densest at 0."""
-        return WIDEST * self.scale * np.linspace(0.0, 1.0, GRID + 1) ** 2
+        """Spreads from 0 to the widest, closest to each other at 0."""
+        return WIDEST * self.scale * GRID
 
     def most_probable(self) -> float:
         """The spread with the highest density."""
         grid = self.grid()
         best = int(np.argmax(self.log_density(grid)))
-        bounds = grid[max(best - 1, 0)], grid[min(best + 1, GRID)]
+        bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
         found = optimize.minimize_scalar(
             lambda spread: -float(self.log_density(np.asarray(spread))),
             bounds=bounds,
@@ -85,14 +108,12 @@ class _Conditional(NamedTuple):
         )
         return 0.0 if self.log_density(np.zeros(())) >= -found.fun else float(found.x)
 
-    def draw(self, random: np.random.Generator, count: int) -> np.ndarray:
-        """Draws from the density, taken as constant between points of the grid."""
+    def density(self) -> SpreadDensity:
+        """The distribution on the grid; in each cell, the density is that of its middle."""
         grid = self.grid()
-        middle, width = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
-        density = self.log_density(middle)
-        weight = np.exp(density - density.max()) * width
-        cells = random.choice(GRID, size=count, p=weight / weight.sum())
-        return grid[cells] + width[cells] * random.random(count)
+        density = self.log_density(0.5 * (grid[1:] + grid[:-1]))
+        weight = np.exp(density - density.max()) * np.diff(grid)
+        return SpreadDensity(grid, weight / weight.sum())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,31 +176,41 @@ class MixedModel:
 
     def draw(self, random: np.random.Generator, count: int) -> Draws:
         """Draws of spreads, centres and clips."""
-        spreads = self._draw_spreads(random, count)
-        blocks = [
-            self._draw_given(part, random) for part in np.array_split(spreads, count // 200 + 1)
-        ]
+        spreads, densities = self._draw_spreads(random, count)
+        parts = np.array_split(spreads, count // BLOCK + 1)
+        blocks = [self._draw_given(part, random) for part in parts]
         centres, clips = (np.concatenate(column) for column in zip(*blocks, strict=True))
-        return Draws(spreads, centres, clips)
+        return Draws(spreads, densities, centres, clips)
 
-    def _draw_spreads(self, random: np.random.Generator, count: int) -> np.ndarray:
+    def _draw_spreads(
+        self, random: np.random.Generator, count: int
+    ) -> tuple[np.ndarray, dict[int, SpreadDensity]]:
         """Draws of the spreads by a Gibbs sampler in which all else is integrated out.
 
         Each is drawn from its density on a grid (Ritter and Tanner 1992); where only one parameter
         varies, that is its distribution, and the draws are independent.
         """
-        varying = self.grouping.varying
-        spreads = np.zeros((count, self._size))
+        varying, spreads = self.grouping.varying, np.zeros((count, self._size))
         if len(varying) == 1:
-            conditional = self._conditional(varying[0], spreads[0])
-            spreads[:, varying[0]] = conditional.draw(random, count)
-        elif varying:
-            present = self.most_probable_spreads.copy()
-            for number in range(-BURN_IN, count):
-                for k in varying:
-                    present[k] = self._conditional(k, present).draw(random, 1)[0]
-                spreads[max(number, 0)] = present
-        return spreads
+            density = self._conditional(varying[0], spreads[0]).density()
+            spreads[:, varying[0]] = density.draw(random, count)
+            return spreads, {varying[0]: density}
+        present, rounds = self.most_probable_spreads.copy(), []
+        for number in range(-BURN_IN, count):
+            densities = {}
+            for k in varying:
+                densities[k] = self._conditional(k, present).density()
+                present[k] = densities[k].draw(random, 1)[0]
+            if number >= 0:
+                spreads[number] = present
+                rounds.append(densities)
+        means = {
+            k: SpreadDensity(
+                rounds[0][k].edges, np.mean([each[k].probability for each in rounds], axis=0)
+            )
+            for k in varying
+        }
+        return spreads, means
 
     def _draw_given(
         self, spreads: Float[np.ndarray, "draws parameters"], random: np.random.Generator

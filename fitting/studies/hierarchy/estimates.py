@@ -102,24 +102,9 @@ def summarise(
     return rows
 
 
-def shortest_interval(
-    draws: Float[np.ndarray, " draws"], probability: float = 0.95
-) -> tuple[float, float]:
-    """The shortest interval with this share of the draws of a spread; from 0 if it may be that.
-
-    It begins at 0 where it contains the smallest of the draws: the density is highest there.
-    """
-    ordered = np.sort(draws)
-    inside = int(np.ceil(probability * len(ordered)))
-    widths = ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]
-    first = int(np.argmin(widths))
-    low = 0.0 if first == 0 else float(ordered[first])
-    return low, float(ordered[first + inside - 1])
-
-
 def _spread(fit: PopulationFit, draws: Draws, k: int) -> Estimate:
-    own = draws.spread[:, np.flatnonzero(fit.smooth).tolist().index(k)]
-    return {"value": float(fit.spread[k]), "interval": list(shortest_interval(own))}
+    density = draws.spread_density[np.flatnonzero(fit.smooth).tolist().index(k)]
+    return {"value": float(fit.spread[k]), "interval": list(density.interval())}
 
 
 def _laplace(
