@@ -56,6 +56,8 @@ class Population:
     """Whom each shows; the clip's own name where the experiment does not say."""
     alone: tuple[Found, ...]
     pooled: Found
+    others: tuple[Found, ...]
+    """All clips but each, pooled."""
     fit: PopulationFit
     parameters: list[ParameterEstimates]
     errors: list[ClipErrors]
@@ -68,7 +70,7 @@ class Population:
     @property
     def unconverged(self) -> list[str]:
         """What has not converged, in a sentence each."""
-        searches = (*self.alone, self.pooled)
+        searches = (*self.alone, self.pooled, *self.others)
         lines = [f"{one['name']}: {one['message']}" for one in searches if not one["converged"]]
         if not self.fit.converged:
             lines.append(f"population: not converged after {self.fit.rounds} rounds")
@@ -156,11 +158,11 @@ def fit_clips_and_population(
     rounds = _Rounds(progress)
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
     fit = fit_population(problems, grouping, starts, rounds.of("population"))
-    errors = []
+    errors, others = [], []
     for c, name in enumerate(clips):
         rest = f"{EVERYTHING} but {name}"
-        _, others = searches.fit(rest, without_clip(pooled_problem, c))
-        others_u = np.array(others["u"])
+        others.append(searches.fit(rest, without_clip(pooled_problem, c))[1])
+        others_u = np.array(others[c]["u"])
         expected = predict(problems, grouping, fit, others_u, c, rounds.of(f"{rest}, population"))
         points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
         errors.append(ClipErrors(name, *(error_at(problems[c], u) for u in points)))
@@ -172,6 +174,7 @@ def fit_clips_and_population(
         subjects=subjects,
         alone=tuple(alone),
         pooled=pooled,
+        others=tuple(others),
         fit=fit,
         parameters=summarise(problems, alone_u, pooled_u, fit, levels),
         errors=errors,
