@@ -22,6 +22,7 @@ from .jobs import ablate as ablate
 from .jobs import calibrate as calibrate
 from .jobs import compare as compare
 from .jobs import fit as fit
+from .jobs import population as population
 from .jobs import sample as sample
 from .jobs import translate as translate
 from .runtime.xla import configure_xla as configure_xla

@@ -12,7 +12,7 @@ from fitting.inference.profiles.profile import Profile
 from fitting.problem.loss import Loss, apply_loss
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
-from fitting.problem.scene import Scene
+from fitting.problem.scene import Scene, run_system
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 
@@ -81,7 +81,7 @@ def _frame_costs(
     ik: jaxik.FootIK, scene: Scene, loss: Loss, tails: Float[Array, ""]
 ) -> dict[str, Array]:
     """The cost of every frame of a clip, (frames), by kind of residual."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
+    result = run_system(ik, scene)
     frames, costs = len(scene.frames.dt), {}
     for kind, residuals in residuals_by_kind(scene, errors_by_kind(scene, result)).items():
         squares = apply_loss(residuals.ravel(), loss, tails).reshape(len(residuals), -1) ** 2

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 import jaxik
 from fitting.inference.optimisation import population
 from fitting.problem.problem import Problem
-from fitting.problem.scene import Scene
+from fitting.problem.scene import Scene, own_system
 from fitting.runtime import program_cache
 from jaxik.maths import parameter_tree
 
@@ -78,7 +78,8 @@ def active_limits(ik: jaxik.FootIK, scene: Scene, result: jaxik.Result) -> dict[
     limit does in this frame counts. Limits are the smooth parameters named `limit`, `max_…` or
     `min_…`.
     """
-    first, states = jaxik.init(ik, scene.rig), stage_outputs(result).advanced.state
+    first = jaxik.init(own_system(ik, scene), scene.rig)
+    states = stage_outputs(result).advanced.state
     before = jax.tree.map(
         lambda start, rest: jnp.concatenate([start[None], rest[:-1]]), first, states
     )
@@ -148,9 +149,10 @@ def _decisions(result: jaxik.Result) -> Bool[np.ndarray, " decisions"]:
 @program_cache.cached
 def _step_each(ik: jaxik.FootIK, scene: Scene, before: jaxik.State) -> tuple[Array, ...]:
     """Body and legs of every frame, each stepped from its own state."""
+    own = own_system(ik, scene)
 
     def step(state: jaxik.State, frame: jaxik.Frame, values: dict[str, Array]) -> tuple[Array, ...]:
-        at = parameter_tree.replace(ik, values) if values else ik
+        at = parameter_tree.replace(own, values) if values else own
         result = jaxik.step(at, scene.rig, scene.terrain, state, frame)[1]
         ankle, body = result.pose.ankle, result.body
         return body.pos, body.rot, ankle.pos, ankle.rot, result.pose.knee.pos

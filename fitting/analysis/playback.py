@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxik
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
-from fitting.problem.scene import Scene, legs_ws, pelvis_ws
+from fitting.problem.scene import Scene, legs_ws, own_system, pelvis_ws
 from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64, with_floats
 from jaxik.maths import vec
@@ -124,7 +124,7 @@ class Playback(eqx.Module):
 @in_float64
 def run(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
     """The result of a system on the scene's clip, in the scene's precision."""
-    ik = with_floats(ik, scene.frames.dt.dtype)
+    ik = own_system(with_floats(ik, scene.frames.dt.dtype), scene)
     tracks = scene.tracks or None
     return program_cache.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks)
 

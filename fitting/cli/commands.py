@@ -64,6 +64,14 @@ def calibrate(options: argparse.Namespace) -> int:
     return 0 if assessment.inside else OUTSIDE
 
 
+def population(options: argparse.Namespace) -> int:
+    """Fits several clips and subjects as a population."""
+    _prepare_jax()
+    with progress.ProgressLine(progress.fit_line) as line:
+        fitted = jobs.population(options.experiment, options.output, progress=line, log=_print_now)
+    return 0 if fitted.converged else NOT_CONVERGED
+
+
 def sample(options: argparse.Namespace) -> int:
     """Samples the posterior of a run, or continues its chain."""
     _prepare_jax()
@@ -232,6 +240,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "fit": fit,
     "ablate": ablate,
     "calibrate": calibrate,
+    "population": population,
     "sample": sample,
     "apply": apply,
     "run": run,

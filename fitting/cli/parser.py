@@ -4,13 +4,21 @@ import argparse
 
 from .parsers.animations import add_apply, add_compare, add_run
 from .parsers.files import add_inspect, add_record, add_terrain
-from .parsers.fits import add_ablate, add_calibrate, add_fit, add_sample, add_translate
+from .parsers.fits import (
+    add_ablate,
+    add_calibrate,
+    add_fit,
+    add_population,
+    add_sample,
+    add_translate,
+)
 from .parsers.machine import add_bench, add_cache
 
 EXAMPLES = """examples:
   jaxik fit data/experiments/uneven_walk.toml -o runs/walk     fit, with plots and a summary
   jaxik ablate data/experiments/blocks.toml -o runs/ablation   the fit without each of its rules
   jaxik calibrate data/experiments/ozz.toml -o runs/known      fits of known truths, judged
+  jaxik population walks.toml -o runs/walks                    several subjects, and their spread
   jaxik sample runs/walk                                       its posterior; again to continue
   jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
   jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --preset record
@@ -23,11 +31,11 @@ EXAMPLES = """examples:
   jaxik bench --quick
   jaxik cache                                                  where compiled programs are kept
 
-exit status: 0 when done, 2 for a mistake in the input (one line says which), 3 when the search of
-`fit` or `translate` has not converged, 4 when `fit` has converged but does not fit, 5 when
+exit status: 0 when done, 2 for a mistake in the input, 3 when the search of `fit`, `population` or
+`translate` has not converged, 4 when `fit` has converged but does not fit, 5 when
 `calibrate` finds something outside its bounds, 130 when interrupted with Ctrl-C: `fit` then has
-written the best point so far, `sample` its chain, `ablate` and `calibrate` each finished fit, and
-`compare --suite` each finished situation.
+written the best point so far, `sample` its chain, `ablate`, `calibrate` and `population` each
+finished fit, and `compare --suite` each finished situation.
 `jaxik COMMAND --help` has more examples.
 """
 
@@ -42,8 +50,8 @@ def make_parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
-        add_fit, add_ablate, add_calibrate, add_sample, add_apply, add_run, add_compare,
-        add_translate, add_inspect, add_terrain, add_bench, add_record, add_cache,
+        add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply, add_run,
+        add_compare, add_translate, add_inspect, add_terrain, add_bench, add_record, add_cache,
     ):  # fmt: skip
         add(commands)
     return top

@@ -14,8 +14,10 @@ from fitting.problem.loss import Loss
 from fitting.problem.prior import Priors
 from fitting.problem.space import Space, make_space
 from fitting.runtime import validation
+from jaxik.world import body
 
 from .ablations import Ablation
+from .hierarchies import Hierarchy
 from .systems import DEFAULT_PRESET, Preset, with_parameters, with_rules
 
 DEFAULT_SIGMAS = {  # what a good fit of captured motion leaves
@@ -55,6 +57,8 @@ class ClipEntry:
     """Where the base's root is put: one of `ground_path.ROOTS`."""
     tracks: Path | None = None
     """What changes along the base; see `track_files`."""
+    subject: str | None = None
+    """Whom it shows."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,8 @@ class Experiment:
     sample: SamplerSettings = SamplerSettings()
     without: tuple[Ablation, ...] = ()
     """What `jaxik ablate` leaves out in turn."""
+    hierarchy: Hierarchy = Hierarchy()
+    """What the clips have in common."""
 
     def __post_init__(self) -> None:
         if self.noise.sigmas == "estimated" and self.loss not in ("squares", "student"):
@@ -131,6 +137,26 @@ class Experiment:
         """The preset with the experiment's rules and fixed parameters; `rig` as above."""
         ik = self.preset_system(rig)
         return with_parameters(ik, self.parameters, f"{self.path} [parameters]")
+
+    def leg_length(self, rig: jaxik.Rig) -> float | None:
+        """Leg length, m, of the body that the numbers are for; None if they fit any body as is.
+
+        Args:
+            rig: of the first clip.
+        """
+        if not self.hierarchy.scale_with_body:
+            return None
+        return body.leg_length(rig) if self.body == "clip" else body.LEG
+
+    def size(self, rig: jaxik.Rig, first: jaxik.Rig) -> float | None:
+        """Leg length of a body over that of the body that the numbers are for; None as above.
+
+        Args:
+            rig: of the body.
+            first: of the first clip.
+        """
+        leg_length = self.leg_length(first)
+        return None if leg_length is None else body.leg_length(rig) / leg_length
 
     def placed_clips(self) -> tuple[ClipEntry, ...]:
         """The clips, with the root as animated where the system is told to place it itself."""

@@ -45,13 +45,14 @@ from fitting.runtime.validation import Constraint, Content, Table, check_table, 
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
+from .hierarchies import hierarchy_to_table, read_hierarchy
 from .prior_tables import priors_to_table, read_priors, read_start
 from .systems import BODY, DEFAULT_PRESET, preset_system, read_free_table, with_rules
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
 FILE_KEYS = ("reference", "terrain", "base", "truth", "tracks")
 CLIP_KEYS: dict[str, Constraint] = {
-    **dict.fromkeys((*FILE_KEYS, "label"), validation.TEXT),
+    **dict.fromkeys((*FILE_KEYS, "label", "subject"), validation.TEXT),
     **dict.fromkeys(("start", "end"), validation.SECONDS),
     "file_up": validation.one_of(("y", "z")),
     "mask_pops": validation.BOOLEAN,
@@ -109,6 +110,7 @@ TOP_KEYS: dict[str, Constraint] = {
     "seed": validation.SEED,
     "independent_every": validation.SECONDS,
     **dict.fromkeys(TABLES, validation.TABLE),
+    "hierarchy": validation.TABLE,
     "clips": validation.list_of("[[clips]], one for each clip"),
     "without": validation.list_of("[[without]], one for each variant"),
 }
@@ -141,8 +143,11 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
     known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
+    clips = tuple(_clip_entry(entry, path) for entry in content["clips"])
+    subjects, hierarchy = [clip.subject for clip in clips], content.get("hierarchy", {})
     tables = {
-        "clips": tuple(_clip_entry(entry, path) for entry in content["clips"]),
+        "clips": clips,
+        "hierarchy": read_hierarchy(hierarchy, free, subjects, f"{path} [hierarchy]"),
         "free": free,
         "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
         "start": read_start(content.get("start", {}), known, f"{path} [start]"),
@@ -206,6 +211,7 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     content = dataclasses.asdict(experiment)
     content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
     content["prior"] = priors_to_table(experiment.prior)
+    content["hierarchy"] = hierarchy_to_table(experiment.hierarchy)
     for name in ("free", "start", "parameters"):
         content[name] = nest(content[name])
     each = {name: content["sigmas"].pop(name) for name in CORRELATIONS if name in content["sigmas"]}

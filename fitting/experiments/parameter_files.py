@@ -3,6 +3,8 @@
 preset = "record"
 faithful = true             # the original, where the preset differs from it
 body = "clip"               # for what is left out: the rig of the clip, or "adult"
+leg_length = 0.84           # m, of the body that all numbers are for, those left out too; with it,
+                            # they change with the legs of the clip as for a similar body
 [rules]                     # where they differ from the preset's
 pelvis = "SupportPelvis"
 [pelvis]                    # names and units as the rules declare them
@@ -16,6 +18,7 @@ import tomli_w
 
 import jaxik
 from fitting.runtime.validation import (
+    FINITE_POSITIVE,
     TABLE,
     check_keys,
     check_table,
@@ -25,6 +28,8 @@ from fitting.runtime.validation import (
     read_toml,
 )
 from jaxik.maths import parameter_tree
+from jaxik.world import body
+from jaxik.world.similarity import similar
 
 from .systems import (
     BODY,
@@ -36,13 +41,24 @@ from .systems import (
     with_rules,
 )
 
+TOP_KEYS = {"rules": TABLE, "body": BODY, "leg_length": FINITE_POSITIVE}
 
-def system_to_toml(ik: jaxik.FootIK, preset: Preset = DEFAULT_PRESET) -> str:
-    """All rules, parameters, conventions, switches and options of a system, as TOML."""
+
+def system_to_toml(
+    ik: jaxik.FootIK, preset: Preset = DEFAULT_PRESET, leg_length: float | None = None
+) -> str:
+    """All rules, parameters, conventions, switches and options of a system, as TOML.
+
+    Args:
+        ik: the system.
+        preset: of which it differs.
+        leg_length: m, of the body that its numbers are for; None if they fit any body as they are.
+    """
     values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
     values |= parameter_tree.options(ik)
     rules = changed_rules(ik, preset.system())
-    return tomli_w.dumps(preset.keys() | ({"rules": rules} if rules else {}) | nest(values))
+    keys = preset.keys() | ({} if leg_length is None else {"leg_length": leg_length})
+    return tomli_w.dumps(keys | ({"rules": rules} if rules else {}) | nest(values))
 
 
 def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.FootIK, Preset]:
@@ -52,7 +68,9 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
 
     Args:
         path: the file.
-        rig: whose body the preset is for, unless the file says otherwise; None is the adult.
+        rig: whose body the preset is for, unless the file says otherwise; None is the adult. If the
+            file has a leg length, the system is made similar for this body, or with None left as it
+            is.
 
     Raises:
         ValueError: the file does not exist or is not TOML; a preset, stage, rule or parameter is
@@ -61,11 +79,15 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
     path = Path(path)
     content = read_toml(path, "a parameter")
     preset = Preset(content.pop("preset", DEFAULT_PRESET.name), content.pop("faithful", False))
-    rules, body = content.pop("rules", {}), content.pop("body", "clip")
-    check_table({"rules": rules, "body": body}, {"rules": TABLE, "body": BODY}, str(path))
-    rig = rig if body == "clip" else None
+    top = {key: content.pop(key) for key in TOP_KEYS if key in content}
+    check_table(top, TOP_KEYS, str(path))
+    rules, leg_length = top.get("rules", {}), top.get("leg_length")
+    own = None if top.get("body") == "adult" or leg_length is not None else rig
     with error_context(path):
-        ik = preset.system(rig)
-    ik = with_rules(ik, rules, f"{path} [rules]", rig)
+        ik = preset.system(own)
+    ik = with_rules(ik, rules, f"{path} [rules]", own)
     check_keys(content, list(vars(ik)), str(path))
-    return with_parameters(ik, flatten(content, 2), str(path)), preset
+    ik = with_parameters(ik, flatten(content, 2), str(path))
+    if leg_length is not None and rig is not None:
+        ik = similar(ik, body.leg_length(rig) / leg_length)
+    return ik, preset

@@ -4,6 +4,7 @@ A clip's reference, flat animation and terrain are cut and resampled alike, so t
 they belong together.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -91,6 +92,8 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     for entry, clip in zip(experiment.clips, data, strict=True):
         clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
         scene = make_scene(clip, experiment.sigmas, entry.label)
+        if (size := experiment.size(scene.rig, rig)) is not None:
+            scene = dataclasses.replace(scene, size=jax.device_put(np.float64(size)))
         with error_context(f"{experiment.path} [parameters]"):
             parameter_tree.check_shapes(ik, len(scene.rig.side))
         scenes.append(scene)

@@ -9,7 +9,8 @@ Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. T
 bits; a system that was made in 32 bits is taken with the values it has there.
 
 `fits` searches: `fit`, `sample`, `ablate` and `translate`. `calibrations` judges what they say:
-`calibrate`. `animations` runs finished systems: `solve`, `apply`, `compare` and `run_suite`.
+`calibrate`. `populations` fits several clips and subjects: `population`. `animations` runs finished
+systems: `solve`, `apply`, `compare` and `run_suite`.
 """
 
 from .animations import apply as apply
@@ -22,3 +23,4 @@ from .fits import fit as fit
 from .fits import sample as sample
 from .fits import translate as translate
 from .output import Log as Log
+from .populations import population as population

@@ -118,7 +118,7 @@ def apply(
         ValueError: as `solve`, or the folder holds no finished fit.
     """
     run_folder.load_fit(Path(run))
-    ik, _ = load_system(Path(run) / run_folder.PARAMETERS)
+    ik, _ = load_system(Path(run) / run_folder.PARAMETERS, animation.flat_clip.rig)
     return solve(ik, animation, output, log=log)
 
 

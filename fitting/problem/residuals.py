@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 import jaxik
 from jaxik.maths import quat, vec
 
-from .scene import Scene, legs_ws, pelvis_ws
+from .scene import Scene, legs_ws, pelvis_ws, run_system
 
 
 def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " residuals"]:
@@ -16,7 +16,7 @@ def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Ar
 
 def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " residuals"]:
     """Residuals of one clip in standard deviations, one kind after another."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
+    result = run_system(ik, scene)
     residuals = residuals_by_kind(scene, errors_by_kind(scene, result))
     return jnp.concatenate([of_kind.ravel() for of_kind in residuals.values()])
 

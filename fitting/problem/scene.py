@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 import jaxik
+from jaxik.world.similarity import similar
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
@@ -67,6 +68,20 @@ class Scene(eqx.Module):
     sigmas: Sigmas
     tracks: dict[str, Array] = eqx.field(default_factory=dict)
     """Parameters that change along the clip, (frames, ...) by dotted name."""
+    size: Float[Array, ""] | None = None
+    """Leg length over that of the body for which systems are meant; they become `similar`. None
+    takes them as they are."""
+
+
+def own_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.FootIK:
+    """The system as it is for the body of a scene."""
+    return ik if scene.size is None else similar(ik, scene.size)
+
+
+def run_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
+    """What a system makes of the clip of a scene."""
+    ik, tracks = own_system(ik, scene), scene.tracks or None
+    return jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks)
 
 
 def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:

@@ -14,7 +14,7 @@ from jaxik.maths import quat
 from jaxik.world.skeleton import Transform
 
 from .problem import Problem
-from .scene import Reference, Scene, legs_ws, pelvis_ws
+from .scene import Reference, Scene, legs_ws, pelvis_ws, run_system
 from .space import Vector
 
 Noise = Float[np.ndarray, "frames *shape"]
@@ -81,7 +81,7 @@ def _simulated(
 @cached
 def _motion(ik: jaxik.FootIK, scene: Scene) -> tuple[Transform, Array, Transform, Array]:
     """Pelvis, knees, ankles and contact weights of a system along a scene, world space."""
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
+    result = run_system(ik, scene)
     assert result.trace is not None  # `jaxik.run` always has one
     legs = legs_ws(scene, result)
     return pelvis_ws(scene, result), legs.knee.pos, legs.ankle, result.trace.sensed.contact.weight

@@ -30,6 +30,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.runtime import files
 from fitting.runtime.validation import Table, error_context
+from jaxik.world.similarity import similar
 
 from .animations import Animation
 from .fit import search_with_noise
@@ -111,7 +112,7 @@ def ablate(
                 any_new = True
                 label = f"{name}, {one_split.name}"
                 with error_context(label):
-                    row = _fit(variant, one_split, _labelled(progress, label))
+                    row = _fit(variant, one_split, labelled(progress, label))
                 row = replace(row, key=key, variant=name, part=part % len(splits))
                 _write(folder, [*rows, row, *finished.values()])
                 if on_row is not None:
@@ -210,8 +211,18 @@ def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] 
         ik = problem.space.unpack(solution.u)
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
         converged, message, seconds = solution.converged, solution.message, solution.seconds
-    accuracy = summarise([_errors(ik, clip, frames) for clip, frames in data.measured])
+    first = data.measured[0][0].base.rig
+    accuracy = summarise(
+        [
+            _errors(_for_body(ik, variant.size(clip.base.rig, first)), clip, frames)
+            for clip, frames in data.measured
+        ]
+    )
     return Row("", "", 0, accuracy, values, converged, message, seconds)
+
+
+def _for_body(ik: jaxik.FootIK, size: float | None) -> jaxik.FootIK:
+    return ik if size is None else similar(ik, size)
 
 
 def _at_rate(data: ClipData, fps: float | None) -> ClipData:
@@ -233,7 +244,7 @@ def _errors(ik: jaxik.FootIK, data: ClipData, frames: slice) -> Errors:
     return clip_errors(*(clip.select(frames) for clip in compared))
 
 
-def _labelled(
+def labelled(
     progress: Callable[[Progress], None] | None, label: str
 ) -> Callable[[Progress], None] | None:
     """Progress whose stage also says what is being fitted."""

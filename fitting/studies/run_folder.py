@@ -68,10 +68,9 @@ def save_solution(
     (run / FIT).unlink(missing_ok=True)
     ik = problem.space.unpack(solution.u)
     write_text(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
-    write_text(
-        run / PARAMETERS,
-        parameter_files.system_to_toml(ik, Preset(experiment.preset, experiment.faithful)),
-    )
+    preset = Preset(experiment.preset, experiment.faithful)
+    leg_length = experiment.leg_length(problem.data[0].rig)
+    write_text(run / PARAMETERS, parameter_files.system_to_toml(ik, preset, leg_length))
 
 
 def save_fit(run: Path, fitted: Fit) -> None:

@@ -99,6 +99,9 @@ class Slot(NamedTuple):
     per_leg: bool
     """Whether it may be one value a leg."""
     follows: Follows
+    """What of a body it changes with."""
+    unit: str
+    """"1" for a plain number and for a switch."""
 
 
 def _meaning(field: dataclasses.Field) -> str:
@@ -237,7 +240,9 @@ def slots(module: eqx.Module) -> Iterator[Slot]:
         if per_leg is None:
             per_leg = getattr(owner, "per_leg", True)
         follows = field.metadata.get("follows", "nothing")
-        yield Slot(name, getattr(owner, field.name), field.metadata["shape"], per_leg, follows)
+        unit = field.metadata.get("unit", "1")
+        shape = field.metadata["shape"]
+        yield Slot(name, getattr(owner, field.name), shape, per_leg, follows, unit)
 
 
 def _fields(

@@ -114,6 +114,11 @@ def ratio(rig: Rig) -> float:
     return float(np.mean(_size(rig, np).ratio))
 
 
+def leg_length(rig: Rig) -> float:
+    """Mean length of the legs, m; the adult's without a leg that has a length."""
+    return LEG * ratio(rig)
+
+
 def _size(rig: Rig, numbers: ModuleType) -> Size:
     """What numbers follow; a leg that is absent or has no length counts as the mean of the others.
 

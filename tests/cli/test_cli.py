@@ -32,8 +32,9 @@ from support.sample_clips import BVH
 
 DATA = ROOT / "data"
 COMMANDS = [
-    "fit", "ablate", "calibrate", "sample", "apply", "run", "compare", "translate", "inspect",
-    "terrain", "bench", "cache", "record", "record show", "record to-toml", "record to-bytes",
+    "fit", "ablate", "calibrate", "population", "sample", "apply", "run", "compare", "translate",
+    "inspect", "terrain", "bench", "cache", "record", "record show", "record to-toml",
+    "record to-bytes",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")

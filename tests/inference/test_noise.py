@@ -21,7 +21,6 @@ from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.problem.loss import apply_loss
 from fitting.problem.problem import Problem
-from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.simulation import autoregression, simulate
 from fitting.studies import run_folder
 from fitting.studies.fit import search_with_noise

@@ -77,6 +77,25 @@ def add_calibrate(commands: Commands) -> None:
     add_output(calibrate, "DIR")
 
 
+def add_population(commands: Commands) -> None:
+    """`jaxik population`."""
+    population = add_command(
+        commands, "population", "fit several clips and subjects, and how they differ",
+        """
+        jaxik population walks.toml -o runs/walks
+
+        The experiment's table [hierarchy] says what varies between clips or subjects. Each clip is
+        fitted alone, all are pooled, and as a population; and each is predicted from the others.
+        Each search is written when it is done: after Ctrl-C (status 130) the same command
+        continues. Status 0: converged. 3: not converged.
+        """,
+    )  # fmt: skip
+    population.add_argument(
+        "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
+    )
+    add_output(population, "DIR")
+
+
 def add_sample(commands: Commands) -> None:
     """`jaxik sample`."""
     sample = add_command(

@@ -13,7 +13,7 @@ from jaxtyping import Array
 import jaxik
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind
-from fitting.problem.scene import MEASURED, WHITENED, Scene
+from fitting.problem.scene import MEASURED, WHITENED, Scene, run_system
 from fitting.problem.space import Vector
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
@@ -159,6 +159,6 @@ def _errors_of(ik: jaxik.FootIK, scene: Scene) -> dict[str, Errors]:
 
 @cached
 def _errors_by_kind(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
-    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=scene.tracks or None)
+    result = run_system(ik, scene)
     errors = errors_by_kind(scene, result)
     return {kind: errors[kind] for kind in MEASURED}

@@ -1,0 +1,121 @@
+"""Searches whose results are kept on disk, each in a file that is named after what it follows from.
+
+An interrupted study continues: called again, it finds what it had. A search of another problem,
+with other settings or another seed has another name.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import NotRequired, TypedDict
+
+import numpy as np
+from jaxtyping import Float
+
+import jaxik
+from fitting.experiments.experiment import Experiment
+from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
+from fitting.inference.noise.settings import NoiseOptions
+from fitting.inference.optimisation.solution import Progress
+from fitting.inference.sampling.posterior import digest
+from fitting.problem.problem import Problem
+from fitting.runtime import files
+from fitting.runtime.validation import Content
+from fitting.studies.ablation import labelled
+from fitting.studies.fit import search_with_noise
+
+SEARCHES = "searches"
+
+
+class Found(TypedDict):
+    """The result of a search, as its file holds it."""
+
+    name: str
+    """What was fitted."""
+    u: list[float]
+    cost: float
+    converged: bool
+    message: str
+    seconds: float
+    noise: NotRequired[Content]
+    """Where it was estimated."""
+
+
+@dataclasses.dataclass(frozen=True)
+class KeptSearches:
+    """Searches with the settings of an experiment."""
+
+    experiment: Experiment
+    folder: Path | None
+    """Where they are kept; None keeps none."""
+    progress: Callable[[Progress], None] | None = None
+    on_found: Callable[[Found], object] = lambda found: None
+    """Called with each new result."""
+
+    def fit(
+        self, name: str, problem: Problem[jaxik.FootIK], *, with_its_noise: bool = False
+    ) -> tuple[Problem[jaxik.FootIK], Found]:
+        """The best fit, and the problem with the noise that was found.
+
+        Args:
+            name: of what is fitted, for the reader.
+            problem: what to fit.
+            with_its_noise: whether the noise that the experiment estimates is estimated here.
+
+        Raises:
+            KeyboardInterrupt: the search was interrupted; half a search counts for nothing.
+            ValueError: a file in the folder is something else.
+        """
+        noise = self.experiment.noise if with_its_noise else NoiseOptions()
+        path = self._path(problem, noise)
+        found = None if path is None else _read(path)
+        if found is None:
+            found = self._search(name, problem, noise)
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                files.write_text(path, json.dumps(found, indent=1) + "\n")
+            self.on_found(found)
+        if "noise" in found:
+            problem = with_noise(problem, NoiseModel(**found["noise"]))
+        return problem, found
+
+    def _search(self, name: str, problem: Problem[jaxik.FootIK], noise: NoiseOptions) -> Found:
+        experiment = dataclasses.replace(self.experiment, noise=noise)
+        progress = labelled(self.progress, name)
+        fitted, solution = search_with_noise(problem, experiment, progress)
+        if solution.interrupted:
+            raise KeyboardInterrupt
+        found: Found = {
+            "name": name,
+            "u": solution.u.tolist(),
+            "cost": solution.cost,
+            "converged": solution.converged,
+            "message": solution.message,
+            "seconds": solution.seconds,
+        }
+        if noise.estimates_any:
+            found["noise"] = dataclasses.asdict(noise_of(fitted))
+        return found
+
+    def _path(self, problem: Problem[jaxik.FootIK], noise: NoiseOptions) -> Path | None:
+        if self.folder is None:
+            return None
+        start: Float[np.ndarray, " free"] = np.asarray(problem.space.start)
+        settings = (self.experiment.fit, self.experiment.seed, noise, start.tolist())
+        key = hashlib.sha256(f"{digest(problem)} {settings}".encode()).hexdigest()
+        return self.folder / SEARCHES / f"{key[:16]}.json"
+
+
+def _read(path: Path) -> Found | None:
+    """The result that a file holds; None if there is no file."""
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if missing := Found.__required_keys__ - found.keys():
+            raise ValueError(f"there is no {sorted(missing)}")
+        return found
+    except (OSError, ValueError, AttributeError) as error:
+        raise ValueError(f"{path}: not written by `jaxik population`: {error!r}") from None
