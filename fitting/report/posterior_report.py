@@ -14,6 +14,7 @@ from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .goodness import noise_report
 from .plots import posterior_plots
+from .uncertainty.islands import island_section, island_sentences
 from .uncertainty.priors import posterior_prior_section
 
 HEADING = "## Posterior"  # what follows it in summary.md is replaced
@@ -66,6 +67,7 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
             f"The 95 % intervals contain the true values of {all_count} parameters; among those "
             f"that the fit calls determined, of {determined_count}."
         )
+    parts += island_section(posterior, sampled.space, units)
     parts += posterior_prior_section(sampled, units)
     parts.append(gallery(plots))
     summary = run / SUMMARY
@@ -84,8 +86,8 @@ def _health(posterior: Posterior) -> list[str]:
         f"out as burn-in; {posterior.seconds:.0f} s in the last call.",
         f"Mean acceptance {percent(float(posterior.acceptance.mean()))}; slowest "
         f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
-        f"Stuck walkers: {stuck}; left out of the summary: "
-        f"{', '.join(map(str, posterior.isolated)) or 'none'}.",
+        f"Stuck walkers: {stuck}.",
+        *island_sentences(posterior),
     ]
 
 

@@ -117,6 +117,17 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "autocorrelation_time": posterior.autocorrelation_time.tolist(),
         "acceptance": float(posterior.acceptance.mean()),
         "stuck": posterior.stuck,
+        "left_out": {"walkers": posterior.isolated, "weight": posterior.isolated_mass},
+        "islands": [
+            {
+                "weight": island.weight,
+                "error": island.error if island.is_weighed else None,
+                "exchanges": island.exchanges,
+                "walkers": island.walkers,
+                "log_probability": island.log_probability,
+            }
+            for island in posterior.islands
+        ],
         "seconds": posterior.seconds,
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
         "sigmas": {

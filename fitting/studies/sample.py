@@ -23,6 +23,8 @@ from fitting.problem.space import Space
 from .fit import FittedParameter
 from .prior_summary import PriorSummary, summarise_priors
 
+APART = 3.0  # widths of the walkers' ball between places where some of them start
+
 
 @dataclasses.dataclass(frozen=True)
 class SampledFit:
@@ -72,10 +74,7 @@ def sample_around(
         raise ValueError(
             f"the fit has the parameters {names}, the experiment {list(problem.space.names)}"
         )
-    start = WalkerStart(
-        np.array([row["u"] for row in parameters]),
-        np.array([row["start_sd"] for row in parameters]),
-    )
+    start = walker_start(parameters, problem.space)
     problem = with_open_noise(problem, experiment)
     posterior = sample_posterior(
         problem, start, experiment.sample, seed=experiment.seed, path=chain, progress=progress
@@ -85,6 +84,20 @@ def sample_around(
     return dataclasses.replace(
         posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed)
     )
+
+
+def walker_start(parameters: Sequence[FittedParameter], space: Space) -> WalkerStart:
+    """Around the fit, and around the other valleys that profiles have met."""
+    u = np.array([row["u"] for row in parameters])
+    sd = np.array([row["start_sd"] for row in parameters])
+    known = [u]
+    valleys = [valley for row in parameters for valley in row.get("valleys", ())]
+    for valley in sorted(valleys, key=lambda valley: valley["rise"]):
+        if "values" in valley:
+            place = np.asarray(space.pack(dict(zip(space.names, valley["values"], strict=True))))
+            if all(np.max(np.abs(place - other) / sd) > APART for other in known):
+                known.append(place)
+    return WalkerStart(u, sd, np.array(known[1:]).reshape(-1, u.size))
 
 
 def with_open_noise(

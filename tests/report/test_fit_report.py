@@ -362,7 +362,7 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():
     assert line_of(text, "leg.soften").endswith("no")
     assert f"{first['ess']:.0f}" in line and "2 steps" in line
     assert "12 walkers, 240 steps, the first 40 left out" in text
-    assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3;" in text
+    assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3." in text
     assert "Converged: the chain is long enough." in text
     assert "The 95 % intervals contain the true values of 1 of 2 parameters." in text
     assert "truth" not in posterior_report.posterior_text(posterior, None)

@@ -20,6 +20,7 @@ from fitting.runtime.precision import in_float64
 
 from . import diagnostics
 from .chain import Chain, Identity
+from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
 
 ROWS = 4096  # of u, whose values are computed at once
@@ -43,7 +44,7 @@ class SamplingProgress:
 
 @dataclasses.dataclass(frozen=True)
 class WalkerStart:
-    """The ball in which the walkers start, usually around a fit.
+    """The ball in which the walkers start, usually around a fit, and others for some of them.
 
     For a threshold `sd` must be small: its Laplace width is the prior's, and walkers that start
     that far away get stuck.
@@ -53,6 +54,8 @@ class WalkerStart:
     """As many as there are free parameters."""
     sd: Float[Array | np.ndarray, " _"]
     """Of u."""
+    elsewhere: Float[Array | np.ndarray, "places _"] | None = None
+    """Other u around which a quarter of the walkers starts, so that islands there are found."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +75,8 @@ class Posterior:
     acceptance: Float[np.ndarray, " walkers"]
     """Fraction of the stored steps' proposals."""
     isolated: list[int]
-    """Walkers on an island of negligible weight; left out of the summary."""
+    """Walkers that never come near the others, on islands of negligible weight; left out of the
+    summary."""
     stuck: list[int]
     """Those, and walkers that hardly ever move."""
     converged: bool
@@ -81,8 +85,12 @@ class Posterior:
     seconds: float
     """Of this call."""
     interrupted: bool = False
+    isolated_mass: float = 0.0
+    """Estimate of the fraction of the posterior where the isolated walkers are."""
     sigmas: Mapping[str, Float[np.ndarray, " draws"]] = dataclasses.field(default_factory=dict)
     """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
+    islands: tuple[Island, ...] = ()
+    """The heaviest first; none where there is only one."""
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
@@ -178,8 +186,7 @@ def _extend(
     names, thin_by = chain.identity.parameters, chain.identity.thin_by
     interval = math.ceil(settings.check_every / thin_by)
     limit = max(settings.max_steps // thin_by, len(chain))
-    u, sd = np.asarray(start.u, float), np.asarray(start.sd, float)
-    steps = sampler.steps(problem, chain, u, sd, limit)
+    steps = sampler.steps(problem, chain, *_balls(start, chain.identity.walkers), limit)
     before = latest = None
     interrupted = False
     try:
@@ -224,8 +231,21 @@ def digest(problem: Problem) -> str:
     return digested.hexdigest()
 
 
+def _balls(
+    start: WalkerStart, walkers: int
+) -> tuple[Float[np.ndarray, "walkers free"], Float[np.ndarray, "walkers free"]]:
+    """Centre and width of the ball in which each walker starts."""
+    centres = np.tile(np.asarray(start.u, float), (walkers, 1))
+    if start.elsewhere is not None and len(start.elsewhere):
+        others = np.arange(walkers // 4)
+        centres[-1 - 4 * others] = np.asarray(start.elsewhere)[others % len(start.elsewhere)]
+    return centres, np.broadcast_to(np.asarray(start.sd, float), centres.shape)
+
+
 def _check_start(size: int, start: WalkerStart) -> None:
     """Raises ValueError for a start that is not finite or has another size than the space."""
+    for place in () if start.elsewhere is None else start.elsewhere:
+        _check_start(size, WalkerStart(place, start.sd))
     for name, array in (("u", start.u), ("sd", start.sd)):
         if array.shape != (size,) or not np.isfinite(array).all():
             raise ValueError(
@@ -276,9 +296,11 @@ def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float
         autocorrelation_time=check.times * chain.identity.thin_by,
         acceptance=acceptance,
         isolated=np.flatnonzero(check.isolated).tolist(),
+        isolated_mass=check.isolated_mass,
         stuck=np.flatnonzero(stuck).tolist(),
         converged=outcome.converged,
         message=outcome.message,
         seconds=seconds,
         interrupted=outcome.interrupted,
+        islands=check.islands,
     )

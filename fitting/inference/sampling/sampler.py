@@ -1,12 +1,12 @@
 """Steps of emcee through the hard program.
 
-The moves are differential evolution, nine steps in ten at its usual scale and one with the whole
-difference, which jumps between modes (ter Braak 2006). Never emcee 3.1.6's snooker move: its
-acceptance is wrong, and in 20 dimensions it shrinks a unit variance to 0.81.
+The moves are differential evolution at its usual scale (ter Braak 2006), and jumps between islands.
+Never emcee 3.1.6's snooker move: its acceptance is wrong, and in 20 dimensions it shrinks a unit
+variance to 0.81.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import emcee
 import jax.numpy as jnp
@@ -18,13 +18,16 @@ from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
 from .chain import Chain, Identity, LastStep, RandomState
+from .jumps import JumpMove
 
+JUMPS = 0.2  # of the steps; 0.1 to 0.5 give as many effective samples or more
+Balls: TypeAlias = Float[np.ndarray, "walkers free"]
 DRAWS = 100  # attempts to start every walker where its log-probability is finite
 
 
-def moves() -> list[tuple[emcee.moves.Move, float]]:
+def moves(chain: Chain) -> list[tuple[emcee.moves.Move, float]]:
     """Proposals, and the fraction of steps that each makes."""
-    return [(emcee.moves.DEMove(), 0.9), (emcee.moves.DEMove(gamma0=1.0), 0.1)]
+    return [(emcee.moves.DEMove(), 1 - JUMPS), (JumpMove(chain), JUMPS)]
 
 
 class _Recorder(emcee.backends.Backend):
@@ -51,9 +54,12 @@ def _log_probabilities(
 
 
 def steps(
-    problem: Problem, chain: Chain, start_u: np.ndarray, start_sd: np.ndarray, limit: int
+    problem: Problem, chain: Chain, centres: Balls, widths: Balls, limit: int
 ) -> Iterator[emcee.State]:
-    """Continues the chain from its last step to `limit` stored steps, one at a time."""
+    """Continues the chain from its last step to `limit` stored steps, one at a time.
+
+    Each walker of a new chain starts in its ball, of this centre and width in `u`.
+    """
     identity = chain.identity
     dtype = problem.space.start.dtype
 
@@ -64,12 +70,12 @@ def steps(
             [np.asarray(_log_probabilities(problem, jnp.asarray(half)), float) for half in halves]
         )
 
-    last = chain.last or _start(identity, evaluate, start_u, start_sd)
+    last = chain.last or _start(identity, evaluate, centres, widths)
     sampler = emcee.EnsembleSampler(
         identity.walkers,
         problem.space.size,
         evaluate,
-        moves=moves(),
+        moves=moves(chain),
         backend=_Recorder(chain),
         vectorize=True,
     )
@@ -85,16 +91,16 @@ def steps(
 def _start(
     identity: Identity,
     evaluate: Callable[[np.ndarray], np.ndarray],
-    start_u: np.ndarray,
-    start_sd: np.ndarray,
+    centres: Balls,
+    widths: Balls,
 ) -> LastStep:
-    """Walkers around the start, each drawn until its log-probability is finite."""
+    """Walkers in their balls, each drawn until its log-probability is finite."""
     random = np.random.RandomState(identity.seed)  # emcee goes on with this generator's state
-    u = np.empty((identity.walkers, start_u.size))
+    u = np.empty(centres.shape)
     log_probability = np.full(identity.walkers, -np.inf)
     for _ in range(DRAWS):
         missing = np.isneginf(log_probability)
-        drawn = start_u + start_sd * random.standard_normal(u.shape)
+        drawn = centres + widths * random.standard_normal(u.shape)
         u[missing] = drawn[missing]
         log_probability[missing] = evaluate(drawn)[missing]
         if np.isfinite(log_probability).all():
