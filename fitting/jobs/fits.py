@@ -100,11 +100,11 @@ def sample(
         experiment = experiment.with_max_sample_steps(max_steps)
     chain = None if run is None else run / run_folder.CHAIN
     posterior = sample_around(parameters, problem, experiment, chain, progress)
+    sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values)
     if run is not None:
-        sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values)
         run_folder.save_posterior(run, sampled)
         posterior_report.write_posterior(run, sampled)
-    log(f"\n{posterior_report.posterior_text(posterior, known_values)}")
+    log(f"\n{posterior_report.posterior_text(sampled, run)}")
     log_output(log, run, run_folder.SUMMARY)
     return posterior
 

@@ -14,16 +14,18 @@ from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .goodness import noise_report
 from .plots import posterior_plots
+from .uncertainty.contradictions import contradiction_sentences
 from .uncertainty.islands import island_section, island_sentences
 from .uncertainty.priors import posterior_prior_section
 
 HEADING = "## Posterior"  # what follows it in summary.md is replaced
 
 
-def posterior_text(posterior: Posterior, known_values: Mapping[str, float] | None) -> str:
-    """The result of a sampling, for the terminal."""
+def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
+    """The result of a sampling, for the terminal; `run` is the folder where it is written."""
+    posterior, known_values = sampled.posterior, sampled.known_values
     table = aligned(posterior_table(posterior, known_values, {}))
-    parts = [*_health(posterior), "", table]
+    parts = [*_health(posterior), *contradiction_sentences(sampled, run), "", table]
     if posterior.sigmas:
         parts += ["", aligned(noise_report.sigma_table(posterior.sigmas))]
     if known_values:
@@ -54,7 +56,8 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
     figure = posterior_plots.chain(posterior, labels, known_values, title)
     plots |= save_plot(run, "chain.png", title, figure)
 
-    parts = [HEADING, bullets(_health(posterior))]
+    parts = [HEADING, *(f"**{line}**" for line in contradiction_sentences(sampled, run))]
+    parts.append(bullets(_health(posterior)))
     parts.append(markdown(posterior_table(posterior, known_values, units)))
     if posterior.sigmas:
         parts.append("Sigmas of the noise, which were sampled along:")

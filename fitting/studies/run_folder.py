@@ -5,9 +5,11 @@ fit.json          the numbers of the fit
 parameters.toml   the fitted system
 chain.h5          the walkers; posterior.json is their summary
 posterior.nc      the kept draws for ArviZ, if it is installed
+lower_point.toml  the experiment, to begin at a point that the chain met below the fit
 summary.md, *.png to read
 """
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -28,7 +30,7 @@ from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
-INFERENCE_DATA = "posterior.nc"
+INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
 
@@ -108,6 +110,7 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         name: {"prior": prior, "prior_sensitivity": sampled.prior_sensitivity[name]}
         for name, prior in sampled.priors.items()
     }
+    lower = {"gain": posterior.improvement, "values": posterior.best_values}
     numbers = {
         "converged": posterior.converged,
         "message": posterior.message,
@@ -129,6 +132,8 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
             for island in posterior.islands
         ],
         "seconds": posterior.seconds,
+        "lower_point": lower if sampled.has_lower_point else None,
+        "disagreements": sampled.disagreements,
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
         "sigmas": {
             kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()
@@ -136,5 +141,9 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         },
     }
     write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))
+    (run / LOWER_POINT).unlink(missing_ok=True)
+    if sampled.has_lower_point:
+        begun_there = dataclasses.replace(sampled.experiment, start=posterior.best_values)
+        write_text(run / LOWER_POINT, experiment_files.experiment_to_toml(begun_there, run))
     if inference_data.is_available():
         inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)

@@ -20,7 +20,9 @@ from fitting.inference.sampling.prior_sensitivity import Reweighted, prior_sensi
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space
 
+from .assess import MIN_IMPROVEMENT
 from .fit import FittedParameter
+from .posterior.contradictions import Disagreement, disagreements
 from .prior_summary import PriorSummary, summarise_priors
 
 APART = 3.0  # widths of the walkers' ball between places where some of them start
@@ -42,6 +44,16 @@ class SampledFit:
     def priors(self) -> dict[str, PriorSummary]:
         """By name of the parameter."""
         return summarise_priors(self.space)
+
+    @cached_property
+    def disagreements(self) -> list[Disagreement]:
+        """Parameters of which chain and fit give clearly different intervals."""
+        return disagreements(self.parameters, self.posterior)
+
+    @property
+    def has_lower_point(self) -> bool:
+        """Whether the chain has met a point that is clearly better than the fit."""
+        return self.posterior.improvement > MIN_IMPROVEMENT
 
     @cached_property
     def prior_sensitivity(self) -> dict[str, list[Reweighted]]:

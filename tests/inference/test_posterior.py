@@ -173,7 +173,7 @@ def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
 
     axes = jnp.linspace(-7, 7, 141), jnp.linspace(-7, 7, 1401)  # cliffs need the finer one
     grid = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    weight = np.exp(np.asarray(sampler._log_probabilities(problem, grid)))
+    weight = np.exp(np.asarray(sampler.log_probabilities(problem, grid)))
     values = np.asarray(values_of_rows(problem.space, grid))
     mean = np.average(values, axis=0, weights=weight)
     sd = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
@@ -235,6 +235,19 @@ def test_a_run_stops_at_fifty_steady_autocorrelation_times():
     assert 0.1 < sampled.acceptance.min() and sampled.stuck == []
     assert [row["name"] for row in sampled.summary] == ["x[0]", "x[1]"]
     assert all(row["r_hat"] < 1.05 and row["ess"] > 8 * 0.8 * 50 for row in sampled.summary)
+
+
+def test_what_a_chain_gains_over_its_start_is_known():
+    problem, mean, covariance = normal(3)
+    sd = np.sqrt(np.diag(covariance))
+    lowest = float(problem.cost(jnp.asarray(mean)))
+    for start, gain in ((mean, 0.0), (mean + 3 * sd, None)):
+        sampled = sample(problem, start, sd, max_steps=300)
+        expected = float(problem.cost(jnp.asarray(start))) - lowest if gain is None else gain
+        assert sampled.start_log_probability == pytest.approx(-expected - lowest)
+        assert expected - 1.0 < sampled.improvement <= expected
+        values = problem.space.values(jnp.asarray(problem.space.pack(sampled.best_values)))
+        assert list(sampled.best_values.values()) == pytest.approx(values.tolist())
 
 
 def test_a_run_that_is_too_short_says_so():
@@ -314,7 +327,7 @@ def test_an_interrupt_before_the_first_step_is_raised_without_output(monkeypatch
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sampler, "_log_probabilities", interrupted)
+    monkeypatch.setattr(sampler, "log_probabilities", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sample(normal(2)[0], np.zeros(2), np.ones(2))
     assert capfd.readouterr().out == ""

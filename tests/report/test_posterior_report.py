@@ -2,9 +2,11 @@
 
 import math
 from dataclasses import replace
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from fitting.inference.sampling.islands import Island
 from fitting.inference.sampling.posterior import Posterior
@@ -14,6 +16,7 @@ from fitting.report import posterior_report
 from fitting.report.formatting import markdown
 from fitting.report.plots import posterior_plots
 from fitting.report.uncertainty import islands
+from fitting.studies.sample import SampledFit
 from support import toy
 
 NAMES = ("foot.share", "foot.idle")
@@ -42,6 +45,16 @@ def posterior_of(names: tuple[str, ...]) -> Posterior:
         message="Converged.",
         seconds=1.0,
     )
+
+
+def sampled_fit(posterior: Posterior, **other: Any) -> SampledFit:
+    """As far as texts need it: a posterior around a fit with these rows."""
+    rows = [
+        {"name": name, "kind": "smooth", "value": 0.6, "interval": [0.5, 0.7]}
+        for name in posterior.names
+    ]
+    space = space_of(posterior.names)
+    return SampledFit(cast(Any, None), space, cast(Any, rows), replace(posterior, **other))
 
 
 def island(weight: float, exchanges: int, u: float) -> Island:
@@ -76,9 +89,8 @@ def test_the_lines_of_known_values_cross_in_every_panel_of_their_parameters():
 def test_islands_are_shown_with_weights_exchanges_and_medians():
     found = (island(0.81, 250, 0.0), island(0.19, 250, 1.5))
     posterior = replace(posterior_of(NAMES), islands=found)
-    assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in posterior_report.posterior_text(
-        posterior, None
-    )
+    text = posterior_report.posterior_text(sampled_fit(posterior))
+    assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text
     space = space_of(NAMES)
     parts = islands.island_section(posterior, space, {"foot.share": "1", "foot.idle": "1"})
     text = "\n".join(parts)
@@ -90,13 +102,51 @@ def test_islands_are_shown_with_weights_exchanges_and_medians():
 
 def test_islands_without_exchanges_are_said_to_be_out_of_reach():
     found = (island(0.75, 3, 0.0), island(0.25, 3, 1.5))
-    text = posterior_report.posterior_text(replace(posterior_of(NAMES), islands=found), None)
+    text = posterior_report.posterior_text(sampled_fit(posterior_of(NAMES), islands=found))
     assert "out of reach (75.0 % of the draws), out of reach (25.0 % of the draws)" in text
     table = islands.island_table(found)
     assert "| 2 | out of reach (25.0 % of the draws) | 3 |" in markdown(table)
 
 
 def test_walkers_are_not_left_out_in_silence():
-    posterior = replace(posterior_of(NAMES), isolated=[2, 5], isolated_mass=0.0071)
-    text = posterior_report.posterior_text(posterior, None)
+    left_out = {"isolated": [2, 5], "isolated_mass": 0.0071}
+    text = posterior_report.posterior_text(sampled_fit(posterior_of(NAMES), **left_out))
     assert "Left out are walkers 2, 5" in text and "about 0.71 % of the posterior" in text
+
+
+def posterior_around(value: float, width: float) -> Posterior:
+    """Draws of which 95 % lie in an interval of this width."""
+    posterior = posterior_of(NAMES[:1])
+    spread = width / 3.92
+    return replace(posterior, values=value + spread * posterior.u / posterior.u.std())
+
+
+@pytest.mark.parametrize(
+    ("value", "width", "kind", "reason"),
+    [
+        (0.6, 0.2, "smooth", None),
+        (0.75, 0.2, "smooth", "leaves out the fit"),
+        (0.6, 0.08, "smooth", "narrower"),
+        (0.6, 0.08, "threshold", None),
+        (0.6, 0.03, "threshold", "narrower"),
+        (0.6, 0.5, "threshold", "wider"),
+    ],
+)
+def test_an_interval_that_contradicts_the_fit_is_found(value, width, kind, reason):
+    sampled = sampled_fit(posterior_around(value, width))
+    sampled.parameters[0]["kind"] = kind
+    found = [row["reason"] for row in sampled.disagreements]
+    assert found == ([] if reason is None else [reason])
+    text = posterior_report.posterior_text(sampled)
+    assert ("The chain contradicts its fit" in text) == (reason is not None)
+    unfinished = sampled_fit(sampled.posterior, converged=False)
+    assert unfinished.disagreements == []
+
+
+def test_a_better_point_of_the_chain_is_said_without_a_folder_too():
+    posterior = posterior_of(NAMES)
+    top = float(posterior.log_probability.max())
+    text = posterior_report.posterior_text(sampled_fit(posterior, start_log_probability=top - 3.25))
+    assert "log-probability is 3.25 higher" in text and "`Posterior.best_values`" in text
+    same = sampled_fit(posterior, start_log_probability=top - 0.05)
+    assert "contradicts" not in posterior_report.posterior_text(same)

@@ -91,6 +91,8 @@ class Posterior:
     """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
     islands: tuple[Island, ...] = ()
     """The heaviest first; none where there is only one."""
+    start_log_probability: float = math.inf
+    """Of the point around which the walkers started."""
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
@@ -101,6 +103,17 @@ class Posterior:
     def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
         """`u` of the values that are kept."""
         return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
+
+    @property
+    def improvement(self) -> float:
+        """How far the best draw is above the start, in log-probability; negative if it is below."""
+        return float(self.log_probability.max()) - self.start_log_probability
+
+    @property
+    def best_values(self) -> dict[str, float]:
+        """The most probable draw of all, by name, in the parameters' units."""
+        best = np.unravel_index(np.argmax(self.log_probability), self.log_probability.shape)
+        return dict(zip(self.names, self.values[best].tolist(), strict=True))
 
     def to_inference_data(self, space: Space) -> Any:
         """The kept draws as ArviZ takes them; see `inference_data.to_inference_data`."""
@@ -159,7 +172,9 @@ def sample_posterior(
                 progress(_describe_progress(chain, check, settings.max_steps, elapsed))
 
         outcome = _extend(problem, chain, start, settings, report)
-    return _posterior(problem, chain, outcome, time.monotonic() - began)
+    at_start = _log_probability(problem, start, walkers)
+    sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
+    return dataclasses.replace(sampled, start_log_probability=at_start)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,6 +244,16 @@ def digest(problem: Problem) -> str:
         digested.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
         digested.update(array.tobytes())
     return digested.hexdigest()
+
+
+def _log_probability(problem: Problem, start: WalkerStart, walkers: int) -> float:
+    """Of the start, by the program that the sampler has."""
+    from .sampler import log_probabilities
+
+    rows = jnp.broadcast_to(
+        jnp.asarray(start.u, problem.space.start.dtype), (walkers // 2, problem.space.size)
+    )
+    return float(log_probabilities(problem, rows)[0])
 
 
 def _balls(

@@ -45,9 +45,10 @@ class _Recorder(emcee.backends.Backend):
 
 
 @cached
-def _log_probabilities(
+def log_probabilities(
     problem: Problem, u: Float[Array, "walkers free"]
 ) -> Float[Array, " walkers"]:
+    """Of several points; -inf where it is not finite."""
     log_probability = lanes(problem.log_probability)(u)
     # emcee raises on NaN
     return jnp.where(jnp.isfinite(log_probability), log_probability, -jnp.inf)
@@ -67,7 +68,7 @@ def steps(
         """Half of the walkers at a time, as the moves need them: one program."""
         halves = np.asarray(u, dtype).reshape(-1, identity.walkers // 2, u.shape[1])
         return np.concatenate(
-            [np.asarray(_log_probabilities(problem, jnp.asarray(half)), float) for half in halves]
+            [np.asarray(log_probabilities(problem, jnp.asarray(half)), float) for half in halves]
         )
 
     last = chain.last or _start(identity, evaluate, centres, widths)

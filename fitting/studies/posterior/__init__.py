@@ -1,0 +1,4 @@
+"""What a sampled posterior says of its fit.
+
+`contradictions` finds where chain and fit disagree.
+"""
