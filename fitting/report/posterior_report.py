@@ -14,6 +14,7 @@ from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .goodness import noise_report
 from .plots import posterior_plots
+from .uncertainty import band_plots, left_out, predictive
 from .uncertainty.contradictions import contradiction_sentences
 from .uncertainty.islands import island_section, island_sentences
 from .uncertainty.priors import posterior_prior_section
@@ -25,7 +26,12 @@ def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
     """The result of a sampling, for the terminal; `run` is the folder where it is written."""
     posterior, known_values = sampled.posterior, sampled.known_values
     table = aligned(posterior_table(posterior, known_values, {}))
-    parts = [*_health(posterior), *contradiction_sentences(sampled, run), "", table]
+    parts = [*_health(posterior), *contradiction_sentences(sampled, run)]
+    if sampled.replay is not None:
+        parts.append(predictive.sentence(sampled.replay.checks))
+    if sampled.left_out is not None:
+        parts.append(left_out.sentence(sampled.left_out))
+    parts += ["", table]
     if posterior.sigmas:
         parts += ["", aligned(noise_report.sigma_table(posterior.sigmas))]
     if known_values:
@@ -72,6 +78,13 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
         )
     parts += island_section(posterior, sampled.space, units)
     parts += posterior_prior_section(sampled, units)
+    if sampled.replay is not None:
+        parts += predictive.section(sampled.replay)
+        title = f"{experiment.name}: the capture inside what the posterior would make"
+        figure = band_plots.bands(sampled.replay.bands, title)
+        plots |= save_plot(run, "predictive.png", title, figure)
+    if sampled.left_out is not None and sampled.replay is not None:
+        parts += left_out.section(sampled.left_out, sampled.replay.blocks)
     parts.append(gallery(plots))
     summary = run / SUMMARY
     text = summary.read_text(encoding="utf-8") if summary.is_file() else f"# {experiment.name}\n"

@@ -26,6 +26,7 @@ from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
 
 from .fit import Fit, FitSummary
+from .posterior.replay_summary import summarise_replay
 from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
@@ -134,6 +135,7 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "seconds": posterior.seconds,
         "lower_point": lower if sampled.has_lower_point else None,
         "disagreements": sampled.disagreements,
+        **summarise_replay(sampled.replay, sampled.left_out),
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
         "sigmas": {
             kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()

@@ -10,6 +10,7 @@ import numpy as np
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.noise.marginal import draw_sigmas, with_unknown_sigmas
+from fitting.inference.sampling.blocks import LeaveOneOut, leave_one_out
 from fitting.inference.sampling.posterior import (
     Posterior,
     SamplingProgress,
@@ -23,6 +24,7 @@ from fitting.problem.space import Space
 from .assess import MIN_IMPROVEMENT
 from .fit import FittedParameter
 from .posterior.contradictions import Disagreement, disagreements
+from .posterior.replay import Replay
 from .prior_summary import PriorSummary, summarise_priors
 
 APART = 3.0  # widths of the walkers' ball between places where some of them start
@@ -39,6 +41,8 @@ class SampledFit:
     posterior: Posterior
     known_values: Mapping[str, float] | None = None
     """What made a synthetic reference, by name."""
+    replay: Replay | None = None
+    """The motion of some draws."""
 
     @cached_property
     def priors(self) -> dict[str, PriorSummary]:
@@ -54,6 +58,11 @@ class SampledFit:
     def has_lower_point(self) -> bool:
         """Whether the chain has met a point that is clearly better than the fit."""
         return self.posterior.improvement > MIN_IMPROVEMENT
+
+    @cached_property
+    def left_out(self) -> LeaveOneOut | None:
+        """How well blocks of frames are predicted from the others, if that can be said."""
+        return None if self.replay is None else leave_one_out(self.replay.blocks)
 
     @cached_property
     def prior_sensitivity(self) -> dict[str, list[Reweighted]]:

@@ -19,6 +19,7 @@ from fitting.problem.space import Space, values_of_rows
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
+from .blocks import BlockLogLikelihood
 from .chain import Chain, Identity
 from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
@@ -93,6 +94,8 @@ class Posterior:
     """The heaviest first; none where there is only one."""
     start_log_probability: float = math.inf
     """Of the point around which the walkers started."""
+    blocks: BlockLogLikelihood | None = None
+    """Of some draws; None until they are run through the clips (`studies.posterior.replay`)."""
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
