@@ -16,6 +16,8 @@ from fitting.inference.sampling.blocks import SECONDS
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 
+ROUNDING = 1e-6  # of a block, by which a frame may begin too early
+
 
 def of_frames(
     playback: Playback, scene: Scene, density: NoiseDensity, ratios: Mapping[str, float]
@@ -48,7 +50,7 @@ def block_of_frames(playback: Playback) -> Int[np.ndarray, " frames"]:
     """The block of each frame, from 0; a short rest at the end belongs to the last one."""
     time = playback.time
     blocks = max(1, round(float(time[-1]) / SECONDS))
-    return np.minimum((time / SECONDS).astype(int), blocks - 1)
+    return np.minimum((time / SECONDS + ROUNDING).astype(int), blocks - 1)
 
 
 def digest(problem: Problem[jaxik.FootIK]) -> str:
