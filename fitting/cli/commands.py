@@ -244,6 +244,8 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 
 def _compare_in_suite(options: argparse.Namespace) -> int:
     """Runs systems, or else all presets, through made situations."""
+    if options.runs is not None:
+        raise ValueError("--runs and --suite exclude each other")
     own = {"CLIP": None, "--terrain": None, "--file-up": "y", "--floor": 0.0, "--root": "auto"}
     for name, unused in own.items():
         given = getattr(options, name.strip("-").replace("-", "_").lower())

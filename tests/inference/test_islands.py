@@ -10,7 +10,7 @@ import pytest
 from jaxtyping import Array
 from scipy import stats
 
-from fitting.inference.sampling import diagnostics, islands, jumps, posterior, sampler
+from fitting.inference.sampling import diagnostics, islands, posterior, sampler
 from fitting.inference.sampling.posterior import Posterior, WalkerStart
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.free_parameters import free_parameter
@@ -151,9 +151,9 @@ def test_a_resumed_chain_makes_the_same_jumps(tmp_path):
 
 
 def test_lessons_are_powers_of_two_times_the_first():
-    lengths = [jumps.lesson(stored, 1) for stored in (0, 99, 100, 199, 200, 399, 400, 6400)]
+    lengths = [sampler.lesson(stored, 1) for stored in (0, 99, 100, 199, 200, 399, 400, 6400)]
     assert lengths == [0, 0, 100, 100, 200, 200, 400, 6400]
-    assert jumps.lesson(33, 3) == 0 and jumps.lesson(34, 3) == 34
+    assert sampler.lesson(33, 3) == 0 and sampler.lesson(34, 3) == 34
 
 
 @pytest.mark.parametrize("size", [1, 2, 6, 17])

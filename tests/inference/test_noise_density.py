@@ -1,13 +1,15 @@
 """The distribution of noise that a loss stands for."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import integrate, stats
 
 from fitting.inference.noise.density import NoiseDensity
-from fitting.problem.loss import CAUCHY
+from fitting.problem.loss import CAUCHY, Loss
 
-EXACT = {
+EXACT: dict[Loss, Any] = {
     "squares": stats.norm(),
     "student": stats.t(3.5),
     # exp(-c²/2 log(1 + r²/c²)) is a t distribution with c² - 1 degrees of freedom.

@@ -105,10 +105,10 @@ def leave_one_out(blocks: BlockLogLikelihood) -> LeaveOneOut | None:
     """
     if not is_available() or len(blocks.clip) < 2 or len(blocks.values) < MIN_DRAWS:
         return None
-    import arviz_stats
+    from arviz_stats.loo import loo
 
     with warnings.catch_warnings(action="ignore"):  # of unreliable blocks, which are counted below
-        found: Any = arviz_stats.loo(to_tree(blocks), pointwise=True, reff=blocks.efficiency)
+        found: Any = loo(to_tree(blocks), pointwise=True, reff=blocks.efficiency)
     elpd_of_block = np.asarray(found.elpd_i)
     return LeaveOneOut(
         elpd=float(found.elpd),

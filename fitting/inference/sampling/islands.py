@@ -2,7 +2,7 @@
 
 They are found in the draws by single linkage: two draws belong together if a chain of draws with
 small gaps leads from one to the other. Around each island stands a multivariate t distribution,
-from which jumps between islands are proposed (`jumps.py`).
+from which jumps between islands are proposed.
 """
 
 import dataclasses
