@@ -7,6 +7,7 @@ Terrains, `terrains/*.ply`. Flat animations over the floor y = 0, in `clips/`:
   down the character slides.
 - `stop_and_go_base.npz`: a walk that stands exactly still three times: on a slope, on a step and on
   rubble.
+- `terraces_base.npz`: a walk of 6 s whose root runs 20 % faster than the feet step, then slower.
 - `quadruped_base.npz` and `climber_base.npz`: bodies on four limbs; the climber is on the wall
   z = 0.
 
@@ -32,6 +33,7 @@ from fitting.datasets import clip_frames
 from fitting.datasets.clips import Clip, save_clip
 from fitting.datasets.synthetic import multi_limb, terrain_meshes, walker
 from fitting.datasets.synthetic.speed_profile import Slide, Slip, Stop
+from fitting.datasets.synthetic.walker import WalkStyle
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import systems
 from fitting.runtime.precision import in_float64
@@ -45,12 +47,14 @@ TERRAINS = {
     "rubble": terrain_meshes.rubble,
     "uneven_walk": terrain_meshes.uneven_walk,
     "stop_and_go": terrain_meshes.stop_and_go,
+    "terraces": terrain_meshes.terraces,
     "meadow": terrain_meshes.meadow,
     "wall": terrain_meshes.wall,
 }
 SECONDS, FPS = 12.0, 30.0
 SLIPS_AND_SLIDE = (Slip(0.6, 4.4, 0.06), Slip(5.6, 8.6, -0.06), Slide(8.8, 10.4))
 STOPS = (Stop(1.6, 3.7), Stop(5.0, 7.2), Stop(8.6, 10.6))
+SLIPS = (Slip(0.4, 2.6, 0.20), Slip(3.0, 5.8, -0.20))
 POSITION_NOISE = 0.002  # m, per coordinate of a joint
 ROTATION_NOISE = float(np.radians(0.5))  # rad, per axis of a joint
 RESOLUTION = 2.0**-24  # m, and of quaternion components; 6e-8
@@ -66,6 +70,11 @@ def stop_and_go() -> Clip:
     return walker.walk(SECONDS, FPS, 4, STOPS)
 
 
+def terraces() -> Clip:
+    """A short walk with slips, knees forward."""
+    return walker.walk(6.0, FPS, 6, SLIPS, WalkStyle(knees=1.0))
+
+
 def quadruped() -> Clip:
     """A quadruped that walks."""
     return multi_limb.locomotion(multi_limb.QUADRUPED, 5.0, FPS, 3)
@@ -79,6 +88,7 @@ def climber() -> Clip:
 FLAT_ANIMATIONS: Mapping[str, Callable[[], Clip]] = {
     "uneven_walk": uneven_walk,
     "stop_and_go": stop_and_go,
+    "terraces": terraces,
     "quadruped": quadruped,
     "climber": climber,
 }
@@ -154,11 +164,24 @@ MEC_TRUTH = {
     "leg.twist": 0.12,
     "foot.max_tilt": 0.2,
 }
+STRIDE_TRUTH = {
+    "probe.steepness": 2.6,
+    "lock.enabled": True,  # the feet of the animation slip
+    "lock.release_distance": 0.09,
+    "lock.unlock_half_life": 0.05,
+    "pelvis.highest_share": 0.5,
+    "pelvis.extension": 0.93,
+    "pelvis.rise_half_life": 0.08,
+    "effector.extension": 0.95,
+    "effector.max_lift": 0.4,
+    "foot.max_pitch": 0.3,
+}
 REFERENCES = (
     SyntheticReference("uneven_walk", "uneven_walk", "record", RECORD_TRUTH, 11, True),
     SyntheticReference("stop_and_go_ozz", "stop_and_go", "ozz", OZZ_TRUTH, 21),
     SyntheticReference("stop_and_go_unreal", "stop_and_go", "unreal", UNREAL_TRUTH, 22),
     SyntheticReference("stop_and_go_mec", "stop_and_go", "mec", MEC_TRUTH, 23, True),
+    SyntheticReference("terraces", "terraces", "stride", STRIDE_TRUTH, 24),
 )
 
 

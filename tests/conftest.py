@@ -9,6 +9,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -27,6 +28,7 @@ if PROGRAMS not in os.environ:
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 
 ROOT = Path(__file__).resolve().parents[1]
+MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530
 LONGEST = ("test_notebooks.py", "test_translation.py", "test_documents.py")
 
 
@@ -39,6 +41,15 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begins with the longest files, so that at the end no worker waits for one of them."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_memory() -> Iterator[None]:
+    """Drops all compiled programs after a file if they take many mappings of memory."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MAX_MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -22,8 +22,10 @@ from jaxik.world import terrain
 DATA = Path(__file__).resolve().parents[1] / "data"
 TOLERANCE = 1e-6  # m, and of quaternions, between machines
 MAX_CLIP_SIZE, MAX_MESH_SIZE = 400_000, 100_000  # bytes
-WALKS = ("uneven_walk", "stop_and_go", "quadruped", "climber")
-REFERENCES = ("uneven_walk", "stop_and_go_ozz", "stop_and_go_unreal", "stop_and_go_mec")
+WALKS = ("uneven_walk", "stop_and_go", "terraces", "quadruped", "climber")
+REFERENCES = (
+    "uneven_walk", "stop_and_go_ozz", "stop_and_go_unreal", "stop_and_go_mec", "terraces"
+)  # fmt: skip
 CLIPS = (*(f"{walk}_base" for walk in WALKS), *REFERENCES)
 
 
@@ -152,7 +154,7 @@ def test_the_true_parameters_of_the_uneven_walk_have_thresholds_in_order(make):
     assert make.RECORD_TRUTH["contact.planted_height"] < make.RECORD_TRUTH["contact.raised_height"]
 
 
-@pytest.mark.parametrize("preset", ["ozz", "unreal", "mec"])
+@pytest.mark.parametrize("preset", ["ozz", "unreal", "mec", "stride"])
 def test_an_experiment_frees_the_true_parameters_and_fixes_the_switches(make, preset):
     (reference,) = (each for each in make.REFERENCES if each.preset == preset)
     entries = experiment_files.load_experiment(DATA / "experiments" / f"{preset}.toml")
@@ -202,7 +204,12 @@ def test_stop_and_go_stands_still_at_three_uneven_places():
 
 @pytest.mark.parametrize(
     ("walk", "mesh"),
-    [("stop_and_go", "stop_and_go"), ("quadruped", "meadow"), ("climber", "wall")],
+    [
+        ("stop_and_go", "stop_and_go"),
+        ("terraces", "terraces"),
+        ("quadruped", "meadow"),
+        ("climber", "wall"),
+    ],
 )
 def test_terrain_lies_below_every_foot(walk, mesh):
     base = load_clip(DATA / "clips" / f"{walk}_base.npz")
@@ -224,7 +231,7 @@ def test_holds_stand_out_of_the_wall_by_two_to_six_centimetres():
 
 
 @pytest.mark.parametrize(
-    "name", ["slope", "steps", "rubble", "uneven_walk", "stop_and_go", "meadow"]
+    "name", ["slope", "steps", "rubble", "uneven_walk", "stop_and_go", "terraces", "meadow"]
 )
 def test_a_terrain_has_no_hole_and_faces_up(tmp_path, name):
     mesh = getattr(terrain_meshes, name)()

@@ -56,6 +56,8 @@ def calibrate(options: argparse.Namespace) -> int:
             options.output,
             replicates=options.replicates,
             chains=options.chains,
+            workers=options.workers,
+            scheduler=options.scheduler,
             progress=line,
             log=_print_now,
         )
@@ -102,7 +104,10 @@ def compare(options: argparse.Namespace) -> int:
     _check_comparison(options)
     animation = _animation(options)
     requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
-    jobs.compare(requested, animation, options.output, during=progress.timed, log=print)
+    jobs.compare(
+        requested, animation, options.output,
+        rates=options.rates, during=progress.timed, log=print,
+    )  # fmt: skip
     return 0
 
 
@@ -247,6 +252,7 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
     if options.runs is not None:
         raise ValueError("--runs and --suite exclude each other")
     own = {"CLIP": None, "--terrain": None, "--file-up": "y", "--floor": 0.0, "--root": "auto"}
+    own["--rates"] = []
     for name, unused in own.items():
         given = getattr(options, name.strip("-").replace("-", "_").lower())
         if given != unused:
@@ -266,8 +272,9 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
 
 def _compare_runs(options: argparse.Namespace) -> int:
     """Compares sampled runs by what they predict."""
-    for name, given in (("CLIP", options.clip), ("--terrain", options.terrain)):
-        if given is not None:
+    own = {"CLIP": options.clip, "--terrain": options.terrain, "--rates": options.rates}
+    for name, given in own.items():
+        if given:
             raise ValueError(f"{name} is {given}; runs are compared on the clips of their fits")
     if options.systems:
         raise ValueError(f"{options.systems[0][0]} and --runs exclude each other")

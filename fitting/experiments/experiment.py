@@ -68,7 +68,11 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is fitted to what."""
+    """What is fitted to what.
+
+    Raises:
+        ValueError: for noise that cannot be estimated in this way.
+    """
 
     path: Path
     """Of the file; relative paths in it start from there."""
@@ -103,6 +107,19 @@ class Experiment:
     sample: SamplerSettings = SamplerSettings()
     without: tuple[Ablation, ...] = ()
     """What `jaxik ablate` leaves out in turn."""
+
+    def __post_init__(self) -> None:
+        if self.noise.sigmas == "estimated" and self.loss not in ("squares", "student"):
+            raise ValueError(
+                f"{self.path}: [noise] sigmas cannot be estimated under the loss {self.loss!r}, "
+                "which is not a distribution of noise; take squares, or student for outliers"
+            )
+        if self.noise.correlation != "given" and self.independent_every:
+            raise ValueError(
+                f"{self.path}: independent_every and [noise] correlation = "
+                f"{self.noise.correlation!r} would account for the same correlation twice; leave "
+                "one of them out"
+            )
 
     def preset_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
         """The preset with the experiment's rules, for a rig unless it is meant for the adult."""

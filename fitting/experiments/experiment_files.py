@@ -148,7 +148,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "start": read_start(content.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(content.get("parameters", {}), 2),
         "sigmas": sigmas,
-        "noise": _noise_options(content, f"{path}"),
+        "noise": _noise_options(content.get("noise", {}), f"{path} [noise]"),
         "without": without,
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
@@ -156,20 +156,8 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     return Experiment(**{"path": path, "name": path.stem, **content, **tables})
 
 
-def _noise_options(content: Table, where: str) -> NoiseOptions:
-    options = NoiseOptions(**check_table(content.get("noise", {}), NOISE_KEYS, f"{where} [noise]"))
-    loss = content.get("loss", "squares")
-    if options.sigmas == "estimated" and loss not in ("squares", "student"):
-        raise ValueError(
-            f"{where}: [noise] sigmas cannot be estimated under the loss {loss!r}, which is not a "
-            "distribution of noise; take squares, or student for outliers"
-        )
-    if options.correlation != "given" and content.get("independent_every", 0.0):
-        raise ValueError(
-            f"{where}: independent_every and [noise] correlation = {options.correlation!r} would "
-            "account for the same correlation twice; leave one of them out"
-        )
-    return options
+def _noise_options(value: object, where: str) -> NoiseOptions:
+    return NoiseOptions(**check_table(value, NOISE_KEYS, where))
 
 
 def _fit_options(value: object, where: str) -> FitOptions:

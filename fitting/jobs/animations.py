@@ -1,7 +1,8 @@
 """Jobs that run finished systems on flat animations, and measure what comes out."""
 
+import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fitting.report import comparison_report, fit_tables, placement_report
 from fitting.report.formatting import aligned
 from fitting.report.suite import suite_report
 from fitting.runtime.precision import in_float64, with_floats
-from fitting.studies import comparison, run_folder
+from fitting.studies import comparison, frame_rates, run_folder
 from fitting.studies.animations import AnimationFiles, load_animation
 from fitting.studies.comparison import Comparison
 from fitting.studies.suite import suite
@@ -32,6 +33,7 @@ def compare(
     animation: AnimationFiles,
     output: str | Path | None = None,
     *,
+    rates: Sequence[float] = (),
     during: Callable[[str], AbstractContextManager] = nullcontext,
     log: Log = silent,
 ) -> Comparison:
@@ -41,23 +43,28 @@ def compare(
         systems: by name.
         animation: the clip, the terrain, and where the root is put for all systems.
         output: folder for the table, the numbers and the figure.
+        rates: Hz, at which each system runs too, to see how much its motion depends on them.
         during: makes a context for the run of each system, from its name.
         log: called with what the command line prints.
 
     Raises:
         ValueError: a file cannot be read, a system does not fit the clip or gives poses that are
-            not finite, or the folder cannot be made.
+            not finite, a rate is above the clip's, or the folder cannot be made.
     """
     folder = checked_folder(output)
     systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
     title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
     loaded = load_animation(animation)
     compared = comparison.compare(systems, loaded, title=title, during=during)
+    differences = frame_rates.measure(systems, loaded, rates, during)
+    compared = dataclasses.replace(compared, rates=differences)
     if folder is not None:
         comparison_report.write(folder, compared)
     table = aligned(comparison_report.transposed(comparison_report.table(compared)))
     where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
     log("\n".join([table, "", *filter(None, where)]))
+    if differences:
+        log(f"\n{aligned(comparison_report.rate_table(compared))}")
     log_output(log, folder, comparison_report.TABLE)
     for name, (placement, cause) in compared.placements.items():
         placement_report.warn(placement, cause, name)

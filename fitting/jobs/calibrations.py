@@ -7,6 +7,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
+from fitting.runtime import cluster
 from fitting.runtime.precision import in_float64
 from fitting.studies.calibration import calibration
 from fitting.studies.calibration.assessment import Assessment, assess
@@ -22,6 +23,8 @@ def calibrate(
     *,
     replicates: int = 200,
     chains: bool = False,
+    workers: int = 0,
+    scheduler: str | None = None,
     progress: Callable[[CalibrationProgress], None] = lambda report: None,
     log: Log = silent,
 ) -> Assessment:
@@ -37,12 +40,15 @@ def calibrate(
         replicates: number of truths.
         chains: whether to sample each posterior as `sample` does; a chain takes much longer than a
             fit.
+        workers: processes on this machine that compute; 0 computes in this process.
+        scheduler: address of the scheduler of a Dask cluster that computes instead.
         progress: called as fits and chains go on.
         log: called with what the command line prints.
 
     Raises:
         ValueError: the experiment is wrong or does not fit its clips; it is one whose noise cannot
-            be simulated; the folder holds another calibration; there is not one replicate.
+            be simulated; the folder holds another calibration; there is not one replicate; there
+            is no such cluster.
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
@@ -54,9 +60,11 @@ def calibrate(
         lambda fitted: log(calibration_report.fit_line(fitted)),
         lambda chain: log(calibration_report.chain_line(chain)),
     )
-    made = calibration.calibrate(
-        experiment, problem, folder, replicates, chains=chains, observers=observers
-    )
+    with cluster.connect(workers, scheduler) as client:
+        made = calibration.calibrate(
+            experiment, problem, folder, replicates,
+            chains=chains, client=client, observers=observers,
+        )  # fmt: skip
     assessment = assess(made)
     if folder is not None:
         calibration_report.write(folder, experiment, made, assessment)

@@ -9,12 +9,14 @@ logarithm of its half-life up to a constant, so that the tick rate cancels. `flo
 bound, or, for a parameter declared above another one, the larger of that bound and the other one's
 value: the order holds for every `u`.
 
-What is known of `u` before any data is its `prior`, and `start` is where a search begins. Both are
-the values of the system as it is, unless told otherwise: the normal priors are centred there. A
-uniform prior of a parameter declared above another one is uniform between that one's value and the
-upper bound, whatever that value is.
+`start` is where a search begins, and `prior` what is known of `u` before any data; both are at the
+values of the system as it is, unless told otherwise. A value in the outer sixth of its range often
+means that something is off, and not how it is when it is on: such a prior is centred a sixth
+inside. A uniform prior of a parameter declared above another one is uniform between that one's
+value and the upper bound, whatever that value is.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any, Generic, TypeAlias, TypeVar
@@ -32,7 +34,8 @@ from jaxik.maths import parameter_tree
 from .free_parameters import FreeParameter, present_value
 from .prior import SPREAD, Prior, Priors
 
-CENTRE_LIMIT = 3.0  # of u, for priors and starts: at a bound they would hide the rest of the range
+OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
+CENTRE_LIMIT = 3.0  # of u, for given centres and for starts: at a bound u is infinite
 EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
 INTERVAL = (0.025, 0.975)  # the probabilities at the ends of a 95 % interval
 DRAWS = 20_000  # from the prior, for the interval of a parameter that depends on another one
@@ -161,7 +164,7 @@ class Space(eqx.Module, Generic[System]):
         spread = [SPREAD if p.spread is None else p.spread for p in chosen.values()]
         dtype = self.start.dtype
         prior = Prior(
-            centre=jax.device_put(np.where(uniform, 0, self._inside("centre", given))),
+            centre=jax.device_put(np.where(uniform, 0, self._centre(given))),
             spread=jax.device_put(np.where(uniform, 1, np.asarray(spread)).astype(dtype)),
             uniform=jax.device_put(uniform),
         )
@@ -177,8 +180,13 @@ class Space(eqx.Module, Generic[System]):
         start = jax.device_put(self._inside("start", values))
         return eqx.tree_at(lambda space: space.start, self, start)
 
+    def _centre(self, given: Mapping[str, float]) -> Float[np.ndarray, " free"]:
+        """`u` of the centres of normal priors; the system's own are not too far out."""
+        centre, is_given = self._inside("centre", given), [name in given for name in self.names]
+        return np.where(is_given, centre, np.clip(centre, -OWN_CENTRE_LIMIT, OWN_CENTRE_LIMIT))
+
     def _inside(self, what: str, values: Mapping[str, float]) -> Float[np.ndarray, " free"]:
-        """`u` of values, the system's where left out, and not too near a bound."""
+        """`u` of values, the system's where left out, and not at a bound."""
         present = {}
         for p in self.parameters:
             value = values.get(p.name)

@@ -32,7 +32,7 @@ from fitting.runtime import files
 from fitting.runtime.validation import Table, error_context
 
 from .animations import Animation
-from .fit import search
+from .fit import search_with_noise
 
 NUMBERS = "contribution.json"
 
@@ -204,7 +204,7 @@ def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] 
         fitted = replace(variant, clips=tuple(entry for entry, _ in data.fitted))
         resampled = (_at_rate(clip, variant.fps) for _, clip in data.fitted)
         problem = problem_from_clips(fitted, resampled)
-        solution = search(problem, variant, progress)
+        problem, solution = search_with_noise(problem, variant, progress)
         if solution.interrupted:
             raise KeyboardInterrupt
         ik = problem.space.unpack(solution.u)

@@ -1,6 +1,6 @@
 """Several systems on one flat animation, measured side by side."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from jaxik.maths import vec
 from jaxik.world.terrain import Terrain, cast
 
 from .animations import Animation
+from .frame_rates import RateDifference
 
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
 
@@ -44,6 +45,8 @@ class Comparison:
     measures: Mapping[str, Measures]
     placements: Mapping[str, tuple[Placement, Cause | None]]
     """Of the systems, without the animation; see `Animation.assess`."""
+    rates: Sequence[RateDifference] = ()
+    """At other frame rates, system by system."""
 
 
 @in_float64

@@ -110,10 +110,11 @@ def load_named_system(
         rig: whose body the system is for; None is the adult.
 
     Raises:
-        ValueError: there is no such preset or file.
+        ValueError: there is no such preset or file, or the file has a table [noise].
     """
     path = Path(text)
     if path.suffix.lower() == ".toml":
+        _check_no_noise(validation.read_toml(path, "a parameter"), text)
         ik, preset = parameter_files.load_system(path, rig)
         return NamedSystem(path.stem, preset, ik)
     with error_context(f"{option} takes a preset or a parameter .toml"):
@@ -130,12 +131,14 @@ def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Free
         rig: whose body their ranges are for; None is the adult.
 
     Raises:
-        ValueError: no parameter is named, one is unknown, or it cannot be what the table says.
+        ValueError: no parameter is named, one is unknown, or it cannot be what the table says; the
+            file has a table [noise].
     """
     path = Path(text)
     free: FreeTable
     if path.suffix.lower() == ".toml":
         content = validation.read_toml(path, "a free-parameter")
+        _check_no_noise(content, text)
         validation.check_table(content, {"free": validation.TABLE}, text)
         free = systems.read_free_table(content.get("free", {}), f"{text} [free]")
     else:
@@ -146,6 +149,14 @@ def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Free
         for name, overrides in free.items():
             free_parameter(ik, name, rig, **overrides)
     return free
+
+
+def _check_no_noise(content: validation.Table, where: str) -> None:
+    if "noise" in content:
+        raise ValueError(
+            f"{where}: there is a table [noise], but nothing to estimate: the reference of a "
+            "translation is exact, and its sigmas are tolerances; leave the table out"
+        )
 
 
 def prepare(request: TranslationRequest, run: Path) -> Translation:

@@ -10,6 +10,7 @@ import jaxik
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.experiments import experiment_files, problems
 from fitting.experiments.experiment import FitOptions
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.prior import ParameterPrior
@@ -340,6 +341,13 @@ def test_a_parameter_that_only_a_variant_frees_may_have_a_prior(tmp_path):
     limit = space.names.index("pelvis.limit")
     assert space.prior.uniform[limit]
     assert float(space.values(space.start)[limit]) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_a_loss_that_is_no_distribution_has_no_estimated_sigmas_in_python_either(tmp_path, loss):
+    loaded = experiment_files.load_experiment(write(tmp_path))
+    with pytest.raises(ValueError, match=f"experiment.toml: .* under the loss '{loss}'.*student"):
+        dataclasses.replace(loaded, loss=loss, noise=NoiseOptions("estimated"))
 
 
 def test_only_settings_that_are_not_the_default_are_written(tmp_path):

@@ -21,7 +21,7 @@ from fitting.inference.optimisation import (
     sweep,
 )
 from fitting.inference.optimisation.settings import SearchSettings
-from fitting.inference.optimisation.state import ROUNDING, Search, SearchState, StepsUsedUp
+from fitting.inference.optimisation.state import ROUNDING, Point, Search, SearchState, StepsUsedUp
 from fitting.problem import free_parameters, space
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree
@@ -344,8 +344,33 @@ def test_the_same_seed_gives_the_same_solution():
     assert [r.cost for r in first.history] == [r.cost for r in second.history]
 
 
-def test_starts_are_made_until_two_of_them_agree():
+def test_descents_that_agree_need_neither_evolution_nor_another_start():
     solution = search.find_best_fit(curve_problem())
+    assert (solution.starts, solution.agreeing) == (2, 2)
+    assert {report.start for report in solution.history} == {0}
+    assert "evolution" not in {report.stage for report in solution.history}
+
+
+def test_the_descents_that_do_not_agree_count_too(monkeypatch):
+    """Of three, one stops where it begins: two of three agree."""
+    settings = SearchSettings(descents=3, draws=3, sweeps=0)
+    problem = curve_problem(("height", "rate", "turn"))
+    begin, far = np.asarray(problem.space.start), problem.space.start.at[1].set(-3.0)
+    points = [Point(np.asarray(u), cost_of(problem, u)) for u in (begin, far, begin)]
+    monkeypatch.setattr(search, "starting_points", lambda of, state, first: (points, state))
+    real = search.descend
+
+    def descend(of, state, stage):
+        return state if state.point is points[1] else real(of, state, stage)
+
+    monkeypatch.setattr(search, "descend", descend)
+    solution = search.find_best_fit(problem, settings)
+    assert (solution.starts, solution.agreeing) == (3, 2)
+    assert solution.message.startswith("Converged: 2 of 3 starts agree")
+
+
+def test_starts_are_made_until_two_of_them_agree():
+    solution = search.find_best_fit(curve_problem(), SearchSettings(descents=1))
     assert (solution.starts, solution.agreeing) == (2, 2)
     assert solution.message.startswith("Converged: 2 of 2 starts agree, and no further step")
     assert {report.start for report in solution.history} == {0, 1}
@@ -353,7 +378,7 @@ def test_starts_are_made_until_two_of_them_agree():
 
 
 def test_one_start_alone_has_not_converged():
-    solution = search.find_best_fit(curve_problem(), starts=1)
+    solution = search.find_best_fit(curve_problem(), SearchSettings(descents=1), starts=1)
     assert not solution.converged
     assert solution.message == "Not converged: stopped in a valley, where the only start led."
     assert (solution.starts, solution.agreeing) == (1, 1)

@@ -1,17 +1,20 @@
 """The prior of `u`: its two shapes against SciPy's distributions, its intervals, its mistakes."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
+from fitting.experiments import systems
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import LOGISTIC_SD, SPREAD, ParameterPrior, Prior, Priors
 from fitting.problem.prior_probability import prior_probability
-from fitting.problem.space import Space, make_space
+from fitting.problem.space import INTERVAL, Space, make_space
+from jaxik.maths import parameter_tree
 from support import toy
 
 PRIOR = Prior(jnp.asarray([0.7, 0.0]), jnp.asarray([1.3, 1.0]), jnp.asarray([False, True]))
@@ -85,6 +88,20 @@ def test_the_interval_of_a_normal_prior_is_that_of_its_u():
     centre = np.log(0.25 / 0.75)  # 0.3 of 1.2
     expected = 1.2 / (1 + np.exp(-(centre + 0.4 * stats.norm.ppf([0.025, 0.975]))))
     np.testing.assert_allclose(space.prior_interval(), [expected])
+
+
+SYSTEMS = [*((name, False) for name in systems.preset_names()), ("record", True), ("mec", True)]
+
+
+@pytest.mark.parametrize(("preset", "faithful"), SYSTEMS)
+def test_the_prior_of_every_parameter_of_every_preset_allows_most_of_its_range(preset, faithful):
+    """On its scale, and also where the preset's value is at a bound, as a half-life of 0 is."""
+    ik = systems.preset_system(preset, faithful=faithful)
+    parameters = [free_parameter(ik, name) for name in parameter_tree.declarations(ik)]
+    prior = make_space(ik, [replace(parameter, above=None) for parameter in parameters]).prior
+    low, high = special.expit(prior.quantile(np.array(INTERVAL)[:, None]))
+    for name, fraction in zip((p.name for p in parameters), high - low, strict=True):
+        assert fraction > 0.8, name
 
 
 def test_a_parameter_above_a_free_one_has_the_interval_of_the_mixture():

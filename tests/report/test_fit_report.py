@@ -197,6 +197,12 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
 
 
+def test_the_table_of_priors_says_where_a_centre_is_not_the_systems_value(fitted):
+    text = "\n".join(priors.prior_section(fitted.summary["parameters"]))
+    assert "| normal | 0.9667 (system: 0.98) | 1.6 |" in line_of(text, "leg.soften")  # of 0.8 to 1
+    assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
+
+
 def test_a_gain_is_shown_as_half_life_and_at_30_and_60_hz(fitted):
     text = fit_report.fit_text(replace(fitted, known_values=None))
     cells = text.split("gain at 60 Hz")[1].split()[-5:]

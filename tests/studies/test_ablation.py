@@ -19,6 +19,7 @@ from fitting.experiments.ablations import COMPLETE, Ablation
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import ClipData
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.report import ablation_report
 from fitting.report.labels import ACCURACY
@@ -67,7 +68,7 @@ class Search:
         best = {name: 0.3 if name != "pelvis.on_gain" else frames / 1000 for name in names}
         u = np.asarray(problem.space.pack(best))
         values = np.asarray(problem.space.values(jnp.asarray(u)))
-        return Solution(
+        return problem, Solution(
             names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, len(names))), (), 1, 0.5,
             interrupted=stopped,
         )  # fmt: skip
@@ -76,7 +77,7 @@ class Search:
 @pytest.fixture
 def search(monkeypatch) -> Search:
     counted = Search()
-    monkeypatch.setattr(ablation, "search", counted)
+    monkeypatch.setattr(ablation, "search_with_noise", counted)
     without_pipeline(monkeypatch)
     return counted
 
@@ -238,6 +239,11 @@ def test_the_problem_of_a_variant_has_its_fixed_values_and_the_sigmas(tmp_path, 
     assert float(parameter_tree.get(problem.space.system, "foot.max_pitch")) == 0.2
     assert float(problem.data[0].sigmas.ankle) == 0.05
     assert variant.free == {"pelvis.on_gain": {}}
+
+
+def test_every_variant_estimates_the_noise_that_the_experiment_says(tmp_path, search):
+    ablation.ablate(load(tmp_path, WITHOUT + '[noise]\nsigmas = "estimated"\n'))
+    assert {variant.noise for _, variant in search.calls} == {NoiseOptions("estimated")}
 
 
 def test_progress_says_what_is_being_fitted(tmp_path, search):

@@ -7,12 +7,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from distributed import LocalCluster
 
 import fitting
 from fitting.cli import main
@@ -22,7 +24,7 @@ from fitting.inference.profiles.profile import make_profile
 from fitting.report.calibration import calibration_report, calibration_tables
 from fitting.report.plots import calibration_plots
 from fitting.studies.calibration import calibration, replicates
-from fitting.studies.calibration.assessment import Assessment, assess
+from fitting.studies.calibration.assessment import Assessment, assess, summarise
 from fitting.studies.calibration.calibration import Calibration, CalibrationProgress, Observers
 from support.experiments import CLIP, ROOT, write
 
@@ -185,6 +187,22 @@ def test_truths_come_from_the_prior_and_differ(experiment_file):
     np.testing.assert_allclose(np.mean(probability, axis=0), 0.5, atol=0.06)
     np.testing.assert_allclose(np.var(probability, axis=0), 1 / 12, atol=0.012)
     assert len({truth.noise_seed for truth in truths} | {t.seed for t in truths}) == 800
+
+
+def test_a_cluster_makes_the_same_replicates(experiment_file, tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    expected = calibrate(experiment_file, here, 2)
+    reports: list[CalibrationProgress] = []
+    options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(n_workers=1, processes=False, **options) as workers:
+        address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
+        assessment = calibrate(
+            experiment_file, there, 2, scheduler=address, progress=reports.append
+        )
+    assert summarise(assessment) == summarise(expected)
+    assert kept(there) == kept(here)
+    assert {report.replicate for report in reports} == {1, 2}
+    assert reports[-1].stage == "2 of 2 fits done" and reports[-1].remaining == 0.0
 
 
 def test_an_interrupted_calibration_continues_bit_by_bit(experiment_file, tmp_path):

@@ -284,3 +284,13 @@ def test_a_file_of_free_parameters_may_have_ranges(tmp_path):
     path = tmp_path / "free.toml"
     path.write_text("[free]\npelvis.limit = { high = 0.4 }\n")
     assert translation.read_free(str(path), presets.record()) == {"pelvis.limit": {"high": 0.4}}
+
+
+def test_noise_is_refused_for_a_translation_has_none(tmp_path):
+    path = tmp_path / "noisy.toml"
+    path.write_text('[free]\npelvis.limit = {}\n[noise]\nsigmas = "estimated"\n')
+    with pytest.raises(ValueError, match=r"noisy.toml: there is a table \[noise\], but nothing"):
+        translation.read_free(str(path), presets.record())
+    path.write_text('preset = "ozz"\n[noise]\ncorrelation = "whitened"\n')
+    with pytest.raises(ValueError, match="reference of a translation is exact"):
+        translation.load_named_system(str(path))

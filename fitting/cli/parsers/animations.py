@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from .options import Commands, add_animation, add_command, add_output
+from .options import Commands, add_animation, add_command, add_output, rates
 
 
 def add_apply(commands: Commands) -> None:
@@ -42,6 +42,8 @@ def add_compare(commands: Commands) -> None:
         """
         jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
         jaxik compare walk.bvh --terrain steps.obj --presets record --parameters a.toml,b.toml -o ab
+        jaxik compare walk.bvh --terrain steps.obj --parameters runs/walk/parameters.toml \
+            --rates 30,60 -o rates                       how much it depends on the frame rate
         jaxik compare --suite -o suite                   every preset in every made situation
         jaxik compare --suite --quick --presets record   a shorter suite, without files
         jaxik compare --suite --only "stairs up,curb" --presets record --parameters a.toml
@@ -62,6 +64,10 @@ def add_compare(commands: Commands) -> None:
     compare.add_argument(
         "--runs", metavar="RUN,...", help="compare what these sampled runs predict, without a clip"
     )
+    compare.add_argument(
+        "--rates", type=rates, default=[], metavar="HZ,...",
+        help="run at these frame rates too, and measure how far that is from the clip's own",
+    )  # fmt: skip
     suite = compare.add_argument_group("made situations")
     suite.add_argument("--suite", action="store_true", help="run them instead of a clip")
     suite.add_argument("--only", metavar="NAME,...", help="these situations (default: all)")

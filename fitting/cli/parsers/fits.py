@@ -50,7 +50,7 @@ def add_calibrate(commands: Commands) -> None:
         commands, "calibrate", "check what fits and posteriors say on motion with known truths",
         """
         jaxik calibrate data/experiments/ozz.toml -n 200 -o runs/calibration
-        jaxik calibrate data/experiments/ozz.toml -n 200 --chains -o runs/calibration
+        jaxik calibrate data/experiments/ozz.toml -n 200 --chains --workers 8 -o runs/calibration
 
         Truths are drawn from the experiment's prior. Each fit is written when it is done: after
         Ctrl-C (status 130) the same command continues, also with a larger -n or with --chains. The
@@ -67,6 +67,13 @@ def add_calibrate(commands: Commands) -> None:
         "--chains", action=argparse.BooleanOptionalAction, default=False,
         help="sample each posterior too, which takes much longer than the fits (default: no)",
     )  # fmt: skip
+    calibrate.add_argument(
+        "--workers", type=int, default=0, metavar="N",
+        help="compute in N other processes of this machine, with the extra `dask` (default: 0)",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "--scheduler", metavar="ADDRESS", help="compute on the Dask cluster of this scheduler"
+    )
     add_output(calibrate, "DIR")
 
 

@@ -78,3 +78,8 @@ def positive(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r}; wanted a number above 0")
     return value
+
+
+def rates(text: str) -> list[float]:
+    """Finite numbers above 0 with commas between them, as the `type` of an option."""
+    return [positive(part) for part in text.split(",")]

@@ -162,6 +162,18 @@ def stop_and_go() -> Mesh:
     )  # fmt: skip
 
 
+def terraces() -> Mesh:
+    """The course of the experiment `stride`, 11 m long: terraces, and a ramp of 17 degrees."""
+    up = stairs(Point(1.1, 0.0), (0.10, 0.15), tread=0.9)
+    down = stairs(up[-1], (-0.15, 0.09, -0.21), tread=0.8)
+    bottom = down[-1]
+    ramp = Point(bottom.z + 1.3, bottom.height + 0.34, 0.08)
+    return strip([
+        Point(-1.5, 0.0), Point(1.1, 0.0), *up, *down, Point(bottom.z + 0.2, bottom.height, 0.08),
+        ramp, Point(ramp.z + 0.2, ramp.height), Point(9.5, ramp.height),
+    ])  # fmt: skip
+
+
 def meadow() -> Mesh:
     """Tussocks on gently rolling ground, 8 m long."""
     profile = Point(-1.5, 0.0), Point(1.5, 0.08, 0.06), Point(4.0, -0.08, -0.05), Point(6.5, 0.05)

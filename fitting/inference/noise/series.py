@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import integrate, optimize, special
 
-from fitting.problem.loss import CAUCHY, HUBER, Loss
+from fitting.problem.loss import Loss, rho, slope_of_rho
 
 MAX_CORRELATION = 0.999
 TAIL_RANGE = (1.5, 100.0)  # degrees of freedom; from 100 on, Student's t is nearly normal
@@ -111,52 +111,29 @@ def innovations(errors: Errors, correlation: float) -> Float[np.ndarray, " value
 def scale(values: Float[np.ndarray, " values"], loss: Loss, tails: float) -> float:
     """The likeliest sigma of independent values: `sigma² = mean(weight * value²)`.
 
-    Iteratively reweighted; see `weights`.
+    Iteratively reweighted; a weight is the slope of the loss at the value in sigmas.
     """
     variance = float(np.mean(values**2))
     for _ in range(ITERATIONS if loss != "squares" else 0):
         if not variance > 0:
             break
-        before = variance
-        variance = float(np.mean(weights(values / math.sqrt(variance), loss, tails) * values**2))
+        before, squares = variance, values**2
+        weights = slope_of_rho(squares / variance, loss, tails, np)
+        variance = float(np.mean(weights * squares))
         if abs(variance - before) <= TOLERANCE * before:
             break
     return math.sqrt(variance)
-
-
-def weights(
-    residuals: Float[np.ndarray, " values"], loss: Loss, tails: float
-) -> Float[np.ndarray, " values"]:
-    """Derivative of the loss's rho by the squared residual, in sigmas."""
-    z = residuals**2
-    match loss:
-        case "huber":
-            return HUBER / np.maximum(np.abs(residuals), HUBER)
-        case "cauchy":
-            return 1 / (1 + z / CAUCHY**2)
-        case "student":
-            return (tails + 1) / (tails + z)
-        case _:
-            return np.ones_like(z)
 
 
 def log_density(
     residuals: Float[np.ndarray, "*values"], loss: Loss, tails: float
 ) -> Float[np.ndarray, "*values"]:
     """Log-density of residuals in sigmas; up to a constant, except for Student's t."""
-    z = residuals**2
-    match loss:
-        case "huber":
-            size = np.abs(residuals)
-            return -0.5 * np.where(size > HUBER, HUBER * (2 * size - HUBER), z)
-        case "cauchy":
-            return -0.5 * CAUCHY**2 * np.log1p(z / CAUCHY**2)
-        case "student":
-            constant = special.gammaln((tails + 1) / 2) - special.gammaln(tails / 2)
-            constant -= 0.5 * math.log(math.pi * tails)
-            return constant - 0.5 * (tails + 1) * np.log1p(z / tails)
-        case _:
-            return -0.5 * z
+    constant = 0.0
+    if loss == "student":
+        constant = special.gammaln((tails + 1) / 2) - special.gammaln(tails / 2)
+        constant -= 0.5 * math.log(math.pi * tails)
+    return constant - 0.5 * rho(residuals**2, loss, tails, np)
 
 
 def _follows(errors: Errors) -> Bool[np.ndarray, "frames columns"]:

@@ -5,11 +5,12 @@ The pipeline stays hard, and its cost has many valleys. Each start is independen
 1. The costs of some draws from the prior are computed; the best few descend by Levenberg–Marquardt
    (`descent`), with a `sweep` of each parameter over its range in between, which frees those that a
    clamp leaves without a derivative.
-2. Where their ends differ, `evolution` combines and varies them, thresholds included.
+2. Where their ends do not agree, `evolution` combines and varies them, thresholds included.
 3. The best point descends to the end (`descent.polish`).
 
 Starts are made until as many of them agree as the settings ask for: a valley that only one start
-has found may well not be the deepest.
+has found may well not be the deepest. Descents of one start that agree without evolution, as starts
+have to, count as starts.
 
 A search compiles two programs, whatever the number of starts and stages: a step of
 Levenberg–Marquardt, and the population's costs.
@@ -75,13 +76,15 @@ def find_best_fit(
     ends: list[float] = []
     try:
         cost_before, latest = _begin(search, latest, search.array(np.asarray(first)))
-        while len(ends) < starts and not agree(ends, settings):
-            state = dataclasses.replace(latest, start=len(ends), start_steps=0)
+        for start in range(starts):
+            if agree(ends, settings):
+                break
+            state = dataclasses.replace(latest, start=start, start_steps=0)
             try:
-                latest = search_from(search, state, None if ends else first)
+                latest, costs = search_from(search, state, None if ends else first)
             except StepsUsedUp as error:
-                latest, used_up = error.state, True
-            ends.append(latest.point.cost)
+                latest, costs, used_up = error.state, [error.state.point.cost], True
+            ends += costs
     except KeyboardInterrupt:
         latest, interrupted = watch.latest or latest, True
         if not np.isfinite(latest.best.cost):
@@ -138,8 +141,10 @@ def agree(ends: Sequence[float], settings: SearchSettings) -> bool:
 
 def search_from(
     search: Search, state: SearchState, first: Float[Array | np.ndarray, " free"] | None = None
-) -> SearchState:
+) -> tuple[SearchState, list[float]]:
     """All stages of one start; the state's point is its end.
+
+    Also the costs of its ends: one, or those of all descents where these agree by themselves.
 
     Args:
         search: the problem and the settings.
@@ -159,11 +164,15 @@ def search_from(
         ends.append(state.point)
     ends = [end for end in ends if np.isfinite(end.cost)]
     if not ends:
-        return state
+        return state, [np.inf]
     state = dataclasses.replace(state, point=min(ends, key=lambda end: end.cost))
-    if any(end.cost > state.point.cost + settings.agreement for end in ends):
-        state = evolve(search, state, ends)
-    return polish(search, state)
+    costs = [end.cost for end in ends]
+    if not agree(costs, settings):
+        state = polish(search, evolve(search, state, ends))
+        return state, [state.point.cost]
+    agreeing = count_agreeing(costs, settings)
+    state = polish(search, state)
+    return state, [state.point.cost] * agreeing + sorted(costs)[agreeing:]
 
 
 def starting_points(

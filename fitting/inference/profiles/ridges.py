@@ -30,12 +30,13 @@ class Ridge:
         """The combination in words: a sum, or a product where all scales are logarithmic."""
         terms = list(zip(self.names, self.coefficients, strict=True))
         if all(parameters[name].scale != "linear" for name in self.names):
-            return _product([(_factor(parameters[n]), _power(parameters[n], c)) for n, c in terms])
-        words = [
+            powers = [(_factor(parameters[n]), _power(parameters[n], c)) for n, c in terms]
+            return _combined(powers, (" × ", " / "), "{name}^{size:.2g}")
+        summands = [
             (_logarithm(parameters[n]), c if parameters[n].scale != "gain" else -c)
             for n, c in terms
         ]
-        return _sum(words)
+        return _combined(summands, (" + ", " - "), "{size:.2g} {name}")
 
 
 def find_ridges(
@@ -102,21 +103,19 @@ def _logarithm(parameter: FreeParameter) -> str:
     return factor if parameter.scale == "linear" else f"ln({factor})"
 
 
-def _product(terms: Sequence[tuple[str, float]]) -> str:
-    sign = np.sign(terms[0][1])
-    words = ""
-    for name, power in terms:
-        size = abs(power)
-        factor = name if np.isclose(size, 1, atol=0.05) else f"{name}^{size:.2g}"
-        words += factor if not words else f" × {factor}" if power * sign > 0 else f" / {factor}"
-    return words
+def _combined(terms: Sequence[tuple[str, float]], signs: tuple[str, str], term: str) -> str:
+    """Names with their coefficients in words, the first of them positive.
 
-
-def _sum(terms: Sequence[tuple[str, float]]) -> str:
-    sign = np.sign(terms[0][1])
+    Args:
+        terms: names and coefficients.
+        signs: between terms, before a positive and before a negative coefficient.
+        term: how a `name` and the `size` of its coefficient are written, unless that is 1.
+    """
+    first = np.sign(terms[0][1])
     words = ""
     for name, coefficient in terms:
         size = abs(coefficient)
-        term = name if np.isclose(size, 1, atol=0.05) else f"{size:.2g} {name}"
-        words += term if not words else f" + {term}" if coefficient * sign > 0 else f" - {term}"
+        sign = signs[0] if coefficient * first > 0 else signs[1]
+        one = np.isclose(size, 1, atol=0.05)
+        words += (sign if words else "") + (name if one else term.format(name=name, size=size))
     return words

@@ -14,7 +14,9 @@ def prior_section(rows: Sequence[FittedParameter]) -> list[str]:
         "## Priors",
         "What was known of the parameters before these clips, beside what the fit leaves of it. A "
         "normal prior is one of `u`, the parameter's range stretched to a coordinate without "
-        "bounds; the spread is its standard deviation there. A uniform prior is the range itself.",
+        "bounds; the spread is its standard deviation there. Unless the experiment says otherwise, "
+        "it is centred at the system's value, or, where that is in the outer sixth of the range, a "
+        "sixth inside. A uniform prior is the range itself.",
         markdown(prior_table(rows)),
     ]
 
@@ -25,11 +27,19 @@ def prior_table(rows: Sequence[FittedParameter]) -> Table:
     table[0] += ["95 % of the prior", "95 % interval of the fit"]
     for row in rows:
         prior = row["prior"]
-        cells = [row["name"], row["unit"], prior["shape"]]
-        numbers = (prior["centre"], prior["spread"])
-        cells += ["" if value is None else number(value) for value in numbers]
+        cells = [row["name"], row["unit"], prior["shape"], _centre(row)]
+        cells.append("" if prior["spread"] is None else number(prior["spread"]))
         table.append([*cells, interval(*prior["interval"]), interval(*row["interval"])])
     return table
+
+
+def _centre(row: FittedParameter) -> str:
+    """The centre of a prior, and the system's value where it is another one."""
+    centre = row["prior"]["centre"]
+    if centre is None:
+        return ""
+    other = number(row["before"]) != number(centre)
+    return number(centre) + (f" (system: {number(row['before'])})" if other else "")
 
 
 def posterior_prior_section(sampled: SampledFit, units: Mapping[str, str]) -> list[str]:

@@ -5,16 +5,17 @@ fits/0000.json       the fit of a replicate
 chains/0000.json     its posterior, where chains were wanted
 
 A call continues where an earlier one ended, also with more replicates, or with chains for fits that
-have none yet. All replicates share their compiled programs.
+have none yet. All replicates of a process share their compiled programs.
 """
 
 import dataclasses
+import functools
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -23,10 +24,13 @@ from fitting.experiments.experiment import Experiment
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress, digest
 from fitting.problem.problem import Problem
-from fitting.runtime import files
+from fitting.runtime import cluster, files
 from fitting.runtime.validation import error_context
 
 from .replicates import ReplicateChain, ReplicateFit, fit_replicate, sample_replicate
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 IDENTITY, FITS, CHAINS = "identity.json", "fits", "chains"
 Result = TypeVar("Result", bound=Mapping[str, Any])
@@ -37,7 +41,7 @@ class CalibrationProgress:
     """How far a calibration is."""
 
     replicate: int
-    """That is being made, from 1."""
+    """That is being made, or was finished last by a cluster, from 1."""
     replicates: int
     stage: str
     """What is being done for it."""
@@ -74,6 +78,7 @@ def calibrate(
     replicates: int,
     *,
     chains: bool = False,
+    client: "Client | None" = None,
     observers: Observers = Observers(),  # noqa: B008
 ) -> Calibration:
     """Makes the replicates that a folder does not hold yet: first all fits, then all chains.
@@ -86,6 +91,7 @@ def calibrate(
         folder: where finished replicates are kept. None keeps them in memory.
         replicates: number of truths.
         chains: whether each posterior is sampled, too.
+        client: of the Dask cluster that computes. None computes in this process.
         observers: what is called meanwhile.
 
     Raises:
@@ -97,18 +103,13 @@ def calibrate(
     if folder is not None:
         _claim(folder, experiment, problem)
 
-    def fit_one(number: int, progress: Callable[[Progress], None]) -> ReplicateFit:
-        return fit_replicate(problem, experiment, number, progress)
-
-    fits = _Stage(folder, FITS, replicates, observers.progress).run(fit_one, observers.on_fit)
+    stage = functools.partial(_Stage, folder, replicates, client, observers.progress)
+    fit = functools.partial(fit_replicate, problem, experiment)
+    fits = stage(FITS).run(fit, range(replicates), observers.on_fit)
     if not chains:
         return Calibration(fits, [])
-
-    def sample_one(number: int, progress: Callable[[SamplingProgress], None]) -> ReplicateChain:
-        return sample_replicate(problem, experiment, fits[number], progress)
-
-    stage = _Stage(folder, CHAINS, replicates, observers.progress)
-    return Calibration(fits, stage.run(sample_one, observers.on_chain))
+    sample = functools.partial(sample_replicate, problem, experiment)
+    return Calibration(fits, stage(CHAINS).run(sample, fits, observers.on_chain))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,31 +117,63 @@ class _Stage:
     """The fits, or the chains, of all replicates."""
 
     folder: Path | None
-    name: str
     replicates: int
+    client: "Client | None"
     progress: Callable[[CalibrationProgress], None]
+    name: str
 
     def run(
         self,
-        make: Callable[[int, Callable[[Any], None]], Result],
+        make: Callable[..., Result],
+        arguments: Sequence[Any],
         on_result: Callable[[Result], object],
     ) -> list[Result]:
-        """The results of all replicates; those that the folder has are not made again."""
+        """The results of all replicates; those that the folder has are not made again.
+
+        Args:
+            make: makes one from its argument; takes `progress`, too.
+            arguments: of each replicate.
+            on_result: called with each new result.
+        """
         results: dict[int, Result] = {}
         for number in range(self.replicates):
             if self.folder is not None and self._path(number).exists():
                 results[number] = self._read(number)
-        began = time.monotonic()
         missing = [number for number in range(self.replicates) if number not in results]
-        for done, number in enumerate(missing):
-            with error_context(f"replicate {number + 1}"):
-                result = make(number, self._reporter(number, done, len(missing), began))
+        computed = self._compute_here if self.client is None else self._compute_on_cluster
+        for number, result in computed(make, arguments, missing):
             if self.folder is not None:
                 self._path(number).parent.mkdir(parents=True, exist_ok=True)
                 files.write_text(self._path(number), json.dumps(result, indent=1) + "\n")
             results[number] = result
             on_result(result)
         return [results[number] for number in range(self.replicates)]
+
+    def _compute_here(
+        self, make: Callable[..., Result], arguments: Sequence[Any], missing: Sequence[int]
+    ) -> Iterator[tuple[int, Result]]:
+        began = time.monotonic()
+        for done, number in enumerate(missing):
+            report = self._reporter(number, done, len(missing), began)
+            with error_context(f"replicate {number + 1}"):
+                result = make(arguments[number], progress=report)
+            yield number, result
+
+    def _compute_on_cluster(
+        self, make: Callable[..., Result], arguments: Sequence[Any], missing: Sequence[int]
+    ) -> Iterator[tuple[int, Result]]:
+        assert self.client is not None
+        began = time.monotonic()
+        wanted = [arguments[number] for number in missing]
+        computed = cluster.compute(self.client, make, wanted)
+        for done, (index, future) in enumerate(computed, start=1):
+            number, elapsed = missing[index], time.monotonic() - began
+            with error_context(f"replicate {number + 1}"):
+                result = future.result()
+            left = elapsed / done * (len(missing) - done)
+            stage = f"{done} of {len(missing)} {self.name} done"
+            self.progress(CalibrationProgress(number + 1, self.replicates, stage, elapsed, left))
+            yield number, result
 
     def _reporter(
         self, number: int, done: int, missing: int, began: float
