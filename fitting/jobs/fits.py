@@ -101,8 +101,10 @@ def sample(
         experiment = experiment.with_max_sample_steps(max_steps)
     chain = None if run is None else run / run_folder.CHAIN
     posterior = sample_around(parameters, problem, experiment, chain, progress)
-    played = replay(problem, posterior, experiment.seed)
-    posterior = dataclasses.replace(posterior, blocks=played.blocks)
+    played = None
+    if not posterior.interrupted:
+        played = replay(problem, posterior, experiment.seed)
+        posterior = dataclasses.replace(posterior, blocks=played.blocks)
     sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
     if run is not None:
         run_folder.save_posterior(run, sampled)

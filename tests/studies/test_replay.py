@@ -13,6 +13,7 @@ import jaxik
 from fitting.analysis import playback
 from fitting.experiments import experiment_files, problems
 from fitting.inference.noise.model import noise_of, with_noise
+from fitting.inference.sampling.blocks import LeaveOneOut
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem import residuals, simulation
 from fitting.problem.loss import apply_loss
@@ -202,7 +203,19 @@ def test_bands_hold_the_capture_and_are_drawn(replayed):
 
 
 def test_the_summary_is_plain_json(replayed):
-    numbers = json.loads(json.dumps(summarise_replay(replayed, None)))
+    left_out = LeaveOneOut(
+        elpd=-3.0,
+        error=0.5,
+        parameters=1.2,
+        elpd_of_block=np.array([-1.0, -2.0]),
+        pareto_k=np.array([0.1, np.inf]),
+        max_k=0.6,
+        neighbours=np.nan,
+    )
+    text = json.dumps(summarise_replay(replayed, left_out), allow_nan=False)
+    numbers = json.loads(text)
+    assert [row["pareto_k"] for row in numbers["leave_one_out"]["blocks"]] == [0.1, None]
+    assert left_out.unreliable == 1
     assert [row["kind"] for row in numbers["predictive_checks"]] == list(KINDS)
     assert 0 <= numbers["predictive_checks"][0]["rms"]["p"] <= 1
     assert summarise_replay(None, None) == {"predictive_checks": None, "leave_one_out": None}

@@ -1,5 +1,7 @@
 """What the motion of a posterior's draws says, as `posterior.json` holds it."""
 
+import math
+
 from fitting.inference.sampling.blocks import LeaveOneOut
 from fitting.runtime.validation import Content
 
@@ -42,15 +44,21 @@ def _statistic(statistic: Statistic) -> Content:
 
 def _left_out(found: LeaveOneOut, replay: Replay) -> Content:
     blocks = replay.blocks
-    columns = (blocks.clip, blocks.start, blocks.end, found.elpd_of_block, found.pareto_k)
+    columns = (blocks.clip, blocks.start, blocks.end, found.elpd_of_block)
     names = ("clip", "start", "end", "elpd", "pareto_k")
-    rows = zip(*(column.tolist() for column in columns), strict=True)
+    shapes = map(_finite, found.pareto_k.tolist())
+    rows = zip(*(column.tolist() for column in columns), shapes, strict=True)
     return {
         "elpd": found.elpd,
         "error": found.error,
         "parameters": found.parameters,
         "max_k": found.max_k,
-        "neighbours": found.neighbours,
+        "neighbours": _finite(found.neighbours),
         "data": blocks.data,
         "blocks": [dict(zip(names, row, strict=True)) for row in rows],
     }
+
+
+def _finite(value: float) -> float | None:
+    """None for what JSON does not have."""
+    return value if math.isfinite(value) else None
