@@ -23,7 +23,7 @@ from .islands import Islands, find_islands
 
 # Fraction of the steps. Effective samples per 1,000 evaluations of the slowest parameter, with 0,
 # 0.2 and 0.5: 39, 96 and 210 for the 6 smooth ones of data/experiments/ozz.toml, 3, 18 and 14 for
-# the 17 of uneven_walk.toml, seven of them thresholds.
+# the 17 of uneven_walk.toml, four of them thresholds.
 JUMPS = 0.3
 Balls: TypeAlias = Float[np.ndarray, "walkers free"]
 DRAWS = 100  # attempts to start every walker where its log-probability is finite
