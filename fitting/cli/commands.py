@@ -103,10 +103,12 @@ def run(options: argparse.Namespace) -> int:
 
 @in_float64
 def compare(options: argparse.Namespace) -> int:
-    """Runs several systems on a clip, or through the suite, and measures them."""
+    """Runs several systems on a clip or through the suite, or compares runs."""
     _prepare_jax()
     if options.suite:
         return _compare_in_suite(options)
+    if options.runs is not None:
+        return _compare_runs(options)
     _check_comparison(options)
     animation = _animation(options)
     requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
@@ -256,6 +258,8 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
 
 def _compare_in_suite(options: argparse.Namespace) -> int:
     """Runs systems, or else all presets, through made situations."""
+    if options.runs is not None:
+        raise ValueError("--runs and --suite exclude each other")
     own = {"CLIP": None, "--terrain": None, "--file-up": "y", "--floor": 0.0, "--root": "auto"}
     own["--rates"] = []
     for name, unused in own.items():
@@ -275,6 +279,18 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
     return _status(interrupted=finished.interrupted)
 
 
+def _compare_runs(options: argparse.Namespace) -> int:
+    """Compares sampled runs by what they predict."""
+    own = {"CLIP": options.clip, "--terrain": options.terrain, "--rates": options.rates}
+    for name, given in own.items():
+        if given:
+            raise ValueError(f"{name} is {given}; runs are compared on the clips of their fits")
+    if options.systems:
+        raise ValueError(f"{options.systems[0][0]} and --runs exclude each other")
+    jobs.compare_runs(options.runs.split(","), options.output, log=print)
+    return 0
+
+
 def _check_comparison(options: argparse.Namespace) -> None:
     """Raises ValueError for what only the suite takes, or only a comparison on a clip needs."""
     for name in ("only", "quick"):
@@ -282,7 +298,7 @@ def _check_comparison(options: argparse.Namespace) -> None:
             raise ValueError(f"--{name} belongs to --suite, which is not given")
     needed = {"CLIP": options.clip, "--terrain": options.terrain, "-o/--output": options.output}
     if missing := [name for name, given in needed.items() if given is None]:
-        raise ValueError(f"the following are required: {', '.join(missing)}; or --suite")
+        raise ValueError(f"the following are required: {', '.join(missing)}; or --suite, or --runs")
 
 
 def _prepare_jax() -> None:

@@ -10,7 +10,8 @@ bits; a system that was made in 32 bits is taken with the values it has there.
 
 `fits` searches: `fit`, `sample`, `ablate` and `translate`. `calibrations` judges what they say:
 `calibrate`. `populations` fits several clips and subjects: `population`. `animations` runs finished
-systems: `solve`, `apply`, `compare` and `run_suite`.
+systems: `solve`, `apply`, `compare` and `run_suite`. `comparisons` compares sampled runs:
+`compare_runs`.
 """
 
 from .animations import apply as apply
@@ -18,6 +19,7 @@ from .animations import compare as compare
 from .animations import run_suite as run_suite
 from .animations import solve as solve
 from .calibrations import calibrate as calibrate
+from .comparisons import compare_runs as compare_runs
 from .fits import ablate as ablate
 from .fits import fit as fit
 from .fits import sample as sample

@@ -18,6 +18,7 @@ from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, run_folder, translation
 from fitting.studies.assess import assess_solution
 from fitting.studies.fit import Fit, search, search_with_noise
+from fitting.studies.posterior.replay import replay
 from fitting.studies.sample import SampledFit, sample_around
 from fitting.studies.translation import TranslationRequest
 
@@ -100,11 +101,15 @@ def sample(
         experiment = experiment.with_max_sample_steps(max_steps)
     chain = None if run is None else run / run_folder.CHAIN
     posterior = sample_around(parameters, problem, experiment, chain, progress)
+    played = None
+    if not posterior.interrupted:
+        played = replay(problem, posterior, experiment.seed)
+        posterior = dataclasses.replace(posterior, blocks=played.blocks)
+    sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
     if run is not None:
-        sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values)
         run_folder.save_posterior(run, sampled)
         posterior_report.write_posterior(run, sampled)
-    log(f"\n{posterior_report.posterior_text(posterior, known_values)}")
+    log(f"\n{posterior_report.posterior_text(sampled, run)}")
     log_output(log, run, run_folder.SUMMARY)
     return posterior
 

@@ -14,15 +14,24 @@ from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .goodness import noise_report
 from .plots import posterior_plots
+from .uncertainty import band_plots, left_out, predictive
+from .uncertainty.contradictions import contradiction_sentences
+from .uncertainty.islands import island_section, island_sentences
 from .uncertainty.priors import posterior_prior_section
 
 HEADING = "## Posterior"  # what follows it in summary.md is replaced
 
 
-def posterior_text(posterior: Posterior, known_values: Mapping[str, float] | None) -> str:
-    """The result of a sampling, for the terminal."""
+def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
+    """The result of a sampling, for the terminal; `run` is the folder where it is written."""
+    posterior, known_values = sampled.posterior, sampled.known_values
     table = aligned(posterior_table(posterior, known_values, {}))
-    parts = [*_health(posterior), "", table]
+    parts = [*_health(posterior), *contradiction_sentences(sampled, run)]
+    if sampled.replay is not None:
+        parts.append(predictive.sentence(sampled.replay.checks))
+    if sampled.left_out is not None:
+        parts.append(left_out.sentence(sampled.left_out))
+    parts += ["", table]
     if posterior.sigmas:
         parts += ["", aligned(noise_report.sigma_table(posterior.sigmas))]
     if known_values:
@@ -53,7 +62,8 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
     figure = posterior_plots.chain(posterior, labels, known_values, title)
     plots |= save_plot(run, "chain.png", title, figure)
 
-    parts = [HEADING, bullets(_health(posterior))]
+    parts = [HEADING, *(f"**{line}**" for line in contradiction_sentences(sampled, run))]
+    parts.append(bullets(_health(posterior)))
     parts.append(markdown(posterior_table(posterior, known_values, units)))
     if posterior.sigmas:
         parts.append("Sigmas of the noise, which were sampled along:")
@@ -66,7 +76,15 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
             f"The 95 % intervals contain the true values of {all_count} parameters; among those "
             f"that the fit calls determined, of {determined_count}."
         )
+    parts += island_section(posterior, sampled.space, units)
     parts += posterior_prior_section(sampled, units)
+    if sampled.replay is not None:
+        parts += predictive.section(sampled.replay)
+        title = f"{experiment.name}: the capture inside what the posterior would make"
+        figure = band_plots.bands(sampled.replay.bands, title)
+        plots |= save_plot(run, "predictive.png", title, figure)
+    if sampled.left_out is not None and sampled.replay is not None:
+        parts += left_out.section(sampled.left_out, sampled.replay.blocks)
     parts.append(gallery(plots))
     summary = run / SUMMARY
     text = summary.read_text(encoding="utf-8") if summary.is_file() else f"# {experiment.name}\n"
@@ -84,8 +102,8 @@ def _health(posterior: Posterior) -> list[str]:
         f"out as burn-in; {posterior.seconds:.0f} s in the last call.",
         f"Mean acceptance {percent(float(posterior.acceptance.mean()))}; slowest "
         f"autocorrelation time {posterior.autocorrelation_time.max():.0f} steps.",
-        f"Stuck walkers: {stuck}; left out of the summary: "
-        f"{', '.join(map(str, posterior.isolated)) or 'none'}.",
+        f"Stuck walkers: {stuck}.",
+        *island_sentences(posterior),
     ]
 
 

@@ -47,6 +47,8 @@ class FittedValley(TypedDict):
     rise: float
     """There, above the lowest of all."""
     interval: list[float]
+    values: NotRequired[list[float]]
+    """Of all parameters there; fits by earlier versions lack them."""
 
 
 class FittedParameter(TypedDict):
@@ -277,7 +279,12 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             "interval": list(curve.interval),
             "verdict": curve.verdict,
             "valleys": [
-                {"value": v.value, "rise": v.rise, "interval": list(v.interval)}
+                {
+                    "value": v.value,
+                    "rise": v.rise,
+                    "interval": list(v.interval),
+                    "values": curve.path[np.argmin(np.abs(curve.values - v.value))].tolist(),
+                }
                 for v in curve.valleys
             ],
             "contraction": float(known.contraction[i]),

@@ -5,9 +5,11 @@ fit.json          the numbers of the fit
 parameters.toml   the fitted system
 chain.h5          the walkers; posterior.json is their summary
 posterior.nc      the kept draws for ArviZ, if it is installed
+lower_point.toml  the experiment, to begin at a point that the chain met below the fit
 summary.md, *.png to read
 """
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -24,11 +26,12 @@ from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
 
 from .fit import Fit, FitSummary
+from .posterior.replay_summary import summarise_replay
 from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
-INFERENCE_DATA = "posterior.nc"
+INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
 
@@ -107,6 +110,7 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         name: {"prior": prior, "prior_sensitivity": sampled.prior_sensitivity[name]}
         for name, prior in sampled.priors.items()
     }
+    lower = {"gain": posterior.improvement, "values": posterior.best_values}
     numbers = {
         "converged": posterior.converged,
         "message": posterior.message,
@@ -116,7 +120,21 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         "autocorrelation_time": posterior.autocorrelation_time.tolist(),
         "acceptance": float(posterior.acceptance.mean()),
         "stuck": posterior.stuck,
+        "left_out": {"walkers": posterior.isolated, "weight": posterior.isolated_mass},
+        "islands": [
+            {
+                "weight": island.weight,
+                "error": island.error if island.is_weighed else None,
+                "exchanges": island.exchanges,
+                "walkers": island.walkers,
+                "log_probability": island.log_probability,
+            }
+            for island in posterior.islands
+        ],
         "seconds": posterior.seconds,
+        "lower_point": lower if sampled.has_lower_point else None,
+        "disagreements": sampled.disagreements,
+        **summarise_replay(sampled.replay, sampled.left_out),
         "parameters": [{**row, **of_prior[row["name"]]} for row in posterior.summary],
         "sigmas": {
             kind: np.percentile(draws, [2.5, 50, 97.5]).tolist()
@@ -124,5 +142,9 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
         },
     }
     write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))
+    (run / LOWER_POINT).unlink(missing_ok=True)
+    if sampled.has_lower_point:
+        begun_there = dataclasses.replace(sampled.experiment, start=posterior.best_values)
+        write_text(run / LOWER_POINT, experiment_files.experiment_to_toml(begun_there, run))
     if inference_data.is_available():
         inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)

@@ -10,6 +10,7 @@ import numpy as np
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.noise.marginal import draw_sigmas, with_unknown_sigmas
+from fitting.inference.sampling.blocks import LeaveOneOut, leave_one_out
 from fitting.inference.sampling.posterior import (
     Posterior,
     SamplingProgress,
@@ -20,8 +21,13 @@ from fitting.inference.sampling.prior_sensitivity import Reweighted, prior_sensi
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space
 
+from .assess import MIN_IMPROVEMENT
 from .fit import FittedParameter
+from .posterior.contradictions import Disagreement, disagreements
+from .posterior.replay import Replay
 from .prior_summary import PriorSummary, summarise_priors
+
+APART = 3.0  # widths of the walkers' ball between places where some of them start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,11 +41,28 @@ class SampledFit:
     posterior: Posterior
     known_values: Mapping[str, float] | None = None
     """What made a synthetic reference, by name."""
+    replay: Replay | None = None
+    """The motion of some draws."""
 
     @cached_property
     def priors(self) -> dict[str, PriorSummary]:
         """By name of the parameter."""
         return summarise_priors(self.space)
+
+    @cached_property
+    def disagreements(self) -> list[Disagreement]:
+        """Parameters of which chain and fit give clearly different intervals."""
+        return disagreements(self.parameters, self.posterior)
+
+    @property
+    def has_lower_point(self) -> bool:
+        """Whether the chain has met a point that is clearly better than the fit."""
+        return self.posterior.improvement > MIN_IMPROVEMENT
+
+    @cached_property
+    def left_out(self) -> LeaveOneOut | None:
+        """How well blocks of frames are predicted from the others, if that can be said."""
+        return None if self.replay is None else leave_one_out(self.replay.blocks)
 
     @cached_property
     def prior_sensitivity(self) -> dict[str, list[Reweighted]]:
@@ -72,10 +95,7 @@ def sample_around(
         raise ValueError(
             f"the fit has the parameters {names}, the experiment {list(problem.space.names)}"
         )
-    start = WalkerStart(
-        np.array([row["u"] for row in parameters]),
-        np.array([row["start_sd"] for row in parameters]),
-    )
+    start = walker_start(parameters, problem.space)
     problem = with_open_noise(problem, experiment)
     posterior = sample_posterior(
         problem, start, experiment.sample, seed=experiment.seed, path=chain, progress=progress
@@ -85,6 +105,20 @@ def sample_around(
     return dataclasses.replace(
         posterior, sigmas=draw_sigmas(problem, posterior.kept_u, experiment.seed)
     )
+
+
+def walker_start(parameters: Sequence[FittedParameter], space: Space) -> WalkerStart:
+    """Around the fit, and around the other valleys that profiles have met."""
+    u = np.array([row["u"] for row in parameters])
+    sd = np.array([row["start_sd"] for row in parameters])
+    known = [u]
+    valleys = [valley for row in parameters for valley in row.get("valleys", ())]
+    for valley in sorted(valleys, key=lambda valley: valley["rise"]):
+        if "values" in valley:
+            place = np.asarray(space.pack(dict(zip(space.names, valley["values"], strict=True))))
+            if all(np.max(np.abs(place - other) / sd) > APART for other in known):
+                known.append(place)
+    return WalkerStart(u, sd, np.array(known[1:]).reshape(-1, u.size))
 
 
 def with_open_noise(

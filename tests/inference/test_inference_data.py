@@ -1,11 +1,14 @@
 """Posteriors as ArviZ takes them: its figures are ours, and a file holds all of it."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
 from fitting.inference.sampling import inference_data
+from fitting.inference.sampling.blocks import BlockLogLikelihood, leave_one_out
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import ParameterPrior, Priors
@@ -89,6 +92,45 @@ def test_a_file_holds_what_was_written(posterior, space, tmp_path):
     assert read["posterior"]["foot.limit[0]"].attrs == {"units": "rad", "kind": "smooth"}
     assert read.attrs["message"] == "Converged."
     assert arviz_base.extract(read, group="prior").sizes["sample"] == inference_data.PRIOR_DRAWS
+
+
+def with_blocks(posterior: Posterior) -> Posterior:
+    random = np.random.default_rng(0)
+    blocks = BlockLogLikelihood(
+        values=0.1 * random.normal(size=(200, 4)),
+        clip=np.array([1, 1, 1, 2]),
+        start=np.array([0.0, 1.0, 2.0, 0.0]),
+        end=np.array([1.0, 2.0, 2.7, 1.2]),
+        data="0123456789abcdef",
+        efficiency=0.8,
+    )
+    return replace(posterior, blocks=blocks)
+
+
+def test_the_log_likelihood_of_blocks_is_one_that_arviz_takes(posterior, space, tmp_path):
+    arviz_stats = pytest.importorskip("arviz_stats")
+    given = with_blocks(posterior)
+    assert given.blocks is not None
+    tree = given.to_inference_data(space)
+    assert tree["log_likelihood"]["motion"].sizes == {"chain": 1, "draw": 200, "block": 4}
+    assert tree["log_likelihood"]["clip"].values.tolist() == [1, 1, 1, 2]
+    ours = leave_one_out(given.blocks)
+    theirs = arviz_stats.loo(tree, reff=0.8)
+    assert ours is not None and theirs.elpd == pytest.approx(ours.elpd)
+    inference_data.write_inference_data(tmp_path / "posterior.nc", given, space)
+    read = inference_data.read_blocks(tmp_path / "posterior.nc")
+    np.testing.assert_array_equal(read.values, given.blocks.values)
+    np.testing.assert_array_equal(read.end, given.blocks.end)
+    assert (read.data, read.efficiency) == ("0123456789abcdef", 0.8)
+
+
+def test_a_file_without_log_likelihood_is_refused(posterior, space, tmp_path):
+    pytest.importorskip("arviz_base")
+    inference_data.write_inference_data(tmp_path / "posterior.nc", posterior, space)
+    (tmp_path / "text.nc").write_text("no draws")
+    for name in ("posterior.nc", "text.nc"):
+        with pytest.raises(ValueError, match=f"{name}: no log-likelihood in it"):
+            inference_data.read_blocks(tmp_path / name)
 
 
 def test_without_arviz_the_error_says_how_to_install_it(posterior, space, monkeypatch):

@@ -68,13 +68,6 @@ def nan_above(ik, data):
     return jnp.where(ik.x < data, ik.x, jnp.nan)
 
 
-def two_islands(ik, data):
-    """A minimum at u = 0 and one at u = 8, worse by `data`, too far for a proposal."""
-    u = jnp.log(ik.x) - jnp.log1p(-ik.x)
-    island = u.mean() > 4
-    return jnp.append(jnp.where(island, u - 8, u), jnp.where(island, jnp.sqrt(2 * data), 0.0))
-
-
 def toy(size, residuals, data):
     ik = Toy(x=jnp.full(size, 0.5))
     return Problem(
@@ -135,11 +128,10 @@ def test_a_known_normal_is_sampled_with_its_variances(size, stop_at):
     assert error_variance.max() < 0.05  # long enough to distinguish them
 
 
-def test_the_moves_are_differential_evolution_only():
-    moves = [
-        (type(move).__name__, vars(move)["gamma0"], fraction) for move, fraction in sampler.moves()
-    ]
-    assert moves == [("DEMove", None, 0.9), ("DEMove", 1.0, 0.1)]
+def test_the_moves_are_differential_evolution_and_jumps():
+    with Chain(Identity(("a",), 4, 0, 1, "0" * 64)) as chain:
+        moves = [(type(move).__name__, fraction) for move, fraction in sampler.moves(chain)]
+    assert moves == [("DEMove", 1 - sampler.JUMPS), ("JumpMove", sampler.JUMPS)]
 
 
 @pytest.mark.slow
@@ -176,12 +168,12 @@ def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
     space = make_space(ik, [free_parameter(ik, "height"), free_parameter(ik, "moment")])
     problem = Problem(space, (moments, observed), step_residuals)
     start = space.pack({"height": 0.7, "moment": 0.43})
-    sampled = sample(problem, start, np.array([0.3, 0.05]), walkers=32)
+    sampled = sample(problem, start, np.array([0.3, 0.05]), walkers=32, stop_at=150.0)
     assert sampled.converged, sampled.message
 
-    axis = jnp.linspace(-7, 7, 281)
-    grid = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    weight = np.exp(np.asarray(sampler._log_probabilities(problem, grid)))
+    axes = jnp.linspace(-7, 7, 141), jnp.linspace(-7, 7, 1401)  # cliffs need the finer one
+    grid = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    weight = np.exp(np.asarray(sampler.log_probabilities(problem, grid)))
     values = np.asarray(values_of_rows(problem.space, grid))
     mean = np.average(values, axis=0, weights=weight)
     sd = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
@@ -243,6 +235,19 @@ def test_a_run_stops_at_fifty_steady_autocorrelation_times():
     assert 0.1 < sampled.acceptance.min() and sampled.stuck == []
     assert [row["name"] for row in sampled.summary] == ["x[0]", "x[1]"]
     assert all(row["r_hat"] < 1.05 and row["ess"] > 8 * 0.8 * 50 for row in sampled.summary)
+
+
+def test_what_a_chain_gains_over_its_start_is_known():
+    problem, mean, covariance = normal(3)
+    sd = np.sqrt(np.diag(covariance))
+    lowest = float(problem.cost(jnp.asarray(mean)))
+    for start, gain in ((mean, 0.0), (mean + 3 * sd, None)):
+        sampled = sample(problem, start, sd, max_steps=300)
+        expected = float(problem.cost(jnp.asarray(start))) - lowest if gain is None else gain
+        assert sampled.start_log_probability == pytest.approx(-expected - lowest)
+        assert expected - 1.0 < sampled.improvement <= expected
+        values = problem.space.values(jnp.asarray(problem.space.pack(sampled.best_values)))
+        assert list(sampled.best_values.values()) == pytest.approx(values.tolist())
 
 
 def test_a_run_that_is_too_short_says_so():
@@ -322,7 +327,7 @@ def test_an_interrupt_before_the_first_step_is_raised_without_output(monkeypatch
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sampler, "_log_probabilities", interrupted)
+    monkeypatch.setattr(sampler, "log_probabilities", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sample(normal(2)[0], np.zeros(2), np.ones(2))
     assert capfd.readouterr().out == ""
@@ -558,26 +563,6 @@ def test_the_digest_changes_with_the_data_the_prior_the_loss_and_the_residuals()
 
 
 # Chains that must not be trusted
-
-
-def test_an_isolated_walker_is_named_and_left_out(monkeypatch):
-    problem = toy(6, two_islands, jnp.asarray(20.0))
-    start = sampler._start
-
-    def with_one_on_the_island(identity, evaluate, start_u, start_sd):
-        last = start(identity, evaluate, start_u, start_sd)
-        last.u[3] = 8.0 + 0.1 * last.u[3]
-        return last._replace(log_probability=evaluate(last.u))
-
-    monkeypatch.setattr(sampler, "_start", with_one_on_the_island)
-    sampled = sample(problem, np.zeros(6), np.ones(6))
-    assert sampled.isolated == [3] and 3 in sampled.stuck
-    assert "left out: 1 of 24 walkers" in sampled.message
-    assert sampled.converged, sampled.message
-    assert sampled.kept.shape[1] == 23 and sampled.kept.max() < 0.999
-    assert all(
-        abs(row["mean"] - 0.5) < 5 * row["sd"] / row["ess"] ** 0.5 for row in sampled.summary
-    )
 
 
 def test_a_chain_with_many_isolated_walkers_has_not_converged():

@@ -3,6 +3,8 @@
 import json
 import re
 import struct
+import tomllib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -356,11 +358,10 @@ def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     assert down.rise == pytest.approx(float(problem.cost(lower) - problem.cost(u)))
 
 
-def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():
+def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitted):
     posterior = invented_posterior(stuck=[3])
-    text = posterior_report.posterior_text(
-        posterior, {"contact.planted_height": 0.106, "leg.soften": 0.8}
-    )
+    known = {"contact.planted_height": 0.106, "leg.soften": 0.8}
+    text = posterior_report.posterior_text(sampled_fit(fitted, posterior, known))
     first = posterior.summary[0]
     line = line_of(text, "contact.planted_height")
     assert f"{first['median']:.4g}" in line and f"{first['low95']:.4g} to" in line
@@ -368,15 +369,19 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers():
     assert line_of(text, "leg.soften").endswith("no")
     assert f"{first['ess']:.0f}" in line and "2 steps" in line
     assert "12 walkers, 240 steps, the first 40 left out" in text
-    assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3;" in text
+    assert "Mean acceptance 25.0 %" in text and "Stuck walkers: 3." in text
     assert "Converged: the chain is long enough." in text
     assert "The 95 % intervals contain the true values of 1 of 2 parameters." in text
-    assert "truth" not in posterior_report.posterior_text(posterior, None)
+    assert "truth" not in posterior_report.posterior_text(sampled_fit(fitted, posterior, None))
+
+
+def sampled_fit(fitted: Fit, posterior: Posterior, known: Mapping[str, float] | None) -> SampledFit:
+    rows, space = fitted.summary["parameters"], fitted.problem.space
+    return SampledFit(fitted.experiment, space, rows, posterior, known)
 
 
 def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> None:
-    rows, space = fitted.summary["parameters"], fitted.problem.space
-    sampled = SampledFit(fitted.experiment, space, rows, posterior, fitted.known_values)
+    sampled = sampled_fit(fitted, posterior, fitted.known_values)
     run_folder.save_posterior(run, sampled)
     posterior_report.write_posterior(run, sampled)
 
@@ -412,6 +417,38 @@ def test_a_posterior_stands_beside_its_prior(fitted, tmp_path):
     moved = [row["name"] for row in rows if row["prior_sensitivity"][0]["sensitive"]]
     assert moved
     assert f"`{moved[0]}`" in text.split("Sensitive to their prior")[1]
+
+
+def test_a_chain_that_meets_a_lower_point_hands_it_back(fitted, tmp_path):
+    # as a run folder has it: with clips that are files
+    posterior = replace(invented_posterior(), start_log_probability=-8.0)
+    best = posterior.best_values
+    assert posterior.improvement == pytest.approx(8.0, abs=0.1)
+    write_posterior(tmp_path, fitted, posterior)
+    text = (tmp_path / run_folder.SUMMARY).read_text()
+    assert f"whose log-probability is {posterior.improvement:.3g} higher" in text
+    command = f"`jaxik fit {tmp_path / run_folder.LOWER_POINT} -o {tmp_path}-lower`"
+    assert command in text.split("## Posterior\n")[1].split("\n- ")[0]  # first of all
+    table = tomllib.loads((tmp_path / run_folder.LOWER_POINT).read_text())["start"]
+    assert table["contact"]["planted_height"] == best["contact.planted_height"]
+    numbers = json.loads((tmp_path / run_folder.POSTERIOR).read_text())
+    assert numbers["lower_point"] == {"gain": posterior.improvement, "values": best}
+    write_posterior(tmp_path, fitted, replace(posterior, start_log_probability=0.0))
+    assert not (tmp_path / run_folder.LOWER_POINT).exists()
+    assert json.loads((tmp_path / run_folder.POSTERIOR).read_text())["lower_point"] is None
+
+
+def test_parameters_of_which_chain_and_fit_disagree_are_named(fitted, tmp_path):
+    posterior = invented_posterior()
+    values = posterior.values.copy()
+    values[..., 0] = 0.105 + 0.3 * (values[..., 0] - 0.105)  # the fit has a two-sided 0.11
+    values[..., 1] += 2.0
+    write_posterior(tmp_path, fitted, replace(posterior, values=values))
+    text = (tmp_path / run_folder.SUMMARY).read_text()
+    assert "the 95 % interval of pelvis.on_gain" in text and "leaves out the fitted value" in text
+    found = json.loads((tmp_path / run_folder.POSTERIOR).read_text())["disagreements"]
+    reasons = {row["name"]: row["reason"] for row in found}
+    assert reasons["pelvis.on_gain"] == "leaves out the fit"
 
 
 def test_a_posterior_starts_a_summary_where_there_is_none(fitted, tmp_path):

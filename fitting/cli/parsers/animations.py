@@ -47,6 +47,7 @@ def add_compare(commands: Commands) -> None:
         jaxik compare --suite -o suite                   every preset in every made situation
         jaxik compare --suite --quick --presets record   a shorter suite, without files
         jaxik compare --suite --only "stairs up,curb" --presets record --parameters a.toml
+        jaxik compare --runs runs/ozz,runs/mec           sampled fits to the same clips
 
         The suite has its own animations and grounds, from a flat walk to stairs and a train, and
         states a bound for every measure; what is beyond it has a !. After Ctrl-C (status 130) the
@@ -54,12 +55,15 @@ def add_compare(commands: Commands) -> None:
         """,
     )  # fmt: skip
     add_animation(compare, required=False)
-    compare.add_argument("-o", "--output", type=Path, metavar="DIR", help="needed without --suite")
+    compare.add_argument("-o", "--output", type=Path, metavar="DIR", help="needed with a CLIP")
     for option, description in (("--presets", "of jaxik.presets"), ("--parameters", "TOML files")):
         compare.add_argument(
             option, dest="systems", action="append", default=[], metavar="NAME,...",
             type=lambda text, option=option: (option, text), help=f"{description}, in this order",
         )  # fmt: skip
+    compare.add_argument(
+        "--runs", metavar="RUN,...", help="compare what these sampled runs predict, without a clip"
+    )
     compare.add_argument(
         "--rates", type=rates, default=[], metavar="HZ,...",
         help="run at these frame rates too, and measure how far that is from the clip's own",

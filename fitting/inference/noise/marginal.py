@@ -62,7 +62,7 @@ def _sizes(legs: int) -> dict[str, int]:
 def draw_sigmas(
     problem: Problem[jaxik.FootIK], u: Float[np.ndarray, "steps walkers free"], seed: int
 ) -> dict[str, Float[np.ndarray, " draws"]]:
-    """Draws of the sigmas that a problem leaves open, by kind, one at each of some samples of `u`.
+    """Draws of the sigmas that a problem leaves open, by kind, one for each of `thinned(u)`.
 
     Args:
         problem: with open sigmas.
@@ -71,8 +71,7 @@ def draw_sigmas(
     """
     assert problem.unknown_sigmas is not None
     random = np.random.default_rng(seed)
-    flat = u.reshape(-1, u.shape[-1])
-    chosen = flat[np.unique(np.linspace(0, len(flat) - 1, DRAWS).astype(int))]
+    chosen = thinned(u)
     filled = np.resize(chosen, (-(-len(chosen) // BATCH) * BATCH, chosen.shape[1]))
     batches = jnp.asarray(filled, problem.space.start.dtype).reshape(-1, BATCH, chosen.shape[1])
     sums = np.concatenate([_sums(problem, batch) for batch in batches])[: len(chosen)]
@@ -80,6 +79,12 @@ def draw_sigmas(
     ratios = np.sqrt(sums / random.chisquare(counts, sums.shape))
     sigmas = noise_of(problem).sigmas
     return {kind: sigma * ratios[:, i] for i, (kind, sigma) in enumerate(sigmas.items())}
+
+
+def thinned(u: Float[np.ndarray, "steps walkers free"]) -> Float[np.ndarray, "draws free"]:
+    """Up to `DRAWS` samples, spread over the chain; each has its draw of the sigmas."""
+    flat = u.reshape(-1, u.shape[-1])
+    return flat[np.unique(np.linspace(0, len(flat) - 1, DRAWS).astype(int))]
 
 
 @cached

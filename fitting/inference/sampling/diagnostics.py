@@ -8,7 +8,9 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Bool, Float
 
-WINDOW = 5.0  # autocorrelation times to sum over (Sokal 1997, Monte Carlo methods, p. 16)
+from .autocorrelation import autocorrelation_time
+from .islands import MIN_EXCHANGES, Island, log_mass, survey
+
 ISOLATED = 5.0  # spreads of log-probability between a walker and the others
 LAZY = 0.1  # of the median acceptance
 STEADY = 0.05  # relative change of the autocorrelation time between two checks
@@ -16,33 +18,7 @@ SPACING = 0.1  # of the chain's length between two checks, so that 5 % means som
 START = 0.1  # of the chain, not counted for the autocorrelation time
 BURN_IN = 5.0  # autocorrelation times
 MAX_ISOLATED = 0.1  # fraction of the walkers that may be left out
-
-
-def autocorrelation_time(
-    chain: Float[np.ndarray, "steps walkers free"],
-) -> Float[np.ndarray, " free"]:
-    """Integrated autocorrelation time of every parameter, in steps, at least 1.
-
-    Sokal's window on the walkers' summed autocovariance about their common mean. emcee takes each
-    walker about its own mean: a walker that never moves then adds nothing, and the time looks
-    healthy. About the common mean its offset never decays, and the time grows with the chain.
-    Infinite for a parameter that never changes.
-    """
-    steps, _, free = chain.shape
-    length = 1 << (2 * steps - 1).bit_length()  # padded, so that the end does not meet the start
-    times = np.empty(free)
-    for i in range(free):
-        centred = chain[..., i] - chain[..., i].mean()
-        power = (np.abs(np.fft.rfft(centred, length, axis=0)) ** 2).sum(axis=1)
-        covariance = np.fft.irfft(power, length)[:steps]
-        if not covariance[0] > 0:
-            times[i] = np.inf
-            continue
-        sums = 2 * np.cumsum(covariance / covariance[0]) - 1
-        inside = np.arange(steps) < WINDOW * sums
-        window = np.argmin(inside) if not inside.all() else steps - 1
-        times[i] = max(1.0, sums[window])
-    return times
+NEGLIGIBLE = 0.01  # of the posterior, that may be left out
 
 
 def split_r_hat(chain: Float[np.ndarray, "steps walkers free"]) -> Float[np.ndarray, " free"]:
@@ -142,6 +118,10 @@ class Check:
     times: Float[np.ndarray, " free"]
     """Autocorrelation times, without isolated walkers."""
     isolated: Bool[np.ndarray, " walkers"]
+    isolated_mass: float = 0.0
+    """Estimate of the fraction of the posterior that is left out with them."""
+    islands: tuple[Island, ...] = ()
+    """On which the other walkers are, in the later half; the heaviest first."""
 
     @property
     def slowest(self) -> float:
@@ -158,10 +138,35 @@ class Check:
 def check(
     u: Float[np.ndarray, "steps walkers free"], log_probability: Float[np.ndarray, "steps walkers"]
 ) -> Check:
-    """Isolated walkers and autocorrelation times of a chain from its first step on."""
+    """Isolated walkers, islands and autocorrelation times of a chain from its first step on.
+
+    Walkers whose island may have 1 % of the posterior are not isolated, however low they are.
+    """
+    later = slice(len(u) // 2, None)
     isolated = isolated_walkers(log_probability)
+    mass = _mass(u[later], log_probability[later], isolated)
+    if mass > NEGLIGIBLE:
+        isolated, mass = np.zeros_like(isolated), 0.0
     counted = u[int(START * len(u)) :, ~isolated]
-    return Check(len(u), autocorrelation_time(counted), isolated)
+    islands = survey(u[later][:, ~isolated], log_probability[later][:, ~isolated])
+    return Check(len(u), autocorrelation_time(counted), isolated, mass, islands)
+
+
+def _mass(
+    u: Float[np.ndarray, "steps walkers free"],
+    log_probability: Float[np.ndarray, "steps walkers"],
+    isolated: Bool[np.ndarray, " walkers"],
+) -> float:
+    """Fraction of the posterior where isolated walkers are, each on an island of its own."""
+    if not isolated.any():
+        return 0.0
+    rest = log_mass(u[:, ~isolated], log_probability[:, ~isolated])
+    apart = [
+        log_mass(u[:, walker : walker + 1], log_probability[:, walker : walker + 1]) - rest
+        for walker in np.flatnonzero(isolated)
+    ]
+    odds = float(np.exp(min(np.logaddexp.reduce(apart), 100.0)))
+    return odds / (1 + odds)
 
 
 def check_lengths(stored: int, interval: int, limit: int) -> list[int]:
@@ -204,9 +209,17 @@ def verdict(
         f" {names[int(latest.times.argmax())]} ({latest.slowest * thin_by:.1f} steps)"
     )
     if left_out:
-        facts += f"; left out: {left_out} of {latest.isolated.size} walkers, which are isolated"
+        facts += (
+            f"; left out: {left_out} of {latest.isolated.size} walkers, which are isolated where"
+            f" about {100 * latest.isolated_mass:.2g} % of the posterior lies"
+        )
     if left_out > MAX_ISOLATED * latest.isolated.size:
         return False, f"Not converged, too many walkers are isolated: {facts}."
+    if cut_off := sum(not island.is_weighed for island in latest.islands):
+        return False, (
+            f"Not converged, the weights of islands are out of reach: {facts}; {cut_off} of"
+            f" {len(latest.islands)} islands have fewer than {MIN_EXCHANGES} exchanges of walkers."
+        )
     if lengths < stop_at:
         return False, f"Not converged, too short: {facts}; wanted {stop_at:g}."
     if before is None or abs(before.slowest / latest.slowest - 1) > STEADY:

@@ -13,8 +13,10 @@ import numpy as np
 from fitting.problem.space import Space, values_of_rows
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
+from fitting.runtime.validation import in_one_line
 from jaxik.maths import parameter_tree
 
+from . import blocks
 from .posterior import Posterior
 
 PACKAGES = ("arviz_base", "h5netcdf")
@@ -27,11 +29,35 @@ def is_available() -> bool:
 
 
 @in_float64
+def _check_available() -> None:
+    if not is_available():
+        raise ImportError('this needs ArviZ: pip install "jaxik[posterior]"')
+
+
+def read_blocks(path: Path) -> blocks.BlockLogLikelihood:
+    """The log-likelihood of blocks that a NetCDF file holds.
+
+    Raises:
+        ImportError: ArviZ is not installed.
+        ValueError: the file holds none.
+    """
+    _check_available()
+    import xarray
+
+    try:
+        with xarray.open_datatree(path, engine="h5netcdf") as tree:
+            return blocks.from_tree(tree)
+    except (OSError, KeyError) as error:
+        raise ValueError(f"{path}: no log-likelihood in it: {in_one_line(error)}") from None
+
+
 def to_inference_data(posterior: Posterior, space: Space) -> Any:
     """The kept draws and draws of the prior as ArviZ's `DataTree` (`InferenceData` in its 0.x).
 
     Groups: `posterior` and `prior` hold a variable for each parameter under its dotted name, in its
     unit, with `units` and `kind` as attributes; `sample_stats` holds the log-probability as `lp`.
+    `log_likelihood`, where the posterior has it, holds that of the captured `motion` for some draws
+    and each `block` of frames, as `arviz_stats.loo` takes it; `clip`, `start` and `end` say which.
     Coordinates: `chain`, the walker's index, and `draw`, the step of the sampler, so that burn-in
     and isolated walkers are seen to be missing. Walkers exchange proposals: ArviZ takes them for
     independent chains, and its effective sample sizes are too large; ours are in the summary.
@@ -43,8 +69,7 @@ def to_inference_data(posterior: Posterior, space: Space) -> Any:
     Raises:
         ImportError: ArviZ is not installed.
     """
-    if not is_available():
-        raise ImportError('this needs ArviZ: pip install "jaxik[posterior]"')
+    _check_available()
     from arviz_base import from_dict
 
     declared = parameter_tree.declarations(space.system)
@@ -69,6 +94,8 @@ def to_inference_data(posterior: Posterior, space: Space) -> Any:
     steps = posterior.thin_by * (1 + np.arange(posterior.burn_in, len(posterior.u)))
     for group in ("posterior", "sample_stats"):
         tree[group].dataset = tree[group].to_dataset().assign_coords(chain=walkers, draw=steps)
+    if posterior.blocks is not None:
+        tree["log_likelihood"] = blocks.to_tree(posterior.blocks)["log_likelihood"]
     for group in ("posterior", "prior"):
         for name in names:
             tree[group][name].attrs.update(attributes[name])

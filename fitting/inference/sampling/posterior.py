@@ -19,7 +19,9 @@ from fitting.problem.space import Space, values_of_rows
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
+from .blocks import BlockLogLikelihood
 from .chain import Chain, Identity
+from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
 
 ROWS = 4096  # of u, whose values are computed at once
@@ -43,7 +45,7 @@ class SamplingProgress:
 
 @dataclasses.dataclass(frozen=True)
 class WalkerStart:
-    """The ball in which the walkers start, usually around a fit.
+    """The ball in which the walkers start, usually around a fit, and others for some of them.
 
     For a threshold `sd` must be small: its Laplace width is the prior's, and walkers that start
     that far away get stuck.
@@ -53,6 +55,8 @@ class WalkerStart:
     """As many as there are free parameters."""
     sd: Float[Array | np.ndarray, " _"]
     """Of u."""
+    elsewhere: Float[Array | np.ndarray, "places _"] | None = None
+    """Other u around which a quarter of the walkers starts, so that islands there are found."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +76,8 @@ class Posterior:
     acceptance: Float[np.ndarray, " walkers"]
     """Fraction of the stored steps' proposals."""
     isolated: list[int]
-    """Walkers on an island of negligible weight; left out of the summary."""
+    """Walkers that never come near the others, on islands of negligible weight; left out of the
+    summary."""
     stuck: list[int]
     """Those, and walkers that hardly ever move."""
     converged: bool
@@ -81,8 +86,16 @@ class Posterior:
     seconds: float
     """Of this call."""
     interrupted: bool = False
+    isolated_mass: float = 0.0
+    """Estimate of the fraction of the posterior where the isolated walkers are."""
     sigmas: Mapping[str, Float[np.ndarray, " draws"]] = dataclasses.field(default_factory=dict)
     """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
+    islands: tuple[Island, ...] = ()
+    """The heaviest first; none where there is only one."""
+    start_log_probability: float = math.inf
+    """Of the point around which the walkers started."""
+    blocks: BlockLogLikelihood | None = None
+    """Of some draws; None until they are run through the clips (`studies.posterior.replay`)."""
 
     @property
     def kept(self) -> Float[np.ndarray, "steps walkers free"]:
@@ -93,6 +106,17 @@ class Posterior:
     def kept_u(self) -> Float[np.ndarray, "steps walkers free"]:
         """`u` of the values that are kept."""
         return np.delete(self.u[self.burn_in :], self.isolated, axis=1)
+
+    @property
+    def improvement(self) -> float:
+        """How far the best draw is above the start, in log-probability; negative if it is below."""
+        return float(self.log_probability.max()) - self.start_log_probability
+
+    @property
+    def best_values(self) -> dict[str, float]:
+        """The most probable draw of all, by name, in the parameters' units."""
+        best = np.unravel_index(np.argmax(self.log_probability), self.log_probability.shape)
+        return dict(zip(self.names, self.values[best].tolist(), strict=True))
 
     def to_inference_data(self, space: Space) -> Any:
         """The kept draws as ArviZ takes them; see `inference_data.to_inference_data`."""
@@ -151,7 +175,9 @@ def sample_posterior(
                 progress(_describe_progress(chain, check, settings.max_steps, elapsed))
 
         outcome = _extend(problem, chain, start, settings, report)
-    return _posterior(problem, chain, outcome, time.monotonic() - began)
+    at_start = _log_probability(problem, start, walkers)
+    sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
+    return dataclasses.replace(sampled, start_log_probability=at_start)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,8 +204,7 @@ def _extend(
     names, thin_by = chain.identity.parameters, chain.identity.thin_by
     interval = math.ceil(settings.check_every / thin_by)
     limit = max(settings.max_steps // thin_by, len(chain))
-    u, sd = np.asarray(start.u, float), np.asarray(start.sd, float)
-    steps = sampler.steps(problem, chain, u, sd, limit)
+    steps = sampler.steps(problem, chain, *_balls(start, chain.identity.walkers), limit)
     before = latest = None
     interrupted = False
     try:
@@ -224,8 +249,31 @@ def digest(problem: Problem) -> str:
     return digested.hexdigest()
 
 
+def _log_probability(problem: Problem, start: WalkerStart, walkers: int) -> float:
+    """Of the start, by the program that the sampler has."""
+    from .sampler import log_probabilities
+
+    rows = jnp.broadcast_to(
+        jnp.asarray(start.u, problem.space.start.dtype), (walkers // 2, problem.space.size)
+    )
+    return float(log_probabilities(problem, rows)[0])
+
+
+def _balls(
+    start: WalkerStart, walkers: int
+) -> tuple[Float[np.ndarray, "walkers free"], Float[np.ndarray, "walkers free"]]:
+    """Centre and width of the ball in which each walker starts."""
+    centres = np.tile(np.asarray(start.u, float), (walkers, 1))
+    if start.elsewhere is not None and len(start.elsewhere):
+        others = np.arange(walkers // 4)
+        centres[-1 - 4 * others] = np.asarray(start.elsewhere)[others % len(start.elsewhere)]
+    return centres, np.broadcast_to(np.asarray(start.sd, float), centres.shape)
+
+
 def _check_start(size: int, start: WalkerStart) -> None:
     """Raises ValueError for a start that is not finite or has another size than the space."""
+    for place in () if start.elsewhere is None else start.elsewhere:
+        _check_start(size, WalkerStart(place, start.sd))
     for name, array in (("u", start.u), ("sd", start.sd)):
         if array.shape != (size,) or not np.isfinite(array).all():
             raise ValueError(
@@ -276,9 +324,11 @@ def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float
         autocorrelation_time=check.times * chain.identity.thin_by,
         acceptance=acceptance,
         isolated=np.flatnonzero(check.isolated).tolist(),
+        isolated_mass=check.isolated_mass,
         stuck=np.flatnonzero(stuck).tolist(),
         converged=outcome.converged,
         message=outcome.message,
         seconds=seconds,
         interrupted=outcome.interrupted,
+        islands=check.islands,
     )

@@ -1,6 +1,7 @@
 """Pictures of a posterior: the corner plot and the chain."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import corner as corner_library
 import numpy as np
@@ -61,8 +62,7 @@ def corner(
         axes.grid(False)
         axes.tick_params(labelsize=font_size - 2)
     for values, colour, dashes in zip(marks, (BEFORE, CAPTURED), ("--", "-"), strict=True):
-        style = {"color": colour, "linestyle": dashes, "linewidth": 1.8}
-        corner_library.overplot_lines(figure, values, **style)
+        _draw_values(figure, values, color=colour, linestyle=dashes, linewidth=1.8)
     if space is not None:
         edges = np.stack([np.linspace(*ends, BINS + 1) for ends in ranges], axis=1)
         expected = len(samples) * np.diff(prior_probability(space, edges), axis=0)
@@ -84,6 +84,17 @@ def corner(
         handles=entries, loc="upper right", bbox_to_anchor=(0.98, 0.94), fontsize=legend_size
     )
     return figure
+
+
+def _draw_values(figure: Figure, values: Sequence[float | None], **style: Any) -> None:
+    """Lines at known values; `corner.overplot_lines` fails with a single parameter."""
+    grid = np.reshape(np.array(figure.axes), (len(values), len(values)))
+    for i, value in enumerate(values):
+        if value is not None:
+            for axes in grid[i:, i]:
+                axes.axvline(value, **style)
+            for axes in grid[i, :i]:
+                axes.axhline(value, **style)
 
 
 @styled

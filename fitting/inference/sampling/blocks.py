@@ -1,0 +1,132 @@
+"""The log-likelihood of blocks of frames, and what it says of motion that was not fitted.
+
+Leaving out one block after another shows how well a fit predicts what it has not seen. The chain is
+not sampled again: its draws are weighted (Pareto-smoothed importance sampling; Vehtari, Gelman and
+Gabry 2017). Blocks, and not frames, because what one frame misses its neighbours give away.
+"""
+
+import importlib.util
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+# s, of a block. A step of a walk takes about half of it, and errors that come with a step hardly
+# last beyond the next one. The same for every fit, so that fits can be compared.
+SECONDS = 1.0
+MIN_DRAWS = 100  # for the tail of the weights
+
+
+@dataclass(frozen=True)
+class BlockLogLikelihood:
+    """The log-likelihood of blocks of frames for some draws of a posterior."""
+
+    values: Float[np.ndarray, "draws blocks"]
+    """Constants included, so that fits with other sigmas or losses can be compared."""
+    clip: Int[np.ndarray, " blocks"]
+    """From 1."""
+    start: Float[np.ndarray, " blocks"]
+    """Seconds from the beginning of the clip."""
+    end: Float[np.ndarray, " blocks"]
+    data: str
+    """Digest of the captured motion and of what of it counts."""
+    efficiency: float
+    """Effective draws for each draw."""
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """How well a posterior predicts each block from the others."""
+
+    elpd: float
+    """Expected log predictive density of all blocks."""
+    error: float
+    """Its standard error."""
+    parameters: float
+    """Effective number of parameters."""
+    elpd_of_block: Float[np.ndarray, " blocks"]
+    pareto_k: Float[np.ndarray, " blocks"]
+    """Shape of each block's weights."""
+    max_k: float
+    """Above it, a block's figure is unreliable."""
+    neighbours: float
+    """Correlation of blocks with the next one in their clip; NaN where there are few."""
+
+    @property
+    def unreliable(self) -> int:
+        """Number of blocks whose figure is unreliable."""
+        return int(np.sum(~(self.pareto_k <= self.max_k)))
+
+
+def is_available() -> bool:
+    """Whether the packages are installed that this needs."""
+    return all(importlib.util.find_spec(name) for name in ("arviz_base", "arviz_stats", "xarray"))
+
+
+def to_tree(blocks: BlockLogLikelihood) -> Any:
+    """The log-likelihood alone, as ArviZ takes it: one chain, a `block` for each observation."""
+    from arviz_base import from_dict
+
+    tree = from_dict(
+        {"log_likelihood": {"motion": blocks.values[None]}},
+        dims={"motion": ["block"]},
+    )
+    group = tree["log_likelihood"]
+    group.attrs.update(data=blocks.data, efficiency=blocks.efficiency)
+    coordinates = {name: ("block", getattr(blocks, name)) for name in ("clip", "start", "end")}
+    group.dataset = group.to_dataset().assign_coords(coordinates)
+    return tree
+
+
+def from_tree(tree: Any) -> BlockLogLikelihood:
+    """The log-likelihood that a tree holds.
+
+    Raises:
+        KeyError: it holds none.
+    """
+    motion = tree["log_likelihood"]["motion"]
+    return BlockLogLikelihood(
+        values=motion.values.reshape(-1, motion.sizes["block"]),
+        clip=motion["clip"].values,
+        start=motion["start"].values,
+        end=motion["end"].values,
+        data=str(tree["log_likelihood"].attrs["data"]),
+        efficiency=float(tree["log_likelihood"].attrs["efficiency"]),
+    )
+
+
+def leave_one_out(blocks: BlockLogLikelihood) -> LeaveOneOut | None:
+    """How well each block is predicted from the others.
+
+    None without ArviZ, with fewer than two blocks or with fewer than `MIN_DRAWS` draws.
+    """
+    if not is_available() or len(blocks.clip) < 2 or len(blocks.values) < MIN_DRAWS:
+        return None
+    from arviz_stats.loo import loo
+
+    with warnings.catch_warnings(action="ignore"):  # of unreliable blocks, which are counted below
+        found: Any = loo(to_tree(blocks), pointwise=True, reff=blocks.efficiency)
+    elpd_of_block = np.asarray(found.elpd_i)
+    return LeaveOneOut(
+        elpd=float(found.elpd),
+        error=float(found.se),
+        parameters=float(found.p),
+        elpd_of_block=elpd_of_block,
+        pareto_k=np.asarray(found.pareto_k),
+        max_k=float(found.good_k),
+        neighbours=_neighbours(elpd_of_block, blocks.clip),
+    )
+
+
+def _neighbours(values: np.ndarray, clip: np.ndarray) -> float:
+    """Correlation of each value with the next one of the same clip."""
+    follows = clip[1:] == clip[:-1]
+    if follows.sum() < 3:
+        return math.nan
+    before, after = values[:-1][follows], values[1:][follows]
+    if not (before.std() and after.std()):
+        return math.nan
+    return float(np.corrcoef(before, after)[0, 1])

@@ -1,0 +1,34 @@
+"""The job that compares sampled runs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from fitting.report.formatting import aligned
+from fitting.report.uncertainty import run_comparison as report
+from fitting.studies.posterior import run_comparison
+from fitting.studies.posterior.run_comparison import ComparedRun
+
+from .output import Log, checked_folder, log_output, silent
+
+
+def compare_runs(
+    runs: Sequence[str | Path], output: str | Path | None = None, *, log: Log = silent
+) -> list[ComparedRun]:
+    """Compares sampled runs of several systems by what they predict of the same motion.
+
+    Args:
+        runs: folders that `fit` and `sample` have filled.
+        output: folder for the table and the numbers.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: as `studies.posterior.run_comparison.compare_runs`, or the folder cannot be
+            made.
+    """
+    folder = checked_folder(output)
+    compared = run_comparison.compare_runs([Path(run) for run in runs])
+    if folder is not None:
+        report.write(folder, compared)
+    log(f"{aligned(report.table(compared))}\n\n{report.explanation()}")
+    log_output(log, folder, report.TABLE)
+    return compared

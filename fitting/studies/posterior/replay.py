@@ -1,0 +1,191 @@
+"""The motion of a posterior's draws, and what follows from it: likelihoods, predictive checks."""
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+import jaxik
+from fitting.analysis import playback
+from fitting.analysis.goodness import groups
+from fitting.analysis.playback import Playback
+from fitting.analysis.worst_window import PER_LEG
+from fitting.inference.noise import marginal
+from fitting.inference.noise.density import NoiseDensity
+from fitting.inference.sampling.blocks import BlockLogLikelihood
+from fitting.inference.sampling.posterior import Posterior
+from fitting.problem.problem import Problem
+from fitting.problem.scene import MEASURED, Scene
+from fitting.runtime.precision import in_float64
+
+from . import likelihoods, predictive
+from .predictive import Band, NoiseProcess, PredictiveCheck, Statistic
+
+DRAWS = 512  # whose motion is made
+REPLICATES = 256  # of them that get noise
+POSITIONS = ("ankle", "knee", "pelvis")
+UP, ABOUT_X = 1, 0  # components of positions and of rotations that bands show
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What the motions of a posterior's draws say."""
+
+    blocks: BlockLogLikelihood
+    checks: tuple[PredictiveCheck, ...]
+    """One for each kind and clip."""
+    bands: tuple[Band, ...]
+    """One channel for each."""
+
+
+@in_float64
+def replay(problem: Problem[jaxik.FootIK], posterior: Posterior, seed: int) -> Replay:
+    """Runs draws of a posterior through the clips.
+
+    Args:
+        problem: that was sampled.
+        posterior: with sigmas, if the problem leaves them open.
+        seed: of the replicates' noise.
+    """
+    every = math.ceil(len(marginal.thinned(posterior.kept_u)) / DRAWS)
+    u = marginal.thinned(posterior.kept_u)[::every]
+    sigmas = {kind: draws[::every] for kind, draws in posterior.sigmas.items()}
+    clips = [_Clip(problem, index, seed) for index in range(len(problem.data))]
+    for draw, row in enumerate(u):
+        ik = problem.space.unpack(jnp.asarray(row))
+        drawn = {kind: float(values[draw]) for kind, values in sigmas.items()}
+        replicated = draw % math.ceil(len(u) / REPLICATES) == 0
+        for clip in clips:
+            clip.add(ik, drawn, replicated)
+    ess = min(row["ess"] for row in posterior.summary)
+    values = np.concatenate([clip.log_likelihood for clip in clips], axis=1)
+    numbers = np.concatenate([np.full(len(clip.starts), clip.index + 1) for clip in clips])
+    observed = np.any(values != 0.0, axis=0)
+    return Replay(
+        blocks=BlockLogLikelihood(
+            values=values[:, observed],
+            clip=numbers[observed],
+            start=np.concatenate([clip.starts for clip in clips])[observed],
+            end=np.concatenate([clip.ends for clip in clips])[observed],
+            data=likelihoods.digest(problem),
+            efficiency=min(1.0, ess / len(u)),
+        ),
+        checks=tuple(check for clip in clips for check in clip.checks),
+        bands=tuple(band for clip in clips for band in clip.bands),
+    )
+
+
+class _Clip:
+    """What the draws make of one clip, draw by draw."""
+
+    def __init__(self, problem: Problem[jaxik.FootIK], index: int, seed: int):
+        self.index = index
+        self._scene: Scene = problem.data[index]
+        self._random = np.random.default_rng([seed, index])
+        self._density = NoiseDensity(problem.loss, float(problem.tails))
+        self._fraction = float(problem.independent_fraction)
+        self._frames: list[Float[np.ndarray, " frames"]] = []
+        self._statistics: dict[str, list[np.ndarray]] = defaultdict(list)
+        self._channels: dict[str, list[np.ndarray]] = defaultdict(list)
+        self._last: Playback | None = None
+
+    def add(self, ik: jaxik.FootIK, sigmas: Mapping[str, float], replicated: bool) -> None:
+        """Runs the system of one draw, and makes a replicate of its motion.
+
+        Args:
+            ik: the system.
+            sigmas: of this draw, by kind; others are the scene's.
+            replicated: whether to make one.
+        """
+        played = playback.play(self._scene, playback.run(ik, self._scene))
+        given = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
+        ratios = {kind: sigma / given[kind] for kind, sigma in sigmas.items()}
+        frames = likelihoods.of_frames(played, self._scene, self._density, ratios)
+        self._frames.append(self._fraction * frames)
+        self._last = played
+        if not replicated:
+            return
+        for kind in self.kinds:
+            plain, _, active = groups.series(played, kind)
+            correlation = float(self._scene.sigmas.correlation_of(kind))
+            process = NoiseProcess(self._density, correlation, self._fraction)
+            noise = process.draw(self._random, (len(plain), plain.shape[1]))
+            both = (plain / ratios.get(kind, 1.0), noise)
+            rows = [predictive.statistics_of(residuals, active) for residuals in both]
+            self._statistics[kind].append(np.array(rows))
+            column, sigma = self.column(kind), given[kind]
+            in_units = (sigma * plain, ratios.get(kind, 1.0) * sigma * noise)
+            self._channels[kind].append(np.stack([series[:, column] for series in in_units]))
+
+    @property
+    def played(self) -> Playback:
+        """The clip with the last draw."""
+        assert self._last is not None  # there is a draw
+        return self._last
+
+    @property
+    def kinds(self) -> list[str]:
+        """Kinds of residuals with a noise of their own."""
+        return [kind for kind in self.played.fitted_kinds if kind in MEASURED]
+
+    def column(self, kind: str) -> int:
+        """The channel that is shown: of the first leg, upwards or about x."""
+        component = UP if kind in POSITIONS else ABOUT_X
+        return 3 * self._first_leg + component if kind in PER_LEG else component
+
+    def channel(self, kind: str) -> str:
+        """The channel that is shown, in words."""
+        direction = "upwards" if kind in POSITIONS else "about its x axis"
+        leg = f"{self._scene.rig.names[self._first_leg]}, " if kind in PER_LEG else ""
+        return leg + direction
+
+    @property
+    def _first_leg(self) -> int:
+        return int(np.argmax(np.asarray(self._scene.rig.present) > 0))
+
+    @property
+    def _blocks(self) -> np.ndarray:
+        return likelihoods.block_of_frames(self.played)
+
+    @property
+    def starts(self) -> Float[np.ndarray, " blocks"]:
+        """Of the blocks, s."""
+        return self.played.time[np.unique(self._blocks, return_index=True)[1]]
+
+    @property
+    def ends(self) -> Float[np.ndarray, " blocks"]:
+        """Of the blocks, s."""
+        return np.append(self.starts[1:], self.played.time[-1])
+
+    @property
+    def log_likelihood(self) -> Float[np.ndarray, "draws blocks"]:
+        """Of the blocks, for each draw."""
+        first = np.unique(self._blocks, return_index=True)[1]
+        return np.add.reduceat(np.stack(self._frames), first, axis=1)
+
+    @property
+    def checks(self) -> list[PredictiveCheck]:
+        """One for each kind."""
+        checks = []
+        for kind in self.kinds:
+            rows = np.stack(self._statistics[kind])  # draws, captured or replicated, statistics
+            statistics = [Statistic(rows[:, 0, i], rows[:, 1, i]) for i in range(rows.shape[2])]
+            checks.append(PredictiveCheck(self.index, kind, *statistics))
+        return checks
+
+    @property
+    def bands(self) -> list[Band]:
+        """A channel of each kind."""
+        bands = []
+        for kind in self.kinds:
+            column = self.column(kind)
+            observed = groups.series(self.played, kind)[2][:, column]
+            channels = np.stack(self._channels[kind])
+            place = (self.index, kind, self.channel(kind))
+            errors, noise = channels[:, 0], channels[:, 1]
+            bands.append(predictive.make_band(place, self.played.time, observed, errors, noise))
+        return bands

@@ -1,0 +1,210 @@
+"""Posteriors with several islands: found, weighted, or said to be out of reach."""
+
+import math
+
+import emcee
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+from scipy import stats
+
+from fitting.inference.sampling import diagnostics, islands, posterior, sampler
+from fitting.inference.sampling.posterior import Posterior, WalkerStart
+from fitting.inference.sampling.settings import SamplerSettings
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.problem import Problem
+from fitting.problem.space import make_space
+from jaxik.maths import parameter_tree
+
+CENTRES = np.array([-6.0, 6.0])  # of the islands, along the first parameter
+WIDTHS = np.array([1.0, 0.3])
+SPREAD = 1.6  # of the prior
+
+
+class Toy(eqx.Module):
+    """Any number of parameters, each between 0 and 1."""
+
+    x: Array = parameter_tree.parameter(
+        (0.5,), unit="", low=0.0, high=1.0, doc="X of the test rule."
+    )
+
+
+def mixture(ik, log_weights):
+    """Residuals whose half squares are minus the log-density of two normals, up to a constant."""
+    u = jnp.log(ik.x) - jnp.log1p(-ik.x)
+    place = jnp.zeros((2, u.size)).at[:, 0].set(CENTRES)
+    squares = jnp.sum(((u - place) / WIDTHS[:, None]) ** 2, axis=1)
+    log_density = jnp.logaddexp(*(log_weights - 0.5 * squares))
+    return jnp.sqrt(2 * (jnp.max(log_weights) + 1 - log_density))[None]
+
+
+def two_islands(size: int, weights: tuple[float, float]) -> Problem:
+    """A problem whose posterior has islands with exactly these weights."""
+    ik = Toy(x=jnp.full(size, 0.5))
+    space = make_space(ik, [free_parameter(ik, f"x[{i}]") for i in range(size)])
+    log_weights = np.log(weights)
+    for k in range(2):  # a normal of this width times the prior has this integral
+        volume = WIDTHS[k] * stats.norm.pdf(0, 0, math.hypot(SPREAD, WIDTHS[k]))
+        log_weights[k] -= size * np.log(volume) + _drawn_to_prior(k)
+    return Problem(space, jnp.asarray(log_weights), mixture)
+
+
+def _drawn_to_prior(k: int) -> float:
+    return -0.5 * CENTRES[k] ** 2 / (SPREAD**2 + WIDTHS[k] ** 2)
+
+
+def start_of(size: int, first: int) -> WalkerStart:
+    """Three quarters of the walkers on one island, a quarter on the other."""
+    u = np.zeros((2, size))
+    precision = 1 / WIDTHS**2 + 1 / SPREAD**2
+    u[:, 0] = CENTRES / WIDTHS**2 / precision
+    return WalkerStart(u[first], np.full(size, 0.2), u[[1 - first]])
+
+
+def sample(problem: Problem, start: WalkerStart, **settings) -> Posterior:
+    return posterior.sample_posterior(problem, start, SamplerSettings(**settings))
+
+
+@pytest.mark.parametrize(("size", "weights"), [(1, (0.8, 0.2)), (2, (0.8, 0.2)), (6, (0.2, 0.8))])
+def test_islands_get_their_exact_weights_from_unbalanced_starts(size, weights):
+    lighter = int(np.argmin(weights))
+    settings = {"walkers": 24, "max_steps": 2000, "stop_at": 1e9}
+    sampled = sample(two_islands(size, weights), start_of(size, lighter), **settings)
+    heavy, light = sampled.islands
+    assert heavy.exchanges > 200 and light.exchanges > 200
+    assert heavy.error < 0.025
+    assert abs(heavy.weight - 0.8) < 4 * heavy.error
+    assert light.weight == pytest.approx(1 - heavy.weight)
+    there = sampled.kept_u[..., 0] > 0
+    assert abs(there.mean() - weights[1]) < 5 * heavy.error
+    assert sampled.isolated == []
+    assert np.sign(heavy.median[0]) == np.sign(CENTRES[1 - lighter])
+
+
+def differential_evolution_only(chain):
+    return [(emcee.moves.DEMove(), 1.0)]
+
+
+def test_without_jumps_weights_are_out_of_reach_and_nothing_is_left_out(monkeypatch):
+    monkeypatch.setattr(sampler, "moves", differential_evolution_only)
+    sampled = sample(two_islands(6, (0.8, 0.2)), start_of(6, 1), max_steps=600)
+    assert not sampled.converged
+    assert "the weights of islands are out of reach" in sampled.message
+    assert sum(island.walkers for island in sampled.islands) == 24
+    assert not any(island.is_weighed for island in sampled.islands)
+    assert all(math.isnan(island.error) for island in sampled.islands)
+    assert sampled.isolated == [] and sampled.kept.shape[1] == 24
+
+
+def test_walkers_on_a_negligible_island_come_home():
+    sampled = sample(two_islands(6, (1 - 1e-9, 1e-9)), start_of(6, 0), stop_at=20.0)
+    assert sampled.converged, sampled.message
+    assert sampled.u[50, :, 0].max() > 5.0 and sampled.u[-500:, :, 0].max() < 0
+    assert sampled.isolated == [] and sampled.islands == ()
+
+
+def test_a_walker_that_cannot_come_home_is_named_with_what_is_left_out(monkeypatch):
+    monkeypatch.setattr(sampler, "moves", differential_evolution_only)
+    problem, start = two_islands(6, (1 - 1e-7, 1e-7)), start_of(6, 0)
+    balls = posterior._balls
+
+    def one_apart(start, walkers):
+        centres, widths = balls(WalkerStart(start.u, start.sd), walkers)
+        centres[3] = start.elsewhere[0]
+        return centres, widths
+
+    monkeypatch.setattr(posterior, "_balls", one_apart)
+    sampled = sample(problem, start, stop_at=20.0)
+    assert sampled.isolated == [3] and 3 in sampled.stuck
+    assert "left out: 1 of 24 walkers" in sampled.message
+    assert sampled.converged, sampled.message
+    assert sampled.isolated_mass < 1e-6
+    assert sampled.kept.shape[1] == 23 and sampled.kept_u[..., 0].max() < 0
+
+
+def test_low_walkers_with_much_room_are_not_left_out():
+    random = np.random.default_rng(0)
+    u = random.normal(size=(1000, 20, 3))
+    log_probability = -0.5 * np.sum(u**2, axis=-1)
+    u[:, 7] *= 1e4
+    log_probability[:, 7] -= 15.0
+    assert diagnostics.isolated_walkers(log_probability)[7]
+    assert not diagnostics.check(u, log_probability).isolated.any()
+    u[:, 7] /= 1e4
+    check = diagnostics.check(u, log_probability)
+    assert check.isolated.nonzero()[0].tolist() == [7]
+    assert check.isolated_mass == pytest.approx(np.exp(-15.0), rel=0.2)
+
+
+def test_a_resumed_chain_makes_the_same_jumps(tmp_path):
+    problem, start = two_islands(2, (0.8, 0.2)), start_of(2, 1)
+    settings = {"walkers": 12, "stop_at": 1e9}
+    whole = sample(problem, start, max_steps=500, **settings)
+    path = tmp_path / "chain.h5"
+    for steps in (90, 250, 500):  # before the first lesson, between two, to the end
+        sampler_settings = SamplerSettings(max_steps=steps, **settings)
+        part = posterior.sample_posterior(problem, start, sampler_settings, path=path)
+    assert np.array_equal(part.u, whole.u)
+    assert np.array_equal(part.log_probability, whole.log_probability)
+
+
+def test_lessons_are_powers_of_two_times_the_first():
+    lengths = [sampler.lesson(stored, 1) for stored in (0, 99, 100, 199, 200, 399, 400, 6400)]
+    assert lengths == [0, 0, 100, 100, 200, 200, 400, 6400]
+    assert sampler.lesson(33, 3) == 0 and sampler.lesson(34, 3) == 34
+
+
+@pytest.mark.parametrize("size", [1, 2, 6, 17])
+@pytest.mark.parametrize("shape", ["normal", "heavy tails", "ridge", "plateau"])
+def test_a_posterior_of_one_piece_has_one_island(size, shape):
+    random = np.random.default_rng(size)
+    u = {
+        "normal": lambda *shape: random.normal(size=shape),
+        "heavy tails": lambda *shape: random.standard_t(3, size=shape),
+        "ridge": lambda *shape: (
+            10 * random.normal(size=(*shape[:2], 1)) + random.normal(size=shape)
+        ),
+        "plateau": lambda *shape: random.uniform(size=shape) ** 3,
+    }[shape](150, 4 * size, size)
+    assert len(islands.find_islands(u)) == 1
+    assert islands.survey(u, np.zeros(u.shape[:2])) == ()
+
+
+@pytest.mark.parametrize("size", [1, 2, 6, 17])
+def test_islands_of_different_width_are_both_found(size):
+    random = np.random.default_rng(size)
+    u = random.normal(size=(150, 4 * max(size, 2), size))
+    few = u.shape[1] // 8
+    u[:, :few] = 0.2 * u[:, :few] + 15.0 * np.eye(size)[0]
+    found = islands.find_islands(u)
+    assert np.sort(np.bincount(found.labels(u).ravel())).tolist() == sorted(
+        [150 * few, 150 * (u.shape[1] - few)]
+    )
+    small, large = islands.survey(u, np.zeros(u.shape[:2]))[::-1]
+    assert (small.exchanges, small.walkers, large.walkers) == (0, few, u.shape[1] - few)
+
+
+def test_walkers_that_have_not_met_yet_are_no_islands():
+    random = np.random.default_rng(0)
+    u = 0.1 * random.normal(size=(100, 24, 6)) + 10.0 * random.normal(size=(24, 6))
+    assert len(islands.find_islands(u)) == 1
+
+
+def test_walkers_that_never_move_do_not_matter():
+    assert len(islands.find_islands(np.ones((50, 8, 2)))) == 1
+
+
+def test_the_density_of_jumps_is_that_of_their_draws():
+    found = islands.Islands(
+        np.array([[0.0, 0.0], [9.0, 1.0]]),
+        np.array([[[1.0, 0.0], [0.8, 0.5]], [[0.2, 0.0], [0.0, 2.0]]]),
+        np.array([0.7, 0.3]),
+    )
+    u = found.draw(np.random.RandomState(0), 20_000)
+    # Any density q has E[p / q] = 1 for a density p that it covers.
+    log_constant = math.lgamma(3.5) - math.lgamma(2.5) - math.log(5 * math.pi)
+    ratio = np.exp(stats.norm.logpdf(u).sum(axis=1) - found.log_density(u) - log_constant)
+    assert ratio.mean() == pytest.approx(1.0, abs=4 * ratio.std() / len(u) ** 0.5)
+    assert (found.labels(u[None])[0] == 1).mean() == pytest.approx(0.3, abs=0.02)

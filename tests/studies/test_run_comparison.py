@@ -1,0 +1,90 @@
+"""Runs compared by what they predict of the same motion."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fitting.cli import main
+from fitting.inference.sampling import blocks
+from fitting.inference.sampling.blocks import BlockLogLikelihood
+from fitting.studies import run_folder
+from fitting.studies.posterior.run_comparison import compare_runs
+
+pytest.importorskip("arviz_stats")
+GOOD = np.array([-3.0, -2.0, -4.0, -3.5, -2.5, -3.0])
+LOSS = np.array([1.0, 1.5, 0.5, 1.2, 0.8, 1.0])  # of the other system, block by block
+
+
+@pytest.fixture(autouse=True)
+def fits(monkeypatch):
+    """Folders need no fit here."""
+    monkeypatch.setattr(run_folder, "load_fit", lambda folder: None)
+
+
+def write_run(folder: Path, level: np.ndarray, data: str = "aaaa", draws: int = 200) -> Path:
+    """A sampled run whose blocks have this log-likelihood, within 0.1."""
+    folder.mkdir()
+    values = level + 0.1 * np.random.default_rng(0).normal(size=(draws, len(level)))
+    clip = np.array([1, 1, 1, 1, 2, 2])
+    start = np.array([0.0, 1.0, 2.0, 3.0, 0.0, 1.0])
+    given = BlockLogLikelihood(values, clip, start, start + 1.0, data, 1.0)
+    blocks.to_tree(given).to_netcdf(folder / run_folder.INFERENCE_DATA, engine="h5netcdf")
+    return folder
+
+
+def test_the_run_that_predicts_better_comes_first_with_the_difference(tmp_path):
+    worse, better = write_run(tmp_path / "a", GOOD - LOSS), write_run(tmp_path / "b", GOOD)
+    first, second = compare_runs([worse, better])
+    assert (first.name, second.name) == (str(better), str(worse))
+    assert first.elpd == pytest.approx(GOOD.sum(), abs=0.1)
+    assert (first.behind, first.behind_error) == (0.0, 0.0)
+    assert second.behind == pytest.approx(LOSS.sum(), abs=0.01)
+    assert second.behind_error == pytest.approx(np.sqrt(6) * LOSS.std(ddof=1), rel=0.01)
+    assert second.error > second.behind_error  # what blocks share does not count
+    assert sum(first.clips.values()) == pytest.approx(first.elpd)
+    assert first.clips[2] == pytest.approx(GOOD[4:].sum(), abs=0.1)
+
+
+def test_the_command_prints_and_writes_the_table(tmp_path, capsys, monkeypatch):
+    write_run(tmp_path / "a", GOOD - LOSS)
+    write_run(tmp_path / "b", GOOD)
+    monkeypatch.chdir(tmp_path)
+    assert main.main(["compare", "--runs", "a,b", "-o", "compared"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].startswith("b ") and lines[3].startswith("a ")
+    assert "elpd of clip 2" in lines[0]
+    text = (tmp_path / "compared" / "runs.md").read_text()
+    assert "| a | " in text and "expected log predictive density" in text
+    rows = json.loads((tmp_path / "compared" / "runs.json").read_text())
+    assert [row["name"] for row in rows] == ["b", "a"]
+    assert main.main(["compare", "--runs", "a,b"]) == 0
+    assert "written" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--runs", "a"], "wanted two or more different ones"),
+        (["--runs", "a,a"], "wanted two or more different ones"),
+        (["--runs", "a,other"], "a and other were fitted to different motion"),
+        (["--runs", "a,few"], "few: 50 draws of 6 blocks"),
+        (["--runs", "a,none"], "none: no posterior.nc; `jaxik sample none` makes it"),
+        (["--runs", "a,b", "--presets", "ozz"], "--presets and --runs exclude each other"),
+        (["walk.bvh", "--runs", "a,b"], "CLIP is walk.bvh; runs are compared on the clips of"),
+        (["--runs", "a,b", "--suite"], "--runs and --suite exclude each other"),
+    ],
+)
+def test_runs_that_cannot_be_compared_are_refused(tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        write_run(Path(name), GOOD)
+    write_run(Path("other"), GOOD, data="bbbb")
+    write_run(Path("few"), GOOD, draws=50)
+    os.mkdir("none")
+    assert main.main(["compare", *words]) == main.MISTAKE
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.count("\n") == 1
+    assert message in output.err
