@@ -42,8 +42,8 @@ SECONDS, FPS = 3.0, 30.0
 FRAMES = round(SECONDS * FPS)
 SPACING, HALF_WIDTH, BEHIND, AHEAD = 0.05, 1.0, 1.5, 7.0  # m, of all grounds: one program
 POSITION, ROTATION = 0.002, 0.0087  # m and rad, sigmas
-SIGMAS = dict.fromkeys(("ankle", "knee", "pelvis"), POSITION)
-SIGMAS |= dict.fromkeys(("foot", "body"), ROTATION)
+POSITIONS, ROTATIONS = ("ankle", "knee", "pelvis"), ("foot", "body")
+SIGMAS: dict[str, float] = dict.fromkeys(POSITIONS, POSITION) | dict.fromkeys(ROTATIONS, ROTATION)
 PLACES = np.linspace(0.01, 0.99, 31)  # of a parameter's range, on its scale
 
 TRUTH = {  # limits that people reach

@@ -88,7 +88,8 @@ def test_the_marginal_density_is_that_of_the_dense_normal():
         mean, covariance = dense_covariance(model, spreads)
         total = covariance + np.linalg.inv(information)
         prior = -0.5 * np.sum((spreads / model.spread_scale) ** 2)
-        exact.append(stats.multivariate_normal(mean, total).logpdf(measured_at) + prior)
+        normal = stats.multivariate_normal(mean, total)  # type: ignore[arg-type]
+        exact.append(normal.logpdf(measured_at) + prior)
         densities.append(model.log_marginal(spreads))
         gain = covariance @ np.linalg.inv(total)
         expected = mean + gain @ (measured_at - mean)

@@ -355,8 +355,9 @@ def test_the_descents_that_do_not_agree_count_too(monkeypatch):
     """Of three, one stops where it begins: two of three agree."""
     settings = SearchSettings(descents=3, draws=3, sweeps=0)
     problem = curve_problem(("height", "rate", "turn"))
-    begin, far = np.asarray(problem.space.start), problem.space.start.at[1].set(-3.0)
-    points = [Point(np.asarray(u), cost_of(problem, u)) for u in (begin, far, begin)]
+    begin = np.asarray(problem.space.start)
+    far = begin + np.asarray([0.0, -3.0, 0.0])
+    points = [Point(u, cost_of(problem, u)) for u in (begin, far, begin)]
     monkeypatch.setattr(search, "starting_points", lambda of, state, first: (points, state))
     real = search.descend
 

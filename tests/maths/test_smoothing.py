@@ -41,7 +41,7 @@ FUNCTIONS = {
 }
 
 
-def call(function, *args: ArrayLike | smoothing.Motion):
+def call(function, *args: ArrayLike | smoothing.Motion | tuple[ArrayLike, ArrayLike]):
     """The function of these arguments, turned into arrays."""
     return function(*jax.tree.map(jnp.asarray, args))
 

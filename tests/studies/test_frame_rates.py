@@ -55,7 +55,9 @@ def test_a_restart_between_two_frames_that_are_played_is_at_the_next_one(animati
     cut = dataclasses.replace(
         animation, given_frames=dataclasses.replace(animation.frames, restart=restart)
     )
-    np.testing.assert_array_equal(np.flatnonzero(every_frame(cut, 4).frames.restart), [2])
+    restart = every_frame(cut, 4).frames.restart
+    assert restart is not None
+    np.testing.assert_array_equal(np.flatnonzero(restart), [2])
 
 
 def test_differences_are_those_at_the_frames_of_both(animation, monkeypatch):

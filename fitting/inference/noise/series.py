@@ -133,7 +133,7 @@ def log_density(
     if loss == "student":
         constant = special.gammaln((tails + 1) / 2) - special.gammaln(tails / 2)
         constant -= 0.5 * math.log(math.pi * tails)
-    return constant - 0.5 * rho(residuals**2, loss, tails, np)
+    return np.asarray(constant - 0.5 * rho(residuals**2, loss, tails, np))
 
 
 def _follows(errors: Errors) -> Bool[np.ndarray, "frames columns"]:
