@@ -8,6 +8,7 @@ import pytest
 
 from fitting import jobs
 from fitting.cli import main
+from fitting.cli.parser import make_parser
 from fitting.datasets import clips
 from fitting.datasets.synthetic import walker
 from fitting.datasets.synthetic.walker import WalkStyle
@@ -91,7 +92,12 @@ def test_the_command_writes_the_table(animation, monkeypatch, tmp_path, capsys):
     assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text
     numbers = json.loads((tmp_path / "out" / comparison_report.NUMBERS).read_text())["rates"]
     assert [entry["fps"] for entry in numbers] == [60.0, 30.0]
-    assert main.main([str(word) for word in [*words[:-4], "--rates", "0", "-o", "x"]]) == 2
+
+
+def test_a_rate_that_is_no_number_above_0_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        make_parser().parse_args(["compare", "c", "--rates", "60,0"])
+    assert "'0'; wanted a number above 0" in capsys.readouterr().err
 
 
 @in_float64
