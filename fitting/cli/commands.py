@@ -56,6 +56,7 @@ def calibrate(options: argparse.Namespace) -> int:
             options.output,
             replicates=options.replicates,
             chains=options.chains,
+            noise_factor=options.noise_factor,
             workers=options.workers,
             scheduler=options.scheduler,
             progress=line,

@@ -23,6 +23,7 @@ def calibrate(
     *,
     replicates: int = 200,
     chains: bool = False,
+    noise_factor: float = 1.0,
     workers: int = 0,
     scheduler: str | None = None,
     progress: Callable[[CalibrationProgress], None] = lambda report: None,
@@ -40,6 +41,8 @@ def calibrate(
         replicates: number of truths.
         chains: whether to sample each posterior as `sample` does; a chain takes much longer than a
             fit.
+        noise_factor: how much larger the simulated noise is than the experiment says: whether fits
+            notice, or estimate it.
         workers: processes on this machine that compute; 0 computes in this process.
         scheduler: address of the scheduler of a Dask cluster that computes instead.
         progress: called as fits and chains go on.
@@ -63,7 +66,7 @@ def calibrate(
     with cluster.connect(workers, scheduler) as client:
         made = calibration.calibrate(
             experiment, problem, folder, replicates,
-            chains=chains, client=client, observers=observers,
+            chains=chains, noise_factor=noise_factor, client=client, observers=observers,
         )  # fmt: skip
     assessment = assess(made)
     if folder is not None:

@@ -20,7 +20,10 @@ import fitting
 from fitting.cli import main
 from fitting.experiments import problems
 from fitting.experiments.experiment_files import load_experiment
+from fitting.inference.noise.model import noise_of
 from fitting.inference.profiles.profile import make_profile
+from fitting.problem.residuals import residuals_of_scenes as residuals_of_motion
+from fitting.problem.simulation import simulate as simulate_motion
 from fitting.report.calibration import calibration_report, calibration_tables
 from fitting.report.plots import calibration_plots
 from fitting.studies.calibration import calibration, replicates
@@ -342,6 +345,33 @@ def test_what_is_outside_is_named_and_ends_with_status_5(
     assert not (tmp_path / "out" / "ranks.png").exists(), "there are no chains"
 
 
+def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(
+    experiment_file, monkeypatch
+):
+    """Residuals of the truth are twice as large; the problem that is fitted assumes what it did."""
+    monkeypatch.setattr(replicates, "simulate", simulate_motion)
+    experiment = load_experiment(experiment_file)
+    problem = problems.make_problem(experiment)
+    problem = dataclasses.replace(problem, residual_function=residuals_of_motion)
+    truth = replicates.draw_truth(problem, experiment, 0)
+    rms = []
+    for factor in (1.0, 2.0):
+        simulated = replicates._simulated(problem, truth, factor)
+        assert noise_of(simulated) == noise_of(problem)
+        residuals = np.asarray(simulated.residuals(jnp.asarray(truth.u)))[:-2]
+        rms.append(np.sqrt(np.mean(residuals[residuals != 0] ** 2)))
+    assert rms == pytest.approx([1.0, 2.0], rel=0.1)
+
+
+@pytest.mark.parametrize("factor", ["0", "-1"])
+def test_noise_that_is_not_positive_is_a_mistake(experiment_file, tmp_path, factor, capsys):
+    out = tmp_path / "out"
+    words = ["calibrate", str(experiment_file), f"--noise-factor={factor}", "-o", str(out)]
+    assert main.main(words) == 2
+    assert f"noise_factor is {factor}; wanted a positive number" in capsys.readouterr().err
+    assert not out.exists()
+
+
 @pytest.mark.parametrize("count", ["0", "-2"])
 def test_fewer_than_one_replicate_is_a_mistake(experiment_file, tmp_path, count, capsys):
     words = ["calibrate", str(experiment_file), "-n", count, "-o", str(tmp_path / "out")]
@@ -355,10 +385,10 @@ def test_ctrl_c_ends_with_status_130_and_keeps_what_is_finished(
 ):
     make = calibration.fit_replicate
 
-    def interrupted(problem, experiment, number, progress):
+    def interrupted(problem, experiment, number, progress, **options):
         if number == 1:
             signal.raise_signal(signal.SIGINT)
-        return make(problem, experiment, number, progress)
+        return make(problem, experiment, number, progress, **options)
 
     monkeypatch.setattr(calibration, "fit_replicate", interrupted)
     out = tmp_path / "out"

@@ -68,6 +68,10 @@ def add_calibrate(commands: Commands) -> None:
         help="sample each posterior too, which takes much longer than the fits (default: no)",
     )  # fmt: skip
     calibrate.add_argument(
+        "--noise-factor", type=finite, default=1.0, metavar="X",
+        help="simulate noise X times as large as the experiment says (default: 1)",
+    )  # fmt: skip
+    calibrate.add_argument(
         "--workers", type=int, default=0, metavar="N",
         help="compute in N other processes of this machine, with the extra `dask` (default: 0)",
     )  # fmt: skip

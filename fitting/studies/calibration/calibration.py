@@ -78,6 +78,7 @@ def calibrate(
     replicates: int,
     *,
     chains: bool = False,
+    noise_factor: float = 1.0,
     client: "Client | None" = None,
     observers: Observers = Observers(),  # noqa: B008
 ) -> Calibration:
@@ -91,24 +92,27 @@ def calibrate(
         folder: where finished replicates are kept. None keeps them in memory.
         replicates: number of truths.
         chains: whether each posterior is sampled, too.
+        noise_factor: how much larger the simulated noise is than the experiment says.
         client: of the Dask cluster that computes. None computes in this process.
         observers: what is called meanwhile.
 
     Raises:
-        ValueError: there is not one replicate; the folder holds something else; a replicate cannot
-            be made.
+        ValueError: there is not one replicate; the noise is not positive; the folder holds
+            something else; a replicate cannot be made.
     """
     if replicates < 1:
         raise ValueError(f"replicates is {replicates}; wanted 1 or more")
+    if not 0 < noise_factor < math.inf:
+        raise ValueError(f"noise_factor is {noise_factor:g}; wanted a positive number")
     if folder is not None:
-        _claim(folder, experiment, problem)
+        _claim(folder, _identity(experiment, problem, noise_factor))
 
     stage = functools.partial(_Stage, folder, replicates, client, observers.progress)
-    fit = functools.partial(fit_replicate, problem, experiment)
+    fit = functools.partial(fit_replicate, problem, experiment, noise_factor=noise_factor)
     fits = stage(FITS).run(fit, range(replicates), observers.on_fit)
     if not chains:
         return Calibration(fits, [])
-    sample = functools.partial(sample_replicate, problem, experiment)
+    sample = functools.partial(sample_replicate, problem, experiment, noise_factor=noise_factor)
     return Calibration(fits, stage(CHAINS).run(sample, fits, observers.on_chain))
 
 
@@ -205,13 +209,13 @@ class _Stage:
             raise ValueError(f"{path}: not written by `jaxik calibrate`: {error!r}") from None
 
 
-def _claim(folder: Path, experiment: Experiment, problem: Problem[jaxik.FootIK]) -> None:
+def _claim(folder: Path, own: Mapping[str, Any]) -> None:
     """Writes into a folder what is calibrated there, or compares it with what is written there.
 
     Raises:
         ValueError: the folder is that of another calibration, or of something else.
     """
-    path, own = folder / IDENTITY, _identity(experiment, problem)
+    path = folder / IDENTITY
     if not path.exists():
         if folder.is_dir() and any((folder / name).exists() for name in (FITS, CHAINS)):
             raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
@@ -231,13 +235,16 @@ def _claim(folder: Path, experiment: Experiment, problem: Problem[jaxik.FootIK])
         )
 
 
-def _identity(experiment: Experiment, problem: Problem[jaxik.FootIK]) -> dict[str, Any]:
+def _identity(
+    experiment: Experiment, problem: Problem[jaxik.FootIK], noise_factor: float
+) -> dict[str, Any]:
     """Everything that a replicate follows from, except the program itself; as JSON reads it."""
     identity = {
         "name": experiment.name,
         "problem": digest(problem),
         "start": np.asarray(problem.space.start).tolist(),
         "seed": experiment.seed,
+        "noise_factor": noise_factor,
         "noise": dataclasses.asdict(experiment.noise),
         "fit": dataclasses.asdict(experiment.fit),
         "sample": dataclasses.asdict(experiment.sample),

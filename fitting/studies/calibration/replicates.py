@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 import jaxik
 from fitting.experiments.experiment import Experiment
-from fitting.inference.noise.model import NoiseModel, with_noise
+from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.optimisation import descent
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.solution import Progress
@@ -98,15 +98,23 @@ def fit_replicate(
     experiment: Experiment,
     number: int,
     progress: Callable[[Progress], None] | None = None,
+    noise_factor: float = 1.0,
 ) -> ReplicateFit:
     """Fits a replicate as `jaxik fit` does, and descends from its truth.
+
+    Args:
+        problem: of the experiment.
+        experiment: its settings of the search, and the seed.
+        number: of the replicate, from 0.
+        progress: called as the search goes on.
+        noise_factor: how much larger the simulated noise is than what the problem assumes.
 
     Raises:
         KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
         ValueError: the fit cannot be assessed.
     """
     truth = draw_truth(problem, experiment, number)
-    simulated = simulate(problem, truth.u, truth.noise_seed)
+    simulated = _simulated(problem, truth, noise_factor)
     own = dataclasses.replace(experiment, seed=truth.seed)
     simulated, solution = search_with_noise(simulated, own, progress)
     if not solution.interrupted:
@@ -144,6 +152,7 @@ def sample_replicate(
     experiment: Experiment,
     fitted: ReplicateFit,
     progress: Callable[[SamplingProgress], None] | None = None,
+    noise_factor: float = 1.0,
 ) -> ReplicateChain:
     """Samples the posterior of a replicate as `jaxik sample` does, around its fit.
 
@@ -153,7 +162,7 @@ def sample_replicate(
     """
     number = fitted["number"]
     truth = draw_truth(problem, experiment, number)
-    simulated = simulate(problem, truth.u, truth.noise_seed)
+    simulated = _simulated(problem, truth, noise_factor)
     own = dataclasses.replace(experiment, seed=truth.seed)
     if "noise" in fitted:
         simulated = with_noise(simulated, NoiseModel(**fitted["noise"]))
@@ -176,6 +185,16 @@ def sample_replicate(
         "message": posterior.message,
         "seconds": posterior.seconds,
     }
+
+
+def _simulated(
+    problem: Problem[jaxik.FootIK], truth: Truth, noise_factor: float
+) -> Problem[jaxik.FootIK]:
+    """The problem with motion made at a truth; it assumes the same noise as before."""
+    assumed = noise_of(problem)
+    sigmas = {kind: noise_factor * sigma for kind, sigma in assumed.sigmas.items()}
+    noisy = with_noise(problem, dataclasses.replace(assumed, sigmas=sigmas))
+    return with_noise(simulate(noisy, truth.u, truth.noise_seed), assumed)
 
 
 def rise_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
