@@ -40,6 +40,7 @@ WRITTEN_PAGES = {
     "summary.md",
     "table.md",
     "compare.md",
+    "runs.md",
     "suite.md",
     "notes.md",
 }  # by commands and by tests

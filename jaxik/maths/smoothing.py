@@ -99,30 +99,6 @@ def follow(before: Motion, goal: Array, fraction: Array, dt: Array, use_spring: 
     )
 
 
-def follow_moving(
-    before: Motion,
-    goals: tuple[Array, Array],
-    fraction: Array,
-    dt: Array,
-    use_spring: Array,
-) -> Motion:
-    """`follow` of a goal that moves evenly from one value to another during the `dt` s.
-
-    Exact for any `dt`, while `follow` holds the goal of the frame's end from its beginning and so
-    runs ahead by half a frame. Both exponential and spring end up `lag = step / -ln(1 - fraction)`
-    behind such a goal; in the space that moves with the goal and its lag they come to rest.
-    """
-    start, end = goals
-    damped = (fraction > 0) & (fraction < 1) & (dt > 0)
-    step = jnp.where(damped, end - start, 0.0)
-    lag = step / -jnp.log1p(-jnp.where(damped, fraction, 0.5))
-    speed = step / jnp.where(damped, dt, 1.0)
-    resting = Motion(before.value - (end - step) + lag, before.velocity - speed)
-    after = follow(resting, jnp.zeros_like(end), fraction, dt, use_spring)
-    velocity = jnp.where(use_spring, after.velocity + speed, after.velocity)
-    return Motion(after.value + end - lag, velocity)
-
-
 def _spring(before: Motion, goal: Array, fraction: Array, dt: Array) -> Motion:
     """The spring whose exponential closes `fraction` of a gap in `dt` s.
 

@@ -341,7 +341,7 @@ def test_a_finished_run_is_returned_and_a_longer_one_continues_it(tmp_path):
     again = sample(problem, **run)
     assert np.array_equal(first.u, again.u) and again.message == first.message
     assert run["path"].read_bytes() == before
-    longer = sample(problem, **run, stop_at=100.0)
+    longer = sample(problem, **run, stop_at=1000.0)
     assert longer.converged and len(longer.u) > len(first.u)
     assert np.array_equal(longer.u[: len(first.u)], first.u)
 

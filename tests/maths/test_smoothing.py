@@ -1,12 +1,10 @@
 """Smoothing laws: exact at any frame time, correct at their limits, with correct gradients."""
 
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.typing import ArrayLike
@@ -34,14 +32,13 @@ FUNCTIONS = {
         smoothing.follow,
         (MOTION, 2 * X, X, X, X > 0.3),
     ),
-    "follow_moving": (smoothing.follow_moving, (MOTION, (X, 2 * X), X, X, X > 0.3)),
     "half_life_of_gain": (smoothing.half_life_of_gain, (X, 30 * X)),
     "gain_of_half_life": (smoothing.gain_of_half_life, (X, 30 * X)),
     "half_life_of_speed": (smoothing.half_life_of_speed, (X, X)),
 }
 
 
-def call(function, *args: ArrayLike | smoothing.Motion | tuple[ArrayLike, ArrayLike]):
+def call(function, *args: ArrayLike | smoothing.Motion):
     """The function of these arguments, turned into arrays."""
     return function(*jax.tree.map(jnp.asarray, args))
 
@@ -227,43 +224,6 @@ def test_following_a_goal_that_changes_every_frame_solves_the_equation_of_each_f
         assert_allclose(value, goal + (eased - goal) * 2 ** (-dt / half_life), rtol=1e-12)
         assert velocity == 0
         eased = float(value)
-
-
-@pytest.mark.parametrize("use_spring", [False, True])
-def test_a_moving_goal_is_followed_alike_in_one_long_frame_and_in_many_short_ones(use_spring):
-    half_life, seconds, start, end = 0.08, 1 / 30, 0.1, 0.16
-
-    def after(frames: int) -> tuple[float, ...]:
-        motion, goals = (0.02, 0.3 * use_spring), np.linspace(start, end, frames + 1)
-        dt = seconds / frames
-        fraction = call(smoothing.fraction_of_half_life, half_life, dt)
-        for pair in itertools.pairwise(goals):
-            value = smoothing.Motion(*map(jnp.asarray, motion))
-            motion = call(smoothing.follow_moving, value, pair, fraction, dt, use_spring)
-        return tuple(map(float, motion))
-
-    assert_allclose(after(1), after(64), rtol=1e-9, atol=1e-12)
-    fraction = call(smoothing.fraction_of_half_life, half_life, seconds)
-    held = follow(0.02, 0.3 * use_spring, end, fraction, seconds, use_spring)
-    assert float(held[0]) - after(1)[0] > 0.003  # half a frame ahead
-
-
-def test_a_goal_that_stays_is_followed_as_a_fixed_one():
-    value = smoothing.Motion(jnp.asarray(0.02), jnp.asarray(0.3))
-    for fraction in (0.0, 0.3, 1.0):
-        for use_spring in (False, True):
-            moving = call(smoothing.follow_moving, value, (0.1, 0.1), fraction, 1 / 60, use_spring)
-            fixed = follow(0.02, 0.3, 0.1, fraction, 1 / 60, use_spring)
-            assert_allclose(moving, fixed, rtol=1e-9, atol=1e-15)
-
-
-def test_a_moving_goal_jumps_or_waits_at_fractions_of_one_and_zero():
-    value = smoothing.Motion(jnp.asarray(0.02), jnp.asarray(0.0))
-    for use_spring in (False, True):
-        jumped = call(smoothing.follow_moving, value, (0.1, 0.2), 1.0, 1 / 60, use_spring)
-        waiting = call(smoothing.follow_moving, value, (0.1, 0.2), 0.0, 1 / 60, use_spring)
-        assert tuple(map(float, jumped)) == (0.2, 0.0)
-        assert float(waiting[0]) == pytest.approx(0.02, abs=1e-15)
 
 
 def test_a_fraction_of_one_jumps_and_stops():

@@ -209,31 +209,6 @@ def follow(before: Motion | None, goal: float, half_life: float, dt: float, spri
     return Motion(goal + (a + b * dt) * left, (b - w * (a + b * dt)) * left)
 
 
-def follow_moving(
-    before: Motion, goals: tuple[float, float], half_life: float, dt: float, spring: bool
-) -> Motion:
-    """The number after `dt` s in which its goal moves evenly from the first to the second.
-
-    The exponential `x' = k (g - x)` is `g - v / k + a e^(-k t)`, the critically damped spring
-    `x'' = w² (g - x) - 2 w x'` is `g - 2 v / w + (a + b t) e^(-w t)`, with the goal g of speed v.
-    A half-life <= 0 s jumps.
-    """
-    start, end = goals
-    if half_life <= 0.0:
-        return Motion(end, 0.0)
-    speed = (end - start) / dt
-    k = math.log(2.0) / half_life
-    if not spring:
-        a = before.value - start + speed / k
-        return Motion(end - speed / k + a * math.exp(-k * dt), 0.0)
-    w = 2.0 * k
-    a = before.value - start + 2.0 * speed / w
-    b = before.velocity - speed + w * a
-    left = math.exp(-w * dt)
-    value = end - 2.0 * speed / w + (a + b * dt) * left
-    return Motion(value, speed + (b - w * (a + b * dt)) * left)
-
-
 def smooth01(x: float) -> float:
     """The smoothstep cubic from 0 at 0 to 1 at 1, constant beyond."""
     x = clip(x, 0.0, 1.0)

