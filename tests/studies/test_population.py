@@ -260,7 +260,7 @@ def test_the_command_writes_a_report_and_parameters(walks, tmp_path, capsys):
 
 
 def test_what_has_not_converged_is_said_and_ends_with_status_3(quick, tmp_path, capsys):
-    path = write_walks(tmp_path, TABLE + "[fit]\nstarts = 1\n")
+    path = write_walks(tmp_path, TABLE + "[fit]\nstarts = 1\n[fit.search]\ndescents = 1\n")
     assert main.main(["population", str(path), "-o", str(tmp_path / "out")]) == 3
     assert "**Not converged**: all clips: Not converged: stopped" in capsys.readouterr().out
 
