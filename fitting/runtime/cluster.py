@@ -46,14 +46,14 @@ def connect(workers: int = 0, scheduler: str | None = None) -> "Iterator[Client 
     if scheduler is None:
         options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
         with LocalCluster(n_workers=workers, **options) as local, Client(local) as client:
-            yield _prepared(client)
+            yield client
         return
     try:
         client = Client(scheduler, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
         raise ValueError(f"no Dask scheduler answers at {scheduler!r}: {error}") from None
     with client:
-        yield _prepared(client)
+        yield client
 
 
 def compute(
@@ -78,7 +78,15 @@ def compute(
 
 @in_float64
 def _call(function: bytes, argument: Any) -> Any:
+    _prepare()
     return _loaded(function)(argument)
+
+
+@functools.cache
+def _prepare() -> None:
+    """Has a worker compute as this process does; nothing of JAX has run there before."""
+    xla.configure_xla()
+    cache_folder.use_default()
 
 
 @functools.lru_cache(maxsize=1)
@@ -87,18 +95,3 @@ def _loaded(function: bytes) -> Callable[[Any], Any]:
     import cloudpickle
 
     return cloudpickle.loads(function)
-
-
-def _prepared(client: "Client") -> "Client":
-    """The client, after which each present and future worker computes as this process does."""
-    from distributed import WorkerPlugin
-
-    class Prepare(WorkerPlugin):
-        name = "jaxik"
-
-        def setup(self, worker: object) -> None:
-            xla.configure_xla()
-            cache_folder.use_default()
-
-    client.register_plugin(Prepare())
-    return client

@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.problem.loss import CAUCHY, HUBER, TAILS, apply_loss, rho, slope_of_rho
+from fitting.problem.loss import (
+    CAUCHY,
+    HUBER,
+    TAILS,
+    _factor_and_slope,
+    apply_loss,
+    rho,
+    slope_of_rho,
+)
 
 LOSSES = {
     "squares": lambda z: z,
@@ -49,4 +57,5 @@ def test_the_derivative_of_a_robust_residual_at_zero_is_known_and_finite_everywh
 
 def test_an_unknown_loss_is_refused():
     with pytest.raises(ValueError, match="loss is 'absolute', wanted one of"):
-        inspect.unwrap(apply_loss)(RESIDUALS, "absolute")  # before any check of types
+        # before any check of types
+        inspect.unwrap(_factor_and_slope)(RESIDUALS**2, "absolute", TAILS, jnp)
