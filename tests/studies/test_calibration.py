@@ -129,6 +129,15 @@ def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(experiment_fil
     assert "a valley 3.5 above the truth's" in calibration_report.fit_line(fits[1])  # type: ignore[arg-type]
 
 
+def test_only_the_intervals_of_thresholds_may_cover_more_than_they_promise(experiment_file):
+    """Whose ends lie on plateaus of the cost: 95 % is what they promise at least."""
+    fitted = calibrate_study(experiment_file, None, 1).fits[0]
+    rows = [{**row, "interval": [row["low"], row["high"]]} for row in fitted["parameters"]]
+    always: Any = {**fitted, "parameters": [{**rows[0], "kind": "threshold"}, rows[1]]}
+    covered = assess(Calibration([always] * 400, [])).fit_coverage_of
+    assert covered["pelvis.on_gain"].inside and not covered["foot.max_pitch"].inside
+
+
 def calibrate_study(path: Path, folder: Path | None, count: int, **options) -> Calibration:
     experiment = load_experiment(path)
     with jax.enable_x64(True):

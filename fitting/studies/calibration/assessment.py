@@ -103,6 +103,7 @@ def assess(calibration: Calibration) -> Assessment:
     width = _of_parameters(fits, "high") - _of_parameters(fits, "low")
     near = np.abs(_of_parameters(fits, "value") - truth) <= NEAR * width
     wanted = (FIT_LEVEL, FIT_LEVEL)
+    at_least = (FIT_LEVEL, 1.0)  # of a threshold, whose interval ends with a plateau of the cost
     chain_coverage, chain_coverage_of = _chain_coverage(chains, names, truth, level)
     return Assessment(
         names=names,
@@ -110,7 +111,7 @@ def assess(calibration: Calibration) -> Assessment:
         level=level,
         fit_coverage=proportion(covered, level=level, wanted=wanted),
         fit_coverage_of={
-            name: proportion(covered[:, [i]], level=level, wanted=wanted)
+            name: proportion(covered[:, [i]], level=level, wanted=wanted if smooth[i] else at_least)
             for i, name in enumerate(names)
         },
         profile_coverage={
