@@ -40,16 +40,15 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
     """
     random = np.random.default_rng(seed)
     fraction = float(problem.independent_fraction)
-    between = (1 - fraction) / (1 + fraction)
     ik = problem.space.unpack(u)
-    scenes = tuple(_simulated(ik, scene, between, random) for scene in problem.data)
+    scenes = tuple(_simulated(ik, scene, fraction, random) for scene in problem.data)
     return eqx.tree_at(lambda problem: problem.data, problem, scenes)
 
 
 def _simulated(
-    ik: jaxik.FootIK, scene: Scene, between: float, random: np.random.Generator
+    ik: jaxik.FootIK, scene: Scene, independent_fraction: float, random: np.random.Generator
 ) -> Scene:
-    """A scene whose reference is the system's motion plus noise; `between` innovations."""
+    """A scene whose reference is the system's motion plus noise."""
     sigmas, reference = scene.sigmas, scene.reference
     if np.isfinite(sigmas.smooth):
         raise ValueError(
@@ -59,9 +58,8 @@ def _simulated(
 
     def noise(kind: str, shape: tuple[int, ...]) -> Noise:
         sigma = float(getattr(sigmas, kind))
-        independent = random.normal(size=shape)
-        innovations = autoregression(independent, between)
-        errors = autoregression(innovations, float(sigmas.correlation_of(kind)))
+        correlation = float(sigmas.correlation_of(kind))
+        errors = correlated(random.normal(size=shape), correlation, independent_fraction)
         return sigma * errors if np.isfinite(sigma) else np.zeros(shape)
 
     pelvis, knee_ws, ankle, contact = _motion(ik, scene)
@@ -85,6 +83,12 @@ def _motion(ik: jaxik.FootIK, scene: Scene) -> tuple[Transform, Array, Transform
     assert result.trace is not None  # `jaxik.run` always has one
     legs = legs_ws(scene, result)
     return pelvis_ws(scene, result), legs.knee.pos, legs.ankle, result.trace.sensed.contact.weight
+
+
+def correlated(draws: Noise, correlation: float, independent_fraction: float) -> Noise:
+    """Independent draws made a series whose residuals count, and are correlated, as assumed."""
+    between = (1 - independent_fraction) / (1 + independent_fraction)
+    return autoregression(autoregression(draws, between), correlation)
 
 
 def autoregression(innovations: Noise, correlation: float) -> Noise:

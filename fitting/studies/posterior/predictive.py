@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fitting.inference.noise.density import NoiseDensity
-from fitting.problem.simulation import autoregression
+from fitting.problem.simulation import correlated
 
 SURPRISING = 0.005  # probability, to either side, of a capture that is unlike the replicates
 BAND = (2.5, 50.0, 97.5)  # per cent
@@ -25,15 +25,14 @@ class NoiseProcess:
     correlation: float
     """From one frame to the next."""
     independent_fraction: float
-    """Of the residuals; a second autoregression, as in `problem.simulation`."""
+    """Of the residuals."""
 
     def draw(
         self, random: np.random.Generator, shape: tuple[int, int]
     ) -> Float[np.ndarray, "frames columns"]:
         """A series of this noise."""
-        between = (1 - self.independent_fraction) / (1 + self.independent_fraction)
-        innovations = autoregression(self.density.draw(random, shape), between)
-        return autoregression(innovations, self.correlation)
+        draws = self.density.draw(random, shape)
+        return correlated(draws, self.correlation, self.independent_fraction)
 
 
 @dataclass(frozen=True)
