@@ -234,3 +234,36 @@ def test_bodies_without_size_or_upright_pelvis_get_a_remark(write_bvh):
 def test_arguments_out_of_range_are_refused(write_bvh, arguments, message):
     with pytest.raises(ValueError, match=message):
         load_clip(write_bvh(BVH), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "arguments", "message"),
+    [
+        ("0 87 1 0 0 5", "0 1e308 1 0 0 5", {},
+         r"Hips is at \(0, 1e\+308, 1\) in frame 1; wanted at most 1e\+12 units of the file"),
+        ("0 87 1 0 0 5", "0 1e9 1 0 0 5", {},
+         r"Hips is at .* in frame 1; wanted at most 1e\+06 m, at 0.01 m per unit"),
+        ("Frame Time: 0.0083333", "Frame Time: 1e21", {},
+         r"1e-21 frames per second; wanted 0.001 to 100000; give fps="),
+        ("", "", {"scale": 10.0},
+         r"the left thigh is 420 m long; wanted at most 100; give another "),
+    ],
+)  # fmt: skip
+def test_what_no_body_can_be_is_refused_with_its_place(write_bvh, old, new, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        load_clip(write_bvh(BVH.replace(old, new, 1)), **arguments)
+
+
+def test_the_bounds_of_a_body_give_way_to_arguments(write_bvh):
+    far = write_bvh(BVH.replace("0 87 1 0 0 5", "0 1e9 1 0 0 5", 1))
+    assert load_clip(far, scale=1e-4).positions_ws.max() == pytest.approx(1e5, rel=1e-3)
+    slow = write_bvh(BVH.replace("Frame Time: 0.0083333", "Frame Time: 1e21", 1))
+    assert load_clip(slow, fps=30.0).fps == 30.0
+
+
+def test_a_leg_without_a_thigh_is_none_and_says_so(write_bvh):
+    clip = load_clip(write_bvh(BVH.replace("OFFSET 0 -42 0", "OFFSET 0 0 0", 1)))
+    assert clip.measured_rig is None
+    assert any("the left thigh has no length" in remark for remark in clip.remarks)
+    with pytest.raises(ValueError, match="without legs"):
+        _ = clip.rig

@@ -17,9 +17,18 @@ from . import contacts
 from .clip import Clip
 from .joint_roles import Roles, find_roles
 from .kinematics import continuous, local_from_world, world_from_local
-from .recording import INCH, Y_UP_FROM_Z_UP, Recording
+from .recording import (
+    FASTEST,
+    FURTHEST,
+    INCH,
+    LONGEST,
+    SLOWEST,
+    Y_UP_FROM_Z_UP,
+    Recording,
+)
 from .rigs import measure_rig, measure_soles, relative_size
 
+HUGE = 1e12  # units of a file, whatever they are
 RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
 RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": INCH, "ft": 12 * INCH, "ASF unit": INCH / 0.45}
@@ -60,8 +69,10 @@ def clip_from_recording(
         overrides: what must not be guessed.
 
     Raises:
-        ValueError: `overrides.joints` names joints that do not exist.
+        ValueError: `overrides.joints` names joints that do not exist, or a joint, a leg or the
+            frame rate is beyond what a body can be.
     """
+    _check_places(recording, source, HUGE, "units of the file")
     remarks = list(recording.remarks)
     roles: Roles | None = None
     try:
@@ -74,10 +85,18 @@ def clip_from_recording(
     if scale is None:
         scale = recording.metres_per_unit or _guess_scale(recording, roles, remarks)
     recording = recording.scaled(scale)
+    _check_places(recording, source, FURTHEST, f"m, at {scale:g} m per unit (scale=...)")
+    if roles is not None:
+        roles = _with_bones(recording, source, roles, remarks)
     up = overrides.up or recording.up_axis or _guess_up(recording, roles, remarks)
     if up == "z":
         recording = recording.rotated(Y_UP_FROM_Z_UP)
     rate = overrides.fps or _common_rate(recording.frame_time, remarks)
+    if not SLOWEST <= rate <= FASTEST:
+        raise ValueError(
+            f"{source}: {rate:.4g} frames per second; wanted {SLOWEST:g} to {FASTEST:g}; "
+            "give fps=... if you know better"
+        )
     positions_ws, rotations_ws = world_from_local(
         recording.parents, recording.positions_ls, recording.rotations_ls
     )
@@ -147,6 +166,43 @@ def _guessed_soles(
         for name, height, known in zip(rig.names, rig.ankle_height, measured, strict=True)
         if not known
     )
+
+
+def _check_places(recording: Recording, source: str, furthest: float, unit: str) -> None:
+    """ValueError where a joint is further from its parent, or the root from the origin."""
+    far = ~(np.abs(recording.positions_ls) <= furthest).all(axis=-1)
+    if far.any():
+        frame, joint = np.argwhere(far)[0]
+        place = ", ".join(f"{value:.4g}" for value in recording.positions_ls[frame, joint])
+        raise ValueError(
+            f"{source}: {recording.names[joint]} is at ({place}) in frame {frame}; "
+            f"wanted at most {furthest:g} {unit}"
+        )
+
+
+def _with_bones(
+    recording: Recording, source: str, roles: Roles, remarks: list[str]
+) -> Roles | None:
+    """The roles, unless a leg has no thigh or no shin: then none, and a remark.
+
+    Raises:
+        ValueError: a bone of a leg is longer than a body's can be.
+    """
+    lengths = np.median(np.linalg.norm(recording.positions_ls, axis=-1), axis=0)
+    for leg in roles.legs:
+        for bone, joint in (("thigh", leg.joints[1]), ("shin", leg.joints[2])):
+            if lengths[joint] > LONGEST:
+                raise ValueError(
+                    f"{source}: the {leg.name} {bone} is {lengths[joint]:.4g} m long; "
+                    f"wanted at most {LONGEST:g}; give another scale=..."
+                )
+            if lengths[joint] == 0.0:
+                remarks.append(
+                    f"the {leg.name} {bone} has no length, so there are no legs; "
+                    "name other joints with joints=..."
+                )
+                return None
+    return roles
 
 
 def _common_rate(frame_time: float, remarks: list[str]) -> float:

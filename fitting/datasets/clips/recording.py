@@ -10,6 +10,11 @@ INCH = 0.0254  # m
 Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
+FURTHEST = 1e6  # m, of any joint from the origin
+LONGEST = 100.0  # m, of a bone of a leg
+SLOWEST, FASTEST = 1e-3, 1e5  # frames per second
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A skeleton and its motion as a file states them, before anything is guessed or converted.
