@@ -4,6 +4,7 @@ An archive of our own holds every field of a `Clip`, so it loads exactly as it w
 file holds joint positions of two legs, once as captured and once as a flat animation.
 """
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,20 +15,70 @@ from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import TRACKS, Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
+from fitting.datasets.clips.recording import FASTEST, FURTHEST, LONGEST, SLOWEST
 from fitting.datasets.clips.rigs import relative_size, with_soles
 from fitting.runtime import files
 from jaxik.world.skeleton import Rig
 
+from .array_checks import Wanted, check_arrays
+
 Arrays = dict[str, np.ndarray]
 
 FORMAT = "jaxik clip 1"
+MAX_BYTES = 2**31  # of all arrays together, unpacked
+FPS = Wanted("number", low=SLOWEST, high=FASTEST)
+FRAMES = Wanted("number", ("frames",), low=0.0, high=1.0, optional=True)
+TRACK_ARRAYS = {
+    "stance": Wanted("switch", ("frames", "legs"), optional=True),
+    "mask": Wanted("switch", ("frames",), optional=True),
+    "slide": FRAMES,
+    "grounded": FRAMES,
+    "weight": Wanted("number", ("frames", "legs"), low=0.0, high=1.0, optional=True),
+}
+RIG_ARRAYS = {
+    "knee_axis_ls": Wanted("number", ("legs", 3), unit=True),
+    "ankle_from_foot": Wanted("number", ("legs", 4), unit=True),
+    "thigh": Wanted("number", ("legs",), low=0.0, high=LONGEST),
+    "shin": Wanted("number", ("legs",), low=0.0, high=LONGEST),
+    "foot": Wanted("number", ("legs",), low=0.0, high=LONGEST),
+    "side": Wanted("number", ("legs",), low=-1.0, high=1.0),
+    "present": Wanted("switch", ("legs",)),
+}
+RIG_JOINTS = {
+    "joints": Wanted("integer", ("legs", 4), low=0.0),
+    "pelvis": Wanted("integer", low=0.0),
+}
+# Measured where an older file does not have them.
+SOLE = Wanted("number", ("legs",), low=-LONGEST, high=LONGEST, optional=True)
+SOLE_ARRAYS = {"ankle_height": SOLE, "ball_height": SOLE}
+CLIP_ARRAYS = {
+    "joint_names": Wanted("text", ("joints",), distinct=True),
+    "rig_names": Wanted("text", ("legs",), distinct=True, optional=True),
+    "parents": Wanted("integer", ("joints",), low=-1.0),
+    "positions_ws": Wanted("number", ("frames", "joints", 3), low=-FURTHEST, high=FURTHEST),
+    "rotations_ws": Wanted("number", ("frames", "joints", 4), unit=True),
+    "offsets_ls": Wanted("number", ("joints", 3), low=-FURTHEST, high=FURTHEST),
+    "source": Wanted("text"),
+    "up_axis": Wanted("text"),
+    "remarks": Wanted("text", ("remarks",), may_be_empty=True),
+    "dialect": Wanted("text", optional=True),
+    "fps": FPS,
+    "raw_frame_time": Wanted("number", low=1e-6, high=1e4),
+    "scale": Wanted("number", low=1e-9, high=1e6),
+    **TRACK_ARRAYS,
+}
 ARRAYS = ("offsets_ls", "positions_ws", "rotations_ws")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
-RIG_ARRAYS = ("knee_axis_ls", "ankle_from_foot", "thigh", "shin", "foot", "side", "present")
-SOLE_ARRAYS = ("ankle_height", "ball_height")  # measured where an older file does not have them
 VARIANTS = {"captured": "", "base": "base_"}  # prefix of their arrays in a blocks file
-BLOCKS_ARRAYS = ("fps", "pelvis", "pelvis_rot", "foot_rot", "stance")
+BLOCKS_ARRAYS = {
+    "fps": FPS,
+    "pelvis_rot": Wanted("number", ("frames", 4), unit=True),
+    "foot_rot": Wanted("number", ("frames", 2, 4), unit=True),
+    "stance": Wanted("label", ("frames", 2)),
+}
+BLOCKS_ROOT = Wanted("number", ("frames", 3), low=-FURTHEST, high=FURTHEST)
+BLOCKS_JOINT = Wanted("number", ("frames", 2, 3), low=-FURTHEST, high=FURTHEST)
 BLOCKS_JOINTS = ("hip", "knee", "ankle", "ball")
 
 
@@ -56,11 +107,8 @@ def save_clip(
         if (value := getattr(clip, name)) is not None:
             content[name] = np.asarray(value)
     if (rig := clip.measured_rig) is not None:
-        arrays = (*RIG_ARRAYS, *SOLE_ARRAYS)
+        arrays = ("names", *RIG_ARRAYS, *RIG_JOINTS, *SOLE_ARRAYS)
         content |= {f"rig_{name}": np.asarray(getattr(rig, name)) for name in arrays}
-        content["rig_names"] = np.array(rig.names)
-        content["rig_joints"] = np.array(rig.joints)
-        content["rig_pelvis"] = np.array(rig.pelvis)
     content |= joints or {}
 
     def fill(temporary: Path) -> None:
@@ -89,10 +137,15 @@ def read_npz(path: Path, variant: str) -> Clip:
             variant.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = dict(archive)
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size <= MAX_BYTES:
+            with np.load(path, allow_pickle=False) as arrays:
+                content = dict(arrays)
     except Exception as error:  # zipfile, zlib and NumPy each raise their own
         raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({error})") from None
+    if size > MAX_BYTES:
+        raise ValueError(f"{path}: its arrays take {size} bytes; wanted {MAX_BYTES} at most")
     if "format" in content:
         if variant != "captured":
             raise ValueError(f"{path}: only blocks files have the variant {variant!r}")
@@ -120,16 +173,16 @@ def is_blocks_file(path: str | Path) -> bool:
 def _read_saved_clip(path: Path, content: Arrays) -> Clip:
     if str(content["format"]) != FORMAT:
         raise ValueError(f"{path}: wanted the format {FORMAT!r}, got {str(content['format'])!r}")
-    required = {"joint_names", "parents", "remarks", *ARRAYS, *TEXTS, *NUMBERS}
+    wanted = dict(CLIP_ARRAYS)
     if "rig_names" in content:
-        required |= {f"rig_{name}" for name in (*RIG_ARRAYS, "joints", "pelvis")}
-    _check_arrays(path, content, required)
+        of_rig = RIG_ARRAYS | RIG_JOINTS | SOLE_ARRAYS
+        wanted |= {f"rig_{name}": array for name, array in of_rig.items()}
+    sizes = check_arrays(path, content, wanted)
+    _check_tree(path, content, sizes["joints"])
     return Clip(
         joint_names=tuple(map(str, content["joint_names"])),
         parents=tuple(map(int, content["parents"])),
-        offsets_ls=content["offsets_ls"],
-        positions_ws=content["positions_ws"],
-        rotations_ws=content["rotations_ws"],
+        **{name: content[name].astype(np.float64) for name in ARRAYS},
         fps=float(content["fps"]),
         raw_frame_time=float(content["raw_frame_time"]),
         source=str(content["source"]),
@@ -137,23 +190,30 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
         up_axis=str(content["up_axis"]),
         dialect=str(content["dialect"]) if "dialect" in content else None,
         measured_rig=_read_rig(content) if "rig_names" in content else None,
-        **_read_tracks(path, content),
+        **{name: content[name] for name in TRACK_ARRAYS if name in content},
         remarks=tuple(map(str, content["remarks"])),
     )
 
 
-def _read_tracks(path: Path, content: Arrays) -> Arrays:
-    """The optional arrays with an entry a frame."""
-    frames = (len(content["positions_ws"]),)
-    legs = (*frames, *content.get("rig_names", np.zeros(0)).shape)
-    tracks = {name: content[name] for name in TRACKS if name in content}
-    for name, track in tracks.items():
-        shape = legs if name in ("stance", "weight") else frames
-        if track.shape != shape:
-            raise ValueError(f"{path}: {name} is {track.shape}; wanted {shape}")
-        if track.dtype.kind == "f" and not ((track >= 0.0) & (track <= 1.0)).all():
-            raise ValueError(f"{path}: {name} has values outside 0..1")
-    return tracks
+def _check_tree(path: Path, content: Arrays, joints: int) -> None:
+    """ValueError unless the joints form a skeleton whose joints the legs name."""
+    if (axis := str(content["up_axis"])) not in ("y", "z"):
+        raise ValueError(f"{path}: up_axis is {axis!r}; wanted 'y' or 'z'")
+    late = np.flatnonzero(content["parents"] >= np.arange(joints))
+    if len(late):
+        joint = int(late[0])
+        raise ValueError(
+            f"{path}: parents has {content['parents'][joint]} at [{joint}]; "
+            "wanted an earlier joint, or -1 for a root"
+        )
+    if "rig_names" not in content:
+        return
+    named = np.append(content["rig_joints"], content["rig_pelvis"])
+    if (named >= joints).any():
+        raise ValueError(f"{path}: rig_joints and rig_pelvis name {named.max()} of {joints} joints")
+    for name in ("rig_thigh", "rig_shin"):
+        if (content[name][content["rig_present"]] <= 0).any():
+            raise ValueError(f"{path}: {name} has a bone of no length")
 
 
 def _read_rig(content: Arrays) -> Rig:
@@ -181,26 +241,13 @@ def _measure_soles(content: Arrays, rig: Rig) -> Rig:
     return with_soles(rig, positions_ws, content["rotations_ws"], stance)
 
 
-def _check_arrays(path: Path, content: Arrays, required: set[str]) -> None:
-    if missing := sorted(required - set(content)):
-        raise ValueError(f"{path}: without the arrays {missing}; it has {sorted(content)}")
-    for name in required:
-        if content[name].dtype.kind == "f" and not np.isfinite(content[name]).all():
-            raise ValueError(f"{path}: {name} has numbers that are not finite")
-
-
 def _read_blocks(path: Path, content: Arrays, variant: str) -> Clip:
     """Joint positions of two legs, left first; thigh and shin get the rotations they imply."""
     prefix = VARIANTS[variant]
     keys = [f"{prefix}{joint}" for joint in BLOCKS_JOINTS]
-    _check_arrays(path, content, {*BLOCKS_ARRAYS, f"{prefix}pelvis", *keys})
+    joints = {f"{prefix}pelvis": BLOCKS_ROOT, **dict.fromkeys(keys, BLOCKS_JOINT)}
+    check_arrays(path, content, joints | BLOCKS_ARRAYS)
     pelvis = content[f"{prefix}pelvis"].astype(np.float64)
-    frames = len(pelvis)
-    shapes = {key: (frames, 2, 3) for key in keys}
-    shapes |= {"pelvis_rot": (frames, 4), "foot_rot": (frames, 2, 4), "stance": (frames, 2)}
-    for key, shape in shapes.items():
-        if content[key].shape != shape:
-            raise ValueError(f"{path}: {key} is {content[key].shape}; wanted {shape}")
     hip, knee, ankle, ball = (content[key].astype(np.float64) for key in keys)
     pelvis_rot = _normalised(content["pelvis_rot"])
     foot_rot = _normalised(content["foot_rot"])
