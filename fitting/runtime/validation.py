@@ -1,6 +1,7 @@
-"""Checks on TOML files that users write: known keys, and values of the right type and range."""
+"""Checks on files that users write: known keys, and values of the right type and range."""
 
 import difflib
+import json
 import math
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -76,6 +77,21 @@ def read_toml(path: Path, description: str) -> Content:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: not TOML: nested too deeply") from None
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ValueError: the file is not JSON; the message does not name it.
+        OSError: it cannot be read.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def why_missing(path: Path) -> str:

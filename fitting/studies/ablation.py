@@ -29,7 +29,7 @@ from fitting.experiments.systems import leaf_names
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.runtime import files
-from fitting.runtime.validation import Table, error_context
+from fitting.runtime.validation import Table, error_context, read_json
 from jaxik.world.similarity import similar
 
 from .animations import Animation
@@ -279,7 +279,7 @@ def read(folder: Path) -> list[Row]:
     if not path.exists():
         return []
     try:
-        return [_row(fields) for fields in json.loads(path.read_text(encoding="utf-8"))["rows"]]
+        return [_row(fields) for fields in read_json(path)["rows"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: not written by `jaxik ablate`: {error!r}") from None
 

@@ -24,6 +24,7 @@ from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
+from fitting.runtime.validation import read_json
 
 from .fit import Fit, FitSummary
 from .posterior.replay_summary import summarise_replay
@@ -94,7 +95,7 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
             present = sorted(path.name for path in run.iterdir()) or "nothing"
             raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
     try:
-        summary = json.loads((run / FIT).read_text(encoding="utf-8"))
+        summary = read_json(run / FIT)
         missing = {key for row in summary["parameters"] for key in SAMPLER_KEYS if key not in row}
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{run / FIT}: not the numbers of a fit: {error!r}; {HINT}") from None

@@ -68,6 +68,7 @@ def test_a_parameter_may_have_one_value_per_leg(tmp_path):
     ("text", "message"),
     [
         ("lock = [[", "not TOML"),
+        ("lock = " + 100_000 * "[", "not TOML: nested too deeply"),
         ("preset = 'recrod'", r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
         ("preset = 3", "no preset named 3"),
         ("preset = 'stride'\nfaithful = true", "'stride' has no other original; faithful is for"),

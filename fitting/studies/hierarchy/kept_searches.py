@@ -22,7 +22,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import digest
 from fitting.problem.problem import Problem
 from fitting.runtime import files
-from fitting.runtime.validation import Content
+from fitting.runtime.validation import Content, read_json
 from fitting.studies.ablation import labelled
 from fitting.studies.fit import search_with_noise
 
@@ -113,7 +113,7 @@ def _read(path: Path) -> Found | None:
     if not path.exists():
         return None
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         if missing := Found.__required_keys__ - found.keys():
             raise ValueError(f"there is no {sorted(missing)}")
         return found
