@@ -13,6 +13,7 @@ from jaxik.maths import vec
 from .heightfield import INTERPOLATIONS, HeightOf
 
 LAYERS = 32
+FURTHEST = 1e7  # m, of a vertex from the origin
 
 
 def float_dtype(*values: ArrayLike | tuple[float, ...]) -> jnp.dtype:
@@ -61,6 +62,12 @@ def check_mesh(vertices: np.ndarray, triangles: np.ndarray) -> None:
         raise ValueError(
             f"{len(wrong)} of {len(vertices)} vertices are not finite; the first is vertex "
             f"{wrong[0]}: {vertices[wrong[0]].tolist()}"
+        )
+    far = np.flatnonzero((np.abs(vertices) > FURTHEST).any(axis=1))
+    if len(far):
+        raise ValueError(
+            f"{len(far)} of {len(vertices)} vertices are too far away; the first is vertex "
+            f"{far[0]}: {vertices[far[0]].tolist()}; wanted at most {FURTHEST:g} m"
         )
 
 

@@ -498,6 +498,7 @@ def test_rays_onto_the_scanned_blocks_agree_with_embree(mocap):
         (lambda v, t: terrain.mesh(v, t * 1.0), "integer indices"),
         (lambda v, t: terrain.mesh(v, t + 99), "index vertices 0 to 15; got 99 to 114"),
         (lambda v, t: terrain.mesh(v * np.where(v == v[5], np.nan, 1), t), "not finite"),
+        (lambda v, t: terrain.mesh(v + np.where(v == v[5], 1e308, 0), t), "vertices are too far "),
         (lambda v, t: terrain.mesh(v, t, up=(0.0, 0.0, 0.0)), "up is a direction"),
         (lambda v, t: terrain.mesh(v, t, layer=32), "from 0 to 31; got 32"),
         (lambda v, t: terrain.plane(normal=(0.0, 0.0, 0.0)), "normal is a direction"),
