@@ -19,7 +19,8 @@ from fitting.runtime.precision import in_float64
 
 from .noise import series
 from .optimisation.solution import Solution
-from .profiles.profile import Profile, max_rise
+from .profiles.heights import usual_rise
+from .profiles.profile import Profile
 from .profiles.profiling import find_curves
 from .profiles.ridges import Ridge, find_ridges
 
@@ -176,10 +177,10 @@ def _contraction(
 def _prior_interval(problem: Problem, solution: Solution) -> np.ndarray:
     """Values at the ends of each parameter's interval from its prior alone, (free, 2).
 
-    By the same rise of the cost as that of a profile; the other parameters are as fitted.
+    By the usual rise of a profile; the other parameters are as fitted.
     """
     space, u = problem.space, jnp.asarray(solution.u)
-    rises = np.array([max_rise(parameter) for parameter in space.parameters])
+    rises = np.array([usual_rise(parameter) for parameter in space.parameters])
     moved = [jnp.where(jnp.eye(space.size, dtype=bool), end, u) for end in space.prior.ends(rises)]
     return np.stack([np.diag(jax.vmap(space.values)(rows)) for rows in moved], axis=1)
 

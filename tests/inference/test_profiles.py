@@ -13,7 +13,7 @@ from fitting.inference import identifiability
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation import search
 from fitting.inference.optimisation.solution import Solution
-from fitting.inference.profiles import profile
+from fitting.inference.profiles import heights
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space, to_fractions
@@ -117,10 +117,11 @@ def test_a_profile_is_the_exact_one_where_the_cost_is_low():
 def test_the_ends_of_an_interval_are_where_the_exact_cost_has_risen_by_half_of_chi_square():
     problem, solution, report = coupled()
     for i, name in enumerate(COUPLED):
+        assert report.profiles[name].max_rise == pytest.approx(heights.RISE_OF_SMOOTH, rel=0.1)
         for end in report.profiles[name].interval:
             place = float(problem.space.pack({name: end})[i])
             exact = exact_cost(problem, solution.u, i, place) - solution.cost
-            assert exact == pytest.approx(profile.RISE_OF_SMOOTH, rel=0.05), (name, end)
+            assert exact == pytest.approx(report.profiles[name].max_rise, rel=0.05), (name, end)
 
 
 def test_every_parameter_has_a_profile_over_its_whole_range():
@@ -165,7 +166,7 @@ def test_two_valleys_are_listed_with_their_intervals_and_heights():
     left, right = square.valleys
     assert left.value == pytest.approx(-0.6, abs=0.03)
     assert right.value == pytest.approx(0.6, abs=0.03)
-    assert right.rise == 0 < left.rise < profile.RISE_OF_SMOOTH
+    assert right.rise == 0 < left.rise < heights.RISE_OF_SMOOTH
     for valley in square.valleys:
         assert valley.interval[0] < valley.value < valley.interval[1] < valley.interval[0] + 0.1
     assert "square" in report.undetermined
@@ -176,7 +177,7 @@ def test_an_exact_ridge_of_two_thresholds_leaves_both_undetermined():
     for name in ("first", "second"):
         curve = report.profiles[name]
         assert name in report.undetermined
-        low = curve.data_rises < profile.RISE_OF_THRESHOLD
+        low = curve.data_rises < heights.RISE_OF_THRESHOLD
         along = curve.path[low]
         assert np.ptp(curve.values[low]) > 0.7
         assert along[:, 0] + along[:, 1] == pytest.approx(1.1, abs=0.05)
@@ -184,3 +185,55 @@ def test_an_exact_ridge_of_two_thresholds_leaves_both_undetermined():
     assert ridge.names == ("first", "second")
     assert ridge.coefficients == pytest.approx((1, 1), rel=0.1)
     assert ridge.describe({p.name: p for p in problem.space.parameters}) == "`first` + `second`"
+
+
+# Cliffs
+
+
+class LettingGo(eqx.Module):
+    """What a foot remembers fades; at a threshold, at a whole frame, it lets go."""
+
+    half_life: jax.Array = parameter_tree.parameter(
+        0.4, unit="s", low=0.1, high=1.0, doc="Half-life of the test rule."
+    )
+    release: jax.Array = parameter_tree.parameter(
+        0.3, unit="m", low=0.0, high=0.9, kind="threshold", doc="Release of the test rule."
+    )
+
+
+def letting_go(ik: LettingGo) -> jax.Array:
+    remaining = 0.5 ** (TIME / ik.half_life)
+    return jnp.stack([0.3 * remaining, jnp.where(remaining > ik.release, 1.0, 0.0)])
+
+
+def letting_go_residuals(ik: LettingGo, data: jax.Array) -> jax.Array:
+    return ((letting_go(ik) - data) / NOISE).ravel()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_intervals_go_on_beyond_cliffs_along_which_parameters_move_together(seed):
+    truth = {"half_life": 0.4, "release": 0.2 + 0.1 * seed}
+    clean = letting_go(LettingGo(**{name: jnp.asarray(value) for name, value in truth.items()}))
+    data = clean + NOISE * np.random.default_rng(seed).normal(size=clean.shape)
+    base = LettingGo()
+    space = make_space(base, [free_parameter(base, name) for name in truth])
+    problem = Problem(space, data, letting_go_residuals)
+    solution = search.find_best_fit(problem, starts=1, first=np.asarray(space.pack(truth)))
+    report = identifiability.assess_identifiability(problem, solution)
+    half_lives = np.linspace(0.35, 0.45, 201)
+    releases = np.linspace(0, 0.9, 1801)
+
+    @jax.jit
+    def costs(half_life: jax.Array) -> jax.Array:
+        def cost(release: jax.Array) -> jax.Array:
+            residuals = letting_go_residuals(LettingGo(half_life, release), data)
+            return 0.5 * jnp.sum(residuals**2)
+
+        return jax.lax.map(cost, jnp.asarray(releases), batch_size=100)
+
+    exact = np.asarray([costs(jnp.asarray(half_life)) for half_life in half_lives])
+    low = exact - exact.min() < heights.RISE_OF_SMOOTH
+    alone = half_lives[low[:, np.argmin(exact.min(axis=0))]]
+    ends = half_lives[low.any(axis=1)][[0, -1]]
+    assert np.ptp(ends) > 1.5 * np.ptp(alone)  # along the cliff, the release has to follow
+    assert report.profiles["half_life"].interval == pytest.approx(ends, abs=0.15 * np.ptp(ends))

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fitting.inference.profiles.profile import Profile, make_profile, max_rise
+from fitting.inference.profiles.heights import usual_rise
+from fitting.inference.profiles.profile import Profile, make_profile
 from fitting.problem.free_parameters import FreeParameter
 from fitting.problem.space import from_fractions, to_fractions
 
@@ -20,7 +21,7 @@ def parabola(parameter: FreeParameter, interval: tuple[float, float], size: int 
     places = np.unique(places[(places > 0) & (places < 1)])
     values = from_fractions(parameter, places)
     distance = (places - middle) / ((high - low) / 2)
-    cost = 1.000001 * max_rise(parameter) * distance**2  # the ends are just outside
+    cost = 1.000001 * usual_rise(parameter) * distance**2  # the ends are just outside
     path = np.tile(values[:, None], (1, size))
     return make_profile(parameter, path, values, cost, np.zeros_like(cost))
 

@@ -90,6 +90,18 @@ def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
     return 0.5 * jnp.sum(residuals.astype(float) ** 2, axis=1), residuals
 
 
+def residuals(
+    problem: Problem, candidates: Float[np.ndarray, "candidates free"]
+) -> Float[np.ndarray, "candidates residuals"]:
+    """Residuals of any number of `u`, of the hard program, with 32-bit floats."""
+    parts = []
+    for first in range(0, len(candidates), BATCH):
+        batch = candidates[first : first + BATCH]
+        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), jnp.float32)
+        parts.append(np.asarray(_evaluate(problem, filled)[1], float)[: len(batch)])
+    return np.concatenate(parts)
+
+
 def evaluate(
     problem: Problem,
     candidates: Float[np.ndarray, "candidates free"],

@@ -2,9 +2,9 @@
 
 The cost has cliffs wherever a hard decision flips, along smooth parameters as well: a full
 Gauss-Newton step often falls off one. So many candidates compete for each value. In each of them a
-random subset of the smooth parameters takes a Gauss-Newton step with the Jacobian at the solution,
-some with a random move besides, since where a cliff is depends on all parameters; the best
-candidate is the base of the next ones. Far from the solution, where its Jacobian does not
+random subset of the parameters that have slopes takes a Gauss-Newton step with the Jacobian at the
+solution, some with a random move besides, since where a cliff is depends on all parameters; the
+best candidate is the base of the next ones. Far from the solution, where its Jacobian does not
 hold, a descent by Levenberg–Marquardt follows.
 """
 
@@ -20,6 +20,8 @@ from fitting.inference.optimisation.models import HardModel
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
 from fitting.problem.space import EDGE, to_fractions
+
+from .secants import slopes_of_thresholds
 
 CANDIDATES = 12  # for each value in a generation
 GENERATIONS = 3  # of candidates
@@ -58,34 +60,36 @@ class Targets:
 
 @dataclasses.dataclass(frozen=True)
 class Conditional:
-    """A problem, and the normal equations of its smooth parameters at a solution."""
+    """A problem, and the normal equations at a solution of its parameters that have slopes."""
 
     problem: Problem
     solution: Float[np.ndarray, " free"]
     """Its u."""
     jacobian: Float[np.ndarray, "residuals free"]
-    """There; 0 for thresholds."""
+    """There; 0 for thresholds whose effect is not gradual."""
     gram: Float[np.ndarray, "free free"]
     """Of the Jacobian."""
     spread: Float[np.ndarray, "free free"]
-    """Turns standard normal numbers into draws from Laplace's approximation; 0 for thresholds."""
+    """Turns standard normal numbers into draws from Laplace's approximation; 0 for the others."""
     random: np.random.Generator
 
     @classmethod
     def around(cls, problem: Problem, solution: Solution, seed: int = 0) -> "Conditional":
         """The normal equations at a solution."""
-        jacobian = np.where(problem.space.smooth, solution.jacobian, 0.0)
+        smooth = np.asarray(problem.space.smooth)
+        slopes = slopes_of_thresholds(problem, np.asarray(solution.u))
+        jacobian = np.where(smooth, solution.jacobian, slopes)
         gram = np.asarray(jnp.asarray(jacobian).T @ jnp.asarray(jacobian))
-        smooth = np.ix_(*[np.asarray(problem.space.smooth)] * 2)
+        sloping = np.ix_(*[np.diag(gram) > 0] * 2)
         spread = np.zeros_like(gram)
-        spread[smooth] = np.linalg.inv(np.linalg.cholesky(gram[smooth])).T
+        spread[sloping] = np.linalg.inv(np.linalg.cholesky(gram[sloping])).T
         random = np.random.default_rng(seed)
         return cls(problem, np.asarray(solution.u), jacobian, gram, spread, random)
 
     @property
-    def smooth(self) -> Bool[np.ndarray, " free"]:
-        """Which parameters have a derivative."""
-        return np.asarray(self.problem.space.smooth)
+    def sloping(self) -> Bool[np.ndarray, " free"]:
+        """Which parameters have a slope: smooth ones, and thresholds with a gradual effect."""
+        return np.diag(self.gram) > 0
 
     def points(self, u: Float[np.ndarray, "points free"]) -> Points:
         """Points with their values and costs."""
@@ -106,7 +110,7 @@ class Conditional:
         following: Bool[np.ndarray, "points free"],
         besides: Float[np.ndarray, "points free"] | float = 0.0,
     ) -> Float[np.ndarray, "points free"]:
-        """Points moved to a target each, some of the smooth parameters following.
+        """Points moved to a target each, some of the parameters with slopes following.
 
         Those that follow take the Gauss-Newton step that is best once the target is reached, and
         the move `besides`.
@@ -118,7 +122,7 @@ class Conditional:
         ]
         fractions = np.clip(fractions, EDGE, 1 - EDGE)
         distance = np.log(fractions / (1 - fractions)) - points.u[rows, targets.index]
-        following = following & self.smooth
+        following = following & self.sloping
         following[rows, targets.index] = False
         both = following[:, :, None] & following[:, None, :]
         matrix = np.where(both, self.gram, np.eye(space.size))
@@ -174,7 +178,7 @@ class Conditional:
             chosen.append(np.resize(mine, max(CANDIDATES, 2 * len(mine))))
         rows = np.concatenate(chosen)
         share = self.random.random((len(rows), 1))
-        following = self.random.random((len(rows), self.smooth.size)) < share
+        following = self.random.random((len(rows), self.solution.size)) < share
         sizes = np.exp(self.random.uniform(np.log(MOVES[0]), np.log(MOVES[1]), (len(rows), 1)))
         sizes[self.random.random(len(rows)) < 0.5] = 0
         besides = sizes * (self.random.normal(size=following.shape) @ self.spread.T)
@@ -189,7 +193,7 @@ class Conditional:
 
     def _near(self, u: Float[np.ndarray, "points free"]) -> Bool[np.ndarray, " points"]:
         """Whether the smooth parameters are so near the solution that its Jacobian still holds."""
-        distance = np.abs(u - self.solution)[:, self.smooth]
+        distance = np.abs(u - self.solution)[:, np.asarray(self.problem.space.smooth)]
         return np.all(distance < NEAR, axis=1)
 
     def descend_each(

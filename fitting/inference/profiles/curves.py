@@ -8,7 +8,8 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import to_fractions
 
 from .conditional import Points, Targets, join
-from .profile import Profile, make_profile, max_rise
+from .heights import max_rise
+from .profile import Profile, make_profile
 
 SAME_PLACE = 1e-9  # fraction of the range
 
@@ -52,7 +53,7 @@ class Curves:
 
     def highest(self, i: int) -> float:
         """Rise of the cost within the 95 % interval of a parameter."""
-        return max_rise(self.space.parameters[i])
+        return max_rise(self.space.parameters[i], self.curves[i].values[:, i], self.rises(i))
 
     @property
     def best(self) -> Points:

@@ -9,11 +9,8 @@ from jaxtyping import Float
 from fitting.problem.free_parameters import FreeParameter
 from fitting.problem.space import from_fractions, to_fractions
 
-# Rise of the cost at the ends of a 95 % interval. A smooth parameter: half the quantile of the
-# chi-square distribution with one degree of freedom. A threshold, whose cost is a walk of random
-# steps to either side: half of 7.35 (Hansen, Sample splitting and threshold estimation, 2000).
-RISE_OF_SMOOTH = 1.92
-RISE_OF_THRESHOLD = 3.68
+from .heights import max_rise
+
 BARRIER = 2.0  # times that rise, at least, lies between two valleys
 SEPARATION = 0.05  # fraction of the range, at least, likewise: hard decisions make small cliffs
 
@@ -36,8 +33,9 @@ class Valley:
 class Profile:
     """Lowest cost for each value of one parameter, all other parameters following.
 
-    The interval is that of the likelihood ratio: where the rise stays below `max_rise`. The verdict
-    leaves the parameter's own prior out: a side is bounded only if the data raise the cost there.
+    The interval is where the rise stays below `max_rise`, usually as the likelihood ratio has it.
+    The verdict leaves the parameter's own prior out: a side is bounded only if the data raise the
+    cost there.
     """
 
     values: Float[np.ndarray, " points"]
@@ -63,11 +61,6 @@ class Profile:
         return self.valleys[0].interval[0], self.valleys[-1].interval[1]
 
 
-def max_rise(parameter: FreeParameter) -> float:
-    """Rise of the cost within a 95 % interval."""
-    return RISE_OF_THRESHOLD if parameter.kind == "threshold" else RISE_OF_SMOOTH
-
-
 def make_profile(
     parameter: FreeParameter,
     path: Float[np.ndarray, "points free"],
@@ -88,9 +81,9 @@ def make_profile(
     own, costs, own_prior = own[order], costs[order], own_prior[order]
     data_costs = costs - own_prior
     rises, data_rises = costs - costs.min(), data_costs - data_costs.min()
-    highest = max_rise(parameter)
+    highest = max_rise(parameter, own, rises)
     parts = low_parts(to_fractions(parameter, own), rises, highest)
-    valleys = tuple(_valley(parameter, own, rises, part) for part in parts)
+    valleys = tuple(_valley(parameter, own, rises, part, highest) for part in parts)
     free_below = bool((data_rises[: parts[0].start] <= highest).all())
     free_above = bool((data_rises[parts[-1].stop :] <= highest).all())
     return Profile(
@@ -140,28 +133,35 @@ def crossing(inside: tuple[float, float], outside: tuple[float, float], highest:
     return a + (b - a) * float(np.clip((np.sqrt(highest) - near) / (far - near), 0, 1))
 
 
-def _valley(parameter: FreeParameter, own: np.ndarray, rises: np.ndarray, part: slice) -> Valley:
+def _valley(
+    parameter: FreeParameter, own: np.ndarray, rises: np.ndarray, part: slice, highest: float
+) -> Valley:
     lowest = part.start + int(np.argmin(rises[part]))
     ends = (
-        _end(parameter, own, rises, part.start, part.start - 1),
-        _end(parameter, own, rises, part.stop - 1, part.stop),
+        _end(parameter, own, rises, (part.start, part.start - 1), highest),
+        _end(parameter, own, rises, (part.stop - 1, part.stop), highest),
     )
     return Valley(float(own[lowest]), float(rises[lowest]), ends)
 
 
 def _end(
-    parameter: FreeParameter, own: np.ndarray, rises: np.ndarray, inside: int, outside: int
+    parameter: FreeParameter,
+    own: np.ndarray,
+    rises: np.ndarray,
+    edge: tuple[int, int],
+    highest: float,
 ) -> float:
     """Value at which a valley ends, between its outermost point and the next.
 
     The interval of a threshold reaches to that next point: a cliff may lie anywhere between them.
     """
+    inside, outside = edge
     if not 0 <= outside < len(own):
         return parameter.low if outside < 0 else parameter.high
     if parameter.kind == "threshold":
         return float(own[outside])
     places = to_fractions(parameter, own[[inside, outside]])
-    place = crossing((places[0], rises[inside]), (places[1], rises[outside]), max_rise(parameter))
+    place = crossing((places[0], rises[inside]), (places[1], rises[outside]), highest)
     return float(from_fractions(parameter, np.asarray(place)))
 
 

@@ -18,9 +18,9 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import from_fractions, to_fractions
 
 from .conditional import Conditional, Points, Targets, join
-from .curves import Curves
+from .curves import SAME_PLACE, Curves
 from .profile import crossing, low_parts
-from .single_moves import other_plateaus, settle
+from .single_moves import other_plateaus, settle, vary
 
 GRID = np.concatenate([[0.001], (np.arange(20) + 0.5) / 20, [0.999]])  # fractions of the range
 FOLLOWED = np.concatenate([GRID[:-1:2], GRID[-1:]])  # where curves are followed outwards
@@ -31,8 +31,10 @@ MINIMA = 2  # of each curve from which descents begin
 FREE_STEPS = 12  # of these descents, at most
 ROUNDS = 8  # of refinement
 SPANS = (1.0, 0.2, 0.04)  # of moves of thresholds, fractions of the range
-CROSSINGS = 2  # rounds in which cliffs are crossed
-CLIFF = 1.5  # times the rise at the end of an interval: what lies behind it may be a cliff
+CROSSINGS = 8  # rounds in which cliffs are crossed, at most
+BEYOND = (0.0, 0.3, 1.0, 3.0)  # how far behind a cliff points are tried, in widths of the valley
+CLIFF = 1.5  # times the rise of a parabola: what lies behind the end of a valley may be a cliff
+NEARBY = 0.25  # widths of the valley within which it is looked for
 NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpolated
 NARROW = 0.05  # fraction of a valley's width that its ends are found to
 
@@ -64,8 +66,9 @@ def find_curves(problem: Problem, solution: Solution) -> Curves:
     refine(profiling)
     profiling.curves.share()
     refine(profiling)
+    tried: set[tuple[int, float]] = set()
     for _ in range(CROSSINGS):
-        if not cross_cliffs(profiling):
+        if not cross_cliffs(profiling, tried):
             break
         refine(profiling)
     return profiling.curves
@@ -155,28 +158,59 @@ def refine(profiling: _Profiling) -> None:
         curves.add(targets, lowest(profiling, targets, starts))
 
 
-def cross_cliffs(profiling: _Profiling) -> bool:
-    """Tries to go on beyond cliffs that end a valley; whether any was crossed."""
+def cross_cliffs(profiling: _Profiling, tried: set[tuple[int, float]]) -> bool:
+    """Tries to go on beyond cliffs that end a valley; whether any was crossed.
+
+    Behind a cliff another decision holds, so other parameters must move together with this one:
+    they are drawn anew within their own intervals and a little beyond.
+
+    Args:
+        profiling: gets the new points.
+        tried: cliffs at which nothing is tried again: parameter and fraction of its range.
+    """
     curves, conditional, space = profiling.curves, profiling.conditional, profiling.space
-    index, places, starts = [], [], []
+    index: list[int] = []
+    places: list[float] = []
+    starts: list[Points] = []
     for i in range(space.size):
-        rises, own = curves.rises(i), curves.fractions(i)
-        for part in low_parts(own, rises, curves.highest(i)):
+        rises, own, highest = curves.rises(i), curves.fractions(i), curves.highest(i)
+        for part in low_parts(own, rises, highest):
+            width = float(own[part.stop - 1] - own[part.start])
             for inside, outside in ((part.start, part.start - 1), (part.stop - 1, part.stop)):
-                if 0 <= outside < len(own) and rises[outside] > CLIFF * curves.highest(i):
-                    index.append(i)
-                    places.append(own[outside])
-                    starts.append(curves.curves[i][inside : inside + 1])
+                cliff = is_cliff(own, rises / highest, outside, width)
+                if cliff and (place := (i, float(own[inside]))) not in tried:
+                    tried.add(place)
+                    distance = np.sign(outside - inside) * width * np.asarray(BEYOND)
+                    beyond = own[outside] + distance
+                    beyond = beyond[(beyond >= 0) & (beyond <= 1)]
+                    index += [i] * len(beyond)
+                    places += list(beyond)
+                    starts += [curves.curves[i][inside : inside + 1]] * len(beyond)
     if not index:
         return False
-    targets, start = targets_at(profiling, np.asarray(index), places), join(starts)
-    alone = np.zeros(start.u.shape, bool)
-    moved = conditional.move(start, np.zeros_like(start.u), targets, alone)
-    settled = conditional.points(settle(conditional, moved, targets, SPANS[-1:]))
-    points = conditional.lowest(targets, [settled[k : k + 1] for k in range(len(index))])
+    targets = targets_at(profiling, np.asarray(index), places)
+    variants = [vary(conditional, curves, start, i) for i, start in zip(index, starts, strict=True)]
+    points = conditional.lowest(targets, variants)
     curves.add(targets, points)
-    highest = np.asarray([curves.highest(i) for i in index])
-    return bool((points.cost - curves.best.cost[0] < highest).any())
+    levels = np.asarray([curves.highest(i) for i in index])
+    return bool((points.cost - curves.best.cost[0] < levels).any())
+
+
+def is_cliff(places: np.ndarray, rises: np.ndarray, outside: int, width: float) -> bool:
+    """Whether a curve rises much faster than a parabola outside a valley.
+
+    Args:
+        places: fractions of the range.
+        rises: there, in units of the rise at the valley's ends.
+        outside: index of the first point outside.
+        width: of the valley, a fraction of the range.
+    """
+    if not 0 <= outside < len(places):
+        return False
+    distance = np.abs(places - places[outside])
+    further = (rises > 1) & (distance <= NEARBY * width)
+    parabola = (1 + 2 * distance[further] / max(width, SAME_PLACE)) ** 2
+    return bool((rises[further] > CLIFF * parabola).any())
 
 
 def targets_at(profiling: _Profiling, index: np.ndarray, places: Sequence[float]) -> Targets:

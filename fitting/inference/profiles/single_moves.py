@@ -17,6 +17,8 @@ PLATEAUS = 5  # kept, besides the solution's
 SAME_PLATEAU = 0.01  # of the cost
 SMALLEST = 0.01  # move of a threshold in a round, a fraction of the largest
 SIZES = 6  # of these moves
+VARIANTS = 64  # of a point, with other parameters moved
+WIDENED = 0.5  # of their intervals, to either side
 DEVIATIONS = np.array([-2.0, -1.0, 1.0, 2.0])  # by which smooth parameters move
 
 
@@ -85,6 +87,24 @@ def settle(
         best = [np.flatnonzero(owner == k)[np.argmin(cost[owner == k])] for k in range(len(u))]
         u = candidates[best]
     return u
+
+
+def vary(conditional: Conditional, curves: Curves, start: Points, held: int) -> Points:
+    """A point, and this point with one or two other parameters drawn from widened intervals."""
+    space, random = conditional.problem.space, conditional.random
+    values = np.repeat(start.values, VARIANTS, axis=0)
+    order = np.argsort(random.random(values.shape), axis=1)
+    drawn = order < random.integers(1, 3, (VARIANTS, 1))
+    drawn[0] = False
+    for i, parameter in enumerate(space.parameters):
+        own = curves.fractions(i)
+        low = own[curves.rises(i) <= curves.highest(i)]
+        reach = WIDENED * (low[-1] - low[0])
+        places = np.clip(random.uniform(low[0] - reach, low[-1] + reach, VARIANTS), 0, 1)
+        chosen = drawn[:, i] & (i != held)
+        values[chosen, i] = from_fractions(parameter, places[chosen])
+    u = population.from_values(space, values)
+    return Points(u, values, np.full(VARIANTS, start.cost[0]))
 
 
 def _single_moves(
