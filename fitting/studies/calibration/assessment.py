@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
 from fitting.inference.calibration.proportions import Proportion, proportion
 from fitting.inference.calibration.rank_bands import RankTest
@@ -92,7 +91,7 @@ def assess(calibration: Calibration) -> Assessment:
     inner = [nominal for nominal in LEVELS if nominal < FIT_LEVEL and smooth.any()]
     checks = len(names) + 2 + len(inner) + (len(names) + 1 + len(LEVELS) if chains else 0)
     level = 1 - (1 - FAMILY_LEVEL) / checks
-    rises = np.asarray([fitted["truth_rises"] for fitted in fits])[:, smooth]
+    levels = np.asarray([fitted["truth_levels"] for fitted in fits])[:, smooth]
     truth = np.asarray([fitted["truth"] for fitted in fits])
     intervals = _of_parameters(fits, "interval")
     covered = (intervals[..., 0] <= truth) & (truth <= intervals[..., 1])
@@ -104,20 +103,19 @@ def assess(calibration: Calibration) -> Assessment:
     near = np.abs(_of_parameters(fits, "value") - truth) <= NEAR * width
     wanted = (FIT_LEVEL, FIT_LEVEL)
     at_least = (FIT_LEVEL, 1.0)  # of a threshold, whose interval ends with a plateau of the cost
+    together = (FIT_LEVEL, float(np.where(smooth, FIT_LEVEL, 1.0).mean()))
     chain_coverage, chain_coverage_of = _chain_coverage(chains, names, truth, level)
     return Assessment(
         names=names,
         replicates=len(fits),
         level=level,
-        fit_coverage=proportion(covered, level=level, wanted=wanted),
+        fit_coverage=proportion(covered, level=level, wanted=together),
         fit_coverage_of={
             name: proportion(covered[:, [i]], level=level, wanted=wanted if smooth[i] else at_least)
             for i, name in enumerate(names)
         },
         profile_coverage={
-            nominal: proportion(
-                rises <= 0.5 * chdtri(1, 1 - nominal), level=level, wanted=(nominal, nominal)
-            )
+            nominal: proportion(levels <= nominal, level=level, wanted=(nominal, nominal))
             for nominal in inner
         },
         valley=proportion(right[:, None], level=level, wanted=(IN_VALLEY, 1.0)),

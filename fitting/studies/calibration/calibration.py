@@ -25,7 +25,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress, digest
 from fitting.problem.problem import Problem
 from fitting.runtime import cluster, files
-from fitting.runtime.validation import error_context
+from fitting.runtime.validation import error_context, read_json
 
 from .replicates import ReplicateChain, ReplicateFit, fit_replicate, sample_replicate
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 IDENTITY, FITS, CHAINS = "identity.json", "fits", "chains"
+KEYS = {FITS: ReplicateFit.__required_keys__, CHAINS: ReplicateChain.__required_keys__}
 Result = TypeVar("Result", bound=Mapping[str, Any])
 
 
@@ -201,11 +202,13 @@ class _Stage:
     def _read(self, number: int) -> Any:
         path = self._path(number)
         try:
-            result = json.loads(path.read_text(encoding="utf-8"))
+            result = read_json(path)
             if result["number"] != number:
                 raise ValueError(f"it is of replicate {result['number']}")
+            if missing := sorted(KEYS[self.name] - result.keys()):
+                raise ValueError(f"there is no {missing}; begin anew in another folder")
             return result
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not written by `jaxik calibrate`: {error!r}") from None
 
 
@@ -223,7 +226,7 @@ def _claim(folder: Path, own: Mapping[str, Any]) -> None:
         files.write_text(path, json.dumps(own, indent=2) + "\n")
         return
     try:
-        present = json.loads(path.read_text(encoding="utf-8"))
+        present = read_json(path)
         changed = [key for key in own if key != "name" and own[key] != present[key]]
         name = present["name"]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -19,6 +19,7 @@ from fitting.inference.optimisation import descent
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.optimisation.state import Search, SearchState, StepsUsedUp
+from fitting.inference.profiles.heights import level_of
 from fitting.inference.profiles.profile import Profile
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.free_parameters import FreeParameter
@@ -52,8 +53,8 @@ class ReplicateFit(TypedDict):
     truth_u: list[float]
     truth: list[float]
     """In the parameters' units."""
-    truth_rises: list[float]
-    """Of each parameter's profile, at its truth."""
+    truth_levels: list[float]
+    """Of the smallest intervals of the profiles that contain the truth, 0..1."""
     truth_valley_cost: float
     """Where a descent that begins at the truth ends."""
     cost: float
@@ -124,15 +125,15 @@ def fit_replicate(
         raise KeyboardInterrupt
     values = np.asarray(problem.space.values(truth.u))
     profiles = fitted.identifiability.profiles
-    rises = [
-        rise_at(profiles[parameter.name], parameter, value)
+    levels = [
+        level_at(profiles[parameter.name], parameter, value)
         for parameter, value in zip(problem.space.parameters, values, strict=True)
     ]
     result: ReplicateFit = {
         "number": number,
         "truth_u": truth.u.tolist(),
         "truth": values.tolist(),
-        "truth_rises": rises,
+        "truth_levels": levels,
         "truth_valley_cost": _polished_cost(simulated, own.fit.search, truth.u),
         "cost": solution.cost,
         "converged": solution.converged,
@@ -197,11 +198,12 @@ def _simulated(
     return with_noise(simulate(noisy, truth.u, truth.noise_seed), assumed)
 
 
-def rise_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
-    """The rise of a profile at a value: between its points like a parabola at its minimum."""
+def level_at(profile: Profile, parameter: FreeParameter, value: float) -> float:
+    """Level, 0..1, of the smallest interval of a profile that contains a value."""
     places = to_fractions(parameter, profile.values)
     place = to_fractions(parameter, np.asarray(value))
-    return float(np.interp(place, places, np.sqrt(np.maximum(profile.rises, 0.0))) ** 2)
+    rise = float(np.interp(place, places, np.sqrt(np.maximum(profile.rises, 0.0))) ** 2)
+    return level_of(parameter, profile.values, profile.rises, rise)
 
 
 def independent_draws(posterior: Posterior) -> Float[np.ndarray, "draws quantities"]:
