@@ -58,6 +58,64 @@ def test_a_fit_with_an_output_can_be_sampled_from_memory_and_from_disk(experimen
     assert (continued.u[:20] == first.u).all() and len(continued.u) == 30
 
 
+def worsen(run: Path) -> dict:
+    """Moves the fit of a run off its optimum; what its file then holds."""
+    worse = json.loads((run / run_folder.FIT).read_text())
+    for row in worse["parameters"]:
+        row["u"] += 3 * row["start_sd"]
+    (run / run_folder.FIT).write_text(json.dumps(worse))
+    return worse
+
+
+@pytest.mark.slow
+def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(experiment_file):
+    run, lines = experiment_file.parent / "run", []
+    fitted = fitting.fit(experiment_file, run)
+    best = fitted.summary["parameters"]
+    worsen(run)
+    posterior = fitting.sample(run, log=lines.append)
+    assert any("higher than the fit's; the fit goes on from there" in line for line in lines)
+    _, adopted = run_folder.load_fit(run)
+    for before, after in zip(best, adopted["parameters"], strict=True):
+        assert after["u"] == pytest.approx(before["u"], abs=0.1 * before["start_sd"])
+    assert posterior.improvement <= assess.MIN_IMPROVEMENT
+    numbers = json.loads((run / run_folder.POSTERIOR).read_text())
+    assert numbers["lower_point"] is None and not (run / run_folder.LOWER_POINT).exists()
+    text = (run / run_folder.SUMMARY).read_text()
+    assert "## Posterior" in text and "The chain contradicts its fit: it met" not in text
+
+
+@pytest.mark.slow
+def test_an_interrupted_adoption_leaves_the_old_fit_and_the_lower_point(
+    experiment_file, monkeypatch
+):
+    run = experiment_file.parent / "run"
+    fitting.fit(experiment_file, run)
+    worse = worsen(run)
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs.fits, "assess_solution", interrupt)
+    fitting.sample(run)
+    assert run_folder.load_fit(run)[1] == worse
+    assert (run / run_folder.LOWER_POINT).is_file()
+
+
+@pytest.mark.slow
+def test_a_replay_that_is_interrupted_leaves_the_report_of_the_chain(experiment_file, monkeypatch):
+    run = experiment_file.parent / "run"
+    fitted = fitting.fit(experiment_file, run)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs.fits, "replay", interrupt)
+    posterior = fitting.sample(fitted)
+    assert posterior.interrupted and (run / run_folder.POSTERIOR).is_file()
+    assert "## Posterior" in (run / run_folder.SUMMARY).read_text()
+
+
 def test_a_solution_is_on_disk_before_anything_else_is_computed(experiment_file, monkeypatch):
     run = experiment_file.parent / "run"
 

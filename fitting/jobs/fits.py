@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
@@ -19,7 +21,7 @@ from fitting.studies import ablation, run_folder, translation
 from fitting.studies.assess import assess_solution
 from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.posterior.replay import replay
-from fitting.studies.sample import SampledFit, sample_around
+from fitting.studies.sample import SampledFit, log_probability_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
 from .output import Log, checked_folder, log_output, silent
@@ -76,7 +78,8 @@ def sample(
     """Samples the posterior around a fit; a fit with a folder has its chain and report there.
 
     A chain that is there is continued. KeyboardInterrupt (Ctrl-C) ends the sampling; the chain so
-    far is summarised, written and returned with `interrupted` set.
+    far is summarised, written and returned with `interrupted` set. Where a chain meets a point that
+    is better than the fit of a folder, the fit goes on from there and takes the old one's place.
 
     Args:
         fitted: a fit, or the folder of its run.
@@ -102,13 +105,18 @@ def sample(
     chain = None if run is None else run / run_folder.CHAIN
     posterior = sample_around(parameters, problem, experiment, chain, progress)
     played = None
-    if not posterior.interrupted:
-        played = replay(problem, posterior, experiment.seed)
-        posterior = dataclasses.replace(posterior, blocks=played.blocks)
+    try:
+        if not posterior.interrupted:
+            played = replay(problem, posterior, experiment.seed)
+            posterior = dataclasses.replace(posterior, blocks=played.blocks)
+    except KeyboardInterrupt:
+        posterior = dataclasses.replace(posterior, interrupted=True)
     sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
     if run is not None:
-        run_folder.save_posterior(run, sampled)
-        posterior_report.write_posterior(run, sampled)
+        _save_and_report(run, sampled)
+        if sampled.has_lower_point and not posterior.interrupted:
+            sampled = _adopt_lower_point(run, problem, sampled, log)
+            posterior = sampled.posterior
     log(f"\n{posterior_report.posterior_text(sampled, run)}")
     log_output(log, run, run_folder.SUMMARY)
     return posterior
@@ -199,6 +207,50 @@ def translate(
     log(translation_report.translation_text(prepared, differences))
     log_output(log, run, run_folder.SUMMARY)
     return fitted
+
+
+def _save_and_report(run: Path, sampled: SampledFit) -> None:
+    run_folder.save_posterior(run, sampled)
+    posterior_report.write_posterior(run, sampled)
+
+
+def _adopt_lower_point(
+    run: Path, problem: Problem[jaxik.FootIK], sampled: SampledFit, log: Log
+) -> SampledFit:
+    """The chain with a fit that went on from its best point, which takes the run's old fit's place.
+
+    The old fit stays until the new one is finished; that of a translation stays in any case, and
+    so does a fit that is not better by the chain's own account.
+    """
+    experiment, posterior = sampled.experiment, sampled.posterior
+    if translation.is_translation(run):
+        return sampled
+    log(
+        f"the chain met a point whose log-probability is {posterior.improvement:.3g} higher than "
+        "the fit's; the fit goes on from there"
+    )
+    try:
+        first = np.asarray(problem.space.pack(posterior.best_values))
+        solution = search(problem, experiment, first=first)
+        at_solution = log_probability_at(problem, experiment, solution.u)
+        if solution.interrupted or at_solution <= posterior.start_log_probability:
+            return sampled
+        fitted = assess_solution(experiment, problem, solution)
+    except KeyboardInterrupt:
+        return sampled
+    fitted = dataclasses.replace(fitted, known_values=sampled.known_values, run=run)
+    at_solution = log_probability_at(problem, experiment, fitted.solution.u)
+    run_folder.save_solution(run, experiment, problem, fitted.solution)
+    run_folder.save_fit(run, fitted)
+    fit_report.write_fit(run, fitted)
+    log(f"\n{fit_report.fit_text(fitted)}")
+    sampled = dataclasses.replace(
+        sampled,
+        parameters=fitted.summary["parameters"],
+        posterior=dataclasses.replace(posterior, start_log_probability=at_solution),
+    )
+    _save_and_report(run, sampled)
+    return sampled
 
 
 def _assess_and_save(

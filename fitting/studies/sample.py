@@ -5,7 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 import jaxik
 from fitting.experiments.experiment import Experiment
@@ -119,6 +121,14 @@ def walker_start(parameters: Sequence[FittedParameter], space: Space) -> WalkerS
             if all(np.max(np.abs(place - other) / sd) > APART for other in known):
                 known.append(place)
     return WalkerStart(u, sd, np.array(known[1:]).reshape(-1, u.size))
+
+
+def log_probability_at(
+    problem: Problem[jaxik.FootIK], experiment: Experiment, u: Float[np.ndarray, " free"]
+) -> float:
+    """Log-probability of a point, as a chain around a fit counts it."""
+    problem = with_open_noise(problem, experiment)
+    return float(problem.log_probability(jnp.asarray(u, problem.space.start.dtype)))
 
 
 def with_open_noise(

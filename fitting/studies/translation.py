@@ -274,6 +274,11 @@ def starting_point(problem: Problem[jaxik.FootIK]) -> np.ndarray:
     return state.point.u
 
 
+def is_translation(run: Path) -> bool:
+    """Whether the folder of a run holds a translation."""
+    return (run / SOURCE).is_file()
+
+
 def save_source(run: Path, translation: Translation) -> None:
     """Starts the folder of the run with the source's motion and parameters."""
     run.mkdir(parents=True, exist_ok=True)
