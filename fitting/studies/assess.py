@@ -1,5 +1,6 @@
 """The assessment of a solution, from which the search goes on where it meets a lower point."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -42,10 +43,15 @@ def assess_solution(
         on_solution(solution)
         identifiability = assess_identifiability(problem, solution)
         found_lower = identifiability.improvement > MIN_IMPROVEMENT
+        fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
         if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
-            return Fit(experiment, problem, solution, identifiability, left=tuple(left))
+            return fit
+        lower = _search_lower(problem, experiment, solution, identifiability.best_u, progress)
+        if not lower.cost < solution.cost:  # with 32-bit floats the point lay before a cliff
+            kept = dataclasses.replace(solution, interrupted=lower.interrupted)
+            return dataclasses.replace(fit, solution=kept)
         left.append(solution.cost)
-        solution = _search_lower(problem, experiment, solution, identifiability.best_u, progress)
+        solution = lower
 
 
 def _search_lower(
