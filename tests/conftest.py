@@ -6,6 +6,7 @@ processes of a run keep their programs in one folder, so that none compiles what
 """
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -26,6 +27,9 @@ if PROGRAMS not in os.environ:
     os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxik-tests-")
     atexit.register(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True)
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
+
+# Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
+gc.set_threshold(200_000, 50, 100)
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530

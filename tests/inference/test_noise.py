@@ -248,7 +248,9 @@ def with_outliers(problem: Problem[jaxik.FootIK], seed: int) -> Problem[jaxik.Fo
 def test_intervals_with_estimated_noise_cover_the_truth(rho, loss, options):
     """Of three truths and six parameters, assumed with twice their sigmas; 14 of 18 or more have
     a probability of 99.8 %."""
-    experiment = dataclasses.replace(load_experiment(OZZ), noise=options, loss=loss)
+    experiment = load_experiment(OZZ)
+    clip = dataclasses.replace(experiment.clips[0], start=2.0, end=8.0)
+    experiment = dataclasses.replace(experiment, clips=(clip,), noise=options, loss=loss)
     problem = problems.make_problem(experiment)
     space, true = problem.space, noise_of(problem)
     made = with_noise(problem, dataclasses.replace(true, correlations=dict.fromkeys(KINDS, rho)))
