@@ -1,12 +1,12 @@
 """The report of a comparison: a table with its explanation, the numbers, and a figure."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from fitting.runtime import files
+from fitting.runtime.storage.json_files import write_json
 from fitting.studies.comparison import ANIMATED, Comparison
 from fitting.studies.frame_rates import JOINTS
 
@@ -30,7 +30,7 @@ def write(folder: Path, comparison: Comparison) -> None:
     """Writes compare.md, compare.json and compare.png into a folder, which is made if needed."""
     folder.mkdir(parents=True, exist_ok=True)
     style.save(folder / FIGURE, comparison_plots.overview(comparison))
-    files.write_text(folder / NUMBERS, json.dumps(_numbers(comparison), indent=2) + "\n")
+    write_json(folder / NUMBERS, _numbers(comparison))
     files.write_text(folder / TABLE, _summary(comparison))
 
 

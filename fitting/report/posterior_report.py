@@ -87,7 +87,9 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
         parts += left_out.section(sampled.left_out, sampled.replay.blocks)
     parts.append(gallery(plots))
     summary = run / SUMMARY
-    text = summary.read_text(encoding="utf-8") if summary.is_file() else f"# {experiment.name}\n"
+    text = f"# {experiment.name}\n"
+    if summary.is_file():
+        text = summary.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay
     before = text.partition(f"\n{HEADING}\n")[0].rstrip()
     files.write_text(summary, before + "\n\n" + "\n\n".join(parts) + "\n")
 

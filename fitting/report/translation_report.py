@@ -1,6 +1,5 @@
 """The report of a translation: numbers, a plot, and its sections of the run's summary.md."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from fitting.experiments import parameter_files, systems
 from fitting.inference import sensitivity
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
+from fitting.runtime.storage.json_files import write_json
 from fitting.studies.fit import Fit
 from fitting.studies.translation import Translation
 from jaxik.maths import parameter_tree
@@ -55,7 +55,7 @@ def write(run: Path, translation: Translation, fitted: Fit, clips: Sequence[Diff
         "clips": [difference_report.numbers([clip]) for clip in clips],
         "shortcomings": difference_report.shortcomings(clips, source.name, target.name),
     }
-    files.write_text(run / NUMBERS, json.dumps(numbers, indent=2))
+    write_json(run / NUMBERS, numbers)
     parameters = parameter_files.system_to_toml(fitted.ik, target.preset)
     files.write_text(run / f"{target.preset.name}.toml", parameters)
     opening = [*_opening(translation, fitted, clips), _plots(run, translation, clips)]

@@ -8,11 +8,11 @@ written at once to `contribution.json`, from which an interrupted call continues
 """
 
 import hashlib
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TypedDict
 
 import jax
 import numpy as np
@@ -28,8 +28,9 @@ from fitting.experiments.problems import ClipData, load_clip_data, problem_from_
 from fitting.experiments.systems import leaf_names
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
-from fitting.runtime import files
-from fitting.runtime.validation import Table, error_context, read_json
+from fitting.runtime.storage.declared_types import checked
+from fitting.runtime.storage.json_files import JsonFile
+from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
 
 from .animations import Animation
@@ -55,6 +56,24 @@ class Row:
     """Of the fit."""
     seconds: float
     """Duration of the fit."""
+
+
+class StoredRow(TypedDict):
+    """What a row's file holds in a way of its own; the rest is as `Row` declares it."""
+
+    agreement: dict[str, float | None]
+    """None for NaN, which JSON does not have."""
+
+
+class Rows(TypedDict):
+    """The content of `contribution.json`."""
+
+    rows: list[StoredRow]
+
+
+ROWS_FILE = JsonFile(
+    Rows, "written by `jaxik ablate`", "delete it to begin anew, or name another folder"
+)
 
 
 @dataclass(frozen=True)
@@ -278,14 +297,14 @@ def read(folder: Path) -> list[Row]:
     path = folder / NUMBERS
     if not path.exists():
         return []
-    try:
-        return [_row(fields) for fields in read_json(path)["rows"]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: not written by `jaxik ablate`: {error!r}") from None
+    stored = ROWS_FILE.read(path)["rows"]
+    with error_context(f"{path}: not {ROWS_FILE.description}"):
+        return [_row(fields) for fields in stored]
 
 
-def _row(fields: Table) -> Row:
-    figures = {key: math.nan if v is None else v for key, v in fields["agreement"].items()}
+def _row(stored: StoredRow) -> Row:
+    figures = {key: math.nan if v is None else v for key, v in stored["agreement"].items()}
+    fields = checked({**stored, "agreement": figures}, Row)
     return Row(**{**fields, "agreement": Accuracy(**figures)})
 
 
@@ -296,4 +315,4 @@ def _write(folder: Path | None, rows: Sequence[Row]) -> None:
     for row in content:  # JSON has no NaN
         row["agreement"] = {k: None if math.isnan(v) else v for k, v in row["agreement"].items()}
     folder.mkdir(parents=True, exist_ok=True)
-    files.write_text(folder / NUMBERS, json.dumps({"rows": content}, indent=2) + "\n")
+    ROWS_FILE.write(folder / NUMBERS, {"rows": content})

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NotRequired, TypedDict
+from typing import Annotated, Literal, NotRequired, TypeAlias, TypedDict
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +26,7 @@ from fitting.inference.profiles import profile
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED
 from fitting.runtime.precision import in_float64
+from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
@@ -38,16 +39,21 @@ THRESHOLD_SD = 0.05
 MIN_START_SD, MAX_START_SD = 1e-3, 0.5
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 
+# Beyond these, a parameter is at the end of its range to the last digit, where no fit ends.
+U: TypeAlias = Annotated[float, between(-40, 40)]
+StartSd: TypeAlias = Annotated[float, between(1e-6, 40)]
+Interval: TypeAlias = Annotated[list[Finite], length(2)]
+
 
 class FittedValley(TypedDict):
     """A part of a parameter's range in which the cost is low."""
 
-    value: float
+    value: Finite
     """Where it is lowest."""
-    rise: float
+    rise: Finite
     """There, above the lowest of all."""
-    interval: list[float]
-    values: NotRequired[list[float]]
+    interval: Interval
+    values: NotRequired[list[Finite]]
     """Of all parameters there; fits by earlier versions lack them."""
 
 
@@ -55,19 +61,18 @@ class FittedParameter(TypedDict):
     """A free parameter after a fit, as `fit.json` holds it."""
 
     name: str
-    kind: str
-    """Smooth or threshold."""
+    kind: Literal["smooth", "threshold"]
     unit: str
-    u: float
-    start_sd: float
+    u: U
+    start_sd: StartSd
     """Of u, where walkers start."""
-    value: float
+    value: Finite
     before: float
     """The value before the fit."""
     low: float
     high: float
     prior: PriorSummary
-    interval: list[float]
+    interval: Interval
     """95 %."""
     verdict: profile.Verdict
     """Which sides the clips bound."""
@@ -90,7 +95,7 @@ class FitSummary(TypedDict):
     converged: bool
     message: str
     goodness: GoodnessSummary
-    noise: NotRequired[Content]
+    noise: NotRequired[Annotated[Content, NoiseModel]]
     """The noise that was estimated, as `NoiseModel` holds it."""
     cost_before: float
     cost: float

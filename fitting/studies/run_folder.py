@@ -7,11 +7,13 @@ chain.h5          the walkers; posterior.json is their summary
 posterior.nc      the kept draws for ArviZ, if it is installed
 lower_point.toml  the experiment, to begin at a point that the chain met below the fit
 summary.md, *.png to read
+
+Each file says in which format it is; one that does not is of an earlier release.
 """
 
 import dataclasses
-import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +22,13 @@ import jaxik
 from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.systems import Preset
+from fitting.inference.noise.model import NoiseModel
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
-from fitting.runtime.validation import read_json
+from fitting.runtime.storage.json_files import JsonFile, check_version, write_json
+from fitting.runtime.validation import error_context, flatten, read_toml
 
 from .fit import Fit, FitSummary
 from .posterior.replay_summary import summarise_replay
@@ -35,6 +39,11 @@ CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
 INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
+FIT_FILE = JsonFile(
+    FitSummary, "the numbers of a fit", HINT, essential={"parameters", *SAMPLER_KEYS}
+)
+FORMAT = 1  # of the two TOML files, in their first line, which is a comment to other readers
+FORMAT_LINE = re.compile(r"# jaxik run, format (\w+)\n")
 
 
 def check_output_folder(folder: Path) -> None:
@@ -71,15 +80,15 @@ def save_solution(
     run.mkdir(parents=True, exist_ok=True)
     (run / FIT).unlink(missing_ok=True)
     ik = problem.space.unpack(solution.u)
-    write_text(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
+    _write_toml(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
     preset = Preset(experiment.preset, experiment.faithful)
     leg_length = experiment.leg_length(problem.data[0].rig)
-    write_text(run / PARAMETERS, parameter_files.system_to_toml(ik, preset, leg_length))
+    _write_toml(run / PARAMETERS, parameter_files.system_to_toml(ik, preset, leg_length))
 
 
 def save_fit(run: Path, fitted: Fit) -> None:
     """Completes a run's folder, after `save_solution`, with the numbers of its fit."""
-    write_text(run / FIT, json.dumps(fitted.summary, indent=2))
+    FIT_FILE.write(run / FIT, fitted.summary)
 
 
 def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
@@ -94,14 +103,58 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
         if not (run / name).is_file():
             present = sorted(path.name for path in run.iterdir()) or "nothing"
             raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
-    try:
-        summary = read_json(run / FIT)
-        missing = {key for row in summary["parameters"] for key in SAMPLER_KEYS if key not in row}
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{run / FIT}: not the numbers of a fit: {error!r}; {HINT}") from None
-    if missing:
-        raise ValueError(f"{run / FIT}: parameters without {sorted(missing)}; {HINT}")
+    summary = FIT_FILE.read(run / FIT)
+    with error_context(f"{run / FIT}: not the numbers of a fit"):
+        _check_numbers(summary)
+    _check_toml_format(run / EXPERIMENT)
     return experiment_files.load_experiment(run / EXPERIMENT), summary
+
+
+def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
+    """The fitted system of a run, for the body of a rig.
+
+    Raises:
+        ValueError: the folder holds no finished fit, or its system lacks a fitted parameter.
+    """
+    _, summary = load_fit(run)
+    path = run / PARAMETERS
+    _check_toml_format(path)
+    present = flatten(read_toml(path, "a parameter"), 2)
+    names = {row["name"].partition("[")[0] for row in summary["parameters"]}
+    if missing := sorted(names - set(present)):
+        raise ValueError(f"{path}: not the system of this fit: no {', '.join(missing)}; {HINT}")
+    ik, _ = parameter_files.load_system(path, rig)
+    return ik
+
+
+def _check_numbers(summary: FitSummary) -> None:
+    """Raises ValueError where the numbers of a fit contradict each other."""
+    if "noise" in summary:
+        NoiseModel(**summary["noise"])  # checks its numbers
+    rows = summary["parameters"]
+    names = [row["name"] for row in rows]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"its parameters are {names}; wanted one or more, each once; {HINT}")
+    for row in rows:
+        for valley in row.get("valleys", ()):
+            if len(valley.get("values", rows)) != len(rows):
+                raise ValueError(
+                    f"a valley of {row['name']} has {len(valley.get('values', ()))} values; wanted "
+                    f"{len(rows)}, one of each parameter; {HINT}"
+                )
+
+
+def _write_toml(path: Path, text: str) -> None:
+    write_text(path, f"# jaxik run, format {FORMAT}\n{text}")
+
+
+def _check_toml_format(path: Path) -> None:
+    """Raises ValueError for a format that is not known; files of the first release name none."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        version = FORMAT_LINE.fullmatch(file.readline())
+    if version is not None:
+        number = version[1]
+        check_version(path, int(number) if number.isdecimal() else number, FORMAT)
 
 
 def save_posterior(run: Path, sampled: SampledFit) -> None:
@@ -142,10 +195,10 @@ def save_posterior(run: Path, sampled: SampledFit) -> None:
             for kind, draws in posterior.sigmas.items()
         },
     }
-    write_text(run / POSTERIOR, json.dumps(numbers, indent=2, default=float))
+    write_json(run / POSTERIOR, numbers)
     (run / LOWER_POINT).unlink(missing_ok=True)
     if sampled.has_lower_point:
         begun_there = dataclasses.replace(sampled.experiment, start=posterior.best_values)
-        write_text(run / LOWER_POINT, experiment_files.experiment_to_toml(begun_there, run))
+        _write_toml(run / LOWER_POINT, experiment_files.experiment_to_toml(begun_there, run))
     if inference_data.is_available():
         inference_data.write_inference_data(run / INFERENCE_DATA, posterior, sampled.space)

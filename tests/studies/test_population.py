@@ -199,14 +199,34 @@ def test_other_settings_are_searched_anew(walks, tmp_path):
     assert len(list((out / "searches").iterdir())) == 14
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}"])
-def test_a_search_that_is_something_else_is_refused(walks, tmp_path, text):
+def test_a_search_that_is_damaged_is_refused(walks, tmp_path):
     out = tmp_path / "out"
     fitting.population(walks, out)
     path = next((out / "searches").iterdir())
-    path.write_text(text)
-    with pytest.raises(ValueError, match=r"\.json: not written by `jaxik population`"):
+    whole = json.loads(path.read_text())
+    damaged = [
+        ("{", "not JSON"),
+        ("[]", "wanted a table"),
+        ("{}", "it has no converged, cost"),
+        (json.dumps(whole | {"u": [0.0]}), "u has 1 numbers; wanted 2"),
+        (json.dumps(whole | {"u": [0.0, float("nan")]}), r"u\[1\] is nan; wanted a finite number"),
+        (json.dumps(whole | {"cost": "low"}), "cost is 'low'; wanted a number"),
+        (json.dumps(whole | {"noise": {"sigmas": {}}}), "noise has no correlations"),
+    ]
+    for text, message in damaged:
+        path.write_text(text)
+        with pytest.raises(
+            ValueError, match=rf"\.json: not written by `jaxik population`: .*{message}"
+        ):
+            fitting.population(walks, out)
+    path.write_text(json.dumps(whole | {"format": 9}))
+    with pytest.raises(ValueError, match=r"\.json: its format is 9"):
         fitting.population(walks, out)
+    path.unlink()
+    fitting.population(walks, out)
+    assert json.loads(path.read_text()) == whole | {
+        "seconds": json.loads(path.read_text())["seconds"]
+    }
 
 
 # Mistakes

@@ -2,8 +2,12 @@
 
 import json
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -88,3 +92,38 @@ def test_runs_that_cannot_be_compared_are_refused(tmp_path, capsys, monkeypatch,
     output = capsys.readouterr()
     assert output.out == "" and output.err.count("\n") == 1
     assert message in output.err
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.write_bytes(b""), "no log-likelihood in it"),
+        (lambda path: path.write_bytes(bytes(range(256)) * 8), "no log-likelihood in it"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-999]), "no log-likelihood in it"),
+        (lambda path: change(path, lambda file: file.pop("log_likelihood")), "Could not find node"),
+        (
+            lambda path: change(path, lambda file: file["log_likelihood"].pop("clip")),
+            "in it: .*clip",
+        ),
+        (lambda path: change(path, set_nan), "values has numbers that are not finite"),
+        (lambda path: change(path, lambda file: file.attrs.create("format", 9)), "format is 9"),
+        (lambda path: change(path, lambda file: file.attrs.create("format", "x")), "in it"),
+    ],
+)
+def test_a_damaged_log_likelihood_is_named(tmp_path, capsys, monkeypatch, damage, message):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        write_run(Path(name), GOOD)
+    damage(Path("b") / run_folder.INFERENCE_DATA)
+    assert main.main(["compare", "--runs", "a,b"]) == main.MISTAKE
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "b/posterior.nc" in line and re.search(message, line), line
+
+
+def change(path: Path, change_file: Callable[[Any], object]) -> None:
+    with h5py.File(path, "a") as file:
+        change_file(file)
+
+
+def set_nan(file: Any) -> None:
+    file["log_likelihood"]["motion"][0, 3, 2] = np.nan

@@ -5,66 +5,23 @@ import json
 import math
 import os
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from fitting.experiments import experiment_files, parameter_files, problems, systems
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.settings import NoiseOptions
-from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.studies import run_folder
 from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
 from jaxik.maths import parameter_tree
-from support.experiments import CLIP, write
-from support.profiles import parabolas
-
-NAMES = ("pelvis.on_gain", "foot.max_pitch")
+from support.runs import NAMES, invented_fit, save
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory) -> Fit:
     """A fit with invented numbers; no search has run."""
     folder = tmp_path_factory.mktemp("experiment")
-    rest = "[sigmas]\nbody = inf\ncorrelation = 0.4\n[parameters]\nlock.enabled = false"
-    path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.2")
-    experiment = experiment_files.load_experiment(path)
-    problem = problems.make_problem(experiment)
-    u = np.array([0.3, -0.2])
-    solution = Solution(
-        names=NAMES,
-        u=u,
-        values=np.asarray(problem.space.values(jnp.asarray(u))),
-        cost_before=90.0,
-        cost=10.0,
-        converged=True,
-        message="Converged.",
-        jacobian=np.zeros((1, 2)),
-        history=(Progress("start", 0, 0, 90.0, 90.0, 1.0),),
-        steps=8,
-        seconds=9.0,
-    )
-    identifiability = Identifiability(
-        names=NAMES,
-        contraction=np.array([0.9, 0.2]),
-        profiles=parabolas(problem.space.parameters, [(0.1, 0.5), (0.2, 0.9)]),
-        sd=np.array([0.01, np.nan]),
-        at_bound=("", "high"),
-        eigenvalues=np.array([0.1, 20.0]),
-        weakest=("foot.max_pitch",),
-        correlated=((*NAMES, 0.95),),
-        ridges=(),
-        best_u=u,
-        best_cost=10.0,
-        improvement=0.0,
-    )
-    return Fit(experiment, problem, solution, identifiability)
-
-
-def save(run, fitted):
-    """Writes a fit as a job does."""
-    run_folder.save_solution(run, fitted.experiment, fitted.problem, fitted.solution)
-    run_folder.save_fit(run, fitted)
+    return invented_fit(folder)
 
 
 def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path):
@@ -140,10 +97,14 @@ def test_a_gain_has_a_half_life_and_gains_at_other_rates():
         ("parameters.toml", None, "no parameters.toml"),
         ("fit.json", "{", "fit.json: not the numbers of a fit"),
         ("fit.json", "[]", "fit.json: not the numbers of a fit"),
-        ("fit.json", "{}", "fit.json: not the numbers of a fit: KeyError"),
+        ("fit.json", "{}", "fit.json: not the numbers of a fit: it has no parameters; `jaxik fit`"),
         ("fit.json", '{"parameters": 3}', "fit.json: not the numbers of a fit"),
         ("fit.json", '{"parameters": [3]}', "fit.json: not the numbers of a fit"),
-        ("fit.json", '{"parameters": [{"name": "x", "u": 1}]}', "parameters without .'determined'"),
+        (
+            "fit.json",
+            '{"parameters": [{"name": "x", "u": 1}]}',
+            r"parameters\[0\] has no determined",
+        ),
         ("experiment.toml", "free = [", "experiment.toml: not TOML"),
     ],
 )

@@ -38,6 +38,14 @@ class NoiseModel:
     independent_fraction: float
     """Of the residuals."""
 
+    def __post_init__(self) -> None:
+        numbers = [*self.sigmas.values(), self.tails, self.independent_fraction]
+        unknown = {*self.sigmas, *self.correlations} - set(MEASURED)
+        if unknown or not all(0 < number < math.inf for number in numbers):
+            raise ValueError(f"{self}; wanted positive numbers, for kinds of {list(MEASURED)}")
+        if not all(-1 < correlation < 1 for correlation in self.correlations.values()):
+            raise ValueError(f"{self}; wanted correlations between -1 and 1")
+
     def change_from(self, other: "NoiseModel") -> float:
         """The largest change: relative of a sigma, of a correlation relative to what is left."""
         changes = [abs(math.log(self.sigmas[kind] / other.sigmas[kind])) for kind in self.sigmas]

@@ -86,9 +86,10 @@ def from_tree(tree: Any) -> BlockLogLikelihood:
 
     Raises:
         KeyError: it holds none.
+        ValueError: its numbers are not finite.
     """
     motion = tree["log_likelihood"]["motion"]
-    return BlockLogLikelihood(
+    stored = BlockLogLikelihood(
         values=motion.values.reshape(-1, motion.sizes["block"]),
         clip=motion["clip"].values,
         start=motion["start"].values,
@@ -96,6 +97,10 @@ def from_tree(tree: Any) -> BlockLogLikelihood:
         data=str(tree["log_likelihood"].attrs["data"]),
         efficiency=float(tree["log_likelihood"].attrs["efficiency"]),
     )
+    for name in ("values", "clip", "start", "end", "efficiency"):
+        if not np.isfinite(getattr(stored, name)).all():
+            raise ValueError(f"{name} has numbers that are not finite")
+    return stored
 
 
 def leave_one_out(blocks: BlockLogLikelihood) -> LeaveOneOut | None:

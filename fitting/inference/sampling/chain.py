@@ -5,44 +5,29 @@ and changes it in place: 4 of 24 kills between two of its writes left a file tha
 Here a finished step is one record appended to a journal beside the HDF5 file, in one write and with
 a checksum. A kill can only tear the last record, which is then dropped.
 
-From time to time `save` writes the whole chain to a new HDF5 file, replaces the old one atomically
-and empties the journal. Steps that are in both are recognised by their number. The HDF5 file has
-the layout of emcee's backend, which can read it.
+From time to time `save` writes the whole chain to a new HDF5 file (`chain_file`), replaces the old
+one atomically and empties the journal. Steps that are in both are recognised by their number.
 """
 
-import dataclasses
+import errno
 import os
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
-import h5py
 import numpy as np
 from jaxtyping import Bool, Float
 
-GROUP = "mcmc"  # emcee's name for it
-FORMAT = 1
+from fitting.runtime.validation import in_one_line
 
-# numpy's `RandomState.get_state()`: generator, keys, position, whether a normal is left, and which.
-RandomState: TypeAlias = tuple[str, np.ndarray, int, int, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Identity:
-    """What a run must have in common with a chain to continue it."""
-
-    parameters: tuple[str, ...]
-    walkers: int
-    seed: int
-    thin_by: int
-    """Sampler steps per stored step."""
-    problem: str
-    """Digest of the data and the parameter space."""
-
-    @property
-    def token(self) -> bytes:
-        """32 characters that identify it in the journal."""
-        return f"{zlib.crc32(repr(self).encode()):08x}{self.problem:.24}".encode()
+from .chain_file import (
+    Identity,
+    RandomState,
+    StoredChain,
+    random_state,
+    read_chain,
+    write_chain,
+)
 
 
 class LastStep(NamedTuple):
@@ -122,19 +107,15 @@ class Chain:
             for name, part in zip(RANDOM_STATE_FIELDS, random_state[1:], strict=True):
                 record[name] = part
             record["checksum"] = _checksum(record)
-            self._journal.write(record.tobytes())
+            self._write_record(record.tobytes())
         self._remember(u, log_probability, accepted, random_state)
 
     def save(self) -> None:
         """Writes the HDF5 file anew and empties the journal; does nothing without a path."""
         if self.path is None or self._saved == len(self):
             return
-        temporary = self.path.with_name(f"{self.path.name}.new")
-        with h5py.File(temporary, "w") as file:
-            self._write(file.create_group(GROUP))
-        with open(temporary, "rb") as raw:
-            os.fsync(raw.fileno())  # the content before the name, in case the power fails
-        os.replace(temporary, self.path)
+        chain = StoredChain(self.u, self.log_probability, self.accepted, self._random_state)
+        write_chain(self.path, self.identity, chain)
         self._saved = len(self)
         if self._journal is not None:
             self._journal.seek(0)
@@ -163,51 +144,22 @@ class Chain:
         self.accepted = self.accepted + accepted
         self._random_state = random_state
 
-    def _write(self, group: h5py.Group) -> None:
-        """The layout of emcee 3.1.6, and the identity."""
-        identity = self.identity
-        group.attrs["format"] = FORMAT
-        group.attrs["parameters"] = list(identity.parameters)
-        for name in ("walkers", "seed", "thin_by", "problem"):
-            group.attrs[name] = getattr(identity, name)
-        group.attrs["version"] = "3.1.6"
-        group.attrs["nwalkers"] = identity.walkers
-        group.attrs["ndim"] = len(identity.parameters)
-        group.attrs["has_blobs"] = False
-        group.attrs["iteration"] = len(self)
-        for i, part in enumerate(self._random_state or ()):
-            group.attrs[f"random_state_{i}"] = part
-        group["accepted"] = self.accepted
-        for name, data in (("chain", self.u), ("log_prob", self.log_probability)):
-            group.create_dataset(name, data=data, maxshape=(None, *data.shape[1:]))
+    def _write_record(self, record: bytes) -> None:
+        assert self.path is not None and self._journal is not None
+        try:
+            if self._journal.write(record) == len(record):
+                return
+            problem = os.strerror(errno.ENOSPC)  # a part of it was written
+        except OSError as error:
+            problem = in_one_line(error)
+        raise ValueError(f"{journal_path(self.path)}: cannot be written: {problem}")
 
     def _read_file(self, path: Path) -> None:
-        try:
-            with h5py.File(path, "r") as file:
-                group: Any = file[GROUP]
-                attributes: dict[str, Any] = dict(group.attrs)
-                chain, log_probability, accepted = (
-                    np.asarray(group[name]) for name in ("chain", "log_prob", "accepted")
-                )
-            if attributes["format"] != FORMAT:
-                raise ValueError(f"its format is {attributes['format']}, wanted {FORMAT}")
-            identity = Identity(
-                parameters=tuple(attributes["parameters"].tolist()),
-                walkers=int(attributes["walkers"]),
-                seed=int(attributes["seed"]),
-                thin_by=int(attributes["thin_by"]),
-                problem=str(attributes["problem"]),
-            )
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(f"{path} is not a chain of this sampler: {error}") from error
-        _check_same_run(path, identity, self.identity)
-        self.accepted = accepted
-        self._u = list(chain)
-        self._log_probability = list(log_probability)
-        if len(self):
-            self._random_state = _random_state(
-                *(attributes[f"random_state_{i}"] for i in range(1, 5))
-            )
+        stored = read_chain(path, self.identity)
+        self.accepted = stored.accepted
+        self._u = list(stored.u)
+        self._log_probability = list(stored.log_probability)
+        self._random_state = stored.random_state
 
     def _read_journal(self, path: Path) -> None:
         """Adds the records that continue the chain, up to the first that is torn."""
@@ -220,7 +172,7 @@ class Chain:
                 continue  # saved already: killed before the journal was emptied
             if record["step"] > len(self):
                 break
-            state = _random_state(*(record[name] for name in RANDOM_STATE_FIELDS))
+            state = random_state(*(record[name] for name in RANDOM_STATE_FIELDS))
             self._remember(record["u"], record["log_probability"], record["accepted"], state)
 
 
@@ -230,13 +182,6 @@ def journal_path(path: Path) -> Path:
 
 
 RANDOM_STATE_FIELDS = ("keys", "position", "has_gauss", "gauss")
-
-
-def _random_state(
-    keys: np.ndarray, position: np.integer, has_gauss: np.integer, gauss: np.floating
-) -> RandomState:
-    """The generator's state from what a file holds of it."""
-    return "MT19937", keys.copy(), int(position), int(has_gauss), float(gauss)
 
 
 def _record(identity: Identity) -> np.dtype:
@@ -261,14 +206,3 @@ def _record(identity: Identity) -> np.dtype:
 def _checksum(record: np.ndarray | np.void) -> int:
     """Of everything before the record's last field."""
     return zlib.crc32(record.tobytes()[:-4])
-
-
-def _check_same_run(path: Path, stored: Identity, current: Identity) -> None:
-    """Raises ValueError for the first thing in which the two differ."""
-    for field in dataclasses.fields(Identity):
-        there, here = getattr(stored, field.name), getattr(current, field.name)
-        if there != here:
-            raise ValueError(
-                f"{path} holds the chain of another run: its {field.name} is {there},"
-                f" here it is {here}; delete the file or sample into another one"
-            )

@@ -13,6 +13,7 @@ import numpy as np
 from fitting.problem.space import Space, values_of_rows
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
+from fitting.runtime.storage.json_files import check_version
 from fitting.runtime.validation import in_one_line
 from jaxik.maths import parameter_tree
 
@@ -21,6 +22,9 @@ from .posterior import Posterior
 
 PACKAGES = ("arviz_base", "h5netcdf")
 PRIOR_DRAWS = 4000
+FORMAT = 1
+# What xarray and its engine raise for a damaged file.
+UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError)
 
 
 def is_available() -> bool:
@@ -46,9 +50,14 @@ def read_blocks(path: Path) -> blocks.BlockLogLikelihood:
 
     try:
         with xarray.open_datatree(path, engine="h5netcdf") as tree:
-            return blocks.from_tree(tree)
-    except (OSError, KeyError) as error:
-        raise ValueError(f"{path}: no log-likelihood in it: {in_one_line(error)}") from None
+            version = int(tree.attrs.get("format", 0))
+            stored = blocks.from_tree(tree)
+    except UNREADABLE as error:
+        raise ValueError(
+            f"{path}: no log-likelihood in it: {in_one_line(error)}; `jaxik sample` writes it"
+        ) from None
+    check_version(path, version, FORMAT)
+    return stored
 
 
 def to_inference_data(posterior: Posterior, space: Space) -> Any:
@@ -88,7 +97,7 @@ def to_inference_data(posterior: Posterior, space: Space) -> Any:
             "sample_stats": {"lp": log_probability.T},
             "prior": {name: drawn[None, :, i] for i, name in enumerate(names)},
         },
-        attrs={"/": {"inference_library": "emcee", "message": posterior.message}},
+        attrs={"/": {"inference_library": "emcee", "message": posterior.message, "format": FORMAT}},
     )
     walkers = np.delete(np.arange(posterior.u.shape[1]), posterior.isolated)
     steps = posterior.thin_by * (1 + np.arange(posterior.burn_in, len(posterior.u)))

@@ -20,7 +20,8 @@ from fitting.runtime.precision import in_float64
 
 from . import diagnostics
 from .blocks import BlockLogLikelihood
-from .chain import Chain, Identity
+from .chain import Chain
+from .chain_file import Identity
 from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
 

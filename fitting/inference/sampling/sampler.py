@@ -18,7 +18,8 @@ from fitting.problem.problem import Problem
 from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
-from .chain import Chain, Identity, LastStep, RandomState
+from .chain import Chain, LastStep
+from .chain_file import Identity, RandomState
 from .islands import Islands, find_islands
 
 # Fraction of the steps. Effective samples per 1,000 evaluations of the slowest parameter, with 0,

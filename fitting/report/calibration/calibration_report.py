@@ -1,12 +1,12 @@
 """The report of a calibration: what is true of the fits' and the posteriors' claims."""
 
-import json
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
 from fitting.report.formatting import aligned, bullets, markdown, percent
 from fitting.report.plots import calibration_plots, style
 from fitting.runtime import files
+from fitting.runtime.storage.json_files import write_json
 from fitting.studies.calibration.assessment import (
     FAMILY_LEVEL,
     IN_VALLEY,
@@ -69,7 +69,7 @@ def write(
 ) -> None:
     """Writes calibration.json, summary.md and the pictures into an existing folder."""
     numbers = {"experiment": experiment.name, **summarise(assessment)}
-    files.write_text(folder / NUMBERS, json.dumps(numbers, indent=2) + "\n")
+    write_json(folder / NUMBERS, numbers)
     title = f"{experiment.name}: fitted against true values"
     style.save(folder / RECOVERY, calibration_plots.recovery(calibration.fits, title))
     parts = [

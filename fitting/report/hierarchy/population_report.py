@@ -1,11 +1,11 @@
 """The report of a population: what its clips and subjects have in common, and how they differ."""
 
-import json
 from pathlib import Path
 
 from fitting.report.formatting import aligned, bullets, interval, markdown, number
 from fitting.report.plots import style
 from fitting.runtime import files
+from fitting.runtime.storage.json_files import write_json
 from fitting.studies.hierarchy.estimates import ParameterEstimates
 from fitting.studies.hierarchy.kept_searches import Found
 from fitting.studies.hierarchy.population import Population
@@ -33,7 +33,7 @@ def write(folder: Path, population: Population) -> None:
     name = population.experiment.name
     title = f"{name}: clips and their population"
     style.save(folder / FIGURE, population_plots.overview(population, title))
-    files.write_text(folder / NUMBERS, json.dumps(population.summary, indent=2) + "\n")
+    write_json(folder / NUMBERS, population.summary)
     parts = [
         f"# {title}",
         *_remarks(population),

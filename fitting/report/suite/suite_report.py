@@ -1,6 +1,5 @@
 """The report of the suite: a table with its explanation, the numbers, and a page of pictures."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from fitting.report.labels import explanations
 from fitting.report.placement_report import numbers as placement_numbers
 from fitting.report.plots import style, suite_plots
 from fitting.runtime import files
+from fitting.runtime.storage.json_files import write_json
 from fitting.studies.suite.suite import Scene, Suite
 
 from . import suite_tables
@@ -21,7 +21,7 @@ TABLE, NUMBERS, PAGE = "suite.md", "suite.json", "suite.png"
 def write(folder: Path, suite: Suite) -> None:
     """Writes suite.md, suite.json and suite.png into a folder, which is made if needed."""
     folder.mkdir(parents=True, exist_ok=True)
-    files.write_text(folder / NUMBERS, json.dumps(_numbers(suite), indent=2) + "\n")
+    write_json(folder / NUMBERS, _numbers(suite))
     files.write_text(folder / TABLE, _summary(suite))
     if suite.scenes:
         style.save(folder / PAGE, suite_plots.page(suite))

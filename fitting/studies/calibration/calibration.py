@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
 
@@ -24,8 +24,9 @@ from fitting.experiments.experiment import Experiment
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress, digest
 from fitting.problem.problem import Problem
-from fitting.runtime import cluster, files
-from fitting.runtime.validation import error_context, read_json
+from fitting.runtime import cluster
+from fitting.runtime.storage.json_files import JsonFile
+from fitting.runtime.validation import Content, error_context
 
 from .replicates import ReplicateChain, ReplicateFit, fit_replicate, sample_replicate
 
@@ -33,8 +34,30 @@ if TYPE_CHECKING:
     from distributed import Client
 
 IDENTITY, FITS, CHAINS = "identity.json", "fits", "chains"
-KEYS = {FITS: ReplicateFit.__required_keys__, CHAINS: ReplicateChain.__required_keys__}
+WRITER, ADVICE = "written by `jaxik calibrate`", "delete it to make it anew, or name another folder"
+FILES = {
+    FITS: JsonFile(ReplicateFit, WRITER, ADVICE),
+    CHAINS: JsonFile(ReplicateChain, WRITER, ADVICE),
+}
+PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
 Result = TypeVar("Result", bound=Mapping[str, Any])
+
+
+class Identity(TypedDict):
+    """What is calibrated: everything that a replicate follows from, except the program itself."""
+
+    name: str
+    problem: str
+    """Digest."""
+    start: list[float]
+    seed: int
+    noise_factor: float
+    noise: Content
+    fit: Content
+    sample: Content
+
+
+IDENTITY_FILE = JsonFile(Identity, WRITER, "name another folder")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +172,7 @@ class _Stage:
         for number, result in computed(make, arguments, missing):
             if self.folder is not None:
                 self._path(number).parent.mkdir(parents=True, exist_ok=True)
-                files.write_text(self._path(number), json.dumps(result, indent=1) + "\n")
+                FILES[self.name].write(self._path(number), result)
             results[number] = result
             on_result(result)
         return [results[number] for number in range(self.replicates)]
@@ -201,18 +224,17 @@ class _Stage:
 
     def _read(self, number: int) -> Any:
         path = self._path(number)
-        try:
-            result = read_json(path)
+        result: Any = FILES[self.name].read(path)
+        with error_context(f"{path}: not {WRITER}"):
             if result["number"] != number:
-                raise ValueError(f"it is of replicate {result['number']}")
-            if missing := sorted(KEYS[self.name] - result.keys()):
-                raise ValueError(f"there is no {missing}; begin anew in another folder")
-            return result
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path}: not written by `jaxik calibrate`: {error!r}") from None
+                raise ValueError(f"it is of replicate {result['number']}; {ADVICE}")
+            sizes = {key: len(result[key]) for key in PER_PARAMETER if key in result}
+            if len(set(sizes.values())) > 1:
+                raise ValueError(f"its lists have different lengths, {sizes}; {ADVICE}")
+        return result
 
 
-def _claim(folder: Path, own: Mapping[str, Any]) -> None:
+def _claim(folder: Path, own: Identity) -> None:
     """Writes into a folder what is calibrated there, or compares it with what is written there.
 
     Raises:
@@ -223,26 +245,21 @@ def _claim(folder: Path, own: Mapping[str, Any]) -> None:
         if folder.is_dir() and any((folder / name).exists() for name in (FITS, CHAINS)):
             raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        files.write_text(path, json.dumps(own, indent=2) + "\n")
+        IDENTITY_FILE.write(path, own)
         return
-    try:
-        present = read_json(path)
-        changed = [key for key in own if key != "name" and own[key] != present[key]]
-        name = present["name"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not written by `jaxik calibrate`: {error!r}") from None
+    present = IDENTITY_FILE.read(path)
+    changed = [key for key in own if key != "name" and own[key] != present[key]]
     if changed:
         raise ValueError(
-            f"{folder}: holds the calibration of {name!r}, which differs from {own['name']!r} in: "
-            f"{', '.join(changed)}; name another folder"
+            f"{folder}: holds the calibration of {present['name']!r}, which differs from "
+            f"{own['name']!r} in: {', '.join(changed)}; name another folder"
         )
 
 
 def _identity(
     experiment: Experiment, problem: Problem[jaxik.FootIK], noise_factor: float
-) -> dict[str, Any]:
-    """Everything that a replicate follows from, except the program itself; as JSON reads it."""
-    identity = {
+) -> Identity:
+    identity: Identity = {
         "name": experiment.name,
         "problem": digest(problem),
         "start": np.asarray(problem.space.start).tolist(),

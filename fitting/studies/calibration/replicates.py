@@ -6,7 +6,7 @@ to be is plain data, which JSON holds without loss.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple, NotRequired, TypedDict
+from typing import Annotated, NamedTuple, NotRequired, TypedDict
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,9 +26,10 @@ from fitting.problem.free_parameters import FreeParameter
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
 from fitting.problem.space import to_fractions
+from fitting.runtime.storage.declared_types import Finite, length
 from fitting.runtime.validation import Content
 from fitting.studies.assess import assess_solution
-from fitting.studies.fit import FittedParameter, search_with_noise
+from fitting.studies.fit import FittedParameter, Interval, search_with_noise
 from fitting.studies.sample import sample_around, with_open_noise
 
 DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99
@@ -50,10 +51,10 @@ class ReplicateFit(TypedDict):
 
     number: int
     """From 0."""
-    truth_u: list[float]
-    truth: list[float]
+    truth_u: list[Finite]
+    truth: list[Finite]
     """In the parameters' units."""
-    truth_levels: list[float]
+    truth_levels: list[Finite]
     """Of the smallest intervals of the profiles that contain the truth, 0..1."""
     truth_valley_cost: float
     """Where a descent that begins at the truth ends."""
@@ -66,7 +67,7 @@ class ReplicateFit(TypedDict):
     """For the search."""
     parameters: list[FittedParameter]
     """As `fit.json` has them."""
-    noise: NotRequired[Content]
+    noise: NotRequired[Annotated[Content, NoiseModel]]
     """Where the experiment estimates it."""
 
 
@@ -77,7 +78,7 @@ class ReplicateChain(TypedDict):
     ranks: dict[str, int]
     """Number of independent draws, of `DRAWS`, below the truth: of each parameter, and of the
     log-probability."""
-    intervals: dict[str, list[list[float]]]
+    intervals: dict[str, Annotated[list[Interval], length(len(LEVELS))]]
     """Of each parameter, in its unit: the central intervals with the `LEVELS`."""
     draws: int
     """Independent ones in the chain."""

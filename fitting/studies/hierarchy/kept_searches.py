@@ -6,10 +6,9 @@ with other settings or another seed has another name.
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import Annotated, NotRequired, TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -21,8 +20,9 @@ from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import digest
 from fitting.problem.problem import Problem
-from fitting.runtime import files
-from fitting.runtime.validation import Content, read_json
+from fitting.runtime.storage.declared_types import Finite
+from fitting.runtime.storage.json_files import JsonFile
+from fitting.runtime.validation import Content, error_context
 from fitting.studies.ablation import labelled
 from fitting.studies.fit import search_with_noise
 
@@ -34,13 +34,18 @@ class Found(TypedDict):
 
     name: str
     """What was fitted."""
-    u: list[float]
-    cost: float
+    u: list[Finite]
+    cost: Finite
     converged: bool
     message: str
     seconds: float
-    noise: NotRequired[Content]
+    noise: NotRequired[Annotated[Content, NoiseModel]]
     """Where it was estimated."""
+
+
+FOUND_FILE = JsonFile(
+    Found, "written by `jaxik population`", "delete it, and its search is made anew"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,12 +75,12 @@ class KeptSearches:
         """
         noise = self.experiment.noise if with_its_noise else NoiseOptions()
         path = self._path(problem, noise)
-        found = None if path is None else _read(path)
+        found = None if path is None else _read(path, problem.space.size)
         if found is None:
             found = self._search(name, problem, noise)
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                files.write_text(path, json.dumps(found, indent=1) + "\n")
+                FOUND_FILE.write(path, found)
             self.on_found(found)
         if "noise" in found:
             problem = with_noise(problem, NoiseModel(**found["noise"]))
@@ -108,14 +113,17 @@ class KeptSearches:
         return self.folder / SEARCHES / f"{key[:16]}.json"
 
 
-def _read(path: Path) -> Found | None:
-    """The result that a file holds; None if there is no file."""
+def _read(path: Path, size: int) -> Found | None:
+    """The result that a file holds, of so many parameters; None if there is no file."""
     if not path.exists():
         return None
-    try:
-        found = read_json(path)
-        if missing := Found.__required_keys__ - found.keys():
-            raise ValueError(f"there is no {sorted(missing)}")
-        return found
-    except (OSError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: not written by `jaxik population`: {error!r}") from None
+    found = FOUND_FILE.read(path)
+    with error_context(f"{path}: not written by `jaxik population`"):
+        if len(found["u"]) != size:
+            raise ValueError(
+                f"u has {len(found['u'])} numbers; wanted {size}, one of each parameter; "
+                f"{FOUND_FILE.advice}"
+            )
+        if "noise" in found:
+            NoiseModel(**found["noise"])  # checks its numbers
+    return found

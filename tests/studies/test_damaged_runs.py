@@ -1,0 +1,204 @@
+"""Run folders in which something is damaged: one sentence names it, and nothing is changed."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import h5py
+import numpy as np
+import pytest
+
+from fitting.cli import main
+from fitting.experiments import problems
+from fitting.inference.sampling.chain import Chain
+from fitting.inference.sampling.chain_file import Identity
+from fitting.inference.sampling.posterior import digest
+from fitting.studies import run_folder
+from support import quick
+from support.experiments import ROOT
+from support.runs import NAMES, invented_fit, save
+
+Damage: TypeAlias = Callable[[Path], object]
+CLIP_FILES = [
+    str(ROOT / "data/clips/uneven_walk_base.npz"),
+    "--terrain",
+    str(ROOT / "data/terrains/uneven_walk.ply"),
+]
+WHOLE_FILES = {
+    "cut in half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "empty": lambda path: path.write_bytes(b""),
+    "garbage": lambda path: path.write_bytes(bytes(range(256)) * 8),
+    "zeros": lambda path: path.write_bytes(bytes(path.stat().st_size)),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+    "a file in it": lambda path: (path.unlink(), path.mkdir(), (path / "x").write_text("x")),
+    "missing": Path.unlink,
+}
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory) -> Path:
+    """A run with its chain, of residuals that compile at once."""
+    folder = tmp_path_factory.mktemp("sampled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
+        fitted = invented_fit(folder, "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 6")
+        save(folder / "run", fitted)
+    settings, random = fitted.experiment.sample, np.random.RandomState(0)
+    identity = Identity(NAMES, 8, fitted.experiment.seed, settings.thin_by, digest(fitted.problem))
+    with Chain(identity, folder / "run" / run_folder.CHAIN) as chain:
+        for _ in range(6):
+            state: Any = random.get_state()
+            chain.append(random.normal(size=(8, 2)), np.zeros(8), np.ones(8, bool), state)
+    return folder / "run"
+
+
+@pytest.fixture
+def run(sampled, tmp_path, monkeypatch) -> Path:
+    """A copy, to be damaged."""
+    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
+    return shutil.copytree(sampled, tmp_path / "run")
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def refusal(words: list[str], run: Path, capsys) -> str:
+    """The one line that a command says of a folder, in which it changes nothing."""
+    before = content(run)
+    assert main.main(words) == main.MISTAKE
+    (line,) = capsys.readouterr().err.splitlines()
+    assert content(run) == before
+    return line
+
+
+def apply_words(run: Path) -> list[str]:
+    return ["apply", str(run), *CLIP_FILES, "-o", str(run.parent / "out.npz")]
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        pytest.param(name, damage, id=f"{name} {kind}")
+        for name in ("experiment.toml", "fit.json", "parameters.toml", "chain.h5")
+        for kind, damage in WHOLE_FILES.items()
+        if (name, kind) != ("chain.h5", "missing")  # which is then begun
+    ],
+)
+def test_a_file_that_is_damaged_as_a_whole_is_named(run, name, damage, capsys):
+    damage(run / name)
+    words = ["sample", str(run)] if name == "chain.h5" else apply_words(run)
+    assert name in refusal(words, run, capsys)
+
+
+def in_fit(change: Callable[[dict[str, Any]], object]) -> Damage:
+    """A change to the content of fit.json."""
+
+    def damage(run: Path) -> None:
+        numbers = json.loads((run / "fit.json").read_text())
+        change(numbers)
+        (run / "fit.json").write_text(json.dumps(numbers))
+
+    return damage
+
+
+def of_row(**changes: object) -> Damage:
+    return in_fit(lambda numbers: numbers["parameters"][0].update(changes))
+
+
+NUMBERS = {
+    "far away": (of_row(u=1e9), r"parameters[0].u is 1000000000.0; wanted a number from -40 to 40"),
+    "NaN": (of_row(u=float("nan")), "parameters[0].u is nan"),
+    "text": (of_row(u="0.1"), "parameters[0].u is '0.1'; wanted a number"),
+    "no width": (of_row(start_sd=0.0), "parameters[0].start_sd is 0.0; wanted"),
+    "list": (of_row(value=[0.1]), "parameters[0].value is [0.1]; wanted a number"),
+    "kind": (of_row(kind="cubic"), "parameters[0].kind is 'cubic'"),
+    "interval": (of_row(interval=[1.0]), "parameters[0].interval is [1.0]; wanted a list of 2"),
+    "valleys": (of_row(valleys=[{"value": 1.0}]), "parameters[0].valleys[0] has no interval"),
+    "same names": (of_row(name="foot.max_pitch"), "wanted one or more, each once"),
+    "other names": (of_row(name="pelvis.limit"), "the fit has the parameters"),
+    "key": (in_fit(lambda n: n["parameters"][1].pop("u")), "parameters[1] has no u"),
+    "rows": (in_fit(lambda n: n.update(parameters=[])), "its parameters are []"),
+    "no rows": (in_fit(lambda n: n.pop("parameters")), "it has no parameters"),
+    "noise": (in_fit(lambda n: n.update(noise={"sigmas": {}})), "noise has no correlations"),
+    "newer": (in_fit(lambda n: n.update(format=9)), "its format is 9; this release reads"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("damage", "message"), NUMBERS.values(), ids=NUMBERS)
+def test_a_wrong_number_of_a_fit_is_named(run, damage, message, capsys):
+    damage(run)
+    assert message in refusal(["sample", str(run)], run, capsys)
+
+
+def test_keys_of_a_later_release_do_no_harm(run):
+    of_row(colour="red")(run)
+    assert run_folder.load_fit(run)[1]["parameters"][0]["name"] == "pelvis.on_gain"
+
+
+@pytest.mark.parametrize("name", [run_folder.EXPERIMENT, run_folder.PARAMETERS])
+def test_a_toml_file_of_a_newer_format_is_refused(run, name, capsys):
+    text = (run / name).read_text()
+    assert text.startswith("# jaxik run, format 1\n")
+    (run / name).write_text(text.replace("format 1", "format 9", 1))
+    line = refusal(apply_words(run), run, capsys)
+    assert f"{name}: its format is 9; this release reads formats up to 1" in line
+
+
+def test_a_system_without_a_fitted_parameter_is_not_applied(run, capsys):
+    (run / run_folder.PARAMETERS).write_text('preset = "record"\n')
+    line = refusal(apply_words(run), run, capsys)
+    assert "no foot.max_pitch, pelvis.on_gain; `jaxik fit` makes a run" in line
+
+
+def in_chain(change: Callable[[Any], object]) -> Damage:
+    """A change to the group of chain.h5."""
+
+    def damage(run: Path) -> None:
+        with h5py.File(run / "chain.h5", "a") as file:
+            change(file["mcmc"])
+
+    return damage
+
+
+def with_array(name: str, array: np.ndarray) -> Damage:
+    def change(group: Any) -> None:
+        del group[name]
+        group[name] = array
+
+    return in_chain(change)
+
+
+def set_nan(group: Any) -> None:
+    group["chain"][3, 2, 0] = np.nan
+
+
+CHAINS = {
+    "another shape": (with_array("chain", np.zeros((6, 8, 3))), "chain is float64 (6, 8, 3)"),
+    "too few axes": (with_array("chain", np.zeros(6)), "chain is float64 (6,); wanted numbers"),
+    "a number": (with_array("chain", np.zeros(())), "chain is float64 ()"),
+    "text": (with_array("chain", np.full((6, 8, 2), b"x")), "chain is |S1 (6, 8, 2)"),
+    "other length": (with_array("log_prob", np.zeros((5, 8))), "log_prob is float64 (5, 8)"),
+    "other walkers": (with_array("accepted", np.zeros(9)), "accepted is float64 (9,)"),
+    "NaN": (in_chain(set_nan), "chain has numbers that are not finite"),
+    "no state": (in_chain(lambda g: g.attrs.pop("random_state_1")), "no random_state_1"),
+    "short state": (
+        in_chain(lambda g: g.attrs.create("random_state_1", np.zeros(3, int))), "state of 3 keys"
+    ),
+    "type": (in_chain(lambda g: g.attrs.create("walkers", "many")), "invalid literal"),
+    "names": (in_chain(lambda g: g.attrs.create("parameters", 3)), "its parameters is ('3',)"),
+    "array": (in_chain(lambda g: g.attrs.create("seed", [1, 2])), "is not a chain"),
+    "no names": (in_chain(lambda g: g.attrs.pop("parameters")), "'parameters'"),
+    "no array": (in_chain(lambda g: g.pop("log_prob")), "log_prob"),
+    "group": (in_chain(lambda g: (g.pop("chain"), g.create_group("chain"))), "is not a chain"),
+    "newer": (in_chain(lambda g: g.attrs.create("format", 9)), "its format is 9; this release"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("damage", "message"), CHAINS.values(), ids=CHAINS)
+def test_a_damaged_chain_is_named_and_stays(run, damage, message, capsys):
+    damage(run)
+    line = refusal(["sample", str(run)], run, capsys)
+    assert "chain.h5" in line and message in line

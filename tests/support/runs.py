@@ -1,0 +1,60 @@
+"""Run folders that need no search: fits with invented numbers."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.experiments import experiment_files, problems
+from fitting.inference.identifiability import Identifiability
+from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.studies import run_folder
+from fitting.studies.fit import Fit
+
+from .experiments import CLIP, write
+from .profiles import parabolas
+
+NAMES = ("pelvis.on_gain", "foot.max_pitch")
+
+
+def invented_fit(folder: Path, more: str = "") -> Fit:
+    """A fit with invented numbers; its experiment, with more tables, is written to the folder."""
+    rest = f"[sigmas]\nbody = inf\ncorrelation = 0.4\n[parameters]\nlock.enabled = false\n{more}"
+    path = write(folder, rest=rest, clips=CLIP, clip="start = 1.0\nend = 1.2")
+    experiment = experiment_files.load_experiment(path)
+    problem = problems.make_problem(experiment)
+    u = np.array([0.3, -0.2])
+    solution = Solution(
+        names=NAMES,
+        u=u,
+        values=np.asarray(problem.space.values(jnp.asarray(u))),
+        cost_before=90.0,
+        cost=10.0,
+        converged=True,
+        message="Converged.",
+        jacobian=np.zeros((1, 2)),
+        history=(Progress("start", 0, 0, 90.0, 90.0, 1.0),),
+        steps=8,
+        seconds=9.0,
+    )
+    identifiability = Identifiability(
+        names=NAMES,
+        contraction=np.array([0.9, 0.2]),
+        profiles=parabolas(problem.space.parameters, [(0.1, 0.5), (0.2, 0.9)]),
+        sd=np.array([0.01, np.nan]),
+        at_bound=("", "high"),
+        eigenvalues=np.array([0.1, 20.0]),
+        weakest=("foot.max_pitch",),
+        correlated=((*NAMES, 0.95),),
+        ridges=(),
+        best_u=u,
+        best_cost=10.0,
+        improvement=0.0,
+    )
+    return Fit(experiment, problem, solution, identifiability)
+
+
+def save(run: Path, fitted: Fit) -> None:
+    """Writes a fit as a job does."""
+    run_folder.save_solution(run, fitted.experiment, fitted.problem, fitted.solution)
+    run_folder.save_fit(run, fitted)
