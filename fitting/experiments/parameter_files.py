@@ -73,11 +73,13 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
             is.
 
     Raises:
-        ValueError: the file does not exist or is not TOML; a preset, stage, rule or parameter is
-            unknown; a value is wrong.
+        ValueError: the file does not exist, is empty or is not TOML; a preset, stage, rule or
+            parameter is unknown; a value is wrong.
     """
     path = Path(path)
     content = read_toml(path, "a parameter")
+    if not content:  # the defaults would pass for what somebody has fitted
+        raise ValueError(f"{path}: nothing is in it; wanted a preset, rules or parameters")
     preset = Preset(content.pop("preset", DEFAULT_PRESET.name), content.pop("faithful", False))
     top = {key: content.pop(key) for key in TOP_KEYS if key in content}
     check_table(top, TOP_KEYS, str(path))

@@ -12,7 +12,6 @@ import jaxik
 from fitting.analysis import accuracy
 from fitting.datasets.clips import Clip, flight, load_clip, save_clip
 from fitting.datasets.clips.formats.npz import check_clip_file, is_blocks_file
-from fitting.experiments.parameter_files import load_system
 from fitting.report import comparison_report, fit_tables, placement_report
 from fitting.report.formatting import aligned
 from fitting.report.suite import suite_report
@@ -117,8 +116,7 @@ def apply(
     Raises:
         ValueError: as `solve`, or the folder holds no finished fit.
     """
-    run_folder.load_fit(Path(run))
-    ik, _ = load_system(Path(run) / run_folder.PARAMETERS, animation.flat_clip.rig)
+    ik = run_folder.load_fitted_system(Path(run), animation.flat_clip.rig)
     return solve(ik, animation, output, log=log)
 
 

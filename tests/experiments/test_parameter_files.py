@@ -67,6 +67,8 @@ def test_a_parameter_may_have_one_value_per_leg(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("", "parameters.toml: nothing is in it; wanted a preset, rules or parameters"),
+        ("# a comment", "nothing is in it"),
         ("lock = [[", "not TOML"),
         ("lock = " + 100_000 * "[", "not TOML: nested too deeply"),
         ("preset = 'recrod'", r"no preset named 'recrod'; there are \['mec', 'ozz', 'rec"),
