@@ -53,7 +53,7 @@ def program_key(function: Callable, arguments: Arguments) -> str:
         plain_tree.describe(types),
         [jax.default_backend(), *settings],
         versions(),
-        _sources(),
+        sources(),
     ]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
@@ -65,7 +65,7 @@ def versions() -> Mapping[str, str]:
 
 
 @functools.cache
-def _sources() -> str:
+def sources() -> str:
     """A digest of this project's source."""
     digest = hashlib.sha256()
     for package in plain_tree.PROJECT:

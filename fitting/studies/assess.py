@@ -9,6 +9,7 @@ from jaxtyping import Float
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import assess_identifiability
+from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.search import refine
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
@@ -25,6 +26,7 @@ def assess_solution(
     solution: Solution,
     progress: Callable[[Progress], None] | None = None,
     on_solution: Callable[[Solution], object] = lambda solution: None,
+    kept: KeptStages | None = None,
 ) -> Fit:
     """The fit: a solution and how certain it is, or the lower one that its profiles led to.
 
@@ -34,6 +36,7 @@ def assess_solution(
         solution: of the problem.
         progress: called as a search goes on.
         on_solution: called with each solution before its assessment, which may fail.
+        kept: the stages of searches that were killed.
 
     Raises:
         ValueError: if the Jacobian at a solution is not finite.
@@ -46,10 +49,11 @@ def assess_solution(
         fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
         if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
             return fit
-        lower = _search_lower(problem, experiment, solution, identifiability.best_u, progress)
+        first = identifiability.best_u
+        lower = _search_lower(problem, experiment, solution, first, progress, kept)
         if not lower.cost < solution.cost:  # with 32-bit floats the point lay before a cliff
-            kept = dataclasses.replace(solution, interrupted=lower.interrupted)
-            return dataclasses.replace(fit, solution=kept)
+            unmoved = dataclasses.replace(solution, interrupted=lower.interrupted)
+            return dataclasses.replace(fit, solution=unmoved)
         left.append(solution.cost)
         solution = lower
 
@@ -60,6 +64,7 @@ def _search_lower(
     before: Solution,
     lower_u: Float[np.ndarray, " free"],
     progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
 ) -> Solution:
     """The best fit from a point that is lower than a solution; steps and time add to its own.
 
@@ -71,9 +76,10 @@ def _search_lower(
         before: the solution that is left.
         lower_u: the lower point, in u.
         progress: called as the search goes on.
+        kept: the stages of searches that were killed.
     """
     settings = experiment.fit.search
-    after = refine(problem, before, lower_u, settings, progress)
+    after = refine(problem, before, lower_u, settings, progress, kept)
     if after.interrupted or before.cost - after.cost <= settings.agreement:
         return after
-    return search(problem, experiment, progress, after.u).following(after)
+    return search(problem, experiment, progress, after.u, kept).following(after)

@@ -20,6 +20,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.joint import fit_with_noise
 from fitting.inference.noise.model import NoiseModel, noise_of
+from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.search import find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.profiles import profile
@@ -227,6 +228,7 @@ def search(
     experiment: Experiment,
     progress: Callable[[Progress], None] | None = None,
     first: Float[np.ndarray, " free"] | None = None,
+    kept: KeptStages | None = None,
 ) -> Solution:
     """The best fit, without any estimate of how certain it is.
 
@@ -235,6 +237,7 @@ def search(
         experiment: its settings of the search.
         progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
         first: the u from which the first descent begins; None is the experiment's.
+        kept: the stages of a search that was killed, which goes on after them.
     """
     return find_best_fit(
         problem,
@@ -243,6 +246,7 @@ def search(
         first=first,
         seed=experiment.seed,
         progress=progress,
+        kept=kept,
     )
 
 
@@ -250,6 +254,7 @@ def search_with_noise(
     problem: Problem[jaxik.FootIK],
     experiment: Experiment,
     progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that the experiment estimates, and the problem with this noise.
 
@@ -257,9 +262,11 @@ def search_with_noise(
         problem: the problem of the experiment.
         experiment: its settings of noise and search.
         progress: as for `search`.
+        kept: as for `search`.
     """
-    solution = search(problem, experiment, progress)
-    return fit_with_noise(problem, experiment.noise, solution, experiment.fit.search, progress)
+    solution = search(problem, experiment, progress, kept=kept)
+    settings = experiment.fit.search
+    return fit_with_noise(problem, experiment.noise, solution, settings, progress, kept)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:

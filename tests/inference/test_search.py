@@ -22,61 +22,12 @@ from fitting.inference.optimisation import (
 )
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.state import ROUNDING, Point, Search, SearchState, StepsUsedUp
-from fitting.problem import free_parameters, space
 from fitting.problem.problem import Problem
-from jaxik.maths import parameter_tree
 from support import toy
+from support.curves import CURVE_TRUTH, Curve, curve_problem
 
 CLIPS = (1, 5)  # seeds of toy clips that determine every threshold
 TOLERANCE = 0.05  # fraction of the range within which a fit must recover the truth
-
-
-class Curve(eqx.Module):
-    """A decay with a jump where a hard decision changes."""
-
-    height: jax.Array = parameter_tree.parameter(
-        0.8, unit="1", low=0.0, high=4.0, doc="Height of the test rule."
-    )
-    rate: jax.Array = parameter_tree.parameter(
-        1.0, unit="1/s", low=0.1, high=10.0, scale="log", doc="Rate of the test rule."
-    )
-    turn: jax.Array = parameter_tree.parameter(
-        0.7, unit="s", low=0.0, high=1.0, kind="threshold", doc="Turn of the test rule."
-    )
-
-
-TIME = jnp.linspace(0, 1, 200)
-CURVE_TRUTH = {"height": 2.0, "rate": 3.0, "turn": 0.4}
-
-
-def curve(ik: Curve) -> jax.Array:
-    time = TIME.astype(ik.rate.dtype)
-    decay = ik.height * jnp.exp(-ik.rate * time)
-    return jnp.where(time <= ik.turn, decay, decay + 0.5)
-
-
-def curve_residuals(ik: Curve, data: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """Finite only while the height is between the walls."""
-    observed, walls = data
-    residuals = (curve(ik) - observed) / jnp.asarray(0.02, observed.dtype)
-    return jnp.where((walls[0] < ik.height) & (ik.height < walls[1]), residuals, jnp.nan)
-
-
-def curve_problem(
-    names: tuple[str, ...] = ("height", "rate"),
-    walls: tuple[float, float] = (-1.0, 9.0),
-    outliers: float = 0.0,
-    **options,
-) -> Problem:
-    base = Curve(turn=jnp.asarray(0.7 if "turn" in names else CURVE_TRUTH["turn"]))
-    random = np.random.default_rng(3)
-    clean = curve(Curve(**{name: jnp.asarray(value) for name, value in CURVE_TRUTH.items()}))
-    outlier = (random.random(TIME.size) < outliers) * random.uniform(1, 3, TIME.size)
-    data = clean + random.normal(0, 0.02, TIME.size) + outlier
-    parameters = [free_parameters.free_parameter(base, name) for name in names]
-    return Problem(
-        space.make_space(base, parameters), (data, jnp.asarray(walls)), curve_residuals, **options
-    )
 
 
 def errors(problem: Problem, values: np.ndarray, truth: dict[str, float]) -> np.ndarray:

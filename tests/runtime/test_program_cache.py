@@ -120,7 +120,7 @@ def test_each_shape_type_and_constant_gets_its_own_program(folder):
 
 def test_a_change_of_the_source_makes_a_new_program(folder, monkeypatch):
     fresh()(2.0, points())
-    monkeypatch.setattr(program_key, "_sources", lambda: "changed")
+    monkeypatch.setattr(program_key, "sources", lambda: "changed")
     fresh()(2.0, points())
     assert len(TRACED) == len(kept(folder)) == 2
 

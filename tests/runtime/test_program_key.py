@@ -65,9 +65,9 @@ def test_only_the_types_of_arrays_count():
 
 
 def test_the_source_of_both_packages_counts(monkeypatch):
-    both = program_key._sources()
+    both = program_key.sources()
     monkeypatch.setattr(plain_tree, "PROJECT", ("jaxik",))
-    assert program_key._sources.__wrapped__() != both
+    assert program_key.sources.__wrapped__() != both
 
 
 def test_the_versions_of_the_libraries_count(monkeypatch):

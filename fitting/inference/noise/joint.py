@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jaxik
+from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.search import refine
 from fitting.inference.optimisation.settings import DEFAULTS, SearchSettings
 from fitting.inference.optimisation.solution import Progress, Solution
@@ -21,6 +22,7 @@ def fit_with_noise(
     solution: Solution,
     settings: SearchSettings = DEFAULTS,
     progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that is likeliest there, and the problem with this noise.
 
@@ -34,6 +36,7 @@ def fit_with_noise(
         solution: of the problem.
         settings: of the descents.
         progress: called as they go on.
+        kept: the stages of searches that were killed.
     """
     if not options.estimates_any:
         return problem, solution
@@ -44,5 +47,5 @@ def fit_with_noise(
         if noise.change_from(noise_of(problem)) < TOLERANCE:
             break
         problem = with_noise(problem, noise)
-        solution = refine(problem, solution, solution.u, settings, progress)
+        solution = refine(problem, solution, solution.u, settings, progress, kept)
     return problem, solution

@@ -6,6 +6,7 @@ Each raises `StepsUsedUp` before a step that would exceed the `max_steps` of a s
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from . import levenberg_marquardt
 from .levenberg_marquardt import LMState
@@ -55,6 +56,15 @@ def point_of(lm: LMState) -> Point:
     return Point(
         np.asarray(lm.u), cost if np.isfinite(cost) else np.inf, problem_jacobian(lm.jacobian)
     )
+
+
+def jacobian_at(search: Search, point: Point) -> Float[np.ndarray, "residuals free"]:
+    """Of the problem's residuals; a point of a population, or of a file, comes without one."""
+    if point.jacobian is not None:
+        return point.jacobian
+    u = search.array(point.u)
+    evaluated = levenberg_marquardt.evaluate(HardModel(search.problem, u), u)
+    return problem_jacobian(evaluated.jacobian)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,15 +14,16 @@ parameters. After some generations the best one descends; rounds of both go on w
 """
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from fitting.problem.space import EDGE, Space
 
-from .descent import descend
+from .descent import descend, jacobian_at
 from .population import ROUNDING, evaluate, from_values, to_values
-from .state import Point, Search, SearchState
+from .state import Elite, Point, Search, SearchState
 
 CROSSED = 0.6  # fraction of the candidates
 CROSSED_VALUES = (0.1, 0.3, 0.5)  # fraction of their values that come from the other candidate
@@ -37,24 +38,6 @@ PARENT_RANK = 0.35  # probability that the best is the parent; of the rest, that
 Candidates = Float[np.ndarray, "candidates free"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Elite:
-    """The best candidates so far, the best one first."""
-
-    u: Candidates
-    cost: Float[np.ndarray, " candidates"]
-
-    @classmethod
-    def best_of(cls, u: Candidates, cost: np.ndarray, size: int) -> "Elite":
-        """As many of them as it has room for."""
-        order = np.argsort(cost, kind="stable")[:size]
-        return cls(u[order], cost[order])
-
-    def joined(self, u: Candidates, cost: np.ndarray, size: int) -> "Elite":
-        """The best of these and others."""
-        return Elite.best_of(np.concatenate([self.u, u]), np.append(self.cost, cost), size)
-
-
 def evolve(search: Search, state: SearchState, ends: list[Point]) -> SearchState:
     """The state at the best point that evolution reaches from the ends of several descents.
 
@@ -66,31 +49,38 @@ def evolve(search: Search, state: SearchState, ends: list[Point]) -> SearchState
     settings = search.settings
     donors = np.stack([end.u for end in ends])
     elite = Elite.best_of(donors, np.array([end.cost for end in ends]), settings.elite)
+    state = dataclasses.replace(state, elite=elite)
     idle = 0
     for _ in range(settings.max_rounds):
-        before = state.point
-        state, elite = _breed(search, state, elite, donors)
-        if elite.cost[0] < before.cost * (1 - ROUNDING):
-            state = dataclasses.replace(state, point=Point(elite.u[0]))
-            state = descend(search, state, "evolution")
-            if state.point.cost > before.cost:  # the two precisions do not agree
-                state = dataclasses.replace(state, point=before)
-        else:
-            state = search.report(state, "evolution", before.cost)
-        elite = elite.joined(state.point.u[None], np.array([state.point.cost]), settings.elite)
-        idle = 0 if before.cost - state.point.cost > settings.min_round_gain else idle + 1
+        before = state
+        state = search.run("evolution", before, partial(_round, search, before, donors))
+        gain = before.point.cost - state.point.cost
+        idle = 0 if gain > settings.min_round_gain else idle + 1
         if idle >= settings.patience:
             break
-    return state
+    return dataclasses.replace(state, elite=None)
 
 
-def _breed(
-    search: Search, state: SearchState, elite: Elite, donors: Candidates
-) -> tuple[SearchState, Elite]:
-    """The elite after some generations, bred around the state's point, which has a Jacobian."""
-    settings, jacobian = search.settings, state.point.jacobian
-    assert jacobian is not None  # of a descent
-    random = state.generator()
+def _round(search: Search, state: SearchState, donors: Candidates) -> SearchState:
+    """The state after some generations and a descent of the best candidate, if it is new."""
+    before, size = state.point, search.settings.elite
+    state, elite = _breed(search, state, donors)
+    if elite.cost[0] < before.cost * (1 - ROUNDING):
+        state = dataclasses.replace(state, point=Point(elite.u[0]))
+        state = descend(search, state, "evolution")
+        if state.point.cost > before.cost:  # the two precisions do not agree
+            state = dataclasses.replace(state, point=before)
+    else:
+        state = search.report(state, "evolution", before.cost)
+    end = state.point
+    return dataclasses.replace(state, elite=elite.joined(end.u[None], np.array([end.cost]), size))
+
+
+def _breed(search: Search, state: SearchState, donors: Candidates) -> tuple[SearchState, Elite]:
+    """The elite after some generations, bred around the state's point."""
+    settings, jacobian = search.settings, jacobian_at(search, state.point)
+    assert state.elite is not None
+    elite, random = state.elite, state.generator()
     uncertainty = _uncertainty(search, jacobian)
     stepped = np.empty((0, donors.shape[1]))
     for _ in range(settings.generations):

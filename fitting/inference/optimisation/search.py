@@ -20,6 +20,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -28,9 +29,10 @@ from fitting.problem.problem import Problem
 from fitting.runtime.precision import for_other_thread, in_float64
 
 from . import levenberg_marquardt
-from .descent import descend, point_of, polish
+from .descent import descend, jacobian_at, point_of, polish
 from .evolution import evolve
-from .models import HardModel, problem_jacobian
+from .kept_stages import KeptStages
+from .models import HardModel
 from .population import evaluate
 from .settings import DEFAULTS, MAX_STARTS, SearchSettings
 from .solution import Progress, Solution
@@ -49,6 +51,7 @@ def find_best_fit(
     first: Float[Array | np.ndarray, " free"] | None = None,
     seed: int = 0,
     progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
 ) -> Solution:
     """The free parameters of minimum cost.
 
@@ -62,6 +65,7 @@ def find_best_fit(
         first: the `u` from which the first start makes its first descent; None is the space's.
         seed: of the random draws; the same seed gives the same solution.
         progress: called with every report.
+        kept: the stages of a search that was killed, which goes on after them; gets those of this.
 
     Raises:
         ValueError: for no start.
@@ -72,6 +76,8 @@ def find_best_fit(
     latest = SearchState.at(np.asarray(first), seed=seed)
     watch = _Watch(progress)
     search = Search(problem, settings, watch)
+    if kept is not None:
+        search = kept.attach(search, latest, starts)
     cost_before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
@@ -89,6 +95,9 @@ def find_best_fit(
         latest, interrupted = watch.latest or latest, True
         if not np.isfinite(latest.best.cost):
             raise
+    finally:
+        if kept is not None:
+            kept.flush()
     agreeing = count_agreeing(ends, settings)
     end = _End(latest, len(ends), agreeing, agree(ends, settings), interrupted, used_up)
     return _solution(search, end, cost_before)
@@ -101,6 +110,7 @@ def refine(
     u: Float[np.ndarray, " free"],
     settings: SearchSettings = DEFAULTS,
     progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
 ) -> Solution:
     """A descent to the end from a point that is better than a solution, or for another noise.
 
@@ -112,17 +122,23 @@ def refine(
         u: where the descent begins.
         settings: how thoroughly to search.
         progress: called with every report.
+        kept: as for `find_best_fit`.
     """
     latest = SearchState.at(np.asarray(u))
     watch = _Watch(progress)
     search = Search(problem, settings, watch)
+    if kept is not None:
+        search = kept.attach(search, latest, 0)
     used_up = interrupted = False
     try:
-        latest = polish(search, latest)
+        latest = _polish(search, latest)
     except StepsUsedUp as error:
         latest, used_up = error.state, True
     except KeyboardInterrupt:
         latest, interrupted = watch.latest or latest, True
+    finally:
+        if kept is not None:
+            kept.flush()
     if not np.isfinite(latest.best.cost):
         return dataclasses.replace(solution, interrupted=interrupted)
     end = _End(latest, solution.starts, solution.agreeing, solution.agreed, interrupted, used_up)
@@ -158,9 +174,7 @@ def search_from(
     points, state = starting_points(search, state, first)
     ends = []
     for point in points:
-        state = search.jump(state, "start", point)
-        state = descend(search, state, "descent")
-        state = sweep_and_descend(search, state, settings.sweeps)
+        state = search.run("descent", state, partial(_descend_from, search, state, point))
         ends.append(state.point)
     ends = [end for end in ends if np.isfinite(end.cost)]
     if not ends:
@@ -168,11 +182,20 @@ def search_from(
     state = dataclasses.replace(state, point=min(ends, key=lambda end: end.cost))
     costs = [end.cost for end in ends]
     if not agree(costs, settings):
-        state = polish(search, evolve(search, state, ends))
+        state = _polish(search, evolve(search, state, ends))
         return state, [state.point.cost]
     agreeing = count_agreeing(costs, settings)
-    state = polish(search, state)
+    state = _polish(search, state)
     return state, [state.point.cost] * agreeing + sorted(costs)[agreeing:]
+
+
+def _descend_from(search: Search, state: SearchState, point: Point) -> SearchState:
+    state = descend(search, search.jump(state, "start", point), "descent")
+    return sweep_and_descend(search, state, search.settings.sweeps)
+
+
+def _polish(search: Search, state: SearchState) -> SearchState:
+    return search.run("polish", state, partial(polish, search, state))
 
 
 def starting_points(
@@ -208,15 +231,6 @@ def _begin(
     lm = levenberg_marquardt.evaluate(HardModel(problem, first), first)
     before = before if np.isfinite(before) else np.inf
     return before, dataclasses.replace(state, evaluated=lm, best=point_of(lm))
-
-
-def _jacobian(search: Search, best: Point) -> Float[np.ndarray, "residuals free"]:
-    """Of the problem's residuals at the best point, which may come from a population."""
-    if best.jacobian is not None:
-        return best.jacobian
-    u = search.array(best.u)
-    evaluated = levenberg_marquardt.evaluate(HardModel(search.problem, u), u)
-    return problem_jacobian(evaluated.jacobian)
 
 
 @dataclasses.dataclass
@@ -263,7 +277,7 @@ def _solution(search: Search, end: _End, cost_before: float) -> Solution:
         cost=state.best.cost,
         converged=end.converged,
         message=_message(search.settings, end),
-        jacobian=_jacobian(search, state.best),
+        jacobian=jacobian_at(search, state.best),
         history=state.history,
         steps=state.steps,
         starts=end.starts,

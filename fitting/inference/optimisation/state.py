@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import time
 from collections.abc import Callable
+from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +36,24 @@ class Point:
 
 
 @dataclasses.dataclass(frozen=True)
+class Elite:
+    """The best candidates of an evolution so far, the best one first."""
+
+    u: Float[np.ndarray, "candidates free"]
+    cost: Float[np.ndarray, " candidates"]
+
+    @classmethod
+    def best_of(cls, u: np.ndarray, cost: np.ndarray, size: int) -> "Elite":
+        """As many of them as it has room for."""
+        order = np.argsort(cost, kind="stable")[:size]
+        return cls(u[order], cost[order])
+
+    def joined(self, u: np.ndarray, cost: np.ndarray, size: int) -> "Elite":
+        """The best of these and others."""
+        return Elite.best_of(np.concatenate([self.u, u]), np.append(self.cost, cost), size)
+
+
+@dataclasses.dataclass(frozen=True)
 class SearchState:
     """Where a search stands."""
 
@@ -56,6 +75,8 @@ class SearchState:
     """So far; the next one looks between the values of these."""
     evaluated: LMState | None = None
     """First starting point, evaluated while programs compiled."""
+    elite: Elite | None = None
+    """Of the evolution that is going on."""
     history: tuple[Progress, ...] = ()
 
     @classmethod
@@ -78,6 +99,9 @@ class StepsUsedUp(Exception):
         self.state = state  # as it was then
 
 
+Stage: TypeAlias = Callable[[], SearchState]
+
+
 @dataclasses.dataclass(frozen=True)
 class Search:
     """What all stages of a search share."""
@@ -88,6 +112,8 @@ class Search:
     """Called with every report."""
     began: float = dataclasses.field(default_factory=time.perf_counter)
     """Seconds."""
+    recall: Callable[["Search", str, SearchState, Stage], SearchState] | None = None
+    """Gives the state in which a stage ended before the search was killed, or calls the stage."""
 
     @property
     def thresholds(self) -> np.ndarray:
@@ -97,6 +123,14 @@ class Search:
     def array(self, u: Float[np.ndarray, "*n free"]) -> Float[Array, "*n free"]:
         """`u` as the problem's programs take it."""
         return jnp.asarray(u, self.problem.space.start.dtype)
+
+    def run(self, name: str, state: SearchState, stage: Stage) -> SearchState:
+        """The state after a stage that follows from this state, and from nothing else that changes.
+
+        Raises:
+            StepsUsedUp: by the stage.
+        """
+        return stage() if self.recall is None else self.recall(self, name, state, stage)
 
     def spend_step(self, state: SearchState) -> SearchState:
         """The state with one more step of Levenberg–Marquardt counted.

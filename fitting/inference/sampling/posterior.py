@@ -1,19 +1,17 @@
 """The posterior of a fit, sampled with emcee through the hard program."""
 
 import dataclasses
-import hashlib
 import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, values_of_rows
 from fitting.runtime.precision import in_float64
@@ -233,21 +231,6 @@ def _extend(
 
 def _check(chain: Chain, length: int) -> diagnostics.Check:
     return diagnostics.check(chain.u[:length], chain.log_probability[:length])
-
-
-def digest(problem: Problem) -> str:
-    """64 characters that change with any number or name on which the log-probability depends."""
-    problem = eqx.tree_at(lambda problem: problem.space.start, problem, replace=None)
-    digested = hashlib.sha256()
-    function = problem.residual_function
-    names = (function.__module__, function.__qualname__, problem.loss)
-    parameters = [dataclasses.astuple(parameter) for parameter in problem.space.parameters]
-    digested.update(repr((names, parameters)).encode())
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(problem, eqx.is_array_like)):
-        array = np.asarray(leaf)
-        digested.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
-        digested.update(array.tobytes())
-    return digested.hexdigest()
 
 
 def _log_probability(problem: Problem, start: WalkerStart, walkers: int) -> float:

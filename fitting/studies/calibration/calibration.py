@@ -22,7 +22,8 @@ import numpy as np
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.optimisation.solution import Progress
-from fitting.inference.sampling.posterior import SamplingProgress, digest
+from fitting.inference.sampling.posterior import SamplingProgress
+from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.runtime import cluster
 from fitting.runtime.storage.json_files import JsonFile

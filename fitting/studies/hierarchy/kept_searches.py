@@ -1,24 +1,22 @@
 """Searches whose results are kept on disk, each in a file that is named after what it follows from.
 
-An interrupted study continues: called again, it finds what it had. A search of another problem,
-with other settings or another seed has another name.
+An interrupted study continues: called again, it finds what it had, and the search that was running
+goes on after its last stage. A search of another problem, with other settings or another seed has
+another name.
 """
 
 import dataclasses
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NotRequired, TypedDict
-
-import numpy as np
-from jaxtyping import Float
 
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.noise.settings import NoiseOptions
+from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Progress
-from fitting.inference.sampling.posterior import digest
+from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.runtime.storage.declared_types import Finite
 from fitting.runtime.storage.json_files import JsonFile
@@ -70,26 +68,35 @@ class KeptSearches:
             with_its_noise: whether the noise that the experiment estimates is estimated here.
 
         Raises:
-            KeyboardInterrupt: the search was interrupted; half a search counts for nothing.
+            KeyboardInterrupt: the search was interrupted; it goes on when it is called again.
             ValueError: a file in the folder is something else.
         """
         noise = self.experiment.noise if with_its_noise else NoiseOptions()
         path = self._path(problem, noise)
         found = None if path is None else _read(path, problem.space.size)
         if found is None:
-            found = self._search(name, problem, noise)
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
+            kept = None if path is None else KeptStages(path.with_suffix(".part"), path.stem)
+            found = self._search(name, problem, noise, kept)
+            if path is not None and kept is not None:
                 FOUND_FILE.write(path, found)
+                kept.remove()
             self.on_found(found)
         if "noise" in found:
             problem = with_noise(problem, NoiseModel(**found["noise"]))
         return problem, found
 
-    def _search(self, name: str, problem: Problem[jaxik.FootIK], noise: NoiseOptions) -> Found:
+    def _search(
+        self,
+        name: str,
+        problem: Problem[jaxik.FootIK],
+        noise: NoiseOptions,
+        kept: KeptStages | None,
+    ) -> Found:
         experiment = dataclasses.replace(self.experiment, noise=noise)
         progress = labelled(self.progress, name)
-        fitted, solution = search_with_noise(problem, experiment, progress)
+        fitted, solution = search_with_noise(problem, experiment, progress, kept)
         if solution.interrupted:
             raise KeyboardInterrupt
         found: Found = {
@@ -107,9 +114,7 @@ class KeptSearches:
     def _path(self, problem: Problem[jaxik.FootIK], noise: NoiseOptions) -> Path | None:
         if self.folder is None:
             return None
-        start: Float[np.ndarray, " free"] = np.asarray(problem.space.start)
-        settings = (self.experiment.fit, self.experiment.seed, noise, start.tolist())
-        key = hashlib.sha256(f"{digest(problem)} {settings}".encode()).hexdigest()
+        key = digest_with(problem, self.experiment.fit, self.experiment.seed, noise)
         return self.folder / SEARCHES / f"{key[:16]}.json"
 
 
