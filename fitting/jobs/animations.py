@@ -23,7 +23,7 @@ from fitting.studies.suite import suite
 from fitting.studies.suite.situations import Plan
 from fitting.studies.suite.suite import Suite, SystemsOf
 
-from .output import Log, checked_folder, log_output, silent
+from .output import Log, log_output, output_folder, silent
 
 
 @in_float64
@@ -50,24 +50,24 @@ def compare(
         ValueError: a file cannot be read, a system does not fit the clip or gives poses that are
             not finite, a rate is above the clip's, or the folder cannot be made.
     """
-    folder = checked_folder(output)
-    systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
-    title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
-    loaded = load_animation(animation)
-    compared = comparison.compare(systems, loaded, title=title, during=during)
-    differences = frame_rates.measure(systems, loaded, rates, during)
-    compared = dataclasses.replace(compared, rates=differences)
-    if folder is not None:
-        comparison_report.write(folder, compared)
-    table = aligned(comparison_report.transposed(comparison_report.table(compared)))
-    where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
-    log("\n".join([table, "", *filter(None, where)]))
-    if differences:
-        log(f"\n{aligned(comparison_report.rate_table(compared))}")
-    log_output(log, folder, comparison_report.TABLE)
-    for name, (placement, cause) in compared.placements.items():
-        placement_report.warn(placement, cause, name)
-    return compared
+    with output_folder(output) as folder:
+        systems = {name: with_floats(ik, np.float64) for name, ik in systems.items()}
+        title = f"{Path(animation.clip).name} on {Path(animation.terrain).name}"
+        loaded = load_animation(animation)
+        compared = comparison.compare(systems, loaded, title=title, during=during)
+        differences = frame_rates.measure(systems, loaded, rates, during)
+        compared = dataclasses.replace(compared, rates=differences)
+        if folder is not None:
+            comparison_report.write(folder, compared)
+        table = aligned(comparison_report.transposed(comparison_report.table(compared)))
+        where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
+        log("\n".join([table, "", *filter(None, where)]))
+        if differences:
+            log(f"\n{aligned(comparison_report.rate_table(compared))}")
+        log_output(log, folder, comparison_report.TABLE)
+        for name, (placement, cause) in compared.placements.items():
+            placement_report.warn(placement, cause, name)
+        return compared
 
 
 @in_float64
@@ -94,13 +94,13 @@ def run_suite(
     Raises:
         ValueError: the folder cannot be made.
     """
-    folder = checked_folder(output)
-    finished = suite.run_suite(systems_of, plan, during=during)
-    if folder is not None:
-        suite_report.write(folder, finished)
-    log(suite_report.text(finished))
-    log_output(log, folder, suite_report.TABLE)
-    return finished
+    with output_folder(output) as folder:
+        finished = suite.run_suite(systems_of, plan, during=during)
+        if folder is not None:
+            suite_report.write(folder, finished)
+        log(suite_report.text(finished))
+        log_output(log, folder, suite_report.TABLE)
+        return finished
 
 
 @in_float64

@@ -13,7 +13,7 @@ from fitting.studies.calibration import calibration
 from fitting.studies.calibration.assessment import Assessment, assess
 from fitting.studies.calibration.calibration import CalibrationProgress, Observers
 
-from .output import Log, checked_folder, log_output, silent
+from .output import Log, log_output, output_folder, silent
 
 
 @in_float64
@@ -55,22 +55,22 @@ def calibrate(
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
-    folder = checked_folder(output)
-    problem = make_problem(experiment)
-    log(f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}")
-    observers = Observers(
-        progress,
-        lambda fitted: log(calibration_report.fit_line(fitted)),
-        lambda chain: log(calibration_report.chain_line(chain)),
-    )
-    with cluster.connect(workers, scheduler) as client:
-        made = calibration.calibrate(
-            experiment, problem, folder, replicates,
-            chains=chains, noise_factor=noise_factor, client=client, observers=observers,
-        )  # fmt: skip
-    assessment = assess(made)
-    if folder is not None:
-        calibration_report.write(folder, experiment, made, assessment)
-    log(f"\n{calibration_report.calibration_text(assessment)}")
-    log_output(log, folder, calibration_report.SUMMARY)
-    return assessment
+    with output_folder(output) as folder:
+        problem = make_problem(experiment)
+        log(f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}")
+        observers = Observers(
+            progress,
+            lambda fitted: log(calibration_report.fit_line(fitted)),
+            lambda chain: log(calibration_report.chain_line(chain)),
+        )
+        with cluster.connect(workers, scheduler) as client:
+            made = calibration.calibrate(
+                experiment, problem, folder, replicates,
+                chains=chains, noise_factor=noise_factor, client=client, observers=observers,
+            )  # fmt: skip
+        assessment = assess(made)
+        if folder is not None:
+            calibration_report.write(folder, experiment, made, assessment)
+        log(f"\n{calibration_report.calibration_text(assessment)}")
+        log_output(log, folder, calibration_report.SUMMARY)
+        return assessment

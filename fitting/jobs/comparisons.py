@@ -8,7 +8,7 @@ from fitting.report.uncertainty import run_comparison as report
 from fitting.studies.posterior import run_comparison
 from fitting.studies.posterior.run_comparison import ComparedRun
 
-from .output import Log, checked_folder, log_output, silent
+from .output import Log, log_output, output_folder, silent
 
 
 def compare_runs(
@@ -25,10 +25,10 @@ def compare_runs(
         ValueError: as `studies.posterior.run_comparison.compare_runs`, or the folder cannot be
             made.
     """
-    folder = checked_folder(output)
-    compared = run_comparison.compare_runs([Path(run) for run in runs])
-    if folder is not None:
-        report.write(folder, compared)
-    log(f"{aligned(report.table(compared))}\n\n{report.explanation()}")
-    log_output(log, folder, report.TABLE)
-    return compared
+    with output_folder(output) as folder:
+        compared = run_comparison.compare_runs([Path(run) for run in runs])
+        if folder is not None:
+            report.write(folder, compared)
+        log(f"{aligned(report.table(compared))}\n\n{report.explanation()}")
+        log_output(log, folder, report.TABLE)
+        return compared

@@ -1,9 +1,11 @@
 """Where a job's results and its lines of text go."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
+from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
 
 Log: TypeAlias = Callable[[str], object]
@@ -14,12 +16,19 @@ def silent(text: str) -> None:
     """Drops a line of the log."""
 
 
-def checked_folder(output: str | Path | None) -> Path | None:
-    """The folder for the results, if there is to be one; ValueError if it cannot be made."""
+@contextmanager
+def output_folder(output: str | Path | None) -> Iterator[Path | None]:
+    """The folder for the results, if there is to be one, claimed for as long as a job fills it.
+
+    Raises:
+        ValueError: it cannot be made, or another process is filling it.
+    """
     if output is None:
-        return None
+        yield None
+        return
     run_folder.check_output_folder(Path(output))
-    return Path(output)
+    with claimed(Path(output)):
+        yield Path(output)
 
 
 def log_output(log: Log, folder: Path | None, text: str) -> None:

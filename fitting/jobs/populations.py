@@ -17,7 +17,7 @@ from fitting.runtime.precision import in_float64
 from fitting.studies import run_folder
 from fitting.studies.hierarchy.population import Population, fit_clips_and_population
 
-from .output import Log, checked_folder, log_output, silent
+from .output import Log, log_output, output_folder, silent
 
 
 @in_float64
@@ -46,25 +46,25 @@ def population(
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
-    folder = checked_folder(output)
-    problem = make_problem(experiment)
-    log(
-        f"fitting {problem.space.size} parameters of {experiment.preset} to "
-        f"{len(experiment.clips)} clips, {len(experiment.hierarchy.varying)} of them varying"
-    )
-    fitted = fit_clips_and_population(
-        experiment,
-        problem,
-        folder,
-        progress,
-        lambda found: log(population_report.found_line(found)),
-    )
-    if folder is not None:
-        _write_systems(folder, fitted)
-        population_report.write(folder, fitted)
-    log(f"\n{population_report.population_text(fitted)}")
-    log_output(log, folder, population_report.SUMMARY)
-    return fitted
+    with output_folder(output) as folder:
+        problem = make_problem(experiment)
+        log(
+            f"fitting {problem.space.size} parameters of {experiment.preset} to "
+            f"{len(experiment.clips)} clips, {len(experiment.hierarchy.varying)} of them varying"
+        )
+        fitted = fit_clips_and_population(
+            experiment,
+            problem,
+            folder,
+            progress,
+            lambda found: log(population_report.found_line(found)),
+        )
+        if folder is not None:
+            _write_systems(folder, fitted)
+            population_report.write(folder, fitted)
+        log(f"\n{population_report.population_text(fitted)}")
+        log_output(log, folder, population_report.SUMMARY)
+        return fitted
 
 
 def _write_systems(folder: Path, fitted: Population) -> None:

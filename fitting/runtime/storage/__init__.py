@@ -1,5 +1,5 @@
 """Folders and files that outlive the process that wrote them, and what may have become of them.
 
 `json_files` reads and writes JSON with a format version and a declared content, which
-`declared_types` checks.
+`declared_types` checks. `claimed_folder` keeps a second process out of a folder.
 """
