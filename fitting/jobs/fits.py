@@ -12,8 +12,10 @@ from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
 from fitting.experiments.problems import make_problem
 from fitting.inference.noise.model import NoiseModel, with_noise
+from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
+from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
 from fitting.runtime.precision import in_float64
@@ -24,7 +26,7 @@ from fitting.studies.posterior.replay import replay
 from fitting.studies.sample import SampledFit, log_probability_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
-from .output import Log, checked_folder, log_output, silent
+from .output import Log, log_output, output_folder, silent
 
 
 @in_float64
@@ -38,7 +40,8 @@ def fit(
     """Fits the free parameters of an experiment to its clips.
 
     KeyboardInterrupt (Ctrl-C) ends the search; the best point so far is assessed, written and
-    returned as any other fit, with `solution.interrupted` set.
+    returned as any other fit, with `solution.interrupted` set. Called again with the same folder,
+    an interrupted or killed fit goes on, to the same result as in one go.
 
     Args:
         experiment: an experiment, or the path of its file.
@@ -53,18 +56,20 @@ def fit(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     known_values = load_known_values(experiment)
-    run = checked_folder(output)
-    roots: list[str] = []
-    problem = make_problem(experiment, roots.append)
-    free, preset = len(experiment.free), experiment.preset
-    log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
-    problem, solution = search_with_noise(problem, experiment, progress)
-    fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress)
-    if run is not None:
-        fit_report.write_fit(run, fitted)
-    log(f"\n{fit_report.fit_text(fitted)}")
-    log_output(log, run, run_folder.SUMMARY)
-    return fitted
+    with output_folder(output) as run:
+        roots: list[str] = []
+        problem = make_problem(experiment, roots.append)
+        free, preset = len(experiment.free), experiment.preset
+        log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
+        kept = _kept_stages(run, experiment, problem, log)
+        problem, solution = search_with_noise(problem, experiment, progress, kept)
+        fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress, kept)
+        if run is not None:
+            fit_report.write_fit(run, fitted)
+        _remove(kept, fitted)
+        log(f"\n{fit_report.fit_text(fitted)}")
+        log_output(log, run, run_folder.SUMMARY)
+        return fitted
 
 
 @in_float64
@@ -102,24 +107,25 @@ def sample(
             problem = with_noise(problem, NoiseModel(**summary["noise"]))
     if max_steps is not None:
         experiment = experiment.with_max_sample_steps(max_steps)
-    chain = None if run is None else run / run_folder.CHAIN
-    posterior = sample_around(parameters, problem, experiment, chain, progress)
-    played = None
-    try:
-        if not posterior.interrupted:
-            played = replay(problem, posterior, experiment.seed)
-            posterior = dataclasses.replace(posterior, blocks=played.blocks)
-    except KeyboardInterrupt:
-        posterior = dataclasses.replace(posterior, interrupted=True)
-    sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
-    if run is not None:
-        _save_and_report(run, sampled)
-        if sampled.has_lower_point and not posterior.interrupted:
-            sampled = _adopt_lower_point(run, problem, sampled, log)
-            posterior = sampled.posterior
-    log(f"\n{posterior_report.posterior_text(sampled, run)}")
-    log_output(log, run, run_folder.SUMMARY)
-    return posterior
+    with output_folder(run):
+        chain = None if run is None else run / run_folder.CHAIN
+        posterior = sample_around(parameters, problem, experiment, chain, progress)
+        played = None
+        try:
+            if not posterior.interrupted:
+                played = replay(problem, posterior, experiment.seed)
+                posterior = dataclasses.replace(posterior, blocks=played.blocks)
+        except KeyboardInterrupt:
+            posterior = dataclasses.replace(posterior, interrupted=True)
+        sampled = SampledFit(experiment, problem.space, parameters, posterior, known_values, played)
+        if run is not None:
+            _save_and_report(run, sampled)
+            if sampled.has_lower_point and not posterior.interrupted:
+                sampled = _adopt_lower_point(run, problem, sampled, log)
+                posterior = sampled.posterior
+        log(f"\n{posterior_report.posterior_text(sampled, run)}")
+        log_output(log, run, run_folder.SUMMARY)
+        return posterior
 
 
 @in_float64
@@ -148,17 +154,17 @@ def ablate(
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
-    folder = checked_folder(output)
+    with output_folder(output) as folder:
 
-    def log_row(row: ablation.Row) -> None:
-        log(ablation_report.row_text(row))
+        def log_row(row: ablation.Row) -> None:
+            log(ablation_report.row_text(row))
 
-    rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)
-    if folder is not None:
-        ablation_report.write(folder, experiment, rows)
-    log(ablation_report.tables_text(rows))
-    log_output(log, folder, ablation_report.TABLE)
-    return rows
+        rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)
+        if folder is not None:
+            ablation_report.write(folder, experiment, rows)
+        log(ablation_report.tables_text(rows))
+        log_output(log, folder, ablation_report.TABLE)
+        return rows
 
 
 @in_float64
@@ -186,27 +192,49 @@ def translate(
     run = None if output is None else Path(output)
     if run is not None:
         run_folder.check_new_folder(run)
-    prepared = translation.prepare(request, Path() if run is None else run)
-    experiment, problem = prepared.experiment, prepared.problem
-    log(
-        f"fitting {len(experiment.free)} parameters of {request.target.name} to "
-        f"{request.source.name} on {len(prepared.motions)} clip(s)"
-    )
-    start = translation.starting_point(problem)
-    solution = search(problem, experiment, progress, start)
-    known_values = None
-    if run is not None:
-        translation.save_source(run, prepared)
-        known_values = load_known_values(experiment)
-    fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress)
-    fitted = dataclasses.replace(fitted, has_noise=False)
-    differences = translation_report.differences(fitted)
-    if run is not None:
-        translation_report.write(run, prepared, fitted, differences)
-    log(f"\n{solution.message} {fitted.verdict.sentence}\n")
-    log(translation_report.translation_text(prepared, differences))
-    log_output(log, run, run_folder.SUMMARY)
-    return fitted
+    with output_folder(run):
+        prepared = translation.prepare(request, Path() if run is None else run)
+        experiment, problem = prepared.experiment, prepared.problem
+        log(
+            f"fitting {len(experiment.free)} parameters of {request.target.name} to "
+            f"{request.source.name} on {len(prepared.motions)} clip(s)"
+        )
+        start = translation.starting_point(problem)
+        kept = _kept_stages(run, experiment, problem, log)
+        solution = search(problem, experiment, progress, start, kept)
+        known_values = None
+        if run is not None:
+            translation.save_source(run, prepared)
+            known_values = load_known_values(experiment)
+        fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress, kept)
+        fitted = dataclasses.replace(fitted, has_noise=False)
+        differences = translation_report.differences(fitted)
+        if run is not None:
+            translation_report.write(run, prepared, fitted, differences)
+        _remove(kept, fitted)
+        log(f"\n{solution.message} {fitted.verdict.sentence}\n")
+        log(translation_report.translation_text(prepared, differences))
+        log_output(log, run, run_folder.SUMMARY)
+        return fitted
+
+
+def _kept_stages(
+    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
+) -> KeptStages | None:
+    """The finished stages of a fit that was killed in this folder, and room for those of this."""
+    if run is None:
+        return None
+    identity = digest_with(problem, experiment.fit, experiment.seed, experiment.noise)
+    kept = KeptStages(run / run_folder.SEARCH, identity, log)
+    if kept.count:
+        log(f"a fit that was interrupted here goes on after {kept.count} stages of its search")
+    return kept
+
+
+def _remove(kept: KeptStages | None, fitted: Fit) -> None:
+    """Removes the stages of a fit that is finished; an interrupted one goes on from them."""
+    if kept is not None and not fitted.solution.interrupted:
+        kept.remove()
 
 
 def _save_and_report(run: Path, sampled: SampledFit) -> None:
@@ -260,6 +288,7 @@ def _assess_and_save(
     solution: Solution,
     known_values: Mapping[str, float] | None,
     progress: Callable[[Progress], None] | None,
+    kept: KeptStages | None,
 ) -> Fit:
     """The fit; each of its solutions is on disk before the assessment, which may fail."""
 
@@ -267,7 +296,7 @@ def _assess_and_save(
         if run is not None:
             run_folder.save_solution(run, experiment, problem, solution)
 
-    fitted = assess_solution(experiment, problem, solution, progress, save)
+    fitted = assess_solution(experiment, problem, solution, progress, save, kept)
     fitted = dataclasses.replace(fitted, known_values=known_values, run=run)
     if run is not None:
         run_folder.save_fit(run, fitted)

@@ -5,6 +5,7 @@ fit.json          the numbers of the fit
 parameters.toml   the fitted system
 chain.h5          the walkers; posterior.json is their summary
 posterior.nc      the kept draws for ArviZ, if it is installed
+search.json       how far an unfinished fit is
 lower_point.toml  the experiment, to begin at a point that the chain met below the fit
 summary.md, *.png to read
 
@@ -27,6 +28,7 @@ from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
 from fitting.runtime.files import write_text
+from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.runtime.storage.json_files import JsonFile, check_version, write_json
 from fitting.runtime.validation import error_context, flatten, read_toml
 
@@ -37,6 +39,7 @@ from .sample import SampledFit
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
 INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
+SEARCH = "search.json"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
 FIT_FILE = JsonFile(
@@ -60,13 +63,17 @@ def check_output_folder(folder: Path) -> None:
 
 
 def check_new_folder(folder: Path) -> None:
-    """Checks that a new folder can be made here; an empty one counts as new.
+    """Checks that a new folder can be made here.
+
+    An empty one counts as new, and so does one in which a search was killed.
 
     Raises:
         ValueError: the folder holds something, or cannot be made.
     """
     check_output_folder(folder)
-    if folder.is_dir() and (present := sorted(os.listdir(folder))):
+    if not folder.is_dir():
+        return
+    if present := sorted(set(os.listdir(folder)) - {LOCK, SEARCH}):
         raise ValueError(f"{folder}: there is something in it already: {present}; name a new one")
 
 

@@ -15,6 +15,7 @@ from fitting.experiments import problems
 from fitting.inference.sampling.chain import Chain
 from fitting.inference.sampling.chain_file import Identity
 from fitting.inference.sampling.posterior import digest
+from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
 from support import quick
 from support.experiments import ROOT
@@ -202,3 +203,9 @@ def test_a_damaged_chain_is_named_and_stays(run, damage, message, capsys):
     damage(run)
     line = refusal(["sample", str(run)], run, capsys)
     assert "chain.h5" in line and message in line
+
+
+def test_a_run_that_another_process_samples_is_left_alone(run, capsys):
+    with claimed(run):
+        line = refusal(["sample", str(run)], run, capsys)
+    assert f"{run}: in use by process" in line
