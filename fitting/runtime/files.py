@@ -1,9 +1,23 @@
-"""Files that are written completely or not at all."""
+"""Files that are written completely or not at all, also where the power fails or the disk is full.
 
+A file is written under a temporary name beside it, which says which process writes it. What killed
+processes have left under such names is removed when the next file is written in the same folder.
+"""
+
+import contextlib
 import os
+import platform
+import re
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+
+from .validation import in_one_line
+
+LONGEST_STEM = 80  # characters of it in a temporary name: names have 255 at most
+HOST = re.sub(r"\W", "_", platform.node())[:40]
+TEMPORARY = re.compile(rf"\..*\.jaxik-{re.escape(HOST)}-(\d+)-\w+(\.\w+)?")
 
 
 def check_output_file(path: Path) -> None:
@@ -21,26 +35,66 @@ def check_output_file(path: Path) -> None:
 def write(path: Path, fill: Callable[[Path], object]) -> None:
     """Calls `fill` with a temporary file in the same folder, then moves that file to `path`.
 
+    When it returns, the file outlives a power failure.
+
     Raises:
-        ValueError: the folder does not exist or may not be written to.
+        ValueError: the folder does not exist or may not be written to, or the disk is full.
     """
     check_output_file(path)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}", suffix=path.suffix)
+        sweep(path.parent)
+        prefix = f".{path.stem[:LONGEST_STEM]}.jaxik-{HOST}-{os.getpid()}-"
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            fill(temporary)
+            mask = os.umask(0)
+            os.umask(mask)
+            temporary.chmod(0o666 & ~mask)  # mkstemp makes files that only their owner can read
+            _synchronise(temporary)  # the content before the name
+            os.replace(temporary, path)
+            if os.name == "posix":
+                _synchronise(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise ValueError(f"{path}: cannot be written: {error.strerror}") from None
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        fill(temporary)
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)  # mkstemp makes files that only their owner can read
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        reason = in_one_line(error) if error.errno is None else os.strerror(error.errno)
+        raise ValueError(f"{path}: cannot be written: {reason}") from None
 
 
 def write_text(path: Path, text: str) -> None:
     """Writes a text file in UTF-8."""
     write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def sweep(folder: Path) -> None:
+    """Removes the temporary files that dead processes of this machine have left in a folder."""
+    for entry in os.scandir(folder):
+        name = TEMPORARY.fullmatch(entry.name)
+        if name is not None and not _is_alive(int(name[1])):
+            with contextlib.suppress(OSError):  # another process has removed it, or may do so
+                os.unlink(entry.path)
+
+
+def _is_alive(process: int) -> bool:
+    """Whether a process runs on this machine; where that cannot be asked, it may."""
+    if sys.platform == "win32":  # there os.kill ends the process, whatever the signal
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OverflowError, OSError):  # somebody else's
+        return True
+    return True
+
+
+def _synchronise(path: Path) -> None:
+    """Waits until a file or folder is on the disk."""
+    flags = os.O_RDONLY if path.is_dir() or os.name == "posix" else os.O_RDWR
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

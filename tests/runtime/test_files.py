@@ -1,7 +1,10 @@
 """Files are written completely or not at all."""
 
 import os
+import signal
 import stat
+import subprocess
+import sys
 
 import pytest
 
@@ -69,3 +72,59 @@ def test_an_error_of_the_system_is_reported_with_the_file(tmp_path, monkeypatch)
     monkeypatch.setattr(files.tempfile, "mkstemp", refuse)
     with pytest.raises(ValueError, match=r"a\.txt: cannot be written: Permission denied"):
         files.write_text(tmp_path / "a.txt", "x")
+
+
+def test_the_content_is_on_the_disk_before_the_name_and_the_name_before_the_return(
+    tmp_path, monkeypatch
+):
+    calls = []
+
+    def record(name):
+        call = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *words: (calls.append(name), call(*words))[1])
+
+    for name in ("fsync", "replace"):
+        record(name)
+    files.write_text(tmp_path / "a.txt", "x")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+# What killed processes leave
+
+KILLED_WHILE_WRITING = """
+import os, signal, sys
+from pathlib import Path
+from fitting.runtime import files
+
+def fill(path):
+    path.write_text("half")
+    print(path.name, flush=True)
+    if sys.argv[2] == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    sys.stdin.read()
+
+files.write(Path(sys.argv[1]), fill)
+"""
+
+
+def writer(path, end):
+    words = [sys.executable, "-c", KILLED_WHILE_WRITING, str(path), end]
+    return subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def test_what_a_killed_process_was_writing_goes_with_the_next_file(tmp_path):
+    killed, alive = writer(tmp_path / "knees.png", "die"), writer(tmp_path / "locks.png", "live")
+    with killed, alive:
+        assert killed.stdout is not None and alive.stdout is not None
+        half, growing = killed.stdout.readline().strip(), alive.stdout.readline().strip()
+        assert killed.wait() == -signal.SIGKILL
+        others = [
+            ".knees.png", ".knees.jaxik-elsewhere-1-abc.png", "knees.jaxik.png", ".knees3kd82hf0.png",
+        ]  # fmt: skip
+        for name in others:
+            (tmp_path / name).write_text("x")
+        assert half.endswith(".png") and names(tmp_path) == sorted([half, growing, *others])
+        files.write_text(tmp_path / "fit.json", "{}")
+        assert names(tmp_path) == sorted([growing, "fit.json", *others])
+        alive.communicate("")
+        assert names(tmp_path) == sorted(["locks.png", "fit.json", *others])
