@@ -125,12 +125,16 @@ class Chain:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Saves the chain and removes the journal."""
-        self.save()
-        if self.path is not None and self._journal is not None:
-            self._journal.close()
+        """Saves the chain and removes the journal, which stays if the chain cannot be saved."""
+        journal, path = self._journal, self.path
+        try:
+            self.save()
+        finally:
             self._journal = None
-            journal_path(self.path).unlink(missing_ok=True)
+            if journal is not None:
+                journal.close()
+        if path is not None:
+            journal_path(path).unlink(missing_ok=True)
 
     def _remember(
         self,

@@ -61,11 +61,12 @@ def write_chain(path: Path, identity: Identity, chain: StoredChain) -> None:
         ValueError: the file cannot be written.
     """
 
-    def fill(temporary: Path) -> None:
-        with h5py.File(temporary, "w") as file:
-            _write(file.create_group(GROUP), identity, chain)
-
-    files.write(path, fill)
+    # Made in memory: on a full disk HDF5 ends the process with a segmentation fault.
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        _write(file.create_group(GROUP), identity, chain)
+        file.flush()
+        image = file.id.get_file_image()
+    files.write(path, lambda temporary: temporary.write_bytes(image))
 
 
 def read_chain(path: Path, current: Identity) -> StoredChain:

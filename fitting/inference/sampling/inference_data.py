@@ -117,5 +117,6 @@ def write_inference_data(path: Path, posterior: Posterior, space: Space) -> None
     Raises:
         ImportError: ArviZ is not installed.
     """
-    tree = to_inference_data(posterior, space)
-    files.write(path, lambda temporary: tree.to_netcdf(temporary, engine="h5netcdf"))
+    # Made in memory: on a full disk HDF5 ends the process with a segmentation fault.
+    image = to_inference_data(posterior, space).to_netcdf(engine="h5netcdf")
+    files.write(path, lambda temporary: temporary.write_bytes(image))

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from fitting.runtime.validation import error_context
+
 LOCK = ".jaxik.lock"
 LONGEST_COMMAND = 100  # characters of it that the file keeps
 
@@ -45,8 +47,8 @@ def _locked(folder: Path) -> Iterator[None]:
     path = folder / LOCK
     with _open_locked(path) as file:
         try:
-            file.truncate(0)
-            file.write(f"{_owner()}\n".encode())
+            with error_context(f"{path}: cannot be written"):
+                _write_owner(file)
             yield
         finally:
             # While it is still locked: nobody else may have locked what is removed.
@@ -80,6 +82,15 @@ def _open_locked(path: Path) -> IO[bytes]:
             if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
                 return file
         file.close()  # its owner has removed it in the meantime
+
+
+def _write_owner(file: IO[bytes]) -> None:
+    """Raises ValueError where the disk is full."""
+    try:
+        file.truncate(0)
+        file.write(f"{_owner()}\n".encode())
+    except OSError as error:
+        raise ValueError(error.strerror) from None
 
 
 def _owner() -> str:
