@@ -27,7 +27,7 @@ from fitting.inference.noise.model import NoiseModel
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
-from fitting.runtime.files import write_text
+from fitting.runtime.files import TEMPORARY, write_text
 from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.runtime.storage.json_files import JsonFile, check_version, write_json
 from fitting.runtime.validation import error_context, flatten, read_toml
@@ -73,7 +73,8 @@ def check_new_folder(folder: Path) -> None:
     check_output_folder(folder)
     if not folder.is_dir():
         return
-    if present := sorted(set(os.listdir(folder)) - {LOCK, SEARCH}):
+    own = {name for name in os.listdir(folder) if TEMPORARY.fullmatch(name)} | {LOCK, SEARCH}
+    if present := sorted(set(os.listdir(folder)) - own):
         raise ValueError(f"{folder}: there is something in it already: {present}; name a new one")
 
 

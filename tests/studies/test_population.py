@@ -172,12 +172,15 @@ def test_an_interrupted_population_continues_and_repeats_nothing(walks, tmp_path
     fitting.population(walks, whole)
 
     def stop(report: Progress) -> None:
-        if report.stage.startswith("all clips but uneven_walk from 1 s"):
+        if report.stage == "all clips but uneven_walk from 1 s: polish":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fitting.population(walks, out, progress=stop)
     assert len(kept(out)) == 5 and not (out / "population.json").exists()
+    (part,) = (out / "searches").glob("*.part")
+    (stages,) = json.loads(part.read_text())["searches"].values()
+    assert [stage["name"] for stage in stages[:2]] == ["descent", "descent"]
     searched: list[str] = []
     search = kept_searches.search_with_noise
 
@@ -187,7 +190,7 @@ def test_an_interrupted_population_continues_and_repeats_nothing(walks, tmp_path
 
     monkeypatch.setattr(kept_searches, "search_with_noise", watched)
     fitting.population(walks, out)
-    assert len(searched) == 2 and kept(out) == kept(whole)
+    assert len(searched) == 2 and kept(out) == kept(whole) and not part.exists()
     for name in ("population.json", "summary.md"):
         assert (out / name).read_text() == (whole / name).read_text()
 

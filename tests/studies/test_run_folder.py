@@ -11,6 +11,7 @@ import pytest
 from fitting.experiments import experiment_files, parameter_files, problems, systems
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.settings import NoiseOptions
+from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.studies import run_folder
 from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
 from jaxik.maths import parameter_tree
@@ -140,6 +141,15 @@ def test_checking_an_output_folder_makes_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)  # the tests may run as root
     with pytest.raises(ValueError, match="is read-only"):
         run_folder.check_output_folder(tmp_path / "run")
+
+
+def test_a_folder_in_which_a_search_was_killed_counts_as_new(tmp_path):
+    for name in (LOCK, run_folder.SEARCH):
+        (tmp_path / name).write_text("x")
+        run_folder.check_new_folder(tmp_path)
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(ValueError, match=r"something in it already: \['notes.txt'\]"):
+        run_folder.check_new_folder(tmp_path)
 
 
 def test_the_numbers_are_plain_json(fitted):

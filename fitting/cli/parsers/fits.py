@@ -15,7 +15,8 @@ def add_fit(commands: Commands) -> None:
 
         Status 0: converged, and fits. 3: not converged. 4: converged, but what is left is no noise
         of the given sigmas; the summary says where. Ctrl-C ends the search; the best point so far
-        is written as any other fit, with status 130.
+        is written as any other fit, with status 130. The same command then goes on, as it does
+        after a kill.
         """,
     )  # fmt: skip
     fit.add_argument(
@@ -126,7 +127,8 @@ def add_translate(commands: Commands) -> None:
 
         Status 0: converged, however much of the motion is reproduced. 3: not converged. Ctrl-C ends
         the search; the best point so far is written as any other fit, with status 130.
-        The folder is a run: `jaxik sample` and `jaxik apply` take it.
+        After a kill during the search the same command goes on. The folder is a run:
+        `jaxik sample` and `jaxik apply` take it.
         """,
     )  # fmt: skip
     for option, dest, description in (
