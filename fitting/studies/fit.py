@@ -41,8 +41,8 @@ MIN_START_SD, MAX_START_SD = 1e-3, 0.5
 TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 
 # Beyond these, a parameter is at the end of its range to the last digit, where no fit ends.
-U: TypeAlias = Annotated[float, between(-40, 40)]
-StartSd: TypeAlias = Annotated[float, between(1e-6, 40)]
+U: TypeAlias = Annotated[float, between(-40.0, 40.0)]
+StartSd: TypeAlias = Annotated[float, between(1e-6, 40.0)]
 Interval: TypeAlias = Annotated[list[Finite], length(2)]
 
 

@@ -19,7 +19,7 @@ class Size:
 
 class Row(TypedDict):
     name: str
-    u: Annotated[float, between(-40, 40)]
+    u: Annotated[float, between(-40.0, 40.0)]
     interval: Annotated[list[Finite], length(2)]
     kind: Literal["smooth", "threshold"]
     steps: int

@@ -35,7 +35,7 @@ JITTERED = 0.4
 JITTERS = (0.3, 1.0, 3.0, 10.0, 30.0)  # standard deviations of Laplace's approximation
 PARENT_RANK = 0.35  # probability that the best is the parent; of the rest, that the next one is
 
-Candidates = Float[np.ndarray, "candidates free"]
+Candidates = Float[np.ndarray, "_ free"]
 
 
 def evolve(search: Search, state: SearchState, ends: list[Point]) -> SearchState:
