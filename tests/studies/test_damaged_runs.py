@@ -17,6 +17,7 @@ from fitting.inference.sampling.chain_file import Identity
 from fitting.inference.sampling.posterior import digest
 from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
+from fitting.studies.fit import Fit
 from support import quick
 from support.experiments import ROOT
 from support.runs import NAMES, invented_fit, save
@@ -44,6 +45,7 @@ def sampled(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sampled")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
+        patch.setattr(Fit, "groups", [])  # they would take the pipeline
         fitted = invented_fit(folder, "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 6")
         save(folder / "run", fitted)
     settings, random = fitted.experiment.sample, np.random.RandomState(0)
