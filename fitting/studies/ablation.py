@@ -28,7 +28,7 @@ from fitting.experiments.problems import ClipData, load_clip_data, problem_from_
 from fitting.experiments.systems import leaf_names
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
-from fitting.runtime.storage.declared_types import checked
+from fitting.runtime.storage.declared_types import Finite, checked
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
@@ -61,7 +61,7 @@ class Row:
 class StoredRow(TypedDict):
     """What a row's file holds in a way of its own; the rest is as `Row` declares it."""
 
-    agreement: dict[str, float | None]
+    agreement: dict[str, Finite | None]
     """None for NaN, which JSON does not have."""
 
 
@@ -136,7 +136,8 @@ def ablate(
                 _write(folder, [*rows, row, *finished.values()])
                 if on_row is not None:
                     on_row(row)
-            rows.append(replace(row, variant=name))  # the variant may have another name by now
+            # The variant may have another name by now.
+            rows.append(replace(row, variant=name, part=part % len(splits)))
         if any_new:
             jax.clear_caches()  # no other variant can use these programs
     _write(folder, rows)

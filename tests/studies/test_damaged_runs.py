@@ -207,6 +207,17 @@ def test_a_damaged_chain_is_named_and_stays(run, damage, message, capsys):
     assert "chain.h5" in line and message in line
 
 
+def test_a_chain_with_a_few_other_bytes_is_named_before_hdf5_reads_it(run, capsys):
+    path, random = run / run_folder.CHAIN, np.random.default_rng(0)
+    whole = np.frombuffer(path.read_bytes(), np.uint8)
+    for place in random.integers(len(whole) - 20, size=6):
+        damaged = whole.copy()
+        damaged[place] ^= 1 << random.integers(8)
+        path.write_bytes(damaged.tobytes())
+        line = refusal(["sample", str(run)], run, capsys)
+        assert "chain.h5 is not a chain of this sampler: its bytes are not those that" in line
+
+
 def test_a_run_that_another_process_samples_is_left_alone(run, capsys):
     with claimed(run):
         line = refusal(["sample", str(run)], run, capsys)

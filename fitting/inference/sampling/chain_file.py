@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from fitting.runtime import files
 from fitting.runtime.storage.json_files import check_version
+from fitting.runtime.storage.sealed_files import check_seal, write_sealed
 from fitting.runtime.validation import in_one_line
 
 GROUP = "mcmc"  # emcee's name for it
@@ -61,12 +61,11 @@ def write_chain(path: Path, identity: Identity, chain: StoredChain) -> None:
         ValueError: the file cannot be written.
     """
 
-    # Made in memory: on a full disk HDF5 ends the process with a segmentation fault.
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         _write(file.create_group(GROUP), identity, chain)
         file.flush()
         image = file.id.get_file_image()
-    files.write(path, lambda temporary: temporary.write_bytes(image))
+    write_sealed(path, image)
 
 
 def read_chain(path: Path, current: Identity) -> StoredChain:
@@ -77,6 +76,7 @@ def read_chain(path: Path, current: Identity) -> StoredChain:
             the message says what to do.
     """
     try:
+        check_seal(path)
         with h5py.File(path, "r") as file:
             group: Any = file[GROUP]
             attributes: dict[str, Any] = dict(group.attrs)

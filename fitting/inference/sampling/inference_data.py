@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.problem.space import Space, values_of_rows
-from fitting.runtime import files
 from fitting.runtime.precision import in_float64
 from fitting.runtime.storage.json_files import check_version
+from fitting.runtime.storage.sealed_files import check_seal, write_sealed
 from fitting.runtime.validation import in_one_line
 from jaxik.maths import parameter_tree
 
@@ -49,6 +49,7 @@ def read_blocks(path: Path) -> blocks.BlockLogLikelihood:
     import xarray
 
     try:
+        check_seal(path)
         with xarray.open_datatree(path, engine="h5netcdf") as tree:
             version = int(tree.attrs.get("format", 0))
             stored = blocks.from_tree(tree)
@@ -117,6 +118,4 @@ def write_inference_data(path: Path, posterior: Posterior, space: Space) -> None
     Raises:
         ImportError: ArviZ is not installed.
     """
-    # Made in memory: on a full disk HDF5 ends the process with a segmentation fault.
-    image = to_inference_data(posterior, space).to_netcdf(engine="h5netcdf")
-    files.write(path, lambda temporary: temporary.write_bytes(image))
+    write_sealed(path, to_inference_data(posterior, space).to_netcdf(engine="h5netcdf"))

@@ -29,7 +29,13 @@ from fitting.runtime import cluster
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import Content, error_context
 
-from .replicates import ReplicateChain, ReplicateFit, fit_replicate, sample_replicate
+from .replicates import (
+    LOG_PROBABILITY,
+    ReplicateChain,
+    ReplicateFit,
+    fit_replicate,
+    sample_replicate,
+)
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -132,7 +138,8 @@ def calibrate(
     if folder is not None:
         _claim(folder, _identity(experiment, problem, noise_factor))
 
-    stage = functools.partial(_Stage, folder, replicates, client, observers.progress)
+    names = problem.space.names
+    stage = functools.partial(_Stage, folder, replicates, client, observers.progress, names)
     fit = functools.partial(fit_replicate, problem, experiment, noise_factor=noise_factor)
     fits = stage(FITS).run(fit, range(replicates), observers.on_fit)
     if not chains:
@@ -149,6 +156,8 @@ class _Stage:
     replicates: int
     client: "Client | None"
     progress: Callable[[CalibrationProgress], None]
+    parameters: Sequence[str]
+    """Their names."""
     name: str
 
     def run(
@@ -229,10 +238,20 @@ class _Stage:
         with error_context(f"{path}: not {WRITER}"):
             if result["number"] != number:
                 raise ValueError(f"it is of replicate {result['number']}; {ADVICE}")
+            for key, names in self._names(result).items():
+                if sorted(names) != sorted(self.parameters):
+                    raise ValueError(f"{key} has {names}; wanted {self.parameters}; {ADVICE}")
             sizes = {key: len(result[key]) for key in PER_PARAMETER if key in result}
             if len(set(sizes.values())) > 1:
                 raise ValueError(f"its lists have different lengths, {sizes}; {ADVICE}")
         return result
+
+    def _names(self, result: Mapping[str, Any]) -> dict[str, list[str]]:
+        """The parameters of which a result says something, in each of its parts."""
+        if self.name == FITS:
+            return {"parameters": [row["name"] for row in result["parameters"]]}
+        ranks = set(result["ranks"]) ^ {LOG_PROBABILITY}  # which is ranked beside them
+        return {"ranks": list(ranks), "intervals": list(result["intervals"])}
 
 
 def _claim(folder: Path, own: Identity) -> None:

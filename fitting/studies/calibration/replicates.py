@@ -26,7 +26,7 @@ from fitting.problem.free_parameters import FreeParameter
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
 from fitting.problem.space import to_fractions
-from fitting.runtime.storage.declared_types import Finite, length
+from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
 from fitting.studies.assess import assess_solution
 from fitting.studies.fit import FittedParameter, Interval, search_with_noise
@@ -75,7 +75,7 @@ class ReplicateChain(TypedDict):
     """The posterior of a replicate, as its file holds it."""
 
     number: int
-    ranks: dict[str, int]
+    ranks: dict[str, Annotated[int, between(0.0, float(DRAWS))]]
     """Number of independent draws, of `DRAWS`, below the truth: of each parameter, and of the
     log-probability."""
     intervals: dict[str, Annotated[list[Interval], length(len(LEVELS))]]
