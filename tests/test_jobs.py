@@ -98,7 +98,7 @@ def test_an_interrupted_adoption_leaves_the_old_fit_and_the_lower_point(
 
     monkeypatch.setattr(jobs.fits, "assess_solution", interrupt)
     fitting.sample(run)
-    assert run_folder.load_fit(run)[1] == worse
+    assert {"format": 1, **run_folder.load_fit(run)[1]} == worse
     assert (run / run_folder.LOWER_POINT).is_file()
 
 
