@@ -19,7 +19,7 @@ FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"  #
 MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"
 TRACED = "traced"  # inside JAX's folder
 # Names of complete and of half-written files: of ours, and of JAX's.
-TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*")
+TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*(\.jaxik-\w+-\d+-\w+)?")
 COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)")
 WARNED: set[str] = set()  # problems that this process has warned of
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from .validation import in_one_line
 
-LONGEST_STEM = 80  # characters of it in a temporary name: names have 255 at most
-HOST = re.sub(r"\W", "_", platform.node())[:40]
+LONGEST_STEM = 150  # bytes of it in a temporary name: names have 255 at most
+HOST = re.sub(r"\W", "_", platform.node(), flags=re.ASCII)[:40]
 TEMPORARY = re.compile(rf"\..*\.jaxik-{re.escape(HOST)}-(\d+)-\w+(\.\w+)?")
 
 
@@ -43,7 +43,8 @@ def write(path: Path, fill: Callable[[Path], object]) -> None:
     check_output_file(path)
     try:
         sweep(path.parent)
-        prefix = f".{path.stem[:LONGEST_STEM]}.jaxik-{HOST}-{os.getpid()}-"
+        stem = path.stem.encode()[:LONGEST_STEM].decode(errors="ignore")
+        prefix = f".{stem}.jaxik-{HOST}-{os.getpid()}-"
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)

@@ -6,4 +6,5 @@ Levenberg–Marquardt alone is enough.
 
 Start with `search.py`, which puts the stages together. The stages are in `descent.py`,
 `population.py`, `sweep.py` and `evolution.py`; what they share is in `state.py` and `settings.py`.
+`kept_stages.py` lets a search that was killed go on.
 """
