@@ -13,6 +13,7 @@ from .maths.gate import Smooth as Smooth
 from .pipeline import FootIK as FootIK
 from .pipeline import Result as Result
 from .pipeline import State as State
+from .pipeline import check as check
 from .pipeline import init as init
 from .pipeline import resume as resume
 from .pipeline import run as run

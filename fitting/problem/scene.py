@@ -81,7 +81,8 @@ def own_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.FootIK:
 def run_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
     """What a system makes of the clip of a scene."""
     ik, tracks = own_system(ik, scene), scene.tracks or None
-    return jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks)
+    # Clips are checked when they are loaded.
+    return jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks, checked=True)
 
 
 def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:

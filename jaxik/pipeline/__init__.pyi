@@ -1,8 +1,11 @@
+from . import faults as faults
 from . import phases as phases
+from . import preconditions as preconditions
 from . import shapes as shapes
 from . import simulation as simulation
 from . import system as system
 from . import tracks as tracks
+from .preconditions import check as check
 from .simulation import resume as resume
 from .simulation import run as run
 from .simulation import step as step

@@ -5,6 +5,7 @@ has to run frame by frame. Contact and root are sensed and advanced before every
 """
 
 import dataclasses
+import functools
 from typing import Literal
 
 import jax
@@ -22,12 +23,18 @@ from jaxik.world.frame import Contact, Sensed, animated_ankles
 from jaxik.world.skeleton import Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
+from .faults import Faults, per_leg, remembered
 from .system import Advanced, Corrections, FootIK, Result, State, Trace, restarted
 from .tracks import Tracks, system_at
 
 
 def sense_first(
-    stage: Literal["contact", "root"], ik: FootIK, state: State, inputs: Inputs, tracks: Tracks
+    stage: Literal["contact", "root"],
+    ik: FootIK,
+    state: State,
+    inputs: Inputs,
+    faults: Faults | None,
+    tracks: Tracks,
 ) -> tuple[PyTree, PyTree]:
     """A stage that runs before everything else, for a whole clip.
 
@@ -38,34 +45,38 @@ def sense_first(
         ik: the system.
         state: memory before the clip.
         inputs: the leaves of `frame` have a leading axis of frames.
+        faults: of the frames; None takes all of them.
         tracks: parameters that change along the clip.
 
     Returns:
         The stage's memory after each frame, and what it returns for each.
     """
     frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
-    fresh = getattr(ik, stage).init(inputs.rig), jnp.zeros_like(state.started)
+    init = getattr(ik, stage).init
+    fresh, of_legs = init(inputs.rig), per_leg(init, inputs.rig)
 
     def rule_at(at: Tracks) -> AbstractContact | AbstractRoot:
         return getattr(system_at(ik, at), stage)
 
     sensed = jax.vmap(lambda frame, at: rule_at(at).sense(inputs.at(frame)))(frames, tracks)
-
-    def advanced(
-        memory: PyTree, started: Array, sensed: PyTree, dt: Array, at: Tracks
-    ) -> tuple[PyTree, PyTree]:
-        return rule_at(at).advance(Moment(dt, started, gate), sensed, memory)
-
-    now = (sensed, frames.dt, tracks)
     if not jax.tree.leaves(memory):
-        return memory, jax.vmap(lambda *now: advanced(memory, state.started, *now)[1])(*now)
 
-    def scanned(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        now, restart = now
-        after, output = advanced(*restarted(carry, fresh, restart), *now)
-        return (after, jnp.ones_like(state.started)), (after, output)
+        def advanced(sensed: PyTree, dt: Array, at: Tracks) -> PyTree:
+            return rule_at(at).advance(Moment(dt, state.started, gate), sensed, memory)[1]
 
-    return jax.lax.scan(scanned, (memory, state.started), (now, frames.restart))[1]
+        return memory, jax.vmap(advanced)(sensed, frames.dt, tracks)
+
+    def scanned(carry: tuple, frame: tuple) -> tuple[tuple, tuple]:
+        sensed, dt, faulty, at, restart = frame
+        memory, started = restarted(carry, (fresh, jnp.zeros_like(state.started)), restart)
+        now = Moment(dt, started, gate)
+        after, output = rule_at(at).advance(now, sensed, memory)
+        after = remembered(now, memory, after, of_legs, faulty)
+        begun = jnp.ones_like(started)
+        return (after, remembered(now, started, begun, False, faulty)), (after, output)
+
+    clip = (sensed, frames.dt, faults, tracks, frames.restart)
+    return jax.lax.scan(scanned, (memory, state.started), clip)[1]
 
 
 def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) -> Sensed:
@@ -177,11 +188,23 @@ def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, Py
     return Advanced(foothold_ws, hold, lean, effector, after)
 
 
-def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Result:
-    """The solved legs."""
-    rig, frame, effector = inputs.rig, inputs.frame, advanced.effector
+def pose(
+    ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced, faults: Faults | None
+) -> Result:
+    """The solved legs; faulty ones as animated, on a body that stays if all are."""
+    rig, frame = inputs.rig, inputs.frame
+    effector, lean = advanced.effector, advanced.lean
     offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
-    body = body_transform(inputs, advanced.lean.rot_ws, offset_ws)
+    rotations = (lean.rot_ws, lean.spine_ws, lean.head_ws)
+    faulty = jnp.zeros_like(rig.present)
+    if faults is not None:
+        faulty = faults.legs
+        effector = dataclasses.replace(effector, weight=jnp.where(faulty, 0.0, effector.weight))
+        offset_ws = jnp.where(faults.frame, 0.0, offset_ws)
+        level = functools.partial(jnp.where, faults.frame, quat.identity(offset_ws.dtype))
+        rotations = (None if rot is None else level(rot) for rot in rotations)
+    rot_ws, spine_ws, head_ws = rotations
+    body = body_transform(inputs, rot_ws, offset_ws)
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):
         moved = frame.pose.transformed(body.repeat(rig.side.size))
@@ -189,12 +212,11 @@ def pose(ik: FootIK, inputs: Inputs, sensed: Sensed, advanced: Advanced) -> Resu
     with jax.named_scope("foot"):
         foot = ik.foot.pose(inputs, sensed, effector, leg)
     spine, head = (
-        None if rot_ws is None else in_model_space(inputs, rot_ws)
-        for rot_ws in (advanced.lean.spine_ws, advanced.lean.head_ws)
+        None if rot is None else in_model_space(inputs, rot) for rot in (spine_ws, head_ws)
     )
     corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head)
     trace = Trace(sensed, advanced)
-    return Result(foot.pose, body, corrections, leg.reached, foot.reached, trace)
+    return Result(foot.pose, body, corrections, leg.reached, foot.reached, faulty, trace)
 
 
 def _shared_platform(hit: Hit, present: Array) -> Hit:

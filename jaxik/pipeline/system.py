@@ -131,6 +131,10 @@ class Result:
     """1 where the ankle is at its target, else 0."""
     aimed: Float[Array, "*b legs"]
     """1 where the foot has the rotation its rule wants, else 0."""
+    faulty: Bool[Array, "*b legs"]
+    """Where the animation has numbers that are not finite: the leg stays as animated, on the body,
+    which stays too where that goes for the whole frame. Joints that are not finite are at the
+    model's origin. Memory is as it was, so that the next frame goes on from there."""
     trace: Trace | None
     """None from a `step` without `trace=True`."""
 
@@ -143,6 +147,11 @@ def init(ik: FootIK, rig: Rig) -> State:
             the rig, or the rig is not that of one character.
     """
     check_system(ik, rig)
+    return fresh_memory(ik, rig)
+
+
+def fresh_memory(ik: FootIK, rig: Rig) -> State:
+    """What `init` returns, without its checks."""
     return State(
         jnp.zeros((), bool),
         ik.contact.init(rig),

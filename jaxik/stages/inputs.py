@@ -1,5 +1,7 @@
 """What the stages read: `Inputs` for a frame by itself, a `Moment` where memory advances."""
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -19,9 +21,17 @@ class Inputs:
     frame: Frame
     gate: AbstractGate
 
-    def at(self, frame: Frame) -> "Inputs":
-        """The inputs of one frame, with what moves of the terrain where it then is."""
-        return Inputs(self.rig, self.terrain.at(frame.platforms), frame, self.gate)
+    def at(self, frame: Frame, faulty: Bool[Array, " legs"] | None = None) -> "Inputs":
+        """The inputs of one frame, with what moves of the terrain where it then is.
+
+        Args:
+            frame: the animation, where numbers that are not finite have been replaced.
+            faulty: legs that had some, and so count as legs that are not there.
+        """
+        rig = self.rig
+        if faulty is not None:
+            rig = dataclasses.replace(rig, present=rig.present & ~faulty)
+        return Inputs(rig, self.terrain.at(frame.platforms), frame, self.gate)
 
 
 @struct

@@ -43,7 +43,7 @@ def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> n
 def _heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> jax.Array:
     rig, ik = walk().rig, dataclasses.replace(jaxik.presets.record(), root=rule)
     inputs = Inputs(rig, ground, clip, jaxik.HARD)
-    return sense_first("root", ik, jaxik.init(ik, rig), inputs, tracks={})[1]
+    return sense_first("root", ik, jaxik.init(ik, rig), inputs, faults=None, tracks={})[1]
 
 
 @functools.cache
