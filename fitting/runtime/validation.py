@@ -12,6 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 Content: TypeAlias = dict[str, Any]  # tables as TOML or JSON reads them, not yet checked
 Table: TypeAlias = Mapping[str, Any]  # the same, to read only
 
+BRIEF = 200  # characters
+
 
 class Constraint(NamedTuple):
     """What a value must be: in words for error messages, and as a test."""
@@ -109,10 +111,18 @@ def error_context(where: Path | str) -> Iterator[None]:
 
 
 def in_one_line(error: Exception) -> str:
-    """An error in one line, for a message."""
+    """An error in one line that any terminal can show, for a message."""
+    text = str(error)
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split("\n"))
+        text = f"{error.filename}: {error.strerror}"
+    line = " ".join(text.splitlines())
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in line)
+
+
+def in_brief(error: Exception) -> str:
+    """An error of another library in one line, for a sentence of ours: they may quote whole files."""
+    line = in_one_line(error)
+    return line if len(line) <= BRIEF else f"{line[: BRIEF - 3]}..."
 
 
 def check_keys(table: Table, known: Sequence[str], where: str) -> None:

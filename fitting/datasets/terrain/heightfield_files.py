@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from fitting.datasets import archives
+
 SUFFIX = ".npz"
 REQUIRED = ("heights", "spacing")
 OPTIONAL = ("origin", "interpolation")
@@ -36,11 +38,7 @@ def read_heightfield(path: Path) -> HeightfieldArrays:
     """
     if not path.is_file():
         raise ValueError(f"{path}: there is no such file")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = dict(archive)
-    except Exception as error:  # zipfile, zlib and NumPy each raise their own
-        raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({error})") from None
+    content = archives.read_arrays(path)
     if not set(REQUIRED) <= set(content) <= {*REQUIRED, *OPTIONAL}:
         raise ValueError(
             f"{path}: a heightfield is the arrays {' and '.join(REQUIRED)}, with or without "

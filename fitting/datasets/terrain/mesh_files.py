@@ -1,6 +1,8 @@
 """Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +12,7 @@ import trimesh
 from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
 
-from fitting.runtime.validation import error_context
+from fitting.runtime.validation import error_context, in_brief
 from jaxik.world import terrain
 
 from . import heightfield_files
@@ -75,7 +77,8 @@ def load_terrain(
                 interpolation=field.interpolation,
             )
     vertices, triangles = _read(path)
-    vertices_ws = _as_dtype(scale * vertices @ _WORLD_FROM_FILE[file_up].T, dtype)
+    with np.errstate(all="ignore"):  # what is not finite, or too far away, is refused below
+        vertices_ws = _as_dtype(scale * vertices @ _WORLD_FROM_FILE[file_up].T, dtype)
     with error_context(path):
         return terrain.mesh(vertices_ws, triangles, up=up, layer=layer, slack=slack)
 
@@ -155,15 +158,32 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
             f"({', '.join(formats)}); not {path.suffix!r}"
         )
     try:
-        # Unprocessed, as trimesh would otherwise merge and drop vertices.
-        scene = trimesh.load_scene(path, process=False)
-        mesh = scene.to_mesh()
+        with _silent_trimesh():
+            # Unprocessed, as trimesh would otherwise merge and drop vertices.
+            scene = trimesh.load_scene(path, process=False)
+            mesh = scene.to_mesh()
     except Exception as error:  # each format's reader fails in its own way
-        raise ValueError(f"{path}: trimesh cannot read it: {error}") from error
+        raise ValueError(f"{path}: trimesh cannot read it: {in_brief(error)}") from None
     if not len(mesh.faces):
         content = ", ".join(type(each).__name__ for each in scene.geometry.values()) or "nothing"
         raise ValueError(f"{path}: terrain needs triangles; the file holds {content}")
-    return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    vertices = np.array(mesh.vertices, np.float64)
+    if vertices.shape[1:] != (3,):
+        raise ValueError(f"{path}: its vertices have {vertices.shape[-1]} coordinates; wanted 3")
+    return vertices, np.array(mesh.faces, np.int64)
+
+
+@contextmanager
+def _silent_trimesh() -> Iterator[None]:
+    """Keeps trimesh from printing what it thinks of a file."""
+    log, nowhere = logging.getLogger("trimesh"), logging.NullHandler()
+    before, log.propagate = log.propagate, False
+    log.addHandler(nowhere)
+    try:
+        yield
+    finally:
+        log.removeHandler(nowhere)
+        log.propagate = before
 
 
 def height_function(

@@ -1,0 +1,38 @@
+"""Reads NumPy archives that somebody else may have made: plain arrays of a bounded size."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from fitting.runtime.validation import in_brief
+
+MAX_BYTES = 2**31  # of all arrays together, unpacked
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays in an archive. Nothing is unpickled.
+
+    Raises:
+        ValueError: no archive, something else than plain arrays in it, or arrays that take more
+            than `MAX_BYTES`, of which none is read then.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size <= MAX_BYTES:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return dict(arrays)
+    except Exception as error:  # zipfile, zlib and NumPy each raise their own
+        what = in_brief(error)
+        raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({what})") from None
+    raise ValueError(f"{path}: its arrays take {size} bytes; wanted {MAX_BYTES} at most")
+
+
+def array_names(path: Path) -> list[str]:
+    """The names of the arrays in an archive; none if it is no archive."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return list(arrays.files)
+    except Exception:  # reading the arrays will report what is wrong
+        return []
