@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fitting.runtime.validation import in_brief
+from fitting.runtime.validation import QUOTED, in_one_line
 
 MAX_BYTES = 2**31  # of all arrays together, unpacked
 
@@ -24,7 +24,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return dict(arrays)
     except Exception as error:  # zipfile, zlib and NumPy each raise their own
-        what = in_brief(error)
+        what = in_one_line(error, QUOTED)
         raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({what})") from None
     raise ValueError(f"{path}: its arrays take {size} bytes; wanted {MAX_BYTES} at most")
 

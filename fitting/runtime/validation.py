@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 Content: TypeAlias = dict[str, Any]  # tables as TOML or JSON reads them, not yet checked
 Table: TypeAlias = Mapping[str, Any]  # the same, to read only
 
-BRIEF = 200  # characters
+QUOTED = 200  # characters of the error of another library, in a sentence of ours
 
 
 class Constraint(NamedTuple):
@@ -110,19 +110,20 @@ def error_context(where: Path | str) -> Iterator[None]:
         raise ValueError(f"{where}: {error}") from None
 
 
-def in_one_line(error: Exception) -> str:
-    """An error in one line that any terminal can show, for a message."""
+def in_one_line(error: Exception, longest: int = 1000) -> str:
+    """An error in one line that any terminal can show, for a message.
+
+    Args:
+        error: ours, or that of another library, which may quote whole files.
+        longest: characters; a longer line loses its middle.
+    """
     text = str(error)
     if isinstance(error, OSError) and error.filename is not None:
         text = f"{error.filename}: {error.strerror}"
     line = " ".join(text.splitlines())
-    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in line)
-
-
-def in_brief(error: Exception) -> str:
-    """An error of another library in one line, for a sentence of ours: they may quote whole files."""
-    line = in_one_line(error)
-    return line if len(line) <= BRIEF else f"{line[: BRIEF - 3]}..."
+    line = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in line)
+    end = longest // 3
+    return line if len(line) <= longest else f"{line[: longest - end - 5]} ... {line[-end:]}"
 
 
 def check_keys(table: Table, known: Sequence[str], where: str) -> None:

@@ -124,8 +124,8 @@ def height_function(height: HeightOf, dtype) -> HeightOf:
 def _check_spacing(spacing: np.ndarray, shape: tuple[int, ...]) -> None:
     if not (spacing > 0).all():
         raise ValueError(f"spacing is in metres, above 0; got {spacing.tolist()}")
-    extent = np.array([shape[1] - 1, shape[0] - 1]) * spacing
-    if not ((spacing >= NARROWEST).all() and (extent <= FURTHEST).all()):
+    widest = FURTHEST / np.array([shape[1] - 1, shape[0] - 1])
+    if not ((spacing >= NARROWEST) & (spacing <= widest)).all():
         rows, columns = shape
         raise ValueError(
             f"spacing is {spacing.tolist()} m for {rows} rows and {columns} columns; wanted "

@@ -14,10 +14,9 @@ from collections import Counter
 from pathlib import Path
 
 from .formats import FORMATS, Format
-from .trial import run_trials
+from .trial import OUTCOMES, run_trials
 
 KEPT = Path("build") / "fuzz"
-OUTCOMES = ("loaded", "refused")
 
 
 def run_format(name: str, form: Format, seed: int, count: int) -> Counter[str]:

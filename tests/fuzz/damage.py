@@ -4,10 +4,14 @@ Every function draws from a generator with a seed, so that each damaged file can
 """
 
 import io
+import json
 import re
+import tomllib
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
+import tomli_w
 
 Random = np.random.Generator
 Arrays = Mapping[str, np.ndarray]
@@ -20,6 +24,11 @@ NUMBER = re.compile(rb"-?[0-9.]+(e-?[0-9]+)?")
 WORDS = (
     "", "true", "\0", "é", "\ufeff", "\u2028", "x" * 300, "../../x", "/dev/null", "[]", "{}", "''",
     "[[1, 2], [3]]", "2020-01-01", "{", "}", "end", "#",
+)  # fmt: skip
+ODD_VALUES = (
+    0, -1, 1, 3, 10**10, 10**400, 2**63 - 1, 0.0, 0.3, -0.5, 1e-300, 1e300, float("nan"),
+    float("inf"), -float("inf"), True, False, "", "x", "\0", "lean.gain", [], {}, [[]], [1.0, 2.0],
+    [1, "x"], [[0.5, 0.4]], {"x": 1}, {"low": 0.1}, [{}], "x" * 10_000,
 )  # fmt: skip
 BLOCKS = (b"\0", b"\xff", b"\0" * 16, b"\xff" * 8, b"\xff\xfe", b"\r\n", b"\n\n", b"\x1b[2J")
 VALUES = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-320, 1e20, 1e308, 2**62)
@@ -107,6 +116,58 @@ TEXT_DAMAGES = (damage_bytes, damage_lines, damage_words, damage_words)
 def damage_text(random: Random, content: bytes) -> bytes:
     """The content with one kind of damage, most often to its words."""
     return choose(random, TEXT_DAMAGES)(random, content)
+
+
+def damage_value(random: Random, content: Any) -> Any:
+    """A tree of tables and lists with one entry changed, removed, put in or given another key."""
+    if not isinstance(content, dict | list) or not content or random.random() < 0.1:
+        return choose(random, ODD_VALUES)
+    changed = content.copy()
+    keys = list(content) if isinstance(content, dict) else range(len(content))
+    key, other = choose(random, keys), choose(random, keys)
+    match random.integers(8):
+        case 0:
+            del changed[key]
+        case 1:
+            changed[key] = content[other]
+        case 2 if isinstance(changed, dict):
+            changed[str(choose(random, WORDS))] = changed.pop(key)
+        case 3 if isinstance(changed, dict):
+            changed[str(choose(random, WORDS))] = choose(random, ODD_VALUES)
+        case _:
+            changed[key] = damage_value(random, content[key])
+    return changed
+
+
+def damage_toml(random: Random, content: bytes) -> bytes:
+    """A TOML file with other values or keys, or with damaged text."""
+    if random.random() < 0.4:
+        return damage_text(random, content)
+    changed = damage_value(random, tomllib.loads(content.decode()))
+    return tomli_w.dumps(changed if isinstance(changed, dict) else {"x": changed}).encode()
+
+
+def damage_json(random: Random, content: bytes) -> bytes:
+    """A JSON file with other values or keys, or with damaged text."""
+    if random.random() < 0.4:
+        return damage_text(random, content)
+    return json.dumps(damage_value(random, json.loads(content))).encode()
+
+
+def damage_glb(random: Random, content: bytes) -> bytes:
+    """A binary glTF with damage to its JSON or its numbers, and often with lengths that fit."""
+    if random.random() < 0.3:
+        return damage_bytes(random, content)
+    length = int.from_bytes(content[12:16], "little")
+    head, numbers = content[20 : 20 + length], content[28 + length :]
+    if random.random() < 0.6:
+        head = damage_json(random, head)
+        head += b" " * (-len(head) % 4)
+    else:
+        numbers = damage_bytes(random, numbers)
+    chunks = len(head).to_bytes(4, "little") + b"JSON" + head
+    chunks += len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers
+    return content[:8] + (12 + len(chunks)).to_bytes(4, "little") + chunks
 
 
 def change_value(random: Random, array: np.ndarray) -> np.ndarray:

@@ -25,7 +25,16 @@ from support.records import packed
 from support.sample_clips import AMC, ASF, BVH, stair_walk
 
 from . import soundness
-from .damage import Random, archive_of, damage_arrays, damage_bytes, damage_text
+from .damage import (
+    Random,
+    archive_of,
+    damage_arrays,
+    damage_bytes,
+    damage_glb,
+    damage_json,
+    damage_text,
+    damage_toml,
+)
 
 DATA = experiments.ROOT / "data"
 TRACKS = """
@@ -159,11 +168,13 @@ def mesh_bytes(kind: str) -> bytes:
 
 def load_record(path: Path) -> None:
     """Reads and shows a record, as `jaxik record show`, with its remarks on doubtful units."""
-    with error_context(path), warnings.catch_warnings():
+    reading = record.Reading()
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        for entry in record_files.read(path, record.Reading(), None):
-            record_files.describe(entry, record.Reading())
-            soundness.check_system(record.to_ik(entry, record.Reading()))
+        for entry in record_files.read(path, reading, None):
+            with error_context(path):
+                record_files.describe(entry, reading)
+                soundness.check_system(record.to_ik(entry, reading))
 
 
 @cache
@@ -216,16 +227,18 @@ FORMATS: dict[str, Format] = {
     "mesh, STL text": mesh_format("stl_ascii", damage_text),
     "mesh, STL": mesh_format("stl", damage_bytes),
     "mesh, OFF": mesh_format("off", damage_text),
-    "mesh, GLB": mesh_format("glb", damage_bytes),
+    "mesh, GLB": mesh_format("glb", damage_glb),
     "experiment": Format(
         "walk.toml",
         lambda: experiments.text(rest=TABLES).encode(),
         lambda path: soundness.check_experiment(load_experiment(path)),
+        damage_toml,
     ),
     "parameters": Format(
         "footik.toml",
         lambda: parameter_files.system_to_toml(presets.record()).encode(),
         lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
+        damage_toml,
     ),
     "truth": Format(
         "truth.toml",
@@ -233,12 +246,19 @@ FORMATS: dict[str, Format] = {
         lambda path: load_known_values(
             load_experiment(experiments.write(path.parent, clip=f'truth = "{path}"\n'))
         ),
+        damage_toml,
     ),
     "free parameters": Format(
-        "free.toml", FREE.encode, lambda path: translation.read_free(str(path), presets.record())
+        "free.toml",
+        FREE.encode,
+        lambda path: translation.read_free(str(path), presets.record()),
+        damage_toml,
     ),
     "tracks": Format(
-        "tracks.toml", TRACKS.encode, lambda path: track_files.along(flat_clip(), path)
+        "tracks.toml",
+        TRACKS.encode,
+        lambda path: track_files.along(flat_clip(), path),
+        damage_toml,
     ),
     "record": Format("footik.bin", lambda: record.to_bytes(packed()), load_record, damage_bytes),
     "record, CSV": Format("footik.csv", lambda: record.to_csv([packed()]).encode(), load_record),
@@ -246,6 +266,7 @@ FORMATS: dict[str, Format] = {
         "run/fit.json",
         lambda: json.dumps(RUN, indent=2).encode(),
         lambda path: run_folder.load_fit(path.parent),
+        damage_json,
         beside={
             "run/experiment.toml": lambda: experiments.text().encode(),
             "run/parameters.toml": lambda: b"",

@@ -17,7 +17,7 @@ from .formats import Format
 
 SECONDS = 10.0  # of CPU, for a file of some kilobytes
 BYTES = 2**32  # of address space more than before; JAX takes one for itself
-LONGEST_MESSAGE = 2000  # characters
+OUTCOMES = ("loaded", "refused")  # as it should be
 
 
 class TooSlowError(BaseException):
@@ -50,7 +50,7 @@ def bounds() -> Iterator[None]:
 
 
 def try_to_load(load: Callable[[Path], object], path: Path, names: tuple[str, ...]) -> str:
-    """What became of the file: "loaded", "refused", or a sentence that says what is wrong.
+    """What became of the file: one of `OUTCOMES`, or a sentence that says what is wrong.
 
     Args:
         load: the loader, which also checks what it has loaded.
@@ -68,8 +68,6 @@ def try_to_load(load: Callable[[Path], object], path: Path, names: tuple[str, ..
         message = in_one_line(error)
         if not any(name in message for name in names):
             return f"a message without the name of the file: {message}"
-        if len(message) > LONGEST_MESSAGE:
-            return f"a message of {len(message)} characters: {message[:200]!r}"
         return f"printed: {printed[0].getMessage()[:200]!r}" if printed else "refused"
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):

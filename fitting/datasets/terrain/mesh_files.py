@@ -12,7 +12,7 @@ import trimesh
 from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
 
-from fitting.runtime.validation import error_context, in_brief
+from fitting.runtime.validation import QUOTED, error_context, in_one_line
 from jaxik.world import terrain
 
 from . import heightfield_files
@@ -162,8 +162,10 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
             scene = trimesh.load_scene(path, process=False)
             mesh = scene.to_mesh()
+    except ImportError:  # of a package that guesses encodings; others are no requirement
+        raise ValueError(f"{path}: trimesh cannot read it: its text is not UTF-8") from None
     except Exception as error:  # each format's reader fails in its own way
-        raise ValueError(f"{path}: trimesh cannot read it: {in_brief(error)}") from None
+        raise ValueError(f"{path}: trimesh cannot read it: {in_one_line(error, QUOTED)}") from None
     if not len(mesh.faces):
         content = ", ".join(type(each).__name__ for each in scene.geometry.values()) or "nothing"
         raise ValueError(f"{path}: terrain needs triangles; the file holds {content}")

@@ -15,7 +15,7 @@ from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import TRACKS, Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
-from fitting.datasets.clips.recording import FASTEST, FURTHEST, LONGEST, SLOWEST
+from fitting.datasets.clips.recording import FASTEST, FURTHEST, LONGEST, SHORTEST, SLOWEST
 from fitting.datasets.clips.rigs import relative_size, with_soles
 from fitting.runtime import files
 from jaxik.world.skeleton import Rig
@@ -196,8 +196,11 @@ def _check_tree(path: Path, content: Arrays, joints: int) -> None:
     if (named >= joints).any():
         raise ValueError(f"{path}: rig_joints and rig_pelvis name {named.max()} of {joints} joints")
     for name in ("rig_thigh", "rig_shin"):
-        if (content[name][content["rig_present"]] <= 0).any():
-            raise ValueError(f"{path}: {name} has a bone of no length")
+        shortest = content[name][content["rig_present"]].min(initial=LONGEST)
+        if shortest < SHORTEST:
+            raise ValueError(
+                f"{path}: {name} has a bone of {shortest:g} m; wanted {SHORTEST:g} to {LONGEST:g}"
+            )
 
 
 def _read_rig(content: Arrays) -> Rig:
@@ -206,6 +209,9 @@ def _read_rig(content: Arrays) -> Rig:
     known = all(f"rig_{name}" in content for name in SOLE_ARRAYS)
     unknown = np.zeros(len(joints))
     arrays |= {name: content[f"rig_{name}"] if known else unknown for name in SOLE_ARRAYS}
+    numbers = {name: array for name, array in arrays.items() if array.dtype != bool}
+    dtype = np.result_type(np.float32, *numbers.values())  # one for all, as JAX mixes none
+    arrays |= {name: array.astype(dtype) for name, array in numbers.items()}
     with jax.enable_x64(True):
         rig = Rig(
             **jax.device_put(arrays),
