@@ -27,6 +27,7 @@ parameters = { lock.enabled = false }
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -58,14 +59,15 @@ CLIP_KEYS: dict[str, Constraint] = {
     "mask_pops": validation.BOOLEAN,
     "root": validation.one_of(ROOTS),
 }
-SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
+KINDS = tuple(kind for kind in DEFAULT_SIGMAS if kind != "correlation")
+SIGMA_KEYS = dict.fromkeys(KINDS, validation.number(1e-9, 1e9, or_inf=True))
 CORRELATIONS = tuple(f"correlation.{kind}" for kind in WHITENED)  # instead of one for all
-SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.FRACTION)
+SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.CORRELATION)
 
 
 def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
     return {
-        name: Constraint(declared.range, lambda value, one=declared: one.allows(_value(value, one)))
+        name: Constraint(declared.range, lambda value, declared=declared: declared.allows(value))
         for name, declared in describe(settings).items()
     }
 
@@ -82,7 +84,8 @@ def _value(value: Any, declared: Setting) -> Any:
 
 
 FIT_KEYS: dict[str, Constraint] = {
-    **dict.fromkeys(("starts", "max_steps"), validation.COUNT),
+    "starts": validation.count(1, 1000),
+    "max_steps": _constraints(SearchSettings)["max_steps"],
     "search": validation.TABLE,
 }
 SEARCH_KEYS = {
@@ -90,11 +93,7 @@ SEARCH_KEYS = {
     for name, constraint in _constraints(SearchSettings).items()
     if name != "max_steps"  # which is a key of [fit]
 }
-SAMPLE_KEYS: dict[str, Constraint] = {
-    **_constraints(SamplerSettings),
-    **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
-    "stop_at": validation.POSITIVE,
-}
+SAMPLE_KEYS = _constraints(SamplerSettings)
 NOISE_KEYS = {
     "sigmas": validation.one_of(get_args(Sigmas)),
     "correlation": validation.one_of(get_args(Correlation)),
@@ -106,7 +105,7 @@ TOP_KEYS: dict[str, Constraint] = {
     "faithful": validation.BOOLEAN,
     "body": BODY,
     "loss": validation.one_of(get_args(Loss)),
-    "fps": validation.FINITE_POSITIVE,
+    "fps": validation.RATE,
     "seed": validation.SEED,
     "independent_every": validation.SECONDS,
     **dict.fromkeys(TABLES, validation.TABLE),
@@ -140,6 +139,8 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
     sigmas = flatten(content.get("sigmas", {}), 2)
     check_table(sigmas, SIGMA_KEYS, f"{path} [sigmas]")
+    if all((DEFAULT_SIGMAS | sigmas)[kind] == math.inf for kind in KINDS):
+        raise ValueError(f"{path} [sigmas]: all of {list(KINDS)} are inf; wanted one that is not")
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
     known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
@@ -191,9 +192,13 @@ def _clip_entry(value: object, path: Path) -> ClipEntry:
     for key in FILE_KEYS:
         if key in table:
             entry[key] = (path.parent / table[key]).resolve()
-            if not entry[key].is_file():
-                why = validation.why_missing(entry[key])
-                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {why}")
+            if reason := validation.why_unreadable(entry[key]):
+                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {reason}")
+    if "end" in table and table["end"] <= table.get("start", 0.0):
+        raise ValueError(
+            f"{path} [[clips]]: end is {table['end']}; wanted more than start, which is "
+            f"{table.get('start', 0.0)}"
+        )
     return ClipEntry(**entry)
 
 

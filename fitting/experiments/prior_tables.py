@@ -14,13 +14,13 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from typing import get_args
 
-from fitting.problem.prior import ParameterPrior, Priors, Shape
+from fitting.problem.prior import SPREADS, ParameterPrior, Priors, Shape
 from fitting.runtime import validation
 from fitting.runtime.validation import Content, Table, check_keys, check_table, flatten, nest
 
 DEFAULT_KEYS: dict[str, validation.Constraint] = {
     "shape": validation.one_of(get_args(Shape)),
-    "spread": validation.FINITE_POSITIVE,
+    "spread": validation.number(*SPREADS),
 }
 KEYS = {**DEFAULT_KEYS, "centre": validation.NUMBER}
 

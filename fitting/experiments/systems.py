@@ -50,8 +50,6 @@ def register_rule(rule: type[Rule]) -> type[Rule]:
     raise ValueError(f"{rule.__name__} is no rule of a stage; the stages are {list(STAGES)}")
 
 
-
-
 def _are_numbers(values: np.ndarray) -> bool:
     """Whether 32 bits hold each; inf stands for no limit."""
     if values.dtype.kind not in "iuf" or np.isnan(values).any():

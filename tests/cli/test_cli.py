@@ -118,19 +118,14 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
         (["fti"], "invalid choice: 'fti'"),
         (["fit"], "required: EXPERIMENT.toml, -o/--output"),
         (["run", BASE, "-o", "a.npz"], "required: --terrain"),
-        (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--floor", "nan"], "finite number"),
         (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--root", "x"], "invalid choice: 'x'"),
-        (
-            ["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--speed", "0"],
-            "'0'; wanted a number a",
-        ),
-        (["record", "show", "a", "--tick-hz", "x"], "'x'; wanted a finite number"),
     ],
 )
 def test_wrong_words_are_rejected(words, message, capsys):
     with pytest.raises(SystemExit, match="2"):
         main.main(words)
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and error.startswith("jaxik")
 
 
 # Fit and sample
@@ -465,8 +460,8 @@ MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
         ("bad.bvh", GROUND, "a.npz", [], "bad.bvh:1: wanted HIERARCHY"),
         ("bad.npz", GROUND, "a.npz", [], "bad.npz: wanted a NumPy archive"),
         ("legless.bvh", GROUND, "a.npz", [], "legless.bvh: no pair of legs recognised"),
-        (BASE, "no.ply", "a.npz", [], "no.ply: there is no such file"),
-        (BASE, str(DATA), "a.npz", [], "data: there is no such file"),
+        (BASE, "no.ply", "a.npz", [], "no.ply: no such file"),
+        (BASE, str(DATA), "a.npz", [], "data: a folder"),
         (BASE, "m.ply", "a.npz", [], "m.ply: trimesh cannot read it"),
         (BASE, "p.obj", "a.npz", [], "p.obj: terrain needs triangles"),
         (BASE, "t.toml", "a.npz", [], "trimesh reads"),
@@ -508,7 +503,6 @@ def test_inspect_describes_a_clip_in_words_and_as_json(capsys):
     [
         (["no.bvh"], "no.bvh: no such file"),
         ([str(DATA)], WANTED_CLIP),
-        (["step.bvh", "--scale", "nan"], "scale is nan; wanted a number above 0"),
         (["step.amc", "--asf", "no.asf"], "no.asf: No such file"),
     ],
 )

@@ -27,7 +27,9 @@ def check_clip(clip: Clip) -> None:
         named = [*np.ravel(clip.rig.joints), clip.rig.pelvis]
         assert min(named) >= 0 and max(named) < joints
         present = np.asarray(clip.rig.present)
-        assert all((np.asarray(bone)[present] > 0).all() for bone in (clip.rig.thigh, clip.rig.shin))
+        assert all(
+            (np.asarray(bone)[present] > 0).all() for bone in (clip.rig.thigh, clip.rig.shin)
+        )
         assert len(clip.stance_labels()) == len(clip.world_from_model().pos) == clip.frame_count
         assert all(0 < cut < clip.frame_count for cut in clip.cuts)
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from fitting.datasets import archives
+from fitting.runtime.validation import check_file
 
 SUFFIX = ".npz"
 REQUIRED = ("heights", "spacing")
@@ -36,8 +37,7 @@ def read_heightfield(path: Path) -> HeightfieldArrays:
     Raises:
         ValueError: no such file, no archive, other arrays in it, or arrays that are no numbers.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
+    check_file(path)
     content = archives.read_arrays(path)
     if not set(REQUIRED) <= set(content) <= {*REQUIRED, *OPTIONAL}:
         raise ValueError(

@@ -12,7 +12,7 @@ import trimesh
 from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
 
-from fitting.runtime.validation import QUOTED, error_context, in_one_line
+from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
 
 from . import heightfield_files
@@ -149,8 +149,7 @@ def embree_tracer(
 
 def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
     """Vertices and triangles of all geometries of a file, in its own unit and axes."""
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
+    check_file(path)
     formats = sorted(trimesh.available_formats())
     if not path.name.lower().endswith(tuple(f".{name}" for name in formats)):
         raise ValueError(
