@@ -154,7 +154,7 @@ def in_one_line(error: Exception, longest: int = 1000) -> str:
         error: ours, or that of another library, which may quote whole files.
         longest: characters; a longer line loses its middle.
     """
-    text = str(error)
+    text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None:
         text = f"{error.filename}: {error.strerror}"
     line = " ".join(text.splitlines())

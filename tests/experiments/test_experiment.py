@@ -276,13 +276,6 @@ def test_a_flat_animation_with_other_frames_is_rejected(tmp_path, change, messag
         problems.make_problem(loaded)
 
 
-def test_a_limit_of_no_sampler_steps_is_rejected(tmp_path):
-    loaded = experiment_files.load_experiment(write(tmp_path))
-    assert loaded.with_max_sample_steps(7).sample.max_steps == 7
-    with pytest.raises(ValueError, match="max-steps is 0; wanted 1 or more"):
-        loaded.with_max_sample_steps(0)
-
-
 def test_the_blocks_experiment_makes_a_problem(mocap):
     path = ROOT / "data" / "experiments" / "blocks.toml"
     problem = problems.make_problem(experiment_files.load_experiment(path))

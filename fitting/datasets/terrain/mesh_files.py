@@ -1,5 +1,6 @@
 """Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes."""
 
+import io
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,9 +16,10 @@ from jaxtyping import ArrayLike, Float, Int
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
 
-from . import heightfield_files
+from . import gltf_checks, heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
+WITH_MATERIALS = ("obj", *gltf_checks.KINDS)  # whose images need not be read
 # A file with z up is rotated about x, as glTF exporters do: (x, y, z) becomes (x, z, -y).
 _WORLD_FROM_FILE = {
     "y": np.eye(3),
@@ -150,19 +152,28 @@ def embree_tracer(
 def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
     """Vertices and triangles of all geometries of a file, in its own unit and axes."""
     check_file(path)
-    formats = sorted(trimesh.available_formats())
-    if not path.name.lower().endswith(tuple(f".{name}" for name in formats)):
+    formats = sorted(trimesh.exchange.load.mesh_formats())  # no archives: they may hold anything
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in formats:
         raise ValueError(
             f"{path}: wanted a heightfield (.npz) or a mesh that trimesh reads "
             f"({', '.join(formats)}); not {path.suffix!r}"
         )
+    options = {"skip_materials": True} if kind in WITH_MATERIALS else {}
+    content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
+        gltf_checks.check_claims(kind, content)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
-            scene = trimesh.load_scene(path, process=False)
+            resolver = trimesh.resolvers.FilePathResolver(str(path))
+            scene = trimesh.load_scene(
+                io.BytesIO(content), file_type=kind, resolver=resolver, process=False, **options
+            )
             mesh = scene.to_mesh()
-    except ImportError:  # of a package that guesses encodings; others are no requirement
-        raise ValueError(f"{path}: trimesh cannot read it: its text is not UTF-8") from None
+    except ImportError:  # of a package that guesses encodings, which is no requirement
+        raise ValueError(
+            f"{path}: trimesh cannot read it: neither a whole binary file nor text in UTF-8"
+        ) from None
     except Exception as error:  # each format's reader fails in its own way
         raise ValueError(f"{path}: trimesh cannot read it: {in_one_line(error, QUOTED)}") from None
     if not len(mesh.faces):

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.recording import INCH, Recording
+from fitting.runtime.validation import check_file
 
 AMC_RATE = 120.0  # Hz, by convention of the CMU database
 ROTATIONS = ("rx", "ry", "rz")
@@ -42,6 +43,7 @@ class _Lines:
     """The words of each line with its number, without comments (`#`) and empty lines."""
 
     def __init__(self, path: Path) -> None:
+        check_file(path)
         self.path = path
         text = path.read_text(encoding="utf-8-sig", errors="replace")
         numbered = (
