@@ -40,6 +40,7 @@ BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
 WANTED_CLIP = f"wanted a {', '.join(formats.READERS)} or .npz file"
 SHOWN = "always::fitting.report.placement_report.PlacementWarning"
+ELSEWHERE = r"../../elsewhere $\frac{$"  # no path, and no formula that Matplotlib could draw
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
 
@@ -59,7 +60,8 @@ def quick_residuals(monkeypatch):
 def experiment_file(tmp_path_factory) -> Path:
     return write(
         tmp_path_factory.mktemp("files"), "hill.toml",
-        clips=CLIP, clip="start = 1.0\nend = 1.5", rest=SAMPLE,
+        top=f"name = '{ELSEWHERE}'", clips=CLIP, rest=SAMPLE,
+        clip=f"start = 1.0\nend = 1.5\nlabel = '{ELSEWHERE}'\nsubject = '{ELSEWHERE}'",
     )  # fmt: skip
 
 
@@ -129,6 +131,13 @@ def test_wrong_words_are_rejected(words, message, capsys):
 
 
 # Fit and sample
+
+
+@pytest.mark.slow
+def test_the_names_in_an_experiment_are_no_paths(run, experiment_file):
+    assert {path.name for path in run.parent.iterdir()} == {"hill"}
+    assert {path.name for path in experiment_file.parent.iterdir()} == {"hill.toml"}
+    assert f"# {ELSEWHERE}" in (run / run_folder.SUMMARY).read_text()
 
 
 @pytest.mark.slow
