@@ -22,7 +22,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-            for entry in archive.infolist():
+            for entry in archive.infolist() if size <= MAX_BYTES else ():
                 _check_claim(archive, entry)
         if size <= MAX_BYTES:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:

@@ -145,7 +145,7 @@ def test_a_fit_writes_numbers_tables_and_plots(run):
     names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
     assert names <= tree(run) and {"motion.png", "cost.png"} <= tree(run)
     numbers = json.loads((run / run_folder.FIT).read_text())
-    assert numbers["converged"] and numbers["experiment"] == "hill"
+    assert numbers["converged"] and numbers["experiment"] == ELSEWHERE
     for row in numbers["parameters"]:
         assert row["value"] == pytest.approx(quick.TARGETS[row["name"]], abs=0.003)
 

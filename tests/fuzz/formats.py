@@ -1,6 +1,7 @@
 """All formats of files that users hand over: a small whole file of each, its loader, its damage."""
 
 import json
+import tempfile
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -114,10 +115,10 @@ class Format:
 @cache
 def clip_archive() -> bytes:
     """A clip in our own format, with all tracks."""
-    path = experiments.ROOT / "build" / "fuzz_clip.npz"
-    path.parent.mkdir(exist_ok=True)
-    save_clip(path, mask_pops(stair_walk()).select(slice(0, 20)))
-    return path.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.npz"
+        save_clip(path, mask_pops(stair_walk()).select(slice(0, 20)))
+        return path.read_bytes()
 
 
 def blocks_archive() -> bytes:
@@ -257,7 +258,7 @@ FORMATS: dict[str, Format] = {
     "tracks": Format(
         "tracks.toml",
         TRACKS.encode,
-        lambda path: track_files.along(flat_clip(), path),
+        lambda path: soundness.check_tracks(*track_files.along(flat_clip(), path)),
         damage_toml,
     ),
     "record": Format("footik.bin", lambda: record.to_bytes(packed()), load_record, damage_bytes),

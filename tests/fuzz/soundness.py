@@ -1,5 +1,7 @@
 """What everything that was loaded must be, whatever was in its file."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 import jaxik
@@ -32,6 +34,14 @@ def check_clip(clip: Clip) -> None:
         )
         assert len(clip.stance_labels()) == len(clip.world_from_model().pos) == clip.frame_count
         assert all(0 < cut < clip.frame_count for cut in clip.cuts)
+
+
+def check_tracks(clip: Clip, values: Mapping[str, np.ndarray]) -> None:
+    """Weights from 0 to 1, and numbers for each frame."""
+    for weight in (clip.grounded, clip.weight):
+        assert weight is None or ((weight >= 0) & (weight <= 1)).all()
+    for track in values.values():
+        assert len(track) == clip.frame_count and not np.isnan(track).any()
 
 
 def check_terrain(ground: Terrain) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.gltf import export_gltf
 
 from fitting.datasets.terrain.mesh_files import load_terrain
 from fuzz.damage import archive_of
@@ -180,7 +181,7 @@ def test_an_archive_is_no_mesh(suffix, tmp_path):
 
 def test_a_gltf_reads_its_own_buffers_and_no_file_outside_its_folder(tmp_path):
     mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 2, 1]], process=False)
-    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh))
+    files = export_gltf(trimesh.Scene(mesh))
     inside = tmp_path / "inside"
     inside.mkdir()
     for name, content in files.items():

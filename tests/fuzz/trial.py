@@ -24,6 +24,21 @@ class TooSlowError(BaseException):
     """The time of a trial is up; no loader may catch it."""
 
 
+class _Listener(logging.Handler):
+    """Keeps what libraries would print."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append(record.getMessage())
+
+    def outcome(self, otherwise: str) -> str:
+        """What was printed, or else another outcome."""
+        return f"printed: {self.messages[0][:200]!r}" if self.messages else otherwise
+
+
 @contextmanager
 def bounds() -> Iterator[None]:
     """Ends what takes too much time or memory, where the system can: MemoryError, TooSlowError."""
@@ -57,9 +72,7 @@ def try_to_load(load: Callable[[Path], object], path: Path, names: tuple[str, ..
         path: the file.
         names: of this file and of those that belong to it; a message has to contain one of them.
     """
-    printed: list[logging.LogRecord] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = printed.append
+    handler = _Listener(logging.WARNING)
     logging.getLogger().addHandler(handler)
     try:
         with bounds():
@@ -68,14 +81,14 @@ def try_to_load(load: Callable[[Path], object], path: Path, names: tuple[str, ..
         message = in_one_line(error)
         if not any(name in message for name in names):
             return f"a message without the name of the file: {message}"
-        return f"printed: {printed[0].getMessage()[:200]!r}" if printed else "refused"
+        return handler.outcome("refused")
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
         return f"{type(error).__name__}: {in_one_line(Exception(str(error)))[:300]}"
     finally:
         logging.getLogger().removeHandler(handler)
-    return f"printed: {printed[0].getMessage()[:200]!r}" if printed else "loaded"
+    return handler.outcome("loaded")
 
 
 def run_trials(form: Format, folder: Path, seed: int, count: int) -> Iterator[tuple[int, str]]:

@@ -5,13 +5,15 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
+from trimesh.exchange.load import mesh_formats
+from trimesh.resolvers import FilePathResolver
 
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
@@ -152,20 +154,20 @@ def embree_tracer(
 def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
     """Vertices and triangles of all geometries of a file, in its own unit and axes."""
     check_file(path)
-    formats = sorted(trimesh.exchange.load.mesh_formats())  # no archives: they may hold anything
+    formats = sorted(mesh_formats())  # no archives: they may hold anything
     kind = path.suffix.lower().removeprefix(".")
     if kind not in formats:
         raise ValueError(
             f"{path}: wanted a heightfield (.npz) or a mesh that trimesh reads "
             f"({', '.join(formats)}); not {path.suffix!r}"
         )
-    options = {"skip_materials": True} if kind in WITH_MATERIALS else {}
+    options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
     content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
         gltf_checks.check_claims(kind, content)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
-            resolver = trimesh.resolvers.FilePathResolver(str(path))
+            resolver = FilePathResolver(str(path))
             scene = trimesh.load_scene(
                 io.BytesIO(content), file_type=kind, resolver=resolver, process=False, **options
             )
