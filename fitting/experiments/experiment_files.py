@@ -42,7 +42,15 @@ from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
 from fitting.problem.scene import WHITENED
 from fitting.runtime import validation
-from fitting.runtime.validation import Constraint, Content, Table, check_table, flatten, nest
+from fitting.runtime.validation import (
+    Constraint,
+    Content,
+    Table,
+    check_table,
+    flatten,
+    nest,
+    with_floats,
+)
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
@@ -153,13 +161,14 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
         "start": read_start(content.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(content.get("parameters", {}), 2),
-        "sigmas": sigmas,
+        "sigmas": with_floats(sigmas, sigmas),
         "noise": _noise_options(content.get("noise", {}), f"{path} [noise]"),
         "without": without,
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
-    return Experiment(**{"path": path, "name": path.stem, **content, **tables})
+    top = with_floats(content, ("fps", "independent_every"))
+    return Experiment(**{"path": path, "name": path.stem, **top, **tables})
 
 
 def _noise_options(value: object, where: str) -> NoiseOptions:
@@ -185,7 +194,7 @@ def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSett
 
 def _clip_entry(value: object, path: Path) -> ClipEntry:
     table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
-    entry: Content = dict(table)
+    entry = with_floats(table, ("start", "end"))
     for key in ("reference", "terrain"):
         if key not in table:
             raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")

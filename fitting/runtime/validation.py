@@ -6,7 +6,7 @@ import math
 import os
 import stat
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -195,6 +195,14 @@ def check_table(value: object, constraints: Mapping[str, Constraint], where: str
         if not constraints[key].accepts(entry):
             raise ValueError(f"{where}: {key} is {entry!r}; wanted {constraints[key].description}")
     return value
+
+
+def with_floats(table: Table, keys: Iterable[str]) -> Content:
+    """The table with whole numbers under these keys as floats, as code expects them."""
+    return {
+        key: float(value) if key in keys and type(value) is int else value
+        for key, value in table.items()
+    }
 
 
 def flatten(tables: Table, depth: int, prefix: str = "") -> Content:
