@@ -65,17 +65,17 @@ def test_a_number_is_accepted_up_to_the_ends_of_its_range(command, option, capsy
 
 def parsers(parser: argparse.ArgumentParser, command: str = "") -> dict[str, list[str]]:
     """The options of each command that take a converted value, paths and texts aside."""
-    found: dict[str, list[str]] = {}
+    options: dict[str, list[str]] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, child in action.choices.items():
-                found |= parsers(child, f"{command} {name}".strip())
+                options |= parsers(child, f"{command} {name}".strip())
         elif action.option_strings and action.choices is None and callable(action.type):
             if getattr(action.type, "__module__", "").endswith("parsers.options"):
-                found.setdefault(command, []).append(action.option_strings[-1])
+                options.setdefault(command, []).append(action.option_strings[-1])
             else:
                 assert getattr(action.type, "__name__", "") not in ("int", "float"), action
-    return found
+    return options
 
 
 def test_every_number_among_the_options_has_a_range_here():

@@ -71,7 +71,7 @@ def claims() -> dict[str, tuple[str, bytes]]:
     stl, glb = mesh_bytes("stl"), mesh_bytes("glb")
     off = b"OFF\n%d %d 0\n0 0 0\n1 0 0\n0 0 1\n3 0 1 2\n"
     obj = b"v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 %d\n"
-    found: dict[str, tuple[str, bytes]] = {
+    files: dict[str, tuple[str, bytes]] = {
         "GLB, length": ("mesh, GLB", glb[:8] + b"\xff" * 4 + glb[12:]),
         "GLB, chunk": ("mesh, GLB", glb[:12] + b"\xff\xff\xff\x7f" + glb[16:]),
         "GLB, no bytes": ("mesh, GLB", glb_with(counts_without_bytes)),
@@ -85,7 +85,7 @@ def claims() -> dict[str, tuple[str, bytes]]:
         of_views = glb_with(lambda h, n=size: [v.update(byteLength=n) for v in h["bufferViews"]])
         of_accessors = glb_with(lambda h, n=size: [a.update(count=n) for a in h["accessors"]])
         half = round(size**0.5)
-        found |= {
+        files |= {
             f"PLY, {size} vertices": ("mesh, PLY", binary.replace(b"element vertex 16", vertices)),
             f"PLY, {size} faces": ("mesh, PLY", binary.replace(b"element face 18", faces)),
             f"PLY text, {size} vertices": (
@@ -104,7 +104,7 @@ def claims() -> dict[str, tuple[str, bytes]]:
             f"clip, {size}": ("clip, NPZ", archive_with_claim("positions_ws", (size, 10, 3))),
             f"BVH, {size} frames": ("clip, BVH", frames),
         }
-    return found
+    return files
 
 
 CLAIMS = claims()
