@@ -154,9 +154,6 @@ def inspect(options: argparse.Namespace) -> int:
 @in_float64
 def terrain(options: argparse.Namespace) -> int:
     """Reconstructs the ground of a clip; writes a mesh, its numbers and a plot."""
-    for name in ("sole", "margin"):
-        if getattr(options, name) < 0:
-            raise ValueError(f"--{name} is {getattr(options, name):g}; wanted 0 or more metres")
     terrain_report.check_output_files(options.output)
     clip = load_clip(options.clip)
     kind = None if options.model == "auto" else options.model

@@ -13,6 +13,7 @@ from .parsers.fits import (
     add_translate,
 )
 from .parsers.machine import add_bench, add_cache
+from .parsers.options import Parser
 
 EXAMPLES = """examples:
   jaxik fit data/experiments/uneven_walk.toml -o runs/walk     fit, with plots and a summary
@@ -42,7 +43,7 @@ finished fit, and `compare --suite` each finished situation.
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    top = argparse.ArgumentParser(
+    top = Parser(
         prog="jaxik",
         description="Fits the parameters of foot IK to captured motion, with their uncertainty.",
         epilog=EXAMPLES,

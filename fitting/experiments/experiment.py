@@ -205,6 +205,6 @@ class Experiment:
 
     def with_max_sample_steps(self, max_steps: int) -> "Experiment":
         """The experiment with another limit to the steps of the sampler."""
-        if max_steps < 1:
-            raise ValueError(f"max-steps is {max_steps}; wanted 1 or more")
-        return replace(self, sample=replace(self.sample, max_steps=max_steps))
+        sample = replace(self.sample, max_steps=max_steps)
+        sample.walkers_for(len(self.free))
+        return replace(self, sample=sample)

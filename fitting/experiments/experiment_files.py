@@ -27,6 +27,7 @@ parameters = { lock.enabled = false }
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -41,7 +42,15 @@ from fitting.inference.settings import Setting, Settings, describe
 from fitting.problem.loss import Loss
 from fitting.problem.scene import WHITENED
 from fitting.runtime import validation
-from fitting.runtime.validation import Constraint, Content, Table, check_table, flatten, nest
+from fitting.runtime.validation import (
+    Constraint,
+    Content,
+    Table,
+    check_table,
+    flatten,
+    nest,
+    with_floats,
+)
 
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
@@ -58,14 +67,15 @@ CLIP_KEYS: dict[str, Constraint] = {
     "mask_pops": validation.BOOLEAN,
     "root": validation.one_of(ROOTS),
 }
-SIGMA_KEYS = dict.fromkeys(DEFAULT_SIGMAS, validation.POSITIVE)
+KINDS = tuple(kind for kind in DEFAULT_SIGMAS if kind != "correlation")
+SIGMA_KEYS = dict.fromkeys(KINDS, validation.number(1e-9, 1e9, or_inf=True))
 CORRELATIONS = tuple(f"correlation.{kind}" for kind in WHITENED)  # instead of one for all
-SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.FRACTION)
+SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.CORRELATION)
 
 
 def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
     return {
-        name: Constraint(declared.range, lambda value, one=declared: one.allows(_value(value, one)))
+        name: Constraint(declared.range, lambda value, declared=declared: declared.allows(value))
         for name, declared in describe(settings).items()
     }
 
@@ -82,7 +92,8 @@ def _value(value: Any, declared: Setting) -> Any:
 
 
 FIT_KEYS: dict[str, Constraint] = {
-    **dict.fromkeys(("starts", "max_steps"), validation.COUNT),
+    "starts": validation.count(1, 1000),
+    "max_steps": _constraints(SearchSettings)["max_steps"],
     "search": validation.TABLE,
 }
 SEARCH_KEYS = {
@@ -90,11 +101,7 @@ SEARCH_KEYS = {
     for name, constraint in _constraints(SearchSettings).items()
     if name != "max_steps"  # which is a key of [fit]
 }
-SAMPLE_KEYS: dict[str, Constraint] = {
-    **_constraints(SamplerSettings),
-    **dict.fromkeys(("walkers", "max_steps", "thin_by"), validation.COUNT),
-    "stop_at": validation.POSITIVE,
-}
+SAMPLE_KEYS = _constraints(SamplerSettings)
 NOISE_KEYS = {
     "sigmas": validation.one_of(get_args(Sigmas)),
     "correlation": validation.one_of(get_args(Correlation)),
@@ -106,7 +113,7 @@ TOP_KEYS: dict[str, Constraint] = {
     "faithful": validation.BOOLEAN,
     "body": BODY,
     "loss": validation.one_of(get_args(Loss)),
-    "fps": validation.FINITE_POSITIVE,
+    "fps": validation.RATE,
     "seed": validation.SEED,
     "independent_every": validation.SECONDS,
     **dict.fromkeys(TABLES, validation.TABLE),
@@ -140,6 +147,8 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     ik = with_rules(ik, content.get("rules", {}), f"{path} [rules]")
     sigmas = flatten(content.get("sigmas", {}), 2)
     check_table(sigmas, SIGMA_KEYS, f"{path} [sigmas]")
+    if all((DEFAULT_SIGMAS | sigmas)[kind] == math.inf for kind in KINDS):
+        raise ValueError(f"{path} [sigmas]: all of {list(KINDS)} are inf; wanted one that is not")
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
     known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
@@ -152,13 +161,14 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
         "start": read_start(content.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(content.get("parameters", {}), 2),
-        "sigmas": sigmas,
+        "sigmas": with_floats(sigmas, sigmas),
         "noise": _noise_options(content.get("noise", {}), f"{path} [noise]"),
         "without": without,
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
-    return Experiment(**{"path": path, "name": path.stem, **content, **tables})
+    top = with_floats(content, ("fps", "independent_every"))
+    return Experiment(**{"path": path, "name": path.stem, **top, **tables})
 
 
 def _noise_options(value: object, where: str) -> NoiseOptions:
@@ -184,16 +194,20 @@ def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSett
 
 def _clip_entry(value: object, path: Path) -> ClipEntry:
     table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
-    entry: Content = dict(table)
+    entry = with_floats(table, ("start", "end"))
     for key in ("reference", "terrain"):
         if key not in table:
             raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
     for key in FILE_KEYS:
         if key in table:
             entry[key] = (path.parent / table[key]).resolve()
-            if not entry[key].is_file():
-                why = validation.why_missing(entry[key])
-                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {why}")
+            if reason := validation.why_unreadable(entry[key]):
+                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {reason}")
+    if "end" in table and table["end"] <= table.get("start", 0.0):
+        raise ValueError(
+            f"{path} [[clips]]: end is {table['end']}; wanted more than start, which is "
+            f"{table.get('start', 0.0)}"
+        )
     return ClipEntry(**entry)
 
 

@@ -16,7 +16,7 @@ from fitting.runtime.validation import Content, check_table
 
 LEVELS = ("per_subject", "per_clip")
 KEYS = {
-    **dict.fromkeys(LEVELS, validation.list_of("a list of names of free parameters")),
+    **dict.fromkeys(LEVELS, validation.list_of_texts("a list of names of free parameters")),
     "scale_with_body": validation.BOOLEAN,
 }
 

@@ -18,13 +18,13 @@ import tomli_w
 
 import jaxik
 from fitting.runtime.validation import (
-    FINITE_POSITIVE,
     TABLE,
     check_keys,
     check_table,
     error_context,
     flatten,
     nest,
+    number,
     read_toml,
 )
 from jaxik.maths import parameter_tree
@@ -41,7 +41,7 @@ from .systems import (
     with_rules,
 )
 
-TOP_KEYS = {"rules": TABLE, "body": BODY, "leg_length": FINITE_POSITIVE}
+TOP_KEYS = {"rules": TABLE, "body": BODY, "leg_length": number(0.01, 100.0, "metres")}
 
 
 def system_to_toml(

@@ -14,13 +14,21 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from typing import get_args
 
-from fitting.problem.prior import ParameterPrior, Priors, Shape
+from fitting.problem.prior import SPREADS, ParameterPrior, Priors, Shape
 from fitting.runtime import validation
-from fitting.runtime.validation import Content, Table, check_keys, check_table, flatten, nest
+from fitting.runtime.validation import (
+    Content,
+    Table,
+    check_keys,
+    check_table,
+    flatten,
+    nest,
+    with_floats,
+)
 
 DEFAULT_KEYS: dict[str, validation.Constraint] = {
     "shape": validation.one_of(get_args(Shape)),
-    "spread": validation.FINITE_POSITIVE,
+    "spread": validation.number(*SPREADS),
 }
 KEYS = {**DEFAULT_KEYS, "centre": validation.NUMBER}
 
@@ -48,9 +56,9 @@ def read_priors(table: Table, free: Collection[str], where: str) -> Priors:
         normal = given.get("shape", default.get("shape")) != "uniform"
         inherited = default if normal else {"shape": "uniform"}
         with validation.error_context(f"{where} {name}"):
-            named[name] = ParameterPrior(**{**inherited, **given})
+            named[name] = ParameterPrior(**with_floats({**inherited, **given}, KEYS))
     with validation.error_context(where):
-        return Priors(ParameterPrior(**default), named)
+        return Priors(ParameterPrior(**with_floats(default, KEYS)), named)
 
 
 def priors_to_table(priors: Priors) -> Content:
@@ -72,4 +80,5 @@ def read_start(table: Table, free: Collection[str], where: str) -> Mapping[str, 
         ValueError: a name is not free, or a value is no number.
     """
     values = flatten(table, 2)
-    return check_table(values, dict.fromkeys(free, validation.NUMBER), where)
+    check_table(values, dict.fromkeys(free, validation.NUMBER), where)
+    return with_floats(values, values)

@@ -12,8 +12,8 @@ from . import parameter_files, systems
 
 def read_binary(path: Path) -> record.Record:
     """The record in a binary file; ValueError if there is none."""
-    if not path.is_file():
-        raise ValueError(f"{path}: {validation.why_missing(path)}, wanted a record")
+    if reason := validation.why_unreadable(path):
+        raise ValueError(f"{path}: {reason}, wanted a record")
     with validation.error_context(path):
         return record.from_bytes(path.read_bytes())
 
@@ -45,7 +45,7 @@ def read(path: Path, reading: record.Reading, base: record.Record | None) -> lis
         return [record.from_ik(ik, base, reading)]
     if base is not None:
         raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
-    if suffix != ".csv" or not path.is_file():
+    if suffix != ".csv" or validation.why_unreadable(path):
         return [read_binary(path)]
     try:
         records = record.from_csv(path.read_text(encoding="utf-8"))

@@ -1,6 +1,6 @@
 """Systems by name: presets, other rules for some stages, parameters fixed or free."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from inspect import signature
 from typing import NamedTuple, TypeVar
@@ -15,6 +15,7 @@ from fitting.runtime.validation import Table, check_keys, check_table, flatten
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world import body
+from jaxik.world.arguments import LAYERS
 
 
 def _concrete_rules(rule: type[eqx.Module]) -> list[type[eqx.Module]]:
@@ -49,6 +50,23 @@ def register_rule(rule: type[Rule]) -> type[Rule]:
     raise ValueError(f"{rule.__name__} is no rule of a stage; the stages are {list(STAGES)}")
 
 
+def _are_numbers(values: np.ndarray) -> bool:
+    """Whether 32 bits hold each; inf stands for no limit."""
+    if values.dtype.kind not in "iuf" or np.isnan(values).any():
+        return False
+    return bool(((np.abs(values) <= LARGEST) | np.isinf(values)).all())
+
+
+def _are_masks(values: np.ndarray) -> bool:
+    return values.dtype.kind in "iu" and bool(((values >= 0) & (values < 2**LAYERS)).all())
+
+
+LARGEST = float(np.finfo(np.float32).max)
+VALUES: dict[str, tuple[str, Callable[[np.ndarray], bool]]] = {  # of leaves, by their kind
+    "b": ("true or false", lambda values: values.dtype.kind == "b"),
+    "u": (f"a whole number from 0 to {2**LAYERS - 1}: a bit for each layer", _are_masks),
+    "f": (f"a number of at most {LARGEST:.2g}, or inf", _are_numbers),
+}
 BODY = validation.one_of(("clip", "adult"))  # whose defaults are meant
 FREE_KEYS: dict[str, validation.Constraint] = {
     **dict.fromkeys(("low", "high"), validation.NUMBER),
@@ -175,8 +193,8 @@ def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK
             new = np.asarray(value)
         except ValueError:  # lists of different lengths
             new = np.asarray(None)
-        if new.dtype.kind not in ("b" if old.dtype == bool else "if") or np.isnan(new).any():
-            wanted = "true or false" if old.dtype == bool else "a number"
+        wanted, accepts = VALUES[old.dtype.kind]
+        if not accepts(new):
             raise ValueError(f"{where}: {name} is {value!r}; wanted {wanted}")
         single = shapes.get(name, old.shape)  # of a value that all legs share
         if new.shape != single and (new.shape[1:] != single or not new.size):

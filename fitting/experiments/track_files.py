@@ -20,9 +20,10 @@ import numpy as np
 
 from fitting.datasets.clips import Clip
 from fitting.runtime import validation
-from fitting.runtime.validation import Table, check_keys, check_table, read_toml
+from fitting.runtime.validation import LARGEST, Table, check_keys, check_table, read_toml
 
 GROUNDED, WEIGHT = "grounded", "weight"
+LATEST = 1e6  # s
 KEYS = {
     "times": validation.list_of("a list of seconds"),
     "values": validation.list_of("a list with a value for each time"),
@@ -115,12 +116,21 @@ def _track(value: object, where: str) -> Track:
     try:
         times = np.asarray(table["times"], np.float64)
         values = np.asarray(table["values"], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{where}: wanted numbers as times and values") from None
     if times.ndim != 1 or not times.size or len(values) != len(times):
         raise ValueError(f"{where}: {len(times)} times and {len(values)} values; wanted as many")
-    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
-        raise ValueError(f"{where}: times are {table['times']}; wanted them ascending")
-    if np.isnan(values).any():
-        raise ValueError(f"{where}: values are not numbers")
-    return Track(times, values, table.get("stepped", False))
+    if not (np.abs(times) <= LATEST).all() or not (np.diff(times) > 0).all():
+        raise ValueError(
+            f"{where}: times are {table['times']}; wanted them ascending, to {LATEST:g} s at most"
+        )
+    stepped = table.get("stepped", False)
+    if not values.size or values.ndim > 2:
+        raise ValueError(f"{where}: values are {table['values']}; wanted numbers, or lists of them")
+    allowed = np.abs(values) <= LARGEST
+    if not (allowed | (stepped & (values == np.inf))).all():
+        raise ValueError(
+            f"{where}: values are {table['values']}; wanted numbers of at most {LARGEST:g}, or "
+            "with stepped = true also inf"
+        )
+    return Track(times, values, stepped)

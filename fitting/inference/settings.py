@@ -6,8 +6,9 @@ experiment files and error messages read it from there.
 """
 
 import dataclasses
-import math
 from typing import Any
+
+from fitting.runtime.validation import is_within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,22 +32,18 @@ class Setting:
     def range(self) -> str:
         """What a value may be, for error messages."""
         kind = "whole number" if self.integer else "number"
-        limits = f" from {self.low:g}" + (f" to {self.high:g}" if self.high < math.inf else "")
+        limits = f" from {self.low:g} to {self.high:g}"
         return f"a list of {kind}s{limits}" if self.several else f"a {kind}{limits}"
 
     def allows(self, value: object) -> bool:
         """Whether a setting may have this value."""
         if self.several:
-            return isinstance(value, tuple) and len(value) > 0 and all(map(self._fits, value))
+            values = value if isinstance(value, tuple | list) else ()
+            return len(values) > 0 and all(map(self._fits, values))
         return (value is None and self.optional) or self._fits(value)
 
     def _fits(self, number: object) -> bool:
-        kinds = int if self.integer else (int, float)
-        return (
-            isinstance(number, kinds)
-            and not isinstance(number, bool)
-            and self.low <= number <= self.high
-        )
+        return is_within(number, self.low, self.high, whole=self.integer)
 
 
 def setting(
@@ -55,7 +52,7 @@ def setting(
     *,
     unit: str = "1",
     low: int | float = 0,
-    high: int | float = math.inf,
+    high: int | float,
 ) -> Any:
     """A field of a settings class; its kind is that of the default, None meaning an integer."""
     several = isinstance(default, tuple)

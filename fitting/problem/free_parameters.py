@@ -12,6 +12,9 @@ from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
 from jaxik.world.skeleton import Rig
 
+DOMAINS = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (1e-9, 1.0 - 1e-9)}
+NARROWEST, WIDEST = 1e-6, 1e6  # of a range, times the one that the rule declares
+LARGEST_RATIO = 1e12  # of the bounds of a logarithmic range
 OVERRIDES = ("low", "high", "kind", "scale")
 
 
@@ -80,7 +83,7 @@ def free_parameter(
         scale=cast(parameter_tree.Scale, scale),
         above=_absolute(declaration.above, leaf),
     )
-    _check(parameter)
+    _check(parameter, declaration)
     return parameter
 
 
@@ -113,12 +116,24 @@ def _check_choice(name: str, key: str, value: float | str, choices: tuple[str, .
         raise ValueError(f"{name}: {key} is {value!r}, wanted one of {choices}")
 
 
-def _check(parameter: FreeParameter) -> None:
+def _check(parameter: FreeParameter, declaration: parameter_tree.Declaration) -> None:
     """Raises ValueError for bounds that make no sense."""
-    domains = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (0.0, 1.0)}
-    minimum, maximum = domains[parameter.scale]
-    if not minimum < parameter.low < parameter.high < maximum:
+    low, high = parameter.low, parameter.high
+    bounds = f"{parameter.name}: bounds are {low} to {high}"
+    minimum, maximum = DOMAINS[parameter.scale]
+    if not minimum < low < high < maximum:
         raise ValueError(
-            f"{parameter.name}: bounds are {parameter.low} to {parameter.high}, wanted low < high"
+            f"{bounds}, wanted low < high"
             f" strictly between {minimum} and {maximum} for the scale {parameter.scale!r}"
+        )
+    usual = declaration.high - declaration.low
+    narrowest, widest = NARROWEST * max(usual, abs(low), abs(high)), WIDEST * usual
+    if not narrowest <= high - low <= widest:
+        raise ValueError(
+            f"{bounds}, {high - low:g} apart, wanted {narrowest:g} to {widest:g};"
+            f" its rule has {declaration.low:g} to {declaration.high:g}"
+        )
+    if parameter.scale == "log" and high / low > LARGEST_RATIO:
+        raise ValueError(
+            f"{bounds}, wanted at most {LARGEST_RATIO:g} times the lower one for the scale 'log'"
         )

@@ -27,6 +27,7 @@ from scipy import special
 Shape = Literal["normal", "uniform"]
 
 SPREAD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
+SPREADS = (1e-3, 1e3)  # of u: from almost known to almost all at the bounds
 LOGISTIC_SD = math.pi / math.sqrt(3)  # of the logistic distribution
 
 
@@ -35,7 +36,7 @@ class ParameterPrior:
     """The prior of one parameter, as an experiment states it.
 
     Raises:
-        ValueError: for an unknown shape, a spread that is no finite number above 0, or a uniform
+        ValueError: for an unknown shape, a spread outside `SPREADS`, or a uniform
             prior with a centre or a spread.
     """
 
@@ -51,8 +52,9 @@ class ParameterPrior:
         for name in ("centre", "spread"):
             if self.shape == "uniform" and getattr(self, name) is not None:
                 raise ValueError(f"{name} is given, but a uniform prior has none: it is the range")
-        if self.spread is not None and not 0 < self.spread < math.inf:
-            raise ValueError(f"spread is {self.spread}, wanted a finite number above 0")
+        low, high = SPREADS
+        if self.spread is not None and not low <= self.spread <= high:
+            raise ValueError(f"spread is {self.spread}, wanted a number from {low:g} to {high:g}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,14 +3,20 @@
 import difflib
 import json
 import math
+import os
+import stat
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 Content: TypeAlias = dict[str, Any]  # tables as TOML or JSON reads them, not yet checked
 Table: TypeAlias = Mapping[str, Any]  # the same, to read only
+
+LONGEST_TEXT = 1000
+LARGEST = 3.4e38  # that 32 bits hold
+QUOTED = 200  # characters of the error of another library, in a sentence of ours
 
 
 class Constraint(NamedTuple):
@@ -20,35 +26,43 @@ class Constraint(NamedTuple):
     accepts: Callable[[object], bool]
 
 
-def _number_in(accepts: Callable[[float], bool]) -> Callable[[object], bool]:
-    """A test for numbers that are not NaN and for which `accepts` holds."""
-
-    def test(value: object) -> bool:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return False
-        return not math.isnan(value) and accepts(value)
-
-    return test
+def is_within(value: object, low: int | float, high: int | float, *, whole: bool = False) -> bool:
+    """Whether it is a number in this range, and with `whole` one without a fraction."""
+    kinds = int if whole else (int, float)
+    return isinstance(value, kinds) and not isinstance(value, bool) and low <= value <= high
 
 
-def _integer_in(accepts: Callable[[float], bool]) -> Callable[[object], bool]:
-    return lambda value: isinstance(value, int) and _number_in(accepts)(value)
+def number(
+    low: int | float, high: int | float, unit: str = "", *, or_inf: bool = False
+) -> Constraint:
+    """A number in a range, or with `or_inf` infinity as well."""
+    words = f"a number{' of ' if unit else ''}{unit} from {low:g} to {high:g}"
+    return Constraint(
+        f"{words}, or inf" if or_inf else words,
+        lambda value: is_within(value, low, high) or (or_inf and value == math.inf),
+    )
 
 
-TEXT = Constraint("a text", lambda value: isinstance(value, str))
+def count(low: int, high: int) -> Constraint:
+    """A whole number in a range."""
+    return Constraint(
+        f"a whole number from {low} to {high}",
+        lambda value: is_within(value, low, high, whole=True),
+    )
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and value.isprintable() and len(value) <= LONGEST_TEXT
+
+
+TEXT = Constraint(f"a text of at most {LONGEST_TEXT} printable characters", _is_text)
 BOOLEAN = Constraint("true or false", lambda value: isinstance(value, bool))
 TABLE = Constraint("a table", lambda value: isinstance(value, Mapping))
-NUMBER = Constraint("a number", _number_in(lambda value: True))
-POSITIVE = Constraint("a number above 0", _number_in(lambda value: value > 0))
-FINITE_POSITIVE = Constraint(
-    "a finite number above 0", _number_in(lambda value: 0 < value < math.inf)
-)
-SECONDS = Constraint("a number of seconds, 0 or more", _number_in(lambda value: value >= 0))
-FRACTION = Constraint("a number from 0 to below 1", _number_in(lambda value: 0 <= value < 1))
-COUNT = Constraint("a whole number above 0", _integer_in(lambda value: value > 0))
-SEED = Constraint(
-    "a whole number from 0 to 4294967295", _integer_in(lambda value: 0 <= value < 2**32)
-)
+NUMBER = Constraint("a finite number", lambda value: is_within(value, -LARGEST, LARGEST))
+SECONDS = number(0, 1e6, "seconds")
+RATE = number(1, 1000, "Hz")
+CORRELATION = number(0, 0.999)
+SEED = count(0, 2**32 - 1)
 
 
 def one_of(words: Sequence[str]) -> Constraint:
@@ -61,6 +75,13 @@ def list_of(description: str) -> Constraint:
     return Constraint(description, lambda value: isinstance(value, list))
 
 
+def list_of_texts(description: str) -> Constraint:
+    """A list of texts, described in these words."""
+    return Constraint(
+        description, lambda value: isinstance(value, list) and all(map(_is_text, value))
+    )
+
+
 def read_toml(path: Path, description: str) -> Content:
     """The tables of a TOML file.
 
@@ -71,14 +92,14 @@ def read_toml(path: Path, description: str) -> Content:
     Raises:
         ValueError: the file does not exist or is not TOML.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: {why_missing(path)}, wanted {description} file")
+    if reason := why_unreadable(path):
+        raise ValueError(f"{path}: {reason}, wanted {description} file")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not TOML: {error}") from None
     except RecursionError:
         raise ValueError(f"{path}: not TOML: nested too deeply") from None
+    except ValueError as error:  # of TOML, UTF-8, or a number of thousands of digits
+        raise ValueError(f"{path}: not TOML: {in_one_line(error, QUOTED)}") from None
 
 
 def read_json(path: Path) -> Any:
@@ -94,9 +115,27 @@ def read_json(path: Path) -> Any:
         raise ValueError("nested too deeply") from None
 
 
-def why_missing(path: Path) -> str:
-    """Why there is no file to read at this path, in words."""
-    return "a folder" if path.is_dir() else "no such file"
+def why_unreadable(path: Path) -> str:
+    """Why there is no file to read at this path, in words; empty if there is one."""
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return "no such file"
+    except ValueError:
+        return "a name with a null byte"
+    except OSError as error:
+        return str(error.strerror).lower()
+    if stat.S_ISDIR(mode):
+        return "a folder"
+    if not stat.S_ISREG(mode):
+        return "no regular file"
+    return "" if os.access(path, os.R_OK) else "may not be read"
+
+
+def check_file(path: Path) -> None:
+    """ValueError unless there is a file to read at this path."""
+    if reason := why_unreadable(path):
+        raise ValueError(f"{path}: {reason}")
 
 
 @contextmanager
@@ -108,11 +147,20 @@ def error_context(where: Path | str) -> Iterator[None]:
         raise ValueError(f"{where}: {error}") from None
 
 
-def in_one_line(error: Exception) -> str:
-    """An error in one line, for a message."""
+def in_one_line(error: Exception, longest: int = 1000) -> str:
+    """An error in one line that any terminal can show, for a message.
+
+    Args:
+        error: ours, or that of another library, which may quote whole files.
+        longest: characters; a longer line loses its middle.
+    """
+    text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split("\n"))
+        text = f"{error.filename}: {error.strerror}"
+    line = " ".join(text.splitlines())
+    line = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in line)
+    end = longest // 3
+    return line if len(line) <= longest else f"{line[: longest - end - 5]} ... {line[-end:]}"
 
 
 def check_keys(table: Table, known: Sequence[str], where: str) -> None:
@@ -147,6 +195,14 @@ def check_table(value: object, constraints: Mapping[str, Constraint], where: str
         if not constraints[key].accepts(entry):
             raise ValueError(f"{where}: {key} is {entry!r}; wanted {constraints[key].description}")
     return value
+
+
+def with_floats(table: Table, keys: Iterable[str]) -> Content:
+    """The table with whole numbers under these keys as floats, as code expects them."""
+    return {
+        key: float(value) if key in keys and type(value) is int else value
+        for key, value in table.items()
+    }
 
 
 def flatten(tables: Table, depth: int, prefix: str = "") -> Content:

@@ -145,7 +145,7 @@ def read_free(text: str, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Free
         free = {name.strip(): {} for name in text.split(",") if name.strip()}
     if not free:
         raise ValueError(f"--free {text}: names no parameter")
-    with error_context("--free"):
+    with error_context(f"--free {text}"):
         for name, overrides in free.items():
             free_parameter(ik, name, rig, **overrides)
     return free

@@ -14,6 +14,7 @@ from .heightfield import INTERPOLATIONS, HeightOf
 
 LAYERS = 32
 FURTHEST = 1e7  # m, of a vertex from the origin
+NARROWEST = 1e-6  # m, between the heights of a heightfield
 
 
 def float_dtype(*values: ArrayLike | tuple[float, ...]) -> jnp.dtype:
@@ -94,11 +95,10 @@ def check_heightfield(
         known = " or ".join(map(repr, INTERPOLATIONS))
         raise ValueError(f"interpolation is {known}; got {interpolation!r}")
     if not isinstance(spacing, Tracer):
-        lengths = np.asarray(spacing)
-        if not ((lengths > 0) & np.isfinite(lengths)).all():
-            raise ValueError(f"spacing is in metres, above 0; got {lengths.tolist()}")
-    if not isinstance(origin, Tracer) and not np.isfinite(np.asarray(origin)).all():
-        raise ValueError(f"origin is three finite numbers, m; got {np.asarray(origin).tolist()}")
+        _check_spacing(np.asarray(spacing, np.float64), shape)
+    if not isinstance(origin, Tracer) and not (np.abs(np.asarray(origin)) <= FURTHEST).all():
+        place = np.asarray(origin).tolist()
+        raise ValueError(f"origin is three numbers of at most {FURTHEST:g} m; got {place}")
     if not isinstance(heights, Tracer):
         _check_heights(np.asarray(heights))
 
@@ -121,6 +121,18 @@ def height_function(height: HeightOf, dtype) -> HeightOf:
     return tree
 
 
+def _check_spacing(spacing: np.ndarray, shape: tuple[int, ...]) -> None:
+    if not (spacing > 0).all():
+        raise ValueError(f"spacing is in metres, above 0; got {spacing.tolist()}")
+    widest = FURTHEST / np.array([shape[1] - 1, shape[0] - 1])
+    if not ((spacing >= NARROWEST) & (spacing <= widest)).all():
+        rows, columns = shape
+        raise ValueError(
+            f"spacing is {spacing.tolist()} m for {rows} rows and {columns} columns; wanted "
+            f"{NARROWEST:g} m or more, and at most {FURTHEST:g} m from end to end"
+        )
+
+
 def _check_heights(heights: np.ndarray) -> None:
     wrong = np.argwhere(np.isinf(heights))
     if len(wrong):
@@ -128,6 +140,13 @@ def _check_heights(heights: np.ndarray) -> None:
         raise ValueError(
             f"{len(wrong)} of {heights.size} heights are infinite; the first is "
             f"heights[{row}, {column}]; a hole is NaN"
+        )
+    high = np.argwhere(np.abs(heights) > FURTHEST)
+    if len(high):
+        row, column = high[0]
+        raise ValueError(
+            f"{len(high)} of {heights.size} heights are too far from 0; the first is "
+            f"heights[{row}, {column}]: {heights[row, column]:g}; wanted at most {FURTHEST:g} m"
         )
     known = ~np.isnan(heights)
     if not (known[1:, 1:] & known[1:, :-1] & known[:-1, 1:] & known[:-1, :-1]).any():

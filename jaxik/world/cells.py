@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 CELLS = 2.0  # cells per triangle at most: fewer mean longer lists, more only take memory
-ENTRIES = 12  # list entries per triangle, on average, above which cells grow
+ENTRIES = 12  # list entries per triangle, on average, above which cells grow, or split no more
 CROWD = 16  # a cell with more triangles is split
 SPLIT = 4  # into this many parts along each side
 DEPTH = 6  # at most this many times
@@ -64,7 +64,9 @@ def build(
     while True:
         cells = len(level.centres)
         crowded = np.bincount(level.cell, minlength=cells) > CROWD
-        if depth < DEPTH and crowded.any():
+        # Triangles that lie on each other, or long ones side by side, would fill all parts.
+        entries = int(crowded[level.cell].sum())
+        if depth < DEPTH and 0 < entries <= _most_entries(len(corners)):
             split, finer = _split(corners, level, crowded, pad)
         else:
             split, finer = np.zeros(0, np.int64), level
@@ -93,6 +95,11 @@ def build(
     )
 
 
+def _most_entries(triangles: int) -> int:
+    """How long the lists of this many triangles may be together, before cells are split."""
+    return ENTRIES * triangles + 64
+
+
 def _lay_out(corners: np.ndarray, pad: float) -> _Layout:
     """The unsplit cells over these triangles, as many as `CELLS` and `ENTRIES` allow."""
     if not len(corners):
@@ -103,7 +110,7 @@ def _lay_out(corners: np.ndarray, pad: float) -> _Layout:
     pitch = max(np.sqrt(size[0] * size[1] / wanted), size.max() / wanted) or 1.0
     while True:
         spans = np.floor((high - origin) / pitch) - np.floor((low - origin) / pitch) + 1
-        if spans.prod(axis=1).sum() <= ENTRIES * len(corners) + 64:
+        if spans.prod(axis=1).sum() <= _most_entries(len(corners)):
             break
         pitch *= 1.25
     # The shift keeps the lines of the grid off those of a mesh that is a regular grid itself.

@@ -40,6 +40,7 @@ BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
 WANTED_CLIP = f"wanted a {', '.join(formats.READERS)} or .npz file"
 SHOWN = "always::fitting.report.placement_report.PlacementWarning"
+ELSEWHERE = r"../../elsewhere $\frac{$"  # no path, and no formula that Matplotlib could draw
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
 
@@ -59,7 +60,8 @@ def quick_residuals(monkeypatch):
 def experiment_file(tmp_path_factory) -> Path:
     return write(
         tmp_path_factory.mktemp("files"), "hill.toml",
-        clips=CLIP, clip="start = 1.0\nend = 1.5", rest=SAMPLE,
+        top=f"name = '{ELSEWHERE}'", clips=CLIP, rest=SAMPLE,
+        clip=f"start = 1.0\nend = 1.5\nlabel = '{ELSEWHERE}'\nsubject = '{ELSEWHERE}'",
     )  # fmt: skip
 
 
@@ -118,22 +120,24 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
         (["fti"], "invalid choice: 'fti'"),
         (["fit"], "required: EXPERIMENT.toml, -o/--output"),
         (["run", BASE, "-o", "a.npz"], "required: --terrain"),
-        (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--floor", "nan"], "finite number"),
         (["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--root", "x"], "invalid choice: 'x'"),
-        (
-            ["run", BASE, "--terrain", GROUND, "-o", "a.npz", "--speed", "0"],
-            "'0'; wanted a number a",
-        ),
-        (["record", "show", "a", "--tick-hz", "x"], "'x'; wanted a finite number"),
     ],
 )
 def test_wrong_words_are_rejected(words, message, capsys):
     with pytest.raises(SystemExit, match="2"):
         main.main(words)
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and error.startswith("jaxik")
 
 
 # Fit and sample
+
+
+@pytest.mark.slow
+def test_the_names_in_an_experiment_are_no_paths(run, experiment_file):
+    assert {path.name for path in run.parent.iterdir()} == {"hill"}
+    assert {path.name for path in experiment_file.parent.iterdir()} == {"hill.toml"}
+    assert f"# {ELSEWHERE}" in (run / run_folder.SUMMARY).read_text()
 
 
 @pytest.mark.slow
@@ -141,7 +145,7 @@ def test_a_fit_writes_numbers_tables_and_plots(run):
     names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
     assert names <= tree(run) and {"motion.png", "cost.png"} <= tree(run)
     numbers = json.loads((run / run_folder.FIT).read_text())
-    assert numbers["converged"] and numbers["experiment"] == "hill"
+    assert numbers["converged"] and numbers["experiment"] == ELSEWHERE
     for row in numbers["parameters"]:
         assert row["value"] == pytest.approx(quick.TARGETS[row["name"]], abs=0.003)
 
@@ -339,12 +343,6 @@ def test_a_fit_with_other_parameters_than_its_experiment_is_rejected(run, tmp_pa
     assert run_folder.CHAIN not in tree(copy)
 
 
-@pytest.mark.slow
-def test_a_limit_of_no_steps_is_rejected(run, tmp_path, capsys):
-    copy = shutil.copytree(run, tmp_path / "run")
-    assert "max-steps is 0" in error_of(capsys, "sample", copy, "--max-steps", "0")
-
-
 # Run and apply
 
 
@@ -465,8 +463,8 @@ MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
         ("bad.bvh", GROUND, "a.npz", [], "bad.bvh:1: wanted HIERARCHY"),
         ("bad.npz", GROUND, "a.npz", [], "bad.npz: wanted a NumPy archive"),
         ("legless.bvh", GROUND, "a.npz", [], "legless.bvh: no pair of legs recognised"),
-        (BASE, "no.ply", "a.npz", [], "no.ply: there is no such file"),
-        (BASE, str(DATA), "a.npz", [], "data: there is no such file"),
+        (BASE, "no.ply", "a.npz", [], "no.ply: no such file"),
+        (BASE, str(DATA), "a.npz", [], "data: a folder"),
         (BASE, "m.ply", "a.npz", [], "m.ply: trimesh cannot read it"),
         (BASE, "p.obj", "a.npz", [], "p.obj: terrain needs triangles"),
         (BASE, "t.toml", "a.npz", [], "trimesh reads"),
@@ -508,8 +506,7 @@ def test_inspect_describes_a_clip_in_words_and_as_json(capsys):
     [
         (["no.bvh"], "no.bvh: no such file"),
         ([str(DATA)], WANTED_CLIP),
-        (["step.bvh", "--scale", "nan"], "scale is nan; wanted a number above 0"),
-        (["step.amc", "--asf", "no.asf"], "no.asf: No such file"),
+        (["step.amc", "--asf", "no.asf"], "no.asf: no such file"),
     ],
 )
 def test_inspect_rejects_a_file_that_it_cannot_read(words, message, tmp_path, capsys, monkeypatch):

@@ -115,7 +115,6 @@ def test_lengths_in_centimetres_are_mentioned_in_one_line(tmp_path, capsys):
         (["show", "bad.toml"], "bad.toml: unknown key 'lok'; nearest is 'lock'"),
         (["show", "nan.bin"], "nan.bin: originalGroundHeightMS is nan"),
         (["show", "axis.bin"], "axis.bin: kneeAxisType is 9"),
-        (["show", "footik.bin", "--tick-hz", "0"], "tick_hz is 0.0"),
         (["to-toml", "nan.bin", "-o", "a.toml"], "nan.bin: originalGroundHeightMS is nan"),
         (["to-toml", "two.csv", "-o", "a.toml"], "two.csv has 2 rows"),
         (["to-toml", "footik.bin", "-o", "no/a.toml"], "there is no folder no"),

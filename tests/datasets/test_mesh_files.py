@@ -178,7 +178,7 @@ def test_the_error_for_a_file_without_terrain_names_it(tmp_path, name, text, mes
 
 def test_the_error_for_a_missing_file_names_it(tmp_path):
     for name in ("nowhere.ply", "nowhere.npz"):
-        with pytest.raises(ValueError, match=f"{name}: there is no such file"):
+        with pytest.raises(ValueError, match=f"{name}: no such file"):
             mesh_files.load_terrain(tmp_path / name)
 
 

@@ -204,8 +204,6 @@ def test_the_command_writes_a_mesh_its_numbers_and_a_picture(clip, tmp_path, cap
     [
         (["-o", "a.glb"], "a.glb: wanted a name that ends in .ply, .obj, .stl"),
         (["-o", "no/a.ply"], "there is no folder no"),
-        (["-o", "a.ply", "--sole", "-1"], "--sole is -1; wanted 0 or more metres"),
-        (["-o", "a.ply", "--margin", "-1"], "--margin is -1; wanted 0 or more"),
         (["-o", "taken.ply"], "taken.json: cannot be written: it is a folder"),
     ],
 )

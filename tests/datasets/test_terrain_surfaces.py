@@ -11,6 +11,7 @@ from fitting.datasets.terrain import block_grids, mesh_files, reconstruction, su
 from fitting.datasets.terrain.block_grids import Footprints, Grid
 from jaxik.world import terrain
 from support.footprints import TILTED, WIDE, block_footprints, block_heights, hill_footprints
+from support.sample_clips import stair_walk
 
 # Grids
 
@@ -159,3 +160,20 @@ def test_the_mesh_of_blocks_has_vertical_risers_between_blocks():
     upper = surface.heights((middle - 0.01 * away)[:, [0, 2]])
     np.testing.assert_allclose(lower, corners[~flat, :, 1].min(axis=1), atol=1e-5)
     np.testing.assert_allclose(upper, corners[~flat, :, 1].max(axis=1), atol=1e-5)
+
+
+def test_a_mesh_of_too_many_cells_is_refused_with_their_number():
+    blocks = surfaces.LevelBlocks(TILTED, np.zeros((1, 2), np.int64), np.zeros(1), np.ones(1, int))
+    for surface in (blocks, surfaces.fit_thin_plate(hill_footprints())):
+        surface.mesh(np.zeros(2), np.full(2, 9.0))
+        for size in (1e3, 1e6):
+            with pytest.raises(ValueError, match="[0-9]{7,} cells; wanted at most 2000000"):
+                surface.mesh(np.zeros(2), np.full(2, size))
+
+
+def test_stances_a_thousand_kilometres_apart_are_refused():
+    clip = stair_walk()
+    far = clip.positions_ws.copy()
+    far[100:] += [1e6 / 2, 0.0, 0.0]
+    with pytest.raises(ValueError, match="stances are up to 5e.05 m apart; wanted at most 1000"):
+        reconstruction.reconstruct(replace(clip, positions_ws=far))

@@ -519,7 +519,7 @@ def test_every_setting_has_a_meaning_and_a_default_within_its_range():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"max_steps": 0}, "max_steps is 0, wanted a whole number from 1: Levenberg"),
+        ({"max_steps": 0}, "max_steps is 0, wanted a whole number from 1 to 100000: Levenberg"),
         ({"agreement": -1.0}, "agreement is -1.0, wanted a number from 0"),
         ({"population": 16}, "gauss_newton_children is 16, wanted less than the population"),
     ],

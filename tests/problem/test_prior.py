@@ -134,8 +134,8 @@ def test_the_probability_of_values_is_that_of_scipy_and_of_draws():
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"spread": 0.0}, "spread is 0.0, wanted a finite number above 0"),
-        ({"spread": np.inf}, "spread is inf, wanted a finite number above 0"),
+        ({"spread": 0.0}, "spread is 0.0, wanted a number from 0.001 to 1000"),
+        ({"spread": np.inf}, "spread is inf, wanted a number from 0.001 to 1000"),
         ({"shape": "uniform", "centre": 0.5}, "centre is given, but a uniform prior has none"),
         ({"shape": "uniform", "spread": 0.5}, "spread is given, but a uniform prior has none"),
     ],

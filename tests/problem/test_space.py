@@ -138,7 +138,7 @@ def test_a_parameter_is_either_smooth_or_a_threshold():
         ("foot.share", {"low": 2.0}, "bounds are 2.0 to 1.2"),
         ("foot.share", {"low": float("nan")}, "bounds are nan"),
         ("lock.release", {"low": 0.0}, "strictly between 0.0"),
-        ("body.gain", {"high": 1.0}, "and 1.0 for the scale 'gain'"),
+        ("body.gain", {"high": 1.0}, "and 0.999999999 for the scale 'gain'"),
         ("foot.share", {"prior_sd": 1.0}, "unknown.*prior_sd.*takes"),
         ("foot.share", {"scale": "square"}, "scale is 'square'"),
         ("foot.share", {"kind": "soft"}, "kind is 'soft'"),

@@ -373,20 +373,17 @@ def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(
     assert rms == pytest.approx([1.0, 2.0], rel=0.1)
 
 
-@pytest.mark.parametrize("factor", ["0", "-1"])
-def test_noise_that_is_not_positive_is_a_mistake(experiment_file, tmp_path, factor, capsys):
-    out = tmp_path / "out"
-    words = ["calibrate", str(experiment_file), f"--noise-factor={factor}", "-o", str(out)]
-    assert main.main(words) == 2
-    assert f"noise_factor is {factor}; wanted a positive number" in capsys.readouterr().err
-    assert not out.exists()
+@pytest.mark.parametrize("factor", [0.0, -1.0])
+def test_noise_that_is_not_positive_is_a_mistake(experiment_file, tmp_path, factor):
+    with pytest.raises(ValueError, match=f"noise_factor is {factor:g}; wanted a positive number"):
+        fitting.calibrate(experiment_file, tmp_path / "out", noise_factor=factor)
+    assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("count", ["0", "-2"])
-def test_fewer_than_one_replicate_is_a_mistake(experiment_file, tmp_path, count, capsys):
-    words = ["calibrate", str(experiment_file), "-n", count, "-o", str(tmp_path / "out")]
-    assert main.main(words) == 2
-    assert f"replicates is {count}; wanted 1 or more" in capsys.readouterr().err
+@pytest.mark.parametrize("count", [0, -2])
+def test_fewer_than_one_replicate_is_a_mistake(experiment_file, tmp_path, count):
+    with pytest.raises(ValueError, match=f"replicates is {count}; wanted 1 or more"):
+        fitting.calibrate(experiment_file, tmp_path / "out", replicates=count)
     assert not (tmp_path / "out").exists()
 
 

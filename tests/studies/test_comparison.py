@@ -247,7 +247,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
     ("clip", "ground", "out", "more", "message"),
     [
         ("no.npz", GROUND, "d", ["--presets", "record"], "no.npz: no such file"),
-        (BASE, "no.ply", "d", ["--presets", "record"], "no.ply: there is no such file"),
+        (BASE, "no.ply", "d", ["--presets", "record"], "no.ply: no such file"),
         (BASE, GROUND, "file", ["--presets", "record"], "file: no folder can be made here"),
         (BASE, GROUND, "file/d", ["--presets", "record"], "/file is a file"),
         (BASE, GROUND, "d", [], "nothing to compare"),

@@ -96,7 +96,7 @@ def test_the_command_writes_the_table(animation, monkeypatch, tmp_path, capsys):
 def test_a_rate_that_is_no_number_above_0_is_refused(capsys):
     with pytest.raises(SystemExit):
         make_parser().parse_args(["compare", "c", "--rates", "60,0"])
-    assert "'0'; wanted a number above 0" in capsys.readouterr().err
+    assert "'0'; wanted a number of Hz from 1 to 1000" in capsys.readouterr().err
 
 
 @in_float64

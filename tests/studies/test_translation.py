@@ -241,14 +241,16 @@ def test_an_interrupted_translation_writes_its_best_point(
         ({"--to": "no.toml"}, "no.toml: no such file, wanted a parameter file"),
         ({"--to": "liar.toml"}, "liar.toml: unknown key 'pelvis.speed'; nearest is"),
         ({"--terrain": None}, "1 clip(s) and 2 terrain(s); wanted a terrain for each clip"),
-        ({"--free": "pelvis.limti"}, "--free: no parameter named 'pelvis.limti'; nearest is"),
+        (
+            {"--free": "pelvis.limti"},
+            "--free pelvis.limti: no parameter named 'pelvis.limti'; nearest is",
+        ),
         ({"--free": ","}, "--free ,: names no parameter"),
         ({"--free": "free.toml"}, "free.toml [free] pelvis.limit: unknown key 'hihg'"),
         ({"--free": "none.toml"}, "none.toml: unknown key 'fre'; nearest is 'free'"),
         ({"-o": "full"}, "full: there is something in it already: ['kept']"),
         ({"-o": "liar.toml"}, "is a file"),
         ({"--from": "still.toml"}, "still moves nothing in these clips"),
-        ({"--fps": "0"}, "fps is 0.0; wanted a number above 0"),
     ],
 )
 def test_wrong_input_is_reported_and_nothing_written(

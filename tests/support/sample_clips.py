@@ -1,4 +1,4 @@
-"""A small BVH file and a walk over stairs, for the tests of loaders, edits and terrain."""
+"""Small files of motion and a walk over stairs, for the tests of loaders, edits and terrain."""
 
 import numpy as np
 
@@ -61,6 +61,62 @@ Frame Time: 0.0083333
 0 87 0 0 0 0  0 -20 0 40 0 0 0 0 0  0 10 0 5 0 0 0 0 0
 0 87 1 0 0 5  0 -25 0 50 0 0 0 0 0  0 15 0 9 0 0 0 0 0
 0 87 2 0 0 9  0 -30 0 60 0 0 0 0 0  0 20 0 3 0 0 0 0 0
+"""
+
+ASF = """# comment
+:version 1.10
+:units
+  length 0.45
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 1 0
+  orientation 0 0 0
+:bonedata
+  begin
+    id 1
+    name lfemur
+    direction 0 -1 0
+    length 7
+    axis 10 20 30 XYZ
+    dof rx ry rz
+    limits (-160.0 20.0)
+           (-70.0 70.0)
+           (-60.0 70.0)
+  end
+  begin
+    name ltibia
+    direction 0 -1 0
+    length 8
+    axis 0 0 20 XYZ
+    dof rx
+    limits (-10.0 170.0)
+  end
+  begin
+    name lfoot
+    direction 0 0 1
+    length 2
+    axis 0 0 0 XYZ
+  end
+:hierarchy
+  begin
+    root lfemur
+    ltibia lfoot
+    lfemur ltibia
+  end
+"""
+AMC = """#!OML:ASF somewhere
+:FULLY-SPECIFIED
+:DEGREES
+1
+root 1 2 3 10 20 30
+lfemur 5 6 7
+ltibia 40
+2
+root 1 2 4 10 20 30
+ltibia 50
+lfemur 5 6 8
 """
 
 

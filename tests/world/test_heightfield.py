@@ -424,7 +424,10 @@ def test_a_walk_over_a_heightfield_is_that_over_the_same_mesh(preset):
         (lambda h: terrain.heightfield(h, (1.0, -1.0)), r"above 0; got \[1.0, -1.0\]"),
         (lambda h: terrain.heightfield(h, (1.0, 1.0, 1.0)), r"between rows; got the shape \(3,\)"),
         (lambda h: terrain.heightfield(h, 1.0, (0.0, 0.0)), r"origin must have the shape \(3,\)"),
-        (lambda h: terrain.heightfield(h, 1.0, (0.0, np.nan, 0.0)), "origin is three finite"),
+        (
+            lambda h: terrain.heightfield(h, 1.0, (0.0, np.nan, 0.0)),
+            "origin is three numbers of at most",
+        ),
         (
             lambda h: terrain.heightfield(h, 1.0, interpolation="cubic"),
             "'triangulated'; got 'cubic'",

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from .options import Commands, add_command, add_output, finite
+from .options import Commands, add_command, add_output, number
 
 
 def add_inspect(commands: Commands) -> None:
@@ -17,7 +17,7 @@ def add_inspect(commands: Commands) -> None:
     inspect.add_argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc or .npz")
     inspect.add_argument("--json", action="store_true", help="as JSON")
     inspect.add_argument("--asf", type=Path, help="skeleton of an .amc, where it is not beside it")
-    inspect.add_argument("--scale", type=float, help="metres per unit of the file")
+    inspect.add_argument("--scale", type=number(1e-9, 1e6), help="metres per unit of the file")
 
 
 def add_terrain(commands: Commands) -> None:
@@ -37,7 +37,7 @@ def add_terrain(commands: Commands) -> None:
     terrain.add_argument("clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc or .npz")
     add_output(terrain, "MESH", ".ply, .obj or .stl")
     terrain.add_argument(
-        "--sole", type=finite, default=0.055, metavar="M",
+        "--sole", type=number(0, 10, "metres"), default=0.055, metavar="M",
         help="height of the ball joint over the sole, m (default: 0.055, an adult's in shoes)",
     )  # fmt: skip
     terrain.add_argument(
@@ -45,7 +45,11 @@ def add_terrain(commands: Commands) -> None:
         help="what is written (default: chosen by the error of prediction)",
     )  # fmt: skip
     terrain.add_argument(
-        "--margin", type=finite, default=1.0, metavar="M", help="of ground around the stances, m"
+        "--margin",
+        type=number(0, 100, "metres"),
+        default=1.0,
+        metavar="M",
+        help="of ground around the stances, m",
     )
 
 
@@ -100,5 +104,8 @@ def add_record(commands: Commands) -> None:
             "--lean-sign", type=int, choices=(1, -1), default=1, help="of the undulation rates"
         )
         way.add_argument(
-            "--tick-hz", type=finite, default=30.0, help="rate of the gains' ticks (default: 30)"
+            "--tick-hz",
+            type=number(1, 1000, "Hz"),
+            default=30.0,
+            help="rate of the gains' ticks (default: 30)",
         )

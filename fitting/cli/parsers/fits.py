@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from .options import Commands, add_command, add_output, finite
+from .options import Commands, add_command, add_output, count, number, rate
 
 
 def add_fit(commands: Commands) -> None:
@@ -40,7 +40,11 @@ def add_ablate(commands: Commands) -> None:
         "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
     )
     ablate.add_argument(
-        "--folds", type=int, default=2, metavar="N", help="parts of each clip (default: 2)"
+        "--folds",
+        type=count(2, 1000),
+        default=2,
+        metavar="N",
+        help="parts of each clip (default: 2)",
     )
     add_output(ablate, "DIR")
 
@@ -62,18 +66,23 @@ def add_calibrate(commands: Commands) -> None:
         "experiment", type=Path, metavar="EXPERIMENT.toml", help="as `jaxik fit` takes it"
     )
     calibrate.add_argument(
-        "-n", "--replicates", type=int, default=200, metavar="N", help="truths (default: 200)"
+        "-n",
+        "--replicates",
+        type=count(1, 100_000),
+        default=200,
+        metavar="N",
+        help="truths (default: 200)",
     )
     calibrate.add_argument(
         "--chains", action=argparse.BooleanOptionalAction, default=False,
         help="sample each posterior too, which takes much longer than the fits (default: no)",
     )  # fmt: skip
     calibrate.add_argument(
-        "--noise-factor", type=finite, default=1.0, metavar="X",
+        "--noise-factor", type=number(1e-3, 1e3), default=1.0, metavar="X",
         help="simulate noise X times as large as the experiment says (default: 1)",
     )  # fmt: skip
     calibrate.add_argument(
-        "--workers", type=int, default=0, metavar="N",
+        "--workers", type=count(0, 1024), default=0, metavar="N",
         help="compute in N other processes of this machine, with the extra `dask` (default: 0)",
     )  # fmt: skip
     calibrate.add_argument(
@@ -114,7 +123,9 @@ def add_sample(commands: Commands) -> None:
         """,
     )  # fmt: skip
     sample.add_argument("run", type=Path, metavar="RUN", help="folder made by `jaxik fit`")
-    sample.add_argument("--max-steps", type=int, metavar="N", help="of the sampler, over all calls")
+    sample.add_argument(
+        "--max-steps", type=count(1, 10**9), metavar="N", help="of the sampler, over all calls"
+    )
 
 
 def add_translate(commands: Commands) -> None:
@@ -152,7 +163,7 @@ def add_translate(commands: Commands) -> None:
         "(default: every parameter that moves these clips)",
     )  # fmt: skip
     translate.add_argument(
-        "--fps", type=finite, metavar="HZ", help="resample the clips first (default: as they are)"
+        "--fps", type=rate, metavar="HZ", help="resample the clips first (default: as they are)"
     )
     translate.add_argument(
         "--file-up", choices=("y", "z"), default="y", help="up axis of the meshes"

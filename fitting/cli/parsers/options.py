@@ -1,12 +1,24 @@
 """Options that several commands share, and how a command is added to the parser."""
 
 import argparse
-import math
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
+from typing import NoReturn, TypeAlias, TypeVar
 
+from fitting.runtime import validation
+
+Number = TypeVar("Number", int, float)
 Commands: TypeAlias = argparse._SubParsersAction
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports a mistake as the commands do: in one line, with status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """Prints what is wrong with the words, without the usage, and exits."""
+        line = validation.in_one_line(ValueError(message))
+        self.exit(2, f"{self.prog}: {line}; see `{self.prog} --help`\n")
 
 
 def add_command(
@@ -44,7 +56,11 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
     )
     command.add_argument("--file-up", choices=("y", "z"), default="y", help="up axis of the mesh")
     command.add_argument(
-        "--floor", type=finite, default=0.0, metavar="M", help="height of the clip's floor, m"
+        "--floor",
+        type=number(-1e6, 1e6, "metres"),
+        default=0.0,
+        metavar="M",
+        help="height of the clip's floor, m",
     )
     command.add_argument(
         "--root", choices=("auto", "animation", "ground"), default="auto",
@@ -52,7 +68,7 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
         "foot IK reaches the ground from there, or where the feet follow this terrain already",
     )  # fmt: skip
     command.add_argument(
-        "--speed", type=positive, default=1.0, metavar="X",
+        "--speed", type=number(0.01, 100), default=1.0, metavar="X",
         help="let the root travel X times as far as in the clip; strides are scaled with it",
     )  # fmt: skip
     command.add_argument(
@@ -61,25 +77,34 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
     )  # fmt: skip
 
 
-def finite(text: str) -> float:
-    """A finite number, as the `type` of an option."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r}; wanted a finite number")
-    return value
+def number(low: int | float, high: int | float, unit: str = "") -> Callable[[str], float]:
+    """A number in a range, as the `type` of an option."""
+    return _read(float, validation.number(low, high, unit))
 
 
-def positive(text: str) -> float:
-    """A finite number above 0, as the `type` of an option."""
-    value = finite(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r}; wanted a number above 0")
-    return value
+def count(low: int, high: int) -> Callable[[str], int]:
+    """A whole number in a range, as the `type` of an option."""
+    return _read(int, validation.count(low, high))
 
 
 def rates(text: str) -> list[float]:
-    """Finite numbers above 0 with commas between them, as the `type` of an option."""
-    return [positive(part) for part in text.split(",")]
+    """Frame rates with commas between them, as the `type` of an option."""
+    return [rate(part) for part in text.split(",")]
+
+
+def _read(
+    convert: Callable[[str], Number], wanted: validation.Constraint
+) -> Callable[[str], Number]:
+    def read(text: str) -> Number:
+        try:
+            value = convert(text)
+        except ValueError:
+            value = None
+        if value is None or not wanted.accepts(value):
+            raise argparse.ArgumentTypeError(f"{text!r}; wanted {wanted.description}")
+        return value
+
+    return read
+
+
+rate = _read(float, validation.RATE)

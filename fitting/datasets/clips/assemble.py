@@ -22,6 +22,7 @@ from .recording import (
     FURTHEST,
     INCH,
     LONGEST,
+    SHORTEST,
     SLOWEST,
     Y_UP_FROM_Z_UP,
     Recording,
@@ -196,7 +197,7 @@ def _with_bones(
                     f"{source}: the {leg.name} {bone} is {lengths[joint]:.4g} m long; "
                     f"wanted at most {LONGEST:g}; give another scale=..."
                 )
-            if lengths[joint] == 0.0:
+            if lengths[joint] < SHORTEST:
                 remarks.append(
                     f"the {leg.name} {bone} has no length, so there are no legs; "
                     "name other joints with joints=..."

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from fitting.runtime.validation import check_file
+
 from . import formats
 from .assemble import Overrides, clip_from_recording
 from .clip import Clip
@@ -46,8 +48,7 @@ def load_clip(
     suffix = path.suffix.lower()
     if suffix not in (*formats.READERS, ".npz"):
         raise ValueError(f"{path}: wanted a {', '.join(formats.READERS)} or .npz file")
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+    check_file(path)
     overrides = Overrides(scale, fps, up, joints)
     if suffix == ".npz":
         arguments = {"asf": asf, **vars(overrides)}

@@ -11,7 +11,7 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 FURTHEST = 1e6  # m, of any joint from the origin
-LONGEST = 100.0  # m, of a bone of a leg
+SHORTEST, LONGEST = 1e-4, 100.0  # m, of a bone of a leg
 SLOWEST, FASTEST = 1e-3, 1e5  # frames per second
 
 
@@ -54,9 +54,9 @@ class Recording:
 
     def scaled(self, factor: float) -> "Recording":
         """The same motion with every length multiplied by `factor`."""
-        return replace(
-            self, offsets_ls=self.offsets_ls * factor, positions_ls=self.positions_ls * factor
-        )
+        with np.errstate(all="ignore"):  # the loader says which joint is too far away
+            offsets_ls, positions_ls = self.offsets_ls * factor, self.positions_ls * factor
+        return replace(self, offsets_ls=offsets_ls, positions_ls=positions_ls)
 
     def rotated(self, matrix: Float64[np.ndarray, "3 3"]) -> "Recording":
         """The same motion in other axes: vectors v become M v, rotations R become M R M⁻¹.

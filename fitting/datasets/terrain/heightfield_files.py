@@ -14,6 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from fitting.datasets import archives
+from fitting.runtime.validation import check_file
+
 SUFFIX = ".npz"
 REQUIRED = ("heights", "spacing")
 OPTIONAL = ("origin", "interpolation")
@@ -34,13 +37,8 @@ def read_heightfield(path: Path) -> HeightfieldArrays:
     Raises:
         ValueError: no such file, no archive, other arrays in it, or arrays that are no numbers.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = dict(archive)
-    except Exception as error:  # zipfile, zlib and NumPy each raise their own
-        raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({error})") from None
+    check_file(path)
+    content = archives.read_arrays(path)
     if not set(REQUIRED) <= set(content) <= {*REQUIRED, *OPTIONAL}:
         raise ValueError(
             f"{path}: a heightfield is the arrays {' and '.join(REQUIRED)}, with or without "

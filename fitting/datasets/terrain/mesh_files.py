@@ -1,21 +1,27 @@
 """Terrain files: reads meshes and heightfields as `jaxik.world.terrain.Terrain`; writes meshes."""
 
-from collections.abc import Callable
+import io
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jax.typing import DTypeLike
 from jaxtyping import ArrayLike, Float, Int
+from trimesh.exchange.load import mesh_formats
+from trimesh.resolvers import FilePathResolver
 
-from fitting.runtime.validation import error_context
+from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
 
-from . import heightfield_files
+from . import gltf_checks, heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
+WITH_MATERIALS = ("obj", *gltf_checks.KINDS)  # whose images need not be read
 # A file with z up is rotated about x, as glTF exporters do: (x, y, z) becomes (x, z, -y).
 _WORLD_FROM_FILE = {
     "y": np.eye(3),
@@ -75,7 +81,8 @@ def load_terrain(
                 interpolation=field.interpolation,
             )
     vertices, triangles = _read(path)
-    vertices_ws = _as_dtype(scale * vertices @ _WORLD_FROM_FILE[file_up].T, dtype)
+    with np.errstate(all="ignore"):  # what is not finite, or too far away, is refused below
+        vertices_ws = _as_dtype(scale * vertices @ _WORLD_FROM_FILE[file_up].T, dtype)
     with error_context(path):
         return terrain.mesh(vertices_ws, triangles, up=up, layer=layer, slack=slack)
 
@@ -146,24 +153,51 @@ def embree_tracer(
 
 def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
     """Vertices and triangles of all geometries of a file, in its own unit and axes."""
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such file")
-    formats = sorted(trimesh.available_formats())
-    if not path.name.lower().endswith(tuple(f".{name}" for name in formats)):
+    check_file(path)
+    formats = sorted(mesh_formats())  # no archives: they may hold anything
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in formats:
         raise ValueError(
             f"{path}: wanted a heightfield (.npz) or a mesh that trimesh reads "
             f"({', '.join(formats)}); not {path.suffix!r}"
         )
+    options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
+    content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
-        # Unprocessed, as trimesh would otherwise merge and drop vertices.
-        scene = trimesh.load_scene(path, process=False)
-        mesh = scene.to_mesh()
+        gltf_checks.check_claims(kind, content)
+        with _silent_trimesh():
+            # Unprocessed, as trimesh would otherwise merge and drop vertices.
+            resolver = FilePathResolver(str(path))
+            scene = trimesh.load_scene(
+                io.BytesIO(content), file_type=kind, resolver=resolver, process=False, **options
+            )
+            mesh = scene.to_mesh()
+    except ImportError:  # of a package that guesses encodings, which is no requirement
+        raise ValueError(
+            f"{path}: trimesh cannot read it: neither a whole binary file nor text in UTF-8"
+        ) from None
     except Exception as error:  # each format's reader fails in its own way
-        raise ValueError(f"{path}: trimesh cannot read it: {error}") from error
+        raise ValueError(f"{path}: trimesh cannot read it: {in_one_line(error, QUOTED)}") from None
     if not len(mesh.faces):
         content = ", ".join(type(each).__name__ for each in scene.geometry.values()) or "nothing"
         raise ValueError(f"{path}: terrain needs triangles; the file holds {content}")
-    return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    vertices = np.array(mesh.vertices, np.float64)
+    if vertices.shape[1:] != (3,):
+        raise ValueError(f"{path}: its vertices have {vertices.shape[-1]} coordinates; wanted 3")
+    return vertices, np.array(mesh.faces, np.int64)
+
+
+@contextmanager
+def _silent_trimesh() -> Iterator[None]:
+    """Keeps trimesh from printing what it thinks of a file."""
+    log, nowhere = logging.getLogger("trimesh"), logging.NullHandler()
+    before, log.propagate = log.propagate, False
+    log.addHandler(nowhere)
+    try:
+        yield
+    finally:
+        log.removeHandler(nowhere)
+        log.propagate = before
 
 
 def height_function(

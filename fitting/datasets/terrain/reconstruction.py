@@ -26,6 +26,7 @@ SOLE = 0.055  # m, ball joint above the sole: CMU database, subject 03, in his s
 TOE_PITCH, TOE_DEVIATIONS = np.radians(5.0), 3.0 * 1.4826
 NEAR = 0.3  # m, about a foot's length: a stance on toes is not used if a flat one is as near
 MIN_STANCES = 4  # three determine a plane, and one tests it
+WIDEST = 1000.0  # m, between stances
 SURFACE_KINDS = ("plane", "smooth", "blocks")  # from simple to complex
 SurfaceFit = Callable[[Footprints], Surface]
 
@@ -111,7 +112,7 @@ def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> R
         kind: which of `SURFACE_KINDS` to choose; None chooses by cross-validation.
 
     Raises:
-        ValueError: an unknown kind, a clip without legs, or too few stances.
+        ValueError: an unknown kind, a clip without legs, too few stances, or some too far apart.
     """
     if kind not in (None, *SURFACE_KINDS):
         raise ValueError(f"no kind of ground named {kind!r}; there are {list(SURFACE_KINDS)}")
@@ -120,6 +121,11 @@ def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> R
     if len(feet.balls) < MIN_STANCES:
         raise ValueError(
             f"{clip.source}: {len(feet.balls)} stances; reconstruction needs {MIN_STANCES} or more"
+        )
+    places = np.column_stack([feet.balls, feet.heights])
+    if (extent := np.ptp(places, axis=0).max()) > WIDEST:
+        raise ValueError(
+            f"{clip.source}: its stances are up to {extent:.4g} m apart; wanted at most {WIDEST:g}"
         )
     grids = block_grids.search(feet)
     fits: dict[str, SurfaceFit] = {

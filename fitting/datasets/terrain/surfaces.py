@@ -17,6 +17,8 @@ from .meshes import Mesh, grid_faces
 PLANE_NOISE = 0.01  # m: footprints farther from the plane weigh less (soft L1)
 SLOPE_PRIOR = 0.05  # m per m, standard deviation; it fixes the tilt across a straight walk
 VERTEX_SPACING = 0.1  # m, in the mesh of a thin plate
+MAX_CELLS = 2_000_000  # of a mesh
+CHUNK = 10_000  # cells whose heights are found at a time; bounds the memory
 SMOOTHING = 10.0 ** np.arange(-6.0, 2.1, 0.5)  # m², candidates for a thin plate
 
 
@@ -75,6 +77,7 @@ class ThinPlate(Surface):
 
     def mesh(self, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]) -> Mesh:
         count = np.ceil((high - low) / VERTEX_SPACING).astype(int) + 1
+        _check_cells(count, VERTEX_SPACING, high - low)
         return _grid_mesh(
             self, *(np.linspace(*part) for part in zip(low, high, count, strict=True))
         )
@@ -102,6 +105,7 @@ class LevelBlocks(Surface):
         box = np.array([[x, z] for x in (low[0], high[0]) for z in (low[1], high[1])])
         reached = self.grid.cells(box)
         first, shape = reached.min(axis=0), np.ptp(reached, axis=0) + 1
+        _check_cells(shape, self.grid.pitch, high - low)
         index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
         tops = self._heights_of((first + index).reshape(-1, 2)).reshape(shape)
         corners = np.array([[0, 0], [0, 1], [1, 1], [1, 0]])  # of a block, seen from below
@@ -120,9 +124,12 @@ class LevelBlocks(Surface):
 
     def _heights_of(self, cells: np.ndarray) -> np.ndarray:
         """Heights of cells: their own, or the mean over the nearest ring of blocks."""
-        rings = self._rings(cells)
-        nearest = rings == rings.min(axis=1, keepdims=True)
-        return (nearest * self.tops).sum(axis=1) / nearest.sum(axis=1)
+        heights = []
+        for part in np.array_split(cells, len(cells) // CHUNK + 1):
+            rings = self._rings(part)
+            nearest = rings == rings.min(axis=1, keepdims=True)
+            heights.append((nearest * self.tops).sum(axis=1) / nearest.sum(axis=1))
+        return np.concatenate(heights)
 
     def _rings(self, cells: np.ndarray) -> np.ndarray:
         """Distance of cells to blocks with footprints, in blocks, diagonals counting as one."""
@@ -187,6 +194,15 @@ def fit_blocks(ranked: RankedGrids, feet: Footprints) -> LevelBlocks:
     block = block.reshape(-1)
     tops = np.array([np.median(feet.heights[block == index]) for index in range(len(cells))])
     return LevelBlocks(grid, cells, tops, np.bincount(block).astype(np.int64))
+
+
+def _check_cells(shape: np.ndarray, pitch: float, extent: np.ndarray) -> None:
+    """ValueError for a mesh of too many cells."""
+    if (cells := int(np.prod(shape.astype(float)))) > MAX_CELLS:
+        raise ValueError(
+            f"{extent[0]:.4g} m by {extent[1]:.4g} m of ground in cells of {pitch:.3g} m are "
+            f"{cells} cells; wanted at most {MAX_CELLS}: a clip or a margin that is smaller"
+        )
 
 
 def _grid_mesh(surface: Surface, x: np.ndarray, z: np.ndarray) -> Mesh:

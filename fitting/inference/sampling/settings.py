@@ -4,6 +4,8 @@ import dataclasses
 
 from fitting.inference.settings import Settings, setting
 
+MAX_CHAIN = 2**33  # bytes of a chain, all of whose stored steps are held in memory
+
 
 @dataclasses.dataclass(frozen=True)
 class SamplerSettings(Settings):
@@ -14,18 +16,27 @@ class SamplerSettings(Settings):
     """
 
     walkers: int | None = setting(
-        None, "Walkers: an even number, by default four per free parameter.", low=1
+        None, "Walkers: an even number, by default four per free parameter.", low=1, high=10_000
     )
     max_steps: int = setting(
-        20_000, "Steps of the sampler at most, over all runs of a chain.", unit="steps", low=1
+        20_000,
+        "Steps of the sampler at most, over all runs of a chain.",
+        unit="steps",
+        low=1,
+        high=10**9,
     )
-    min_steps: int = setting(0, "Steps before which sampling does not stop.", unit="steps")
-    thin_by: int = setting(1, "One step in so many is stored.", unit="steps", low=1)
+    min_steps: int = setting(
+        0, "Steps before which sampling does not stop.", unit="steps", high=10**9
+    )
+    thin_by: int = setting(1, "One step in so many is stored.", unit="steps", low=1, high=10**6)
     check_every: int = setting(
-        100, "Steps between reports, and at least between checks of convergence.", low=1
+        100, "Steps between reports, and at least between checks of convergence.", low=1, high=10**6
     )
     stop_at: float = setting(
-        50.0, "Length that ends the sampling, if the time is steady.", unit="autocorrelation times"
+        50.0,
+        "Length that ends the sampling, if the time is steady.",
+        unit="autocorrelation times",
+        high=1e12,
     )
 
     def __post_init__(self) -> None:
@@ -39,17 +50,24 @@ class SamplerSettings(Settings):
         """Number of walkers for `size` free parameters.
 
         Raises:
-            ValueError: for an odd number, or fewer than two per free parameter.
+            ValueError: for an odd number, fewer than two per free parameter, or a chain that is too
+                large for memory.
         """
-        if self.walkers is None:
-            return max(4 * size, 4)
         minimum = max(4, 2 * size)
-        if self.walkers % 2 or self.walkers < minimum:
+        walkers = max(4 * size, 4) if self.walkers is None else self.walkers
+        if walkers % 2 or walkers < minimum:
             raise ValueError(
-                f"walkers is {self.walkers}, wanted an even number from {minimum} on,"
+                f"walkers is {walkers}, wanted an even number from {minimum} on,"
                 " two per free parameter"
             )
-        return self.walkers
+        stored = self.max_steps // self.thin_by
+        if (needed := 8 * stored * walkers * size) > MAX_CHAIN:
+            raise ValueError(
+                f"max_steps is {self.max_steps}, of which {stored} are stored: with {walkers} "
+                f"walkers and {size} parameters {needed / 2**30:.3g} GiB, wanted at most "
+                f"{MAX_CHAIN / 2**30:g}; take a larger thin_by"
+            )
+        return walkers
 
 
 DEFAULTS = SamplerSettings()

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.text import Text
 
 from fitting.runtime import files
 
@@ -99,4 +100,13 @@ def legend(figure: Figure, *entries: Artist, columns: int = 4) -> None:
 def save(path: Path, figure: Figure) -> None:
     """Writes a figure; never leaves half a file."""
     look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
-    files.write(path, lambda temporary: figure.savefig(temporary, **look))
+
+    def fill(temporary: Path) -> None:
+        try:
+            figure.savefig(temporary, **look)
+        except ValueError:  # a name of the user's, such as "$x^$", is no mathematics
+            for text in figure.findobj(Text):
+                text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
+            figure.savefig(temporary, **look)
+
+    files.write(path, fill)

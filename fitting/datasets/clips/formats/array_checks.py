@@ -98,7 +98,7 @@ def _problem_of_values(array: np.ndarray, wanted: Wanted) -> str:
     return ""
 
 
-def _place(chosen: np.ndarray) -> str:
+def _place(chosen: np.ndarray | np.bool_) -> str:
     """Where the first of the chosen entries is."""
     return "" if chosen.ndim == 0 else f" at {[int(i) for i in np.argwhere(chosen)[0]]}"
 

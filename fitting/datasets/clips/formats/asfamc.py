@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.recording import INCH, Recording
+from fitting.runtime.validation import check_file
 
 AMC_RATE = 120.0  # Hz, by convention of the CMU database
 ROTATIONS = ("rx", "ry", "rz")
@@ -42,6 +43,7 @@ class _Lines:
     """The words of each line with its number, without comments (`#`) and empty lines."""
 
     def __init__(self, path: Path) -> None:
+        check_file(path)
         self.path = path
         text = path.read_text(encoding="utf-8-sig", errors="replace")
         numbered = (
@@ -98,7 +100,8 @@ def read_asfamc(amc: Path, asf: Path | None = None) -> Recording:
     asf = find_asf(amc) if asf is None else asf
     skeleton = _read_asf(asf)
     values, degrees = _read_amc(amc, skeleton, asf)
-    return _assemble(skeleton, values, degrees)
+    with np.errstate(all="ignore"):  # the loader says which joint is too far away
+        return _assemble(skeleton, values, degrees)
 
 
 def _read_asf(path: Path) -> _Skeleton:

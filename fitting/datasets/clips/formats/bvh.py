@@ -131,7 +131,7 @@ class _Reader:
 
     def _header(self) -> tuple[int, float]:
         """The declared number of frames and the frame time, s."""
-        match = re.fullmatch(r"Frames\s*:\s*(\d+)", self._next("Frames:"), re.IGNORECASE)
+        match = re.fullmatch(r"Frames\s*:\s*(\d{1,18})", self._next("Frames:"), re.IGNORECASE)
         if not match or int(match[1]) < 1:
             raise self._error("wanted 'Frames:' and a whole number from 1 up")
         frames = int(match[1])

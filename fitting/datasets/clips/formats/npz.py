@@ -4,18 +4,18 @@ An archive of our own holds every field of a `Clip`, so it loads exactly as it w
 file holds joint positions of two legs, once as captured and once as a flat animation.
 """
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from fitting.datasets import archives
 from fitting.datasets.clips import contacts
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
 from fitting.datasets.clips.clip import TRACKS, Clip
 from fitting.datasets.clips.leg_geometry import leg_rotations, unit
-from fitting.datasets.clips.recording import FASTEST, FURTHEST, LONGEST, SLOWEST
+from fitting.datasets.clips.recording import FASTEST, FURTHEST, LONGEST, SHORTEST, SLOWEST
 from fitting.datasets.clips.rigs import relative_size, with_soles
 from fitting.runtime import files
 from jaxik.world.skeleton import Rig
@@ -25,7 +25,6 @@ from .array_checks import Wanted, check_arrays
 Arrays = dict[str, np.ndarray]
 
 FORMAT = "jaxik clip 1"
-MAX_BYTES = 2**31  # of all arrays together, unpacked
 FPS = Wanted("number", low=SLOWEST, high=FASTEST)
 FRAMES = Wanted("number", ("frames",), low=0.0, high=1.0, optional=True)
 TRACK_ARRAYS = {
@@ -136,16 +135,7 @@ def read_npz(path: Path, variant: str) -> Clip:
         ValueError: neither kind of file, arrays missing, misshapen or not finite, or no such
             variant.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size <= MAX_BYTES:
-            with np.load(path, allow_pickle=False) as arrays:
-                content = dict(arrays)
-    except Exception as error:  # zipfile, zlib and NumPy each raise their own
-        raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({error})") from None
-    if size > MAX_BYTES:
-        raise ValueError(f"{path}: its arrays take {size} bytes; wanted {MAX_BYTES} at most")
+    content = archives.read_arrays(path)
     if "format" in content:
         if variant != "captured":
             raise ValueError(f"{path}: only blocks files have the variant {variant!r}")
@@ -161,13 +151,7 @@ def read_npz(path: Path, variant: str) -> Clip:
 
 def is_blocks_file(path: str | Path) -> bool:
     """Whether a file belongs to the `blocks` benchmark, with a captured clip and its flat base."""
-    if Path(path).suffix.lower() != ".npz" or not Path(path).is_file():
-        return False
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return "base_pelvis" in archive.files
-    except Exception:  # reading the file will report what is wrong with it
-        return False
+    return Path(path).suffix.lower() == ".npz" and "base_pelvis" in archives.array_names(Path(path))
 
 
 def _read_saved_clip(path: Path, content: Arrays) -> Clip:
@@ -212,8 +196,11 @@ def _check_tree(path: Path, content: Arrays, joints: int) -> None:
     if (named >= joints).any():
         raise ValueError(f"{path}: rig_joints and rig_pelvis name {named.max()} of {joints} joints")
     for name in ("rig_thigh", "rig_shin"):
-        if (content[name][content["rig_present"]] <= 0).any():
-            raise ValueError(f"{path}: {name} has a bone of no length")
+        shortest = content[name][content["rig_present"]].min(initial=LONGEST)
+        if shortest < SHORTEST:
+            raise ValueError(
+                f"{path}: {name} has a bone of {shortest:g} m; wanted {SHORTEST:g} to {LONGEST:g}"
+            )
 
 
 def _read_rig(content: Arrays) -> Rig:
@@ -222,6 +209,9 @@ def _read_rig(content: Arrays) -> Rig:
     known = all(f"rig_{name}" in content for name in SOLE_ARRAYS)
     unknown = np.zeros(len(joints))
     arrays |= {name: content[f"rig_{name}"] if known else unknown for name in SOLE_ARRAYS}
+    numbers = {name: array for name, array in arrays.items() if array.dtype != bool}
+    dtype = np.result_type(np.float32, *numbers.values())  # one for all, as JAX mixes none
+    arrays |= {name: array.astype(dtype) for name, array in numbers.items()}
     with jax.enable_x64(True):
         rig = Rig(
             **jax.device_put(arrays),

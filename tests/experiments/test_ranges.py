@@ -1,0 +1,188 @@
+"""The range of every number in an experiment file: its ends are accepted, nothing beyond is."""
+
+import math
+import re
+import time
+
+import pytest
+
+from fitting.experiments import experiment_files, systems
+from fitting.experiments.experiment import Experiment
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.sampling.settings import SamplerSettings
+from fitting.inference.settings import describe
+from fitting.runtime import validation
+from support.experiments import CLIP, write
+
+INF = math.inf
+TOP = {"fps": (1, 1000), "independent_every": (0, 1e6), "seed": (0, 2**32 - 1)}
+SIGMAS = dict.fromkeys(experiment_files.KINDS, (1e-9, 1e9))
+CORRELATIONS = dict.fromkeys(("correlation", *experiment_files.CORRELATIONS), (0, 0.999))
+SEARCH = {
+    "draws": (2, 100_000), "descents": (1, 1000), "agreement": (0, 1e6),
+    "agreeing_starts": (1, 1000), "descent_steps": (1, 1000), "min_step_gain": (0, 1),
+    "max_small_steps": (1, 1000), "max_rejected_steps": (1, 1000),
+    "polish_max_rejected_steps": (1, 1000), "population": (17, 100_000), "generations": (1, 1000),
+    "elite": (1, 100_000), "gauss_newton_children": (0, 63), "max_rounds": (1, 1000),
+    "min_round_gain": (0, 1e6), "patience": (1, 1000), "sweep_values": (1, 1000),
+    "sweep_tries": (1, 1000), "min_sweep_gain": (0, 1), "sweeps": (0, 1000),
+}  # fmt: skip
+SAMPLE = {
+    "walkers": (4, 10_000), "max_steps": (1, 2**26), "min_steps": (0, 10**9),
+    "thin_by": (1, 20_000), "check_every": (1, 10**6), "stop_at": (0, 1e12),
+}  # fmt: skip
+RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "": TOP,
+    "[sigmas]": SIGMAS | CORRELATIONS,
+    "[prior]": {"spread": (1e-3, 1e3)},
+    "[prior.foot]": {"max_pitch.spread": (1e-3, 1e3)},
+    "[fit]": {"starts": (1, 1000), "max_steps": (1, 100_000)},
+    "[fit.search]": SEARCH,
+    "[sample]": SAMPLE,
+}
+WHERE = [(table, key, *ends) for table, keys in RANGES.items() for key, ends in keys.items()]
+OF_CLIPS = {"start": (0, 1e6), "end": (1e-3, 1e6)}
+WORDS = ("name", "preset", "body", "loss", "faithful")
+TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "noise", "fit", "sample")
+
+
+def toml(value: float) -> str:
+    return str(value) if isinstance(value, int) else repr(float(value))
+
+
+def load(folder, table: str, key: str, value: float) -> Experiment:
+    """An experiment with one key in one table; raises as the loader does, and soon."""
+    line = f"{key} = {toml(value)}\n"
+    parts = {"rest": f"{table}\n{line}"} if table else {"top": line}
+    begin = time.process_time()
+    try:
+        return experiment_files.load_experiment(write(folder, **parts))
+    finally:
+        assert time.process_time() - begin < 5.0
+
+
+def beyond(low: float, high: float) -> list[float]:
+    """Values outside a range: near its ends, far away, and no numbers."""
+    step = 1 if isinstance(low, int) and isinstance(high, int) else 1e-12
+    odd = [-1, -(10**9), 1e300, -1e300, INF, -INF, math.nan, 10**400, 2**63]
+    return [low - step if low else -step, high + max(step, 1e-9 * high), *odd]
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "low", "high"), WHERE, ids=[f"{table}{key}" for table, key, *_ in WHERE]
+)
+def test_a_number_is_accepted_up_to_the_ends_of_its_range(table, key, low, high, tmp_path):
+    for value in (low, high):
+        load(tmp_path, table, key, value)
+    for value in beyond(low, high):
+        if value == INF and key in SIGMAS:
+            continue
+        with pytest.raises(ValueError) as refused:
+            load(tmp_path, table, key, value)
+        message, leaf = str(refused.value), key.rpartition(".")[2]
+        assert message.startswith(f"{tmp_path / 'experiment.toml'}")
+        assert table in message or "[prior]" in message
+        assert re.search(rf"\b{leaf}\b.*wanted |wanted .*\b{leaf}\b", message), message
+        assert len(validation.in_one_line(refused.value)) <= 1000
+
+
+@pytest.mark.parametrize("key", OF_CLIPS)
+def test_a_time_is_accepted_up_to_the_ends_of_its_range(key, tmp_path):
+    low, high = OF_CLIPS[key]
+    for value in (low, high):
+        write_clip = {"clips": CLIP, "clip": f"{key} = {toml(value)}"}
+        experiment_files.load_experiment(write(tmp_path, **write_clip))
+    for value in (-1e-9, high * 1.001, -1, INF, -INF, math.nan, 1e300):
+        with pytest.raises(ValueError, match=rf"experiment.toml \[\[clips\]\]: {key} is .*wanted "):
+            experiment_files.load_experiment(
+                write(tmp_path, clips=CLIP, clip=f"{key} = {toml(value)}")
+            )
+
+
+def test_every_number_of_the_format_has_a_range_here():
+    assert SEARCH.keys() | {"max_steps"} == describe(SearchSettings).keys()
+    assert SAMPLE.keys() == describe(SamplerSettings).keys()
+    assert {**SIGMAS, **CORRELATIONS}.keys() == experiment_files.SIGMA_KEYS.keys()
+    others = (*WORDS, *TABLES, "hierarchy", "clips", "without")
+    assert {*TOP, *others} == experiment_files.TOP_KEYS.keys()
+    texts = (*experiment_files.FILE_KEYS, "label", "subject", "file_up", "mask_pops", "root")
+    assert {*OF_CLIPS, *texts} == experiment_files.CLIP_KEYS.keys()
+    for settings in (SearchSettings, SamplerSettings):
+        assert all(math.isfinite(declared.high) for declared in describe(settings).values())
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ("low = 0.3, high = 0.3", "low < high"),
+        ("low = 0.5, high = 0.1", "low < high"),
+        ("low = inf", "low is inf; wanted a finite number"),
+        ("high = 1e300", "high is 1e.300; wanted a finite number"),
+        ("high = 1e30", "1e.30 apart, wanted .*; its rule has 0"),
+        ("low = 0.5, high = 0.50000000001", "apart, wanted"),
+        ("low = 0.0, high = 1e-300", "1e-300 apart, wanted 1.4e-06 to"),
+        ("low = 1e-13, high = 1.0, scale = 'log'", "at most 1e.12 times the lower one"),
+        ("low = 1e-300, high = 0.5, scale = 'gain'", "strictly between 1e-09 and 0.999999999"),
+        ("low = 0.5, high = 1.0, scale = 'gain'", "strictly between 1e-09 and 0.999999999"),
+    ],
+)
+def test_a_range_of_a_free_parameter_is_neither_too_narrow_nor_too_wide(bounds, message, tmp_path):
+    path = write(tmp_path, free=f"foot.max_pitch = {{ {bounds} }}")
+    with pytest.raises(ValueError, match=f"experiment.toml .free..*max_pitch.*{message}"):
+        loaded = experiment_files.load_experiment(path)
+        loaded.free_parameters(loaded.starting_system())
+
+
+def test_a_range_may_be_a_millionth_or_a_million_times_the_declared_one(tmp_path):
+    for bounds in ("low = 0.0, high = 1.5e-6", "high = 1e6", "low = 1e-9, high = 1, scale = 'log'"):
+        path = write(tmp_path, free=f"foot.max_pitch = {{ {bounds} }}")
+        loaded = experiment_files.load_experiment(path)
+        (parameter,) = loaded.free_parameters(loaded.starting_system())
+        assert parameter.low < parameter.high
+
+
+@pytest.mark.parametrize("preset", systems.preset_names())
+def test_a_fixed_number_is_one_that_32_bits_hold(preset, tmp_path):
+    ik = systems.preset_system(preset)
+    name = next(iter(systems.parameter_tree.declarations(ik)))
+    for value in (1e39, -1e39, math.nan, 10**400, "x", [], {}):
+        with pytest.raises(ValueError, match=f"file: {name} (is|has shape) .*wanted "):
+            systems.with_parameters(ik, {name: value}, "file")
+    systems.with_parameters(ik, {name: 3e38}, "file")
+    systems.with_parameters(ik, {name: INF}, "file")
+    for value in (0.5, -1, 2**32, INF, True):
+        with pytest.raises(ValueError, match="probe.layers is .*; wanted a whole number from 0"):
+            systems.with_parameters(ik, {"probe.layers": value}, "file")
+
+
+@pytest.mark.parametrize(
+    ("rest", "message"),
+    [
+        ("[sigmas]\nankle = inf\nknee = inf\npelvis = inf\nfoot = inf", "wanted one that is not"),
+        ("[sample]\nwalkers = 10_000\nmax_steps = 1_000_000", "149 GiB, wanted at most 8; take a"),
+        ("[sample]\nmax_steps = 10\nthin_by = 20", "wanted at least thin_by"),
+        ("[hierarchy]\nper_clip = [[]]", "per_clip is .*; wanted a list of names"),
+        ("[hierarchy]\nper_subject = [1, {}]", "per_subject is .*; wanted a list of names"),
+        ('[hierarchy]\nper_clip = ["a\\u0000"]', "per_clip is .*; wanted a list of names"),
+        ("[prior.pelvis]\non_gain = { centre = inf }", "centre is inf; wanted a finite number"),
+        ("[start]\npelvis.on_gain = inf", "on_gain is inf; wanted a finite number"),
+    ],
+)
+def test_a_request_that_cannot_be_met_is_refused(rest, message, tmp_path):
+    with pytest.raises(ValueError, match=f"experiment.toml.*{message}"):
+        experiment_files.load_experiment(write(tmp_path, rest=rest))
+
+
+@pytest.mark.parametrize("key", ["name", "preset", "loss", "body"])
+@pytest.mark.parametrize("word", ["a\\u0000b", "a\\nb", "x" * 1001, "\\u202e"])
+def test_a_text_is_short_and_printable(key, word, tmp_path):
+    with pytest.raises(ValueError, match=rf"experiment.toml: {key} is .*; wanted "):
+        experiment_files.load_experiment(write(tmp_path, top=f'{key} = "{word}"'))
+
+
+def test_more_steps_of_a_chain_than_fit_into_memory_are_refused(tmp_path):
+    loaded = experiment_files.load_experiment(write(tmp_path))
+    assert loaded.with_max_sample_steps(40_000).sample.max_steps == 40_000
+    for steps in (0, -1, 10**9):
+        with pytest.raises(ValueError, match="max_steps is "):
+            loaded.with_max_sample_steps(steps)

@@ -1,0 +1,276 @@
+"""All formats of files that users hand over: a small whole file of each, its loader, its damage."""
+
+import json
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from fitting.datasets.clips import load_clip, save_clip
+from fitting.datasets.clips.clip import Clip
+from fitting.datasets.clips.edit import mask_pops
+from fitting.datasets.terrain.mesh_files import load_terrain
+from fitting.experiments import parameter_files, record_files, track_files
+from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.known_values import load_known_values
+from fitting.runtime.validation import error_context
+from fitting.studies import run_folder, translation
+from jaxik import presets, record
+from support import experiments
+from support.records import packed
+from support.sample_clips import AMC, ASF, BVH, stair_walk
+
+from . import soundness
+from .damage import (
+    Random,
+    archive_of,
+    damage_arrays,
+    damage_bytes,
+    damage_glb,
+    damage_json,
+    damage_text,
+    damage_toml,
+)
+
+DATA = experiments.ROOT / "data"
+TRACKS = """
+[grounded]
+times = [0.0, 0.2, 0.4]
+values = [1, 1, 0]
+[weight.left]
+times = [0.0, 0.3]
+values = [1, 0.5]
+stepped = true
+[foot.max_pitch]
+times = [0.0]
+values = [[0.5, 0.4]]
+"""
+FREE = """
+[free]
+lean.gain = {}
+target.foot_height = { low = 0.0, high = 0.2 }
+"foot.max_pitch" = { low = 0.1, kind = "smooth", scale = "log" }
+"""
+TABLES = """
+[prior]
+spread = 1.6
+[prior.foot]
+max_pitch = { centre = 0.3, spread = 1.0 }
+[start]
+foot.max_pitch = 0.5
+[sigmas]
+ankle = 0.02
+correlation = { pelvis = 0.9, ankle = 0.8 }
+[noise]
+sigmas = "estimated"
+[hierarchy]
+scale_with_body = true
+[fit]
+starts = 6
+max_steps = 1000
+[fit.search]
+population = 64
+agreement = 3.0
+[sample]
+walkers = 64
+thin_by = 1
+stop_at = 50.0
+[[without]]
+name = "locks"
+parameters = { lock.enabled = false }
+free = { pelvis.limit = {} }
+"""
+RUN = {
+    "parameters": [
+        {"name": "lean.gain", "unit": "1", "u": 0.5, "start_sd": 0.1, "value": 0.2}
+        | {"determined": True}
+    ]
+}
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file."""
+
+    file: str
+    """The name of the damaged file."""
+    whole: Callable[[], bytes]
+    load: Callable[[Path], object]
+    """Reads the file and checks what it read."""
+    damage: Callable[[Random, bytes], bytes] = damage_text
+    beside: Mapping[str, Callable[[], bytes]] = field(default_factory=dict)
+    """The other files that it needs, whole."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of which a message must contain one."""
+        return (self.file, *self.beside)
+
+
+@cache
+def clip_archive() -> bytes:
+    """A clip in our own format, with all tracks."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.npz"
+        save_clip(path, mask_pops(stair_walk()).select(slice(0, 20)))
+        return path.read_bytes()
+
+
+def blocks_archive() -> bytes:
+    """A file of the `blocks` benchmark, of a character that stands."""
+    frames, side = 12, np.array([0.1, -0.1])
+    arrays: dict[str, np.ndarray] = {"fps": np.array(30.0), "stance": np.ones((frames, 2), int)}
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+    arrays |= {"pelvis_rot": np.tile(identity, (frames, 1))}
+    arrays |= {"foot_rot": np.tile(identity, (frames, 2, 1))}
+    places = {"hip": (0.9, 0.0), "knee": (0.5, 0.03), "ankle": (0.1, 0.0), "ball": (0.05, 0.12)}
+    for prefix in ("", "base_"):
+        arrays[f"{prefix}pelvis"] = np.tile([0.0, 1.0, 0.0], (frames, 1))
+        for joint, (y, z) in places.items():
+            leg = np.stack([side, np.full(2, y), np.full(2, z)], axis=-1)
+            arrays[f"{prefix}{joint}"] = np.tile(leg, (frames, 1, 1))
+    return archive_of(arrays)
+
+
+def heightfield_archive() -> bytes:
+    """A heightfield of four rows and five columns with a hole."""
+    heights = np.arange(20.0).reshape(4, 5) / 50
+    heights[0, 0] = np.nan
+    return archive_of(
+        {
+            "heights": heights,
+            "spacing": np.array([0.5, 0.4]),
+            "origin": np.zeros(3),
+            "interpolation": np.array("triangulated"),
+        }
+    )
+
+
+def mesh_bytes(kind: str) -> bytes:
+    """A hill of 18 triangles as trimesh writes it."""
+    x, z = (part.ravel() for part in np.meshgrid(np.arange(4.0), np.arange(4.0)))
+    corner = (np.arange(3)[:, None] * 4 + np.arange(3)).ravel()
+    near, far = corner, corner + 4
+    faces = np.concatenate(
+        [np.stack([near, far, far + 1], -1), np.stack([near, far + 1, near + 1], -1)]
+    )
+    hill = trimesh.Trimesh(np.stack([x, 0.1 * x * z, z], -1), faces, process=False)
+    options = {"encoding": "ascii"} if kind == "ply_ascii" else {}
+    content = hill.export(file_type=kind.removesuffix("_ascii") if options else kind, **options)
+    if isinstance(content, dict):  # of a glTF, its files
+        content = content["model.gltf"]
+    return content.encode() if isinstance(content, str) else content
+
+
+def load_record(path: Path) -> None:
+    """Reads and shows a record, as `jaxik record show`, with its remarks on doubtful units."""
+    reading = record.Reading()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        for entry in record_files.read(path, reading, None):
+            with error_context(path):
+                record_files.describe(entry, reading)
+                soundness.check_system(record.to_ik(entry, reading))
+
+
+@cache
+def flat_clip() -> Clip:
+    """A second over flat ground."""
+    return load_clip(DATA / "clips" / "uneven_walk_base.npz").select(slice(0, 30))
+
+
+def clip_format(name: str, whole: Callable[[], bytes], **options) -> Format:
+    """A kind of clip."""
+    return Format(name, whole, lambda path: soundness.check_clip(load_clip(path)), **options)
+
+
+def mesh_format(kind: str, damage: Callable[[Random, bytes], bytes]) -> Format:
+    """A kind of mesh."""
+    suffix = kind.removesuffix("_ascii")
+    return Format(
+        f"hill.{suffix}",
+        lambda: mesh_bytes(kind),
+        lambda path: soundness.check_terrain(load_terrain(path)),
+        damage,
+    )
+
+
+def text_of(path: Path) -> Callable[[], bytes]:
+    """A file of this repository."""
+    return path.read_bytes
+
+
+FORMATS: dict[str, Format] = {
+    "clip, BVH": clip_format("walk.bvh", BVH.encode),
+    "clip, AMC": clip_format("walk.amc", AMC.encode, beside={"walk.asf": ASF.encode}),
+    "clip, ASF": Format(
+        "walk.asf",
+        ASF.encode,
+        lambda path: soundness.check_clip(load_clip(path.with_suffix(".amc"))),
+        beside={"walk.amc": AMC.encode},
+    ),
+    "clip, NPZ": clip_format("walk.npz", clip_archive, damage=damage_arrays),
+    "clip, blocks": clip_format("blocks.npz", blocks_archive, damage=damage_arrays),
+    "heightfield": Format(
+        "hill.npz",
+        heightfield_archive,
+        lambda path: soundness.check_terrain(load_terrain(path)),
+        damage_arrays,
+    ),
+    "mesh, PLY text": mesh_format("ply_ascii", damage_text),
+    "mesh, PLY": mesh_format("ply", damage_bytes),
+    "mesh, OBJ": mesh_format("obj", damage_text),
+    "mesh, STL text": mesh_format("stl_ascii", damage_text),
+    "mesh, STL": mesh_format("stl", damage_bytes),
+    "mesh, OFF": mesh_format("off", damage_text),
+    "mesh, GLB": mesh_format("glb", damage_glb),
+    "experiment": Format(
+        "walk.toml",
+        lambda: experiments.text(rest=TABLES).encode(),
+        lambda path: soundness.check_experiment(load_experiment(path)),
+        damage_toml,
+    ),
+    "parameters": Format(
+        "footik.toml",
+        lambda: parameter_files.system_to_toml(presets.record()).encode(),
+        lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
+        damage_toml,
+    ),
+    "truth": Format(
+        "truth.toml",
+        text_of(DATA / "clips" / "uneven_walk_truth.toml"),
+        lambda path: load_known_values(
+            load_experiment(experiments.write(path.parent, clip=f'truth = "{path}"\n'))
+        ),
+        damage_toml,
+    ),
+    "free parameters": Format(
+        "free.toml",
+        FREE.encode,
+        lambda path: translation.read_free(str(path), presets.record()),
+        damage_toml,
+    ),
+    "tracks": Format(
+        "tracks.toml",
+        TRACKS.encode,
+        lambda path: soundness.check_tracks(*track_files.along(flat_clip(), path)),
+        damage_toml,
+    ),
+    "record": Format("footik.bin", lambda: record.to_bytes(packed()), load_record, damage_bytes),
+    "record, CSV": Format("footik.csv", lambda: record.to_csv([packed()]).encode(), load_record),
+    "numbers of a fit": Format(
+        "run/fit.json",
+        lambda: json.dumps(RUN, indent=2).encode(),
+        lambda path: run_folder.load_fit(path.parent),
+        damage_json,
+        beside={
+            "run/experiment.toml": lambda: experiments.text().encode(),
+            "run/parameters.toml": lambda: b"",
+        },
+    ),
+}

@@ -1,0 +1,136 @@
+"""Files that mean harm: nothing in them is run, and nothing is written where they say."""
+
+import ast
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import house
+from fitting.cli import main
+from fitting.datasets.clips import load_clip, save_clip
+from fitting.datasets.clips.formats.npz import is_blocks_file
+from fitting.datasets.terrain.mesh_files import load_terrain
+from fitting.experiments.experiment import ClipEntry
+from fitting.experiments.experiment_files import load_experiment, parse_experiment
+from fitting.report.plots import style
+from fitting.studies.hierarchy.population import clip_names
+from support import experiments
+from support.sample_clips import BVH
+
+ELSEWHERE = "../../elsewhere"
+FORMULA = r"$\frac{$"  # which Matplotlib would not draw
+
+
+class Harmful:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.target),)
+
+
+def tree(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("name", ["positions_ws", "heights", "base_pelvis", "format"])
+@pytest.mark.parametrize("load", [load_clip, load_terrain, is_blocks_file])
+def test_nothing_is_unpickled(name, load, tmp_path):
+    path, target = tmp_path / "file.npz", tmp_path / "written"
+    harmful = np.array([Harmful(target)], object)
+    np.savez(path, **{name: harmful, "spacing": np.ones(2)})
+    if load is is_blocks_file:
+        load(path)
+    else:
+        with pytest.raises(ValueError, match="file.npz: wanted a NumPy archive of plain arrays"):
+            load(path)
+    assert not target.exists()
+    with np.load(path, allow_pickle=True) as archive:  # it would work
+        archive[name]
+    assert target.exists()
+
+
+def test_a_pickle_under_the_name_of_an_archive_is_not_unpickled(tmp_path):
+    path, target = tmp_path / "file.npz", tmp_path / "written"
+    np.array([Harmful(target)], object).dump(path)
+    for load in (load_clip, load_terrain):
+        with pytest.raises(ValueError, match="file.npz: wanted a NumPy archive of plain arrays"):
+            load(path)
+    assert not target.exists()
+
+
+def called(node: ast.Call) -> str:
+    """The dotted name of what is called."""
+    return ast.unparse(node.func)
+
+
+@pytest.mark.parametrize("package", house.PACKAGES)
+def test_no_module_unpickles_or_runs_text(package):
+    for path, tree_of_file in house.Package(package).trees.items():
+        for node in ast.walk(tree_of_file):
+            if not isinstance(node, ast.Call):
+                continue
+            name, keywords = called(node), {word.arg: word.value for word in node.keywords}
+            if name in ("np.load", "numpy.load"):
+                assert ast.unparse(keywords["allow_pickle"]) == "False", path
+            assert name not in ("eval", "exec", "compile", "os.system", "np.fromregex"), path
+            assert "shell" not in keywords, path
+            if name.endswith("pickle.loads"):  # between the processes of one call
+                assert path == house.ROOT / "fitting" / "runtime" / "cluster.py"
+            assert not name.endswith("pickle.load"), path
+
+
+def test_joint_names_are_no_paths(tmp_path, monkeypatch, capsys):
+    inside = tmp_path / "a" / "b"
+    inside.mkdir(parents=True)
+    monkeypatch.chdir(inside)
+    Path("walk.bvh").write_text(BVH.replace("JOINT LeftFoot", f"JOINT {ELSEWHERE}_LeftFoot"))
+    clip = load_clip("walk.bvh")
+    assert any(ELSEWHERE in name for name in clip.joint_names)
+    save_clip("walk.npz", clip)
+    assert load_clip("walk.npz").joint_names == clip.joint_names
+    assert main.main(["inspect", "walk.npz", "--json"]) == 0
+    assert ELSEWHERE in json.dumps(json.loads(capsys.readouterr().out))
+    assert tree(tmp_path) == {"a", "a/b", "a/b/walk.bvh", "a/b/walk.npz"}
+
+
+def test_the_name_of_a_clip_is_that_of_its_file_without_folders():
+    references = ("../../etc/passwd.bvh", "/etc/walk.bvh", "/tmp/walk.bvh", "..npz", "a/...npz")
+    entries = [ClipEntry(Path(name), Path("hill.ply")) for name in references]
+    for name in clip_names(entries):
+        assert "/" not in name and (Path("clips") / f"{name}.toml").parent == Path("clips")
+
+
+@pytest.mark.parametrize(
+    "top", ['preset = "__import__"', 'preset = "os"', 'rules.pelvis = "__class__"', 'body = "os"']
+)
+def test_a_name_in_an_experiment_is_looked_up_in_a_table(top, tmp_path):
+    with pytest.raises(ValueError, match="experiment.toml"):
+        load_experiment(experiments.write(tmp_path, top=top))
+
+
+def test_a_parameter_is_no_attribute(tmp_path):
+    for name in ("__class__.x", "leg.__init__", "leg.__dict__"):
+        stage, _, leaf = name.partition(".")
+        content = {"clips": [{}], "free": {"leg.soften": {}}, "parameters": {stage: {leaf: 1.0}}}
+        content["clips"] = [{"reference": str(experiments.ROOT / "README.md")}]
+        content["clips"][0]["terrain"] = content["clips"][0]["reference"]
+        loaded = parse_experiment(content, tmp_path / "e.toml")
+        with pytest.raises(ValueError, match="e.toml .parameters.: unknown key"):
+            loaded.starting_system()
+
+
+@pytest.mark.parametrize("name", [FORMULA, "$x^$", "a $ b", "$x$"])
+def test_a_plot_shows_a_name_that_looks_like_a_formula(name, tmp_path):
+    figure = Figure(layout="constrained")
+    axes = figure.subplots()
+    axes.set_title(name)
+    axes.set_yscale("log")
+    style.save(tmp_path / "a.png", figure)
+    assert (tmp_path / "a.png").stat().st_size > 1000
