@@ -165,7 +165,9 @@ def test_after_a_long_frame_everything_is_where_it_is_going(preset: str):
 def test_a_bad_member_does_not_touch_its_neighbours(batched):
     ik = jaxik.presets.record()
     clips = jax.tree.map(lambda *x: jnp.stack(x), frames(), spoilt("pose"), frames())
-    run = jax.jit(batched(lambda clip: jaxik.run(ik, RIG, GROUND, clip).pose))
+    run = jax.jit(
+        batched(lambda clip: jaxik.run(ik, RIG, GROUND, clip).pose), compiler_options=QUICK
+    )
     poses = run(clips)
     alone = run(jax.tree.map(lambda x: jnp.stack([x] * 3), frames()))
     for got, wanted in zip(jax.tree.leaves(poses), jax.tree.leaves(alone), strict=True):
@@ -174,8 +176,7 @@ def test_a_bad_member_does_not_touch_its_neighbours(batched):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["record", "mec"])
-def test_gradients_stay_finite(preset: str):
+def test_gradients_stay_finite():
     clip = twice_spoilt()
 
     def size(ik):
@@ -183,7 +184,7 @@ def test_gradients_stay_finite(preset: str):
         return jnp.sum(result.pose.ankle.pos**2) + jnp.sum(result.body.pos**2)
 
     slopes = jax.jit(lambda ik: equinox.filter_grad(size)(ik), compiler_options=QUICK)
-    gradient = slopes(getattr(jaxik.presets, preset)())
+    gradient = slopes(jaxik.presets.record())
     assert finite(gradient)
     assert any(np.any(x != 0) for x in jax.tree.leaves(gradient))
 
