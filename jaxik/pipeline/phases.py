@@ -195,15 +195,15 @@ def pose(
     rig, frame = inputs.rig, inputs.frame
     effector, lean = advanced.effector, advanced.lean
     offset_ws = sensed.root_ws + advanced.state.pelvis.offset_ws
-    rotations = (lean.rot_ws, lean.spine_ws, lean.head_ws)
+    rot_ws, spine_ws, head_ws = lean.rot_ws, lean.spine_ws, lean.head_ws
     faulty = jnp.zeros_like(rig.present)
     if faults is not None:
         faulty = faults.legs
         effector = dataclasses.replace(effector, weight=jnp.where(faulty, 0.0, effector.weight))
         offset_ws = jnp.where(faults.frame, 0.0, offset_ws)
         level = functools.partial(jnp.where, faults.frame, quat.identity(offset_ws.dtype))
-        rotations = (None if rot is None else level(rot) for rot in rotations)
-    rot_ws, spine_ws, head_ws = rotations
+        rot_ws = level(rot_ws)
+        spine_ws, head_ws = (None if rot is None else level(rot) for rot in (spine_ws, head_ws))
     body = body_transform(inputs, rot_ws, offset_ws)
     target_ms = frame.world_from_model.inverse().apply(effector.target_ws)
     with jax.named_scope("leg"):

@@ -289,7 +289,8 @@ def test_the_parameters_are_written_before_anything_can_fail_after_the_search(
 
     monkeypatch.setattr(assess, "assess_identifiability", fail)
     assert "no slopes" in last_error_of(capsys, "fit", experiment_file, "-o", tmp_path / "run")
-    assert tree(tmp_path / "run") == {run_folder.EXPERIMENT, run_folder.PARAMETERS}
+    kept = {run_folder.EXPERIMENT, run_folder.PARAMETERS, run_folder.SEARCH}
+    assert tree(tmp_path / "run") == kept
 
 
 def last_error_of(capsys, *words: object) -> str:

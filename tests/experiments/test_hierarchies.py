@@ -122,7 +122,7 @@ def test_a_run_is_applied_to_the_body_of_the_animation(tmp_path, monkeypatch):
     )
     save_clip(tmp_path / "giant.npz", scaled(load_clip(BASE), 2.0))
     applied = []
-    monkeypatch.setattr(animations.run_folder, "load_fit", lambda run: None)
+    monkeypatch.setattr(animations.run_folder, "load_fit", lambda run: (None, {"parameters": []}))
     monkeypatch.setattr(animations, "solve", lambda ik, *_, **__: applied.append(ik))
     files = AnimationFiles(tmp_path / "giant.npz", tmp_path / "unused.ply")
     animations.apply(tmp_path, files)

@@ -407,9 +407,10 @@ def deadly_run(path, death):
 
         def write(self, record):
             self.left -= 1
-            self.file.write(record[: len(record) // 2] if not self.left else record)
+            written = self.file.write(record[: len(record) // 2] if not self.left else record)
             if not self.left:
                 die()
+            return written
 
     if death == "writing a record":
         opened = Chain.__enter__

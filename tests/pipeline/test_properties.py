@@ -443,7 +443,7 @@ def test_a_bad_member_does_not_affect_the_others_of_a_batch():
         lambda f: f.pose.ankle.pos, frames, frames.pose.ankle.pos.at[1, 40:50, 0].set(jnp.nan)
     )
     result = crowd_run()(ik, rig, ground, spoiled)
-    assert np.isnan(result.pose.ankle.pos[1]).any()
+    assert result.faulty[1].sum() == 10 and np.isfinite(result.pose.ankle.pos).all()
     for member in (0, 2):
         assert_close(at(result, member), at(crowd_result(), member), 0.0)
 

@@ -426,15 +426,12 @@ def test_the_command_continues_after_an_interrupt_and_writes_its_tables(
     assert rows[0].values == pytest.approx(quick.TARGETS, abs=0.003)
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--folds", "1"], "folds is 1; wanted 2"),
-        (["--folds", "30"], "foot never stands; take few"),
-    ],
-)
-def test_the_command_rejects_wrong_folds(more, message, tmp_path, capsys):
-    path = write(tmp_path, clips=SIX)
-    assert main.main(["ablate", str(path), "-o", str(tmp_path / "out"), *more]) == main.MISTAKE
+def test_the_command_rejects_more_folds_than_feet_stand_in(tmp_path, capsys):
+    path, out = write(tmp_path, clips=SIX), str(tmp_path / "out")
+    assert main.main(["ablate", str(path), "-o", out, "--folds", "30"]) == main.MISTAKE
     error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+    assert (
+        "foot never stands; take few" in error
+        and error.count("\n") == 1
+        and not (tmp_path / "out").exists()
+    )

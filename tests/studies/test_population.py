@@ -142,9 +142,9 @@ def test_noise_is_estimated_in_each_clip_alone(quick, tmp_path, monkeypatch):
     estimated: list[int] = []
     search = kept_searches.search_with_noise
 
-    def watched(problem, experiment, progress):
+    def watched(problem, experiment, progress, kept):
         estimated.append(len(problem.data) if experiment.noise.estimates_any else 0)
-        return search(problem, dataclasses.replace(experiment, noise=no_noise), progress)
+        return search(problem, dataclasses.replace(experiment, noise=no_noise), progress, kept)
 
     no_noise = load_experiment(write_walks(tmp_path)).noise
     monkeypatch.setattr(kept_searches, "search_with_noise", watched)
