@@ -15,14 +15,14 @@ from typing import ParamSpec, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 from numpy.polynomial import chebyshev
 
 Args = ParamSpec("Args")
 Output = TypeVar("Output")
 
 
-def unstack(v: Float[Array, "*b n"]) -> tuple[Array, ...]:
+def unstack(v: Shaped[Array, "*b n"]) -> tuple[Array, ...]:
     """The entries of the last axis, each of shape `*b`."""
     # Split, not sliced: the reverse of a slice is a padded array, and all of them are summed.
     parts = jax.lax.split(v, (1,) * v.shape[-1], axis=v.ndim - 1)

@@ -94,13 +94,13 @@ def _rule(field: str, numbers: np.ndarray) -> tuple[str, np.ndarray]:
     with np.errstate(invalid="ignore", over="ignore"):
         if field in UNIT:
             length = np.linalg.norm(numbers, axis=-1)
-            return "a length of 1", np.abs(length - 1.0) <= NOT_UNIT
+            return "a length of 1", np.asarray(np.abs(length - 1.0) <= NOT_UNIT)
         if field in FRACTIONS:
-            return "0 to 1", (numbers >= 0) & (numbers <= 1)
+            return "0 to 1", np.asarray((numbers >= 0) & (numbers <= 1))
         if field in SIGNED_FRACTIONS:
-            return "-1 to 1", np.abs(numbers) <= 1
+            return "-1 to 1", np.asarray(np.abs(numbers) <= 1)
         if field in SIZES:
-            return "0 or more, finite", numbers >= 0
+            return "0 or more, finite", np.asarray(numbers >= 0)
         if field in POSITIVE:
-            return "more than 0, finite", numbers > 0
+            return "more than 0, finite", np.asarray(numbers > 0)
     return "finite numbers", np.ones(numbers.shape, bool)
