@@ -51,7 +51,8 @@ class Findings(NamedTuple):
     not_finite: int
     """Frames after which a result or the memory was not finite."""
     bone_error: float
-    """m, by which a bone was longer or shorter than in the animation, at most."""
+    """By which a bone was longer or shorter than in the animation, at most: m, for each metre, from
+    1 on, between a joint and the model's origin, since that is what numbers are rounded by."""
 
 
 @functools.cache
@@ -157,7 +158,7 @@ def _happens(key: Array, rate: float) -> Array:
 
 
 def _bone_error(solved: jaxik.LegPose, animated: jaxik.LegPose) -> Array:
-    """m, by which bones of each leg differ in length from those of the animation."""
+    """How much bones of each leg differ in length from the animation's; see `Findings`."""
     errors = [
         jnp.abs(
             vec.length(getattr(solved, end).pos - getattr(solved, start).pos)
@@ -165,4 +166,9 @@ def _bone_error(solved: jaxik.LegPose, animated: jaxik.LegPose) -> Array:
         )
         for start, end in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe"))
     ]
-    return jnp.stack(errors).max(axis=0)
+    far = jnp.abs(jnp.stack([joint.pos for joint in _joints(solved)])).max(axis=(0, 2))
+    return jnp.stack(errors).max(axis=0) / jnp.maximum(far, 1.0)
+
+
+def _joints(pose: jaxik.LegPose) -> tuple[jaxik.Transform, ...]:
+    return pose.hip, pose.knee, pose.ankle, pose.toe
