@@ -53,7 +53,7 @@ def sense_first(
     """
     frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
     init = getattr(ik, stage).init
-    fresh, of_legs = init(inputs.rig), per_leg(init, inputs.rig)
+    fresh, of_legs = init(inputs.rig), faults and per_leg(init, inputs.rig)
 
     def rule_at(at: Tracks) -> AbstractContact | AbstractRoot:
         return getattr(system_at(ik, at), stage)

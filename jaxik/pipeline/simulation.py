@@ -84,7 +84,7 @@ def step(
     sensed = sense(ik, inputs, contact, rise)
     sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, inputs.terrain)
     advanced = advance(ik, sensed_now, state, (contact_state, root_state))
-    of_legs = per_leg(functools.partial(fresh_memory, ik), rig)
+    of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
     after = remembered(now, state, advanced.state, of_legs, faults)
     advanced = dataclasses.replace(advanced, state=after)
     result = pose(ik, inputs, sensed, advanced, faults)
@@ -136,7 +136,7 @@ def resume(
     sensed = jax.vmap(
         lambda frame, faulty, at, *first: sense(system_at(ik, at), inputs.at(frame, faulty), *first)
     )(frames, faulty, values, contacts, rises)
-    of_legs = per_leg(functools.partial(fresh_memory, ik), rig)
+    of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
 
     def scanned(state: State, frame: ScannedFrame) -> tuple[State, Advanced]:
         sensed, first, platforms, faults, at, restart = frame
