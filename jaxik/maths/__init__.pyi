@@ -1,4 +1,5 @@
 from . import gate as gate
+from . import outline as outline
 from . import parameter_tree as parameter_tree
 from . import quat as quat
 from . import smoothing as smoothing

@@ -10,15 +10,16 @@ presets, fits, reports and error messages read it from there.
 import dataclasses
 import inspect
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
+
+from .outline import ALL_LAYERS, outline, table, value_text
 
 Tree = TypeVar("Tree", bound=eqx.Module)
 Declared = TypeVar("Declared")  # whatever type a field is annotated with
@@ -29,9 +30,6 @@ Follows = Literal[
     "ankle height", "ball height", "over ankle height", "over ball height",
 ]  # fmt: skip
 BY_UNIT: dict[str, Follows] = {"m": "leg length", "m/s": "speed"}  # what follows the body at once
-
-MOST_SHOWN = 8  # numbers of one leaf that are printed one by one
-ALL_LAYERS = 0xFFFFFFFF
 
 
 if TYPE_CHECKING:
@@ -66,6 +64,10 @@ class Rule(eqx.Module):
 
     def __repr__(self) -> str:
         return outline(self)
+
+    def _repr_html_(self) -> str:
+        """What notebooks show."""
+        return table(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,6 +187,11 @@ def switch(default: bool, *, doc: str, per_leg: bool | None = None) -> Declared:
     return _field(default, as_switch, {"doc": doc, "per_leg": per_leg})
 
 
+def option(default: bool, *, doc: str) -> Declared:
+    """Declares what is switched when a program is compiled, not while it runs."""
+    return eqx.field(default=default, static=True, kw_only=True, metadata={"doc": doc})
+
+
 def layers(default: int = ALL_LAYERS) -> Declared:
     """Declares a mask of the layers that a rule's rays see, one bit a layer (`layer_mask`)."""
     doc = "Layers of the terrain that the rays see, one bit each."
@@ -209,7 +216,7 @@ def declarations(module: eqx.Module) -> dict[str, Declaration]:
 
 
 def docs(module: eqx.Module) -> dict[str, str]:
-    """The sentence of meaning of each parameter, constant and switch, by dotted name."""
+    """The sentence of meaning of each parameter, constant, switch and option, by dotted name."""
     return {
         name: field.metadata["doc"] for name, _, field in _fields(module) if "doc" in field.metadata
     }
@@ -274,7 +281,7 @@ def with_option(module: Tree, name: str, on: bool) -> Tree:
 
 
 def get(module: eqx.Module, name: str) -> Array:
-    """The leaf with this dotted name."""
+    """The leaf with this dotted name; options are no leaves."""
     return operator.attrgetter(name)(module)
 
 
@@ -296,47 +303,6 @@ def replace(module: Tree, values: Mapping[str, ArrayLike | Sequence]) -> Tree:
 
 
 def shown(module: eqx.Module, name: str) -> str:
-    """The leaf with this dotted name as `outline` prints it: value and unit."""
+    """The leaf or option with this dotted name as `outline` prints it: value and unit."""
     units = {path: field.metadata.get("unit", "") for path, _, field in _fields(module)}
-    return _shown(get(module, name), units[name])
-
-
-def outline(module: eqx.Module) -> str:
-    """A tree of rules as aligned text: stage, rule, and each parameter with its unit."""
-    return "\n".join([type(module).__name__, *_outlined(module, "  ")])
-
-
-def _outlined(module: eqx.Module, indent: str) -> Iterator[str]:
-    fields = dataclasses.fields(module)
-    width = max((len(field.name) for field in fields), default=0)
-    for field in fields:
-        value = getattr(module, field.name)
-        head = f"{indent}{field.name:<{width}}  "
-        if isinstance(value, eqx.Module):
-            yield head + type(value).__name__
-            yield from _outlined(value, f"{indent}  ")
-        else:
-            yield head + _shown(value, field.metadata.get("unit", ""))
-
-
-def _shown(value: object, unit: str) -> str:
-    """A leaf's value and unit; its type and shape where it is a tracer, or many numbers."""
-    if isinstance(value, Tracer) or not isinstance(value, jax.Array | np.ndarray):
-        return eqx.tree_pformat(value)
-    if value.size > MOST_SHOWN:
-        return f"{eqx.tree_pformat(value)} {unit}".rstrip()
-    numbers = np.asarray(value)
-    if numbers.dtype == bool:
-        return _listed(numbers, lambda on: "on" if on else "off")
-    if numbers.dtype == np.uint32:
-        return _listed(numbers, lambda mask: "all" if mask == ALL_LAYERS else f"{mask:#x}")
-    text = _listed(numbers, "{:.4g}".format)
-    if unit == "rad":
-        return f"{text} rad ({_listed(np.asarray(np.degrees(numbers)), '{:.4g}°'.format)})"
-    return text if unit == "1" else f"{text} {unit}".rstrip()
-
-
-def _listed(numbers: np.ndarray, show: Callable) -> str:
-    """Numbers as text: one alone, more in brackets."""
-    parts = [_listed(np.asarray(part), show) for part in numbers] if numbers.ndim else []
-    return f"[{', '.join(parts)}]" if numbers.ndim else show(numbers[()])
+    return value_text(operator.attrgetter(name)(module), units[name])

@@ -3,15 +3,27 @@
 import dataclasses
 from collections.abc import Callable, Iterable
 from operator import attrgetter
-from typing import TypeVar, cast, dataclass_transform
+from typing import Any, Literal, TypeAlias, TypeVar, cast, dataclass_transform
 
 import equinox as eqx
 import jax
 
 Data = TypeVar("Data")
+Place: TypeAlias = Literal["point", "height", "leg height", "motion"]
 
 
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(eqx.field,))
+def place(kind: Place) -> Any:
+    """A field with what depends on where the world's origin is: `jaxik.world.places` moves it.
+
+    Args:
+        kind: "point" for positions, m, or a `Transform` to world space; "height" for heights, m,
+            along the up of the body; "leg height" along that of each leg; "motion" for a
+            `Transform` that moves things about in the world.
+    """
+    return dataclasses.field(metadata={"place": kind})
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(eqx.field, place))
 def struct(cls: type[Data]) -> type[Data]:
     """Turns a class of fields into a frozen dataclass that JAX flattens quickly.
 

@@ -1,3 +1,4 @@
+from . import centring as centring
 from . import faults as faults
 from . import phases as phases
 from . import preconditions as preconditions

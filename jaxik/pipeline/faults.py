@@ -57,13 +57,15 @@ def clean(frame: Frame, present: Bool[Array, " legs"]) -> tuple[Frame, Faults]:
     frame_sound = _is_sound(whole, rank) & jnp.all(_is_sound(platforms, rank + 1), axis=-1)
     frame_sound &= _any(usable) | ~_any(faulty)
     faulty |= ~frame_sound[..., None]
+    # Legs that are not there count for nothing, but what they hold takes part in sums all the same.
+    sound &= frame_sound[..., None]
     # Otherwise each reader of a number would look through the whole frame.
-    flags = (*joints_sound, faulty, frame_sound[..., None])
-    *joints_sound, faulty, frame_sound = _materialised(flags, rank)
+    flags = (*joints_sound, sound, faulty, frame_sound[..., None])
+    *joints_sound, sound, faulty, frame_sound = _materialised(flags, rank)
     frame_sound = frame_sound[..., 0]
 
     joints = tuple(map(_chosen, joints_sound, joints))
-    joints, of_legs = _materialised((joints, _chosen(~faulty, of_legs)), rank + 1)
+    joints, of_legs = _materialised((joints, _chosen(sound, of_legs)), rank + 1)
     whole = _materialised(_chosen(frame_sound, whole), rank)
     weight, foot_speed, toe_speed, stride = of_legs
     world_from_model, grounded, slide, velocity_ws, stride_scale, dt = whole

@@ -10,9 +10,10 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxik.maths import quat, vec
+from jaxik.maths.struct import struct
 from jaxik.stages.contact import AbstractContact
 from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.stages.leg import LegGoal
@@ -20,12 +21,23 @@ from jaxik.stages.pelvis import PelvisMoment
 from jaxik.stages.probe import foot_heading
 from jaxik.stages.root import AbstractRoot
 from jaxik.world.frame import Contact, Sensed, animated_ankles
-from jaxik.world.skeleton import Transform, bone_lengths, mean_position
+from jaxik.world.places import centre_about
+from jaxik.world.skeleton import Rig, Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
 
+from .centring import in_world, recentred
 from .faults import Faults, per_leg, remembered
 from .system import Advanced, Corrections, FootIK, Result, State, Trace, restarted
 from .tracks import Tracks, system_at
+
+
+@struct
+class _FirstMemory:
+    """Memory of a stage that runs before everything else."""
+
+    started: Bool[Array, ""]
+    centre_ws: Float[Array, "3"]
+    memory: PyTree
 
 
 def sense_first(
@@ -52,8 +64,6 @@ def sense_first(
         The stage's memory after each frame, and what it returns for each.
     """
     frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
-    init = getattr(ik, stage).init
-    fresh, of_legs = init(inputs.rig), faults and per_leg(init, inputs.rig)
 
     def rule_at(at: Tracks) -> AbstractContact | AbstractRoot:
         return getattr(system_at(ik, at), stage)
@@ -66,17 +76,24 @@ def sense_first(
 
         return memory, jax.vmap(advanced)(sensed, frames.dt, tracks)
 
-    def scanned(carry: tuple, frame: tuple) -> tuple[tuple, tuple]:
-        sensed, dt, faulty, at, restart = frame
-        memory, started = restarted(carry, (fresh, jnp.zeros_like(state.started)), restart)
-        now = Moment(dt, started, gate)
-        after, output = rule_at(at).advance(now, sensed, memory)
-        after = remembered(now, memory, after, of_legs, faulty)
-        begun = jnp.ones_like(started)
-        return (after, remembered(now, started, begun, False, faulty)), (after, output)
+    def scanned(before: _FirstMemory, frame: tuple) -> tuple[_FirstMemory, tuple]:
+        sensed, dt, centre_ws, faulty, at, restart = frame
+        before = restarted(before, fresh, restart)
+        before = recentred(before, centre_ws, inputs.terrain, faulty)
+        now = Moment(dt, before.started, gate)
+        memory, output = rule_at(at).advance(now, sensed, before.memory)
+        after = _FirstMemory(jnp.ones_like(before.started), before.centre_ws, memory)
+        after = remembered(now, before, after, of_legs, faulty)
+        return after, (after.memory, output)
 
-    clip = (sensed, frames.dt, faults, tracks, frames.restart)
-    return jax.lax.scan(scanned, (memory, state.started), clip)[1]
+    def begin(rig: Rig) -> _FirstMemory:
+        started, centre_ws = (jnp.zeros_like(x) for x in (state.started, state.centre_ws))
+        return _FirstMemory(started, centre_ws, getattr(ik, stage).init(rig))
+
+    fresh, of_legs = begin(inputs.rig), faults and per_leg(begin, inputs.rig)
+    centres = centre_about(frames.world_from_model.pos)
+    clip = (sensed, frames.dt, centres, faults, tracks, frames.restart)
+    return jax.lax.scan(scanned, _FirstMemory(state.started, state.centre_ws, memory), clip)[1]
 
 
 def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) -> Sensed:
@@ -175,6 +192,7 @@ def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, Py
         effector = dataclasses.replace(effector, weight=effector.weight * weight)
     after = State(
         started=jnp.ones_like(now.started),
+        centre_ws=state.centre_ws,
         contact=first[0],
         root=first[1],
         target=target_state,
@@ -215,7 +233,8 @@ def pose(
         None if rot is None else in_model_space(inputs, rot) for rot in (spine_ws, head_ws)
     )
     corrections = Corrections(leg.hip, leg.knee, foot.ankle, spine, head)
-    trace = Trace(sensed, advanced)
+    advanced_ws = dataclasses.replace(in_world(inputs, advanced), state=advanced.state)
+    trace = Trace(in_world(inputs, sensed), advanced_ws)
     return Result(foot.pose, body, corrections, leg.reached, foot.reached, faulty, trace)
 
 

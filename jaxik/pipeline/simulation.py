@@ -12,9 +12,11 @@ from jaxtyping import Array, PyTree
 from jaxik.maths.gate import HARD, AbstractGate
 from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.world.frame import Frame, Sensed
+from jaxik.world.places import centre_about
 from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
+from .centring import recentred
 from .faults import Faults, clean, per_leg, remembered
 from .phases import advance, pose, sense, sense_first
 from .shapes import check_inputs, check_state
@@ -23,7 +25,7 @@ from .tracks import Tracks, read_tracks, system_at
 
 Function = TypeVar("Function", bound=Callable[..., object])
 ScannedFrame: TypeAlias = tuple[
-    Sensed, tuple[PyTree, PyTree], Transform, Faults | None, Tracks, Array | None
+    Sensed, tuple[PyTree, PyTree], Transform, Array | None, Faults | None, Tracks, Array | None
 ]
 
 
@@ -76,6 +78,7 @@ def step(
         frame, faults = clean(frame, rig.present)
     inputs = inputs.at(frame, faults and faults.legs)
     state = restarted(state, fresh, frame.restart)
+    state = recentred(state, inputs.centre_ws, terrain, faults)
     now = Moment(frame.dt, state.started, gate)
     with jax.named_scope("contact"):
         contact_state, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
@@ -139,17 +142,18 @@ def resume(
     of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
 
     def scanned(state: State, frame: ScannedFrame) -> tuple[State, Advanced]:
-        sensed, first, platforms, faults, at, restart = frame
+        sensed, first, platforms, centre_ws, faults, at, restart = frame
         state = restarted(state, fresh, restart)
-        now = SensedMoment(sensed.dt, state.started, gate, sensed, terrain.at(platforms))
+        state = recentred(state, centre_ws, terrain, faults)
+        ground = inputs.ground(platforms, centre_ws)
+        now = SensedMoment(sensed.dt, state.started, gate, sensed, ground)
         advanced = advance(system_at(ik, at), now, state, first)
         after = remembered(now, state, advanced.state, of_legs, faults)
         return after, dataclasses.replace(advanced, state=after)
 
-    first = (contact_states, root_states)
-    after, advanced = jax.lax.scan(
-        scanned, state, (sensed, first, frames.platforms, faults, values, frames.restart)
-    )
+    first, centres = (contact_states, root_states), centre_about(frames.world_from_model.pos)
+    clip = (sensed, first, frames.platforms, centres, faults, values, frames.restart)
+    after, advanced = jax.lax.scan(scanned, state, clip)
     result = jax.vmap(
         lambda frame, faults, s, a, at: pose(
             system_at(ik, at), inputs.at(frame, faults and faults.legs), s, a, faults

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxik.maths.parameter_tree import Rule
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.stages.contact import AbstractContact
 from jaxik.stages.effector import AbstractEffector, Effector
 from jaxik.stages.fade import AbstractFade, NoFade
@@ -66,6 +66,8 @@ class State:
 
     started: Bool[Array, "*b"]
     """False before the first frame, where memory jumps to its goals."""
+    centre_ws: Float[Array, "*b 3"]
+    """m, the origin of all places in this memory; 0 with 64 bits."""
     contact: PyTree
     root: PyTree
     target: PyTree
@@ -81,7 +83,7 @@ class State:
 class Advanced:
     """Output of the stages with memory, in one frame."""
 
-    foothold_ws: Float[Array, "legs 3"]
+    foothold_ws: Float[Array, "legs 3"] = place("point")
     """m, smoothed and limited, not yet locked."""
     hold: Hold
     lean: Lean
@@ -154,6 +156,7 @@ def fresh_memory(ik: FootIK, rig: Rig) -> State:
     """What `init` returns, without its checks."""
     return State(
         jnp.zeros((), bool),
+        jnp.zeros(3, rig.side.dtype),
         ik.contact.init(rig),
         ik.root.init(rig),
         ik.target.init(rig),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt
 
 from jaxik.maths import quat, vec
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 
 from .skeleton import LegPose, Still, Transform
 from .terrain import Hit
@@ -26,9 +26,9 @@ class Stride:
 
     standing: Float[Array, "*b legs"]
     """0..1, contact label of the animation."""
-    last_ws: Float[Array, "*b legs 3"]
+    last_ws: Float[Array, "*b legs 3"] = place("point")
     """Metres."""
-    next_ws: Float[Array, "*b legs 3"]
+    next_ws: Float[Array, "*b legs 3"] = place("point")
     """Metres."""
     fraction: Float[Array, "*b legs"]
     """0..1, time of the swing that has passed; 0 while standing."""
@@ -46,7 +46,7 @@ class Stride:
 class Frame:
     """One frame of animation, before foot IK."""
 
-    world_from_model: Transform
+    world_from_model: Transform = place("point")
     pose: LegPose
     """Legs, model space."""
     weight: Float[Array, "*b legs"]
@@ -64,9 +64,9 @@ class Frame:
     stride: Stride
     dt: Float[Array, "*b"]
     """s, since the previous frame."""
-    platforms: Transform
+    platforms: Transform = place("point")
     """`world_from_platform` of each moving terrain (platforms); there may be none."""
-    platforms_before: Transform
+    platforms_before: Transform = place("point")
     """The same in the previous frame; on the first frame, the same as `platforms`."""
     stride_scale: Float[Array, "*b"] | None = None
     """Speed of the character over that of its animation, by which its strides are to be scaled.
@@ -160,11 +160,11 @@ class Contact:
 class Foothold:
     """Where each foot would stand. The ankle is `lift` above that point along up."""
 
-    point_ws: Float[Array, "legs 3"]
+    point_ws: Float[Array, "legs 3"] = place("point")
     """Metres."""
     lift: Float[Array, " legs"]
     """Metres."""
-    height: Float[Array, " legs"]
+    height: Float[Array, " legs"] = place("leg height")
     """m, of the point along up."""
     ankle_height_ms: Float[Array, " legs"]
     """m, of the ankle above it, model space."""
@@ -198,7 +198,7 @@ class Sensed:
     """Up of each leg, or one for all."""
     dt: Float[Array, ""]
     slide: Float[Array, ""]
-    carry: Transform | Still
+    carry: Transform | Still = place("motion")
     """World motion, since the previous frame, of the ground under each foot."""
     present: Bool[Array, " legs"]
     side: Float[Array, " legs"]
@@ -209,15 +209,15 @@ class Sensed:
     """0..1, how much of its motion the body gets; the weights have it as a factor."""
     root_ws: Float[Array, "3"]
     """m, offset that put the character on its ground."""
-    hip_ws: Float[Array, "legs 3"]
+    hip_ws: Float[Array, "legs 3"] = place("point")
     """m, animated, with that offset."""
-    ankle_ws: Float[Array, "legs 3"]
+    ankle_ws: Float[Array, "legs 3"] = place("point")
     """m, likewise."""
     ankle_rot_ws: Float[Array, "legs 4"]
     """Animated."""
     foot_speed: Float[Array, " legs"]
     """m/s, of the animated ankles."""
-    ball_ws: Float[Array, "legs 3"]
+    ball_ws: Float[Array, "legs 3"] = place("point")
     """m, animated toes, likewise."""
     ahead_ws: Float[Array, "legs 3"]
     """Unit, horizontal direction of each animated foot."""

@@ -77,10 +77,10 @@ class Grid(eqx.Module):
         end = self.first.at[cell + 1].get(mode="promise_in_bounds")
         return start, jnp.where(inside, end - start, 0)
 
-    def search(
-        self, origins_ws: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]
-    ) -> Int[Array, "*b"]:
+    def search(self, offsets: Float[Array, "*b 3"], mask: UInt[Array, "*#b"]) -> Int[Array, "*b"]:
         """The first triangle that each ray hits, -1 for none.
+
+        Rays start at `offsets`, m, from the frame's origin, world axes.
 
         Watertight, after Woop, Benthin and Wald (Watertight Ray/Triangle Intersection, JCGT 2013).
         Corners are taken relative to the ray, which rounds a shared corner in the same way for all
@@ -88,9 +88,8 @@ class Grid(eqx.Module):
         functions are tested with a tolerance above their rounding error. A needle whose winding
         the rounding flips is missed, but its neighbours cover the same place.
         """
-        grid, origins = jax.lax.stop_gradient((self, origins_ws))
-        offset = origins - grid.centre_ws
-        xyz = vec.stacked_barrier(*(vec.dot(offset, grid.axes_ws[axis]) for axis in range(3)))
+        grid, offsets = jax.lax.stop_gradient((self, offsets))
+        xyz = vec.stacked_barrier(*(vec.dot(offsets, grid.axes_ws[axis]) for axis in range(3)))
         return _first_hit(grid, *xyz, mask)
 
 
@@ -194,9 +193,8 @@ def build(
     axes_ws = frame_axes(up_ws)
     corners, wall = _corners(vertices_ws, triangles, centre_ws, axes_ws)
     plan = np.asarray(corners).reshape(-1, 3, 3)[..., :2]
-    # Entering the frame, rays and corners are rounded in proportion to their size.
-    size = float(np.abs(used).max()) + float(np.abs(plan).max())
-    pad = slack + 16 * float(np.finfo(plan.dtype).eps) * size
+    # Looked up, the place of a ray is rounded in proportion to its size.
+    pad = slack + 32 * float(np.finfo(plan.dtype).eps) * float(np.abs(plan).max())
     # A wall can only be hit after its corners have moved sideways.
     listed = np.ones(len(plan), bool) if slack > 0 else ~np.asarray(wall)
     lists = cells.build(plan.astype(np.float64), listed, pad)

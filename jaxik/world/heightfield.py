@@ -4,6 +4,7 @@ Over a regular grid (`Heightfield`), or by a function of one's own (`HeightFunct
 searches: the place of a ray says at once which cell it hits, however large the grid is.
 """
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -43,6 +44,9 @@ class AbstractHeightfield(AbstractSurface):
     """Rows: x, up and z, unit; those of the world where up is its y."""
     layers: UInt[Array, "*t"]
     """One bit."""
+
+    def moved(self, by_ws: Float[Array, "3"]) -> "AbstractHeightfield":
+        return dataclasses.replace(self, origin_ws=self.origin_ws + by_ws)
 
     @abstractmethod
     def sample(

@@ -30,6 +30,10 @@ class AbstractSurface(eqx.Module):
         return self
 
     @abstractmethod
+    def moved(self, by_ws: Float[Array, "3"]) -> "AbstractSurface":
+        """The surface moved by `by_ws`, m, world axes: for coordinates with another origin."""
+
+    @abstractmethod
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
     ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
@@ -48,14 +52,19 @@ class Plane(AbstractSurface):
     normal_ws: Float[Array, "*t 3"]  # unit
     layers: UInt[Array, "*t"]  # one bit
 
+    def moved(self, by_ws: Float[Array, "3"]) -> "Plane":
+        return dataclasses.replace(self, point_ws=self.point_ws + by_ws)
+
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
     ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
-        distance = _plane_distance(origins_ws, up_ws, self.point_ws, self.normal_ws)
         rise = vec.dot(self.normal_ws, up_ws)
+        # The point may be far away: its height is rounded once, and so in the same way for all.
+        over = vec.dot(origins_ws, self.normal_ws) - vec.dot(self.point_ws, self.normal_ws)
+        distance = vec.safe_divide(over, rise)
         # A ray that starts on the plane hits it, however the difference is rounded.
-        size = vec.sum_last(jnp.abs(origins_ws)) + vec.sum_last(jnp.abs(self.point_ws))
-        tolerance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(size)
+        parts = (vec.dot(jnp.abs(x), jnp.abs(self.normal_ws)) for x in (origins_ws, self.point_ws))
+        tolerance = 4 * jnp.finfo(distance.dtype).eps * jax.lax.stop_gradient(sum(parts))
         hit = (rise != 0) & (distance * jnp.abs(rise) >= -tolerance) & (self.layers & mask != 0)
         normal = jnp.where(rise < 0, -self.normal_ws, self.normal_ws)
         return distance, jnp.broadcast_to(normal, (*distance.shape, 3)), hit
@@ -74,6 +83,16 @@ class Mesh(AbstractSurface):
     grid: Grid
     wide: Grid | None = None
     """For shapes (`jaxik.world.sweep.sweepable`): lists triangles beside a cell too."""
+    offset_ws: Float[Array, "*t 3"] | None = None
+    """m, to be added to vertices and grids; None for nothing."""
+
+    def moved(self, by_ws: Float[Array, "3"]) -> "Mesh":
+        offset_ws = by_ws if self.offset_ws is None else self.offset_ws + by_ws
+        return dataclasses.replace(self, offset_ws=offset_ws)
+
+    def centre_of(self, grid: Grid) -> Float[Array, "3"]:
+        """m, the origin of a grid's frame, which has moved with the mesh."""
+        return grid.centre_ws if self.offset_ws is None else grid.centre_ws + self.offset_ws
 
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"]) -> "Mesh":
         """The same triangles with moved vertices, m; differentiable.
@@ -85,18 +104,20 @@ class Mesh(AbstractSurface):
         triangles, layers = self.triangles, self.layers
         grid = self.grid.with_vertices(vertices_ws, triangles, layers)
         wide = self.wide and self.wide.with_vertices(vertices_ws, triangles, layers)
-        return Mesh(vertices_ws, triangles, layers, grid, wide)
+        return Mesh(vertices_ws, triangles, layers, grid, wide, self.offset_ws)
 
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]
     ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Bool[Array, "*b"]]:
-        triangle = self.grid.search(origins_ws, mask)
+        triangle = self.grid.search(origins_ws - self.centre_of(self.grid), mask)
         hit = triangle >= 0
         corners = self.triangles.at[jnp.where(hit, triangle, 0)].get(mode="promise_in_bounds")
         a, b, c = (
             self.vertices_ws.at[corners[..., corner]].get(mode="promise_in_bounds")
             for corner in range(3)
         )
+        if self.offset_ws is not None:
+            a, b, c = (corner + self.offset_ws for corner in (a, b, c))
         normal = vec.triangle_normal(a, b, c, up_ws)
         distance = _plane_distance(origins_ws, up_ws, a, normal)
         # A ray that rounding lets in lies just outside its triangle, which a steep plane turns into
@@ -129,6 +150,10 @@ class MovingSurface(AbstractSurface):
     def at(self, platforms: Transform) -> "MovingSurface":
         pose = Transform(platforms.pos[..., self.number, :], platforms.rot[..., self.number, :])
         return dataclasses.replace(self, world_from_platform=pose)
+
+    def moved(self, by_ws: Float[Array, "3"]) -> "MovingSurface":
+        pose = self.world_from_platform
+        return dataclasses.replace(self, world_from_platform=Transform(pose.pos + by_ws, pose.rot))
 
     def intersect(
         self, origins_ws: Float[Array, "*b 3"], up_ws: Float[Array, "3"], mask: UInt[Array, "*#b"]

@@ -1,6 +1,7 @@
 """Rules: parameters that know their unit and range, and trees of them by dotted name."""
 
 from dataclasses import fields
+from xml.etree import ElementTree
 
 import equinox as eqx
 import jax
@@ -138,6 +139,21 @@ def test_printing_a_rule_shows_switches_and_layers_of_each_leg():
         "  early      [on, off]",
         "  layers     0x5",
     ]
+
+
+def test_a_notebook_shows_value_range_and_meaning_of_each_parameter():
+    lift = Lift(height=0.25, early=False)
+    rows = ElementTree.fromstring(lift._repr_html_()).findall("tr")
+    cells = {row[0].text: [cell.text for cell in row[1:]] for row in rows}
+    assert cells["Lift"] == ["value", "range", "meaning"]
+    assert cells["height"] == ["0.25 m", "0 to 0.5", "Height of the foot."]
+    assert cells["tick_hz"] == ["30 Hz", None, "Ticks per second."]
+    assert cells["early"][0] == "off"
+    walk = ElementTree.fromstring(Walk()._repr_html_())
+    assert {"lift", "lift.height", "max_angle"} <= {row[0].text for row in walk}
+    texts = []
+    jax.jit(lambda lift: texts.append(lift._repr_html_()))(lift)
+    assert "bool[]" in texts[0] and "Whether the foot is lifted early." in texts[0]
 
 
 def test_printing_a_batch_or_a_traced_rule_shows_shapes():

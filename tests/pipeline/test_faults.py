@@ -205,3 +205,18 @@ def test_legs_that_are_not_there_may_hold_anything():
     assert not result.faulty.any() and finite(result.pose)
     expected = run(ik, rig, GROUND, frames()).pose.ankle.pos[:, 1]
     np.testing.assert_allclose(result.pose.ankle.pos[:, 1], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("others", [True, False])
+def test_legs_that_are_not_there_spoil_no_memory(others: bool):
+    """Sums over legs take in what has the weight 0, which makes NaN of what is infinite."""
+    rig = dataclasses.replace(RIG, present=jnp.array([False, others]))
+    call = jax.jit(functools.partial(jaxik.step, jaxik.presets.stride()), compiler_options=QUICK)
+    state, _ = call(rig, GROUND, jaxik.init(jaxik.presets.stride(), rig), at(BAD - 1))
+    expected = call(rig, GROUND, state, at(BAD))[1]
+    for name, frame in damages(at(BAD)):
+        if name.split(".")[1] in LEG_FIELDS:
+            after, result = call(rig, GROUND, state, frame)
+            assert finite((after, result)), name
+            assert not result.faulty.any()
+            assert_same(result.pose.ankle.pos[1], expected.pose.ankle.pos[1], 1e-9)

@@ -165,7 +165,8 @@ def test_equal_values_per_leg_act_like_a_shared_value(preset: str):
         one_for_all = name in ("effector.latch", "lock.hold_ball")
         return not one_for_all and not name.startswith(("root.", "lean.", "separation.", "pelvis."))
 
-    values = {name: widened(name) for name in filter(may_be_per_leg, parameter_tree.docs(ik))}
+    names = [slot.name for slot in parameter_tree.slots(ik)]
+    values = {name: widened(name) for name in filter(may_be_per_leg, names)}
     result = run(parameter_tree.replace(ik, values), rig, ground, frames)
     assert_same_pose(result.pose, alone(preset).pose)
 

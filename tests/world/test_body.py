@@ -156,3 +156,11 @@ def test_a_batch_of_bodies_has_the_numbers_of_each_alone():
 
     slopes = jax.jit(jax.jacobian(ray_down))(jnp.ones(2))
     assert np.isfinite(slopes).all()  # the ray is endless
+
+
+def test_a_leg_that_does_not_count_is_taken_as_the_mean_of_the_others():
+    rig = to_rig(make_rig(legs=3))
+    length = jnp.array([1.0, 3.0, 9.0]) * body.LEG
+    there = jnp.array([True, True, False])
+    rig = dataclasses.replace(rig, thigh=0.5 * length, shin=0.5 * length, present=there)
+    assert body.ratio(rig) == pytest.approx(2.0)

@@ -11,6 +11,7 @@ import trimesh
 from jaxik import lanes
 from jaxik.world import sweep, terrain
 from jaxik.world.skeleton import Transform
+from jaxik.world.sweep import shapes
 from support.cases import QUICK
 
 REACH = 9.0
@@ -150,6 +151,27 @@ def test_a_plane_is_met_by_the_lowest_point(capsule):
     np.testing.assert_allclose(np.asarray(hit.point) @ normal, 0.0, rtol=0, atol=1e-12)
 
 
+def test_a_capsule_on_a_function_that_is_a_plane_rests_as_on_the_plane():
+    slope = terrain.function(lambda x, z: 0.2 * z - 0.3 * x)
+    plane = terrain.plane(normal=(0.3, 1.0, -0.2))
+    for half in (HALF, HALF * [1, 1, -1], HALF * [-1, -1, 1]):
+        ours, exact = (swept(ground, centres(20), RADIUS, half) for ground in (slope, plane))
+        for name in ("distance", "point", "normal"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(exact, name), atol=1e-9)
+
+
+@pytest.mark.parametrize("fall", [0.4, -0.4, -1.5])
+def test_an_upright_edge_is_met_at_its_upper_end(fall):
+    """Whichever end it starts from."""
+    aside, start, radius = 0.06, 0.2, jnp.asarray(0.1)
+    edge, along = (map(jnp.asarray, x) for x in ((aside, start, 0.0), (0.0, fall, 0.0)))
+    rest, place = shapes.on_edge(tuple(edge), tuple(along), radius)  # type: ignore[arg-type]
+    top = max(start, start + fall)
+    np.testing.assert_allclose(rest.height, top + 0.08, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rest.contact, (aside, top, 0.0), rtol=0, atol=1e-12)
+    assert place == float(fall > 0)
+
+
 def box_grid() -> terrain.Terrain:
     """A grating: boxes 10 cm wide with gaps of 5 cm, 1 m above a floor."""
     boxes = []
@@ -179,9 +201,37 @@ def test_a_face_that_a_shape_overlaps_at_its_start_is_not_met_but_the_next_is():
     np.testing.assert_allclose(hit.point[:, 1], 0.9, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("interpolation", ["bilinear", "triangulated"])
+def test_a_shape_in_the_ground_of_any_cell_meets_nothing(interpolation):
+    """Also in the first cell, whose number is 0."""
+    ground = terrain.heightfield(jnp.zeros((3, 3)), 1.0, interpolation=interpolation)
+    centres = np.array([[x, 0.02, z] for x in (0.5, 1.5) for z in (0.5, 1.5)])
+    assert not np.asarray(swept(ground, centres, 0.1).found).any()
+    assert np.asarray(swept(ground, centres + np.array([0.0, 0.3, 0.0]), 0.1).found).all()
+
+
 def test_a_shape_that_starts_at_rest_has_come_no_way():
     hit = swept(box_grid(), np.array([[0.0, 1.05, 0.0]]), 0.05)
     assert float(hit.found[0]) == 1 and abs(float(hit.distance[0])) < 1e-6
+
+
+def test_a_shape_that_starts_at_rest_high_up_has_come_no_way():
+    """Heights there are rounded by more than those at the origin."""
+    heights, starts = rough()[0] + 300.0, 0.7 * centres(60) + [0, 300, 0]
+    ground = terrain.heightfield(heights, 0.5, (-2.0, 0.0, -2.0), interpolation="triangulated")
+    resting = starts - np.asarray(swept(ground, starts, RADIUS).distance)[:, None] * [0, 1, 0]
+    again = swept(ground, resting, RADIUS)
+    np.testing.assert_array_equal(again.found, 1.0)
+    np.testing.assert_allclose(again.distance, 0.0, rtol=0, atol=1e-12)
+
+
+def test_a_miss_has_the_end_of_the_way_as_point_and_up_as_normal():
+    plate = terrain.heightfield(jnp.zeros((2, 2)), 1.0)
+    hit = swept(plate, np.array([[0.5, 9.5, 0.5], [3.0, 2.0, 0.5]]), 0.2)
+    np.testing.assert_array_equal(hit.found, 0.0)
+    np.testing.assert_array_equal(hit.distance, REACH)
+    np.testing.assert_allclose(hit.point, [[0.5, 0.5, 0.5], [3.0, -7.0, 0.5]], atol=1e-12)
+    np.testing.assert_array_equal(hit.normal, [[0, 1, 0]] * 2)
 
 
 # Transformations.

@@ -497,6 +497,7 @@ def test_rays_onto_the_scanned_blocks_agree_with_embree(mocap):
         (lambda v, t: terrain.mesh(v, t[:0]), "triangles must have the shape"),
         (lambda v, t: terrain.mesh(v, t * 1.0), "integer indices"),
         (lambda v, t: terrain.mesh(v, t + 99), "index vertices 0 to 15; got 99 to 114"),
+        (lambda v, t: terrain.mesh(v, t - 1), "index vertices 0 to 15; got -1 to 14"),
         (lambda v, t: terrain.mesh(v * np.where(v == v[5], np.nan, 1), t), "not finite"),
         (lambda v, t: terrain.mesh(v + np.where(v == v[5], 1e308, 0), t), "vertices are too far "),
         (lambda v, t: terrain.mesh(v, t, up=(0.0, 0.0, 0.0)), "up is a direction"),
@@ -515,3 +516,27 @@ def test_rays_onto_the_scanned_blocks_agree_with_embree(mocap):
 def test_invalid_terrain_is_rejected_with_what_was_expected(make, message):
     with pytest.raises(ValueError, match=message):
         make(*rough(3))
+
+
+@pytest.mark.parametrize("distance", [1.0, 1e2, 1e4])
+@pytest.mark.parametrize("rise", [0.9, 0.02], ids=["slanted", "steep"])
+def test_a_ray_that_starts_on_a_plane_hits_it_whatever_is_rounded(distance, rise):
+    rng = np.random.default_rng(3)
+    normal = np.array([0.3, rise, -0.2]) / np.linalg.norm([0.3, rise, -0.2])
+    point = distance * rng.normal(size=3)
+    offsets = distance * rng.normal(size=(2000, 3))
+    origins = point + offsets - (offsets @ normal)[:, None] * normal  # on it, but for rounding
+    ground = terrain.plane(jnp.asarray(point, jnp.float32), jnp.asarray(normal, jnp.float32))
+    above = np.sign(origins.astype(np.float32) @ normal - point.astype(np.float32) @ normal)
+    assert (above < 0).mean() > 0.1, "no ray starts a little below"
+    cast = jax.jit(lambda origins: terrain.cast(ground, origins, 1.0).found)
+    assert np.all(cast(jnp.asarray(origins, jnp.float32)) == 1.0)
+    below = origins - 1e-5 * distance * normal
+    assert np.all(cast(jnp.asarray(below, jnp.float32)) == 0.0)
+
+
+def test_lists_stay_short_where_all_triangles_lie_on_each_other():
+    count = 300
+    corners = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]])
+    lists = cells.build(np.tile(corners, (count, 1, 1)), np.ones(count, bool), 0.0)
+    assert count <= len(lists.members) < 2 * cells.ENTRIES * count

@@ -68,7 +68,7 @@ def rest_on(
                 "the terrain has a mesh that is not prepared for shapes: sweep them over "
                 "jaxik.world.sweep.sweepable(terrain, margin)"
             )
-        axes, origin = wide.axes_ws, wide.centre_ws
+        axes, origin = wide.axes_ws, surface.centre_of(wide)
         centre, half = shapes.relative(axes, origin)
         rest = _on_mesh(surface, wide, (centre, half, shapes.radius), mask)
     elif isinstance(surface, Heightfield | HeightFunction):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt
 
 from jaxik.maths import vec
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.world.skeleton import Transform
 from jaxik.world.surfaces import STATIC, AbstractSurface, Mesh
 
@@ -20,7 +20,7 @@ HORIZON = 1e4  # m; longer rays, infinite ones too, end here
 class Hit:
     """What a ray hit. A miss has `found` 0, the end of the ray as its point and up as normal."""
 
-    point: Float[Array, "*b 3"]
+    point: Float[Array, "*b 3"] = place("point")
     """m, world."""
     normal: Float[Array, "*b 3"]
     """Unit, on the side of the ray's origin: never points down."""
@@ -60,6 +60,10 @@ class Terrain:
         """The terrain with what moves where the platforms `world_from_platform` (platforms) are."""
         surfaces = tuple(surface.at(platforms) for surface in self.surfaces)
         return Terrain(self.up_ws, surfaces)
+
+    def moved(self, by_ws: Float[Array, "3"]) -> "Terrain":
+        """The terrain moved by `by_ws`, m, with the platforms where they are now."""
+        return Terrain(self.up_ws, tuple(surface.moved(by_ws) for surface in self.surfaces))
 
     def with_vertices(self, vertices_ws: Float[Array, "vertices 3"], surface: int = 0) -> "Terrain":
         """This terrain with moved vertices in one of its meshes; see `Mesh.with_vertices`.
@@ -109,6 +113,11 @@ class LegTerrains:
         """The terrains with what moves where the platforms are; see `Terrain.at`."""
         legs = tuple(terrain.at(platforms) for terrain in self.legs)
         return LegTerrains(self.body.at(platforms), legs)
+
+    def moved(self, by_ws: Float[Array, "3"]) -> "LegTerrains":
+        """The terrains moved by `by_ws`, m; see `Terrain.moved`."""
+        legs = tuple(terrain.moved(by_ws) for terrain in self.legs)
+        return LegTerrains(self.body.moved(by_ws), legs)
 
 
 def cast(
