@@ -13,6 +13,7 @@ from .layout import FLAGS as FLAGS
 from .layout import FLOAT_NAMES as FLOAT_NAMES
 from .layout import FLOATS as FLOATS
 from .layout import KNEE_AXIS_NAMES as KNEE_AXIS_NAMES
+from .layout import PARAMETERS as PARAMETERS
 from .layout import SIZE as SIZE
 from .layout import Record as Record
 from .layout import besides_parameters as besides_parameters

@@ -47,6 +47,9 @@ FLOATS = (  # name in the record, in the order of the offsets; our name; unit at
 )
 FLOAT_NAMES = tuple(name for name, _, _ in FLOATS)
 FLAG_NAMES = tuple(name for _, name, _ in FLAGS)
+PARAMETERS = frozenset(  # our names of all that the bytes hold, whole vectors without an index
+    [ours for _, _, ours in FLAGS] + [ours.partition("[")[0] for _, ours, _ in FLOATS]
+)
 KNEE_AXES = np.concatenate([np.eye(3), -np.eye(3)])  # by kneeAxisType
 KNEE_AXIS_NAMES = ("+X", "+Y", "+Z", "-X", "-Y", "-Z")  # likewise
 QUIET_NAN = b"\0\0\xc0\x7f"  # what "nan" reads as

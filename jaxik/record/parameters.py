@@ -11,7 +11,7 @@ from jaxik.maths import parameter_tree
 from jaxik.pipeline import FootIK
 from jaxik.world.skeleton import Rig
 
-from .layout import FLAGS, FLOATS, Record, besides_parameters, knee_axis, pack_float
+from .layout import FLAGS, FLOATS, PARAMETERS, Record, besides_parameters, knee_axis, pack_float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,11 +66,16 @@ def to_ik(record: Record, reading: Reading | None = None) -> FootIK:
     )
 
 
-def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = None) -> Record:
+def from_ik(
+    ik: FootIK,
+    base: Record | None = None,
+    reading: Reading | None = None,
+    *,
+    drop: bool = False,
+) -> Record:
     """The record with a system's parameters.
 
-    Warns of parameters that the record cannot hold (`dropped`) and, without a base, of what is
-    written for knee axis, padding and tail.
+    Warns, without a base, of what is written for knee axis, padding and tail.
 
     Args:
         ik: a system with the rules of `presets.record(faithful=True)`.
@@ -78,19 +83,24 @@ def from_ik(ik: FootIK, base: Record | None = None, reading: Reading | None = No
             and `ik` keeps its bytes.
         reading: units and signs to write. With `length_unit` "auto" lengths get the unit of `base`,
             or metres.
+        drop: whether to leave out, with a warning, what the record cannot hold (`dropped`).
 
     Raises:
-        ValueError: if the system has other rules, or a parameter differs between legs, does not fit
-            a 32-bit float, or would be read back in another unit.
+        ValueError: if the system has other rules, or values that the record cannot hold and that
+            are not to be left out; if a parameter differs between legs, does not fit a 32-bit
+            float, or would be read back in another unit.
     """
     reading = reading or Reading()
     template = base or Record()
     if lost := dropped(ik, reading):
         listed = ", ".join(f"{name} = {ours} ({theirs})" for name, (ours, theirs) in lost.items())
-        warnings.warn(
-            f"the record cannot hold {listed}; its reader takes the values in brackets",
-            stacklevel=2,
-        )
+        message = f"the record cannot hold {listed}; its reader takes the values in brackets"
+        if not drop:
+            raise ValueError(
+                f"{message}. To leave them out nevertheless, pass drop=True, or --drop to `jaxik "
+                "record to-bytes`; `jaxik fit --record-only` fits only what the record holds"
+            )
+        warnings.warn(message, stacklevel=2)
     if base is None:
         (knee,) = besides_parameters(template)
         warnings.warn(
@@ -141,11 +151,10 @@ def dropped(ik: FootIK, reading: Reading | None = None) -> dict[str, tuple[str, 
                 f"{stage} is a {type(other).__name__}; a record holds parameters of a system with "
                 f"the record's rules, there a {type(rule).__name__}"
             )
-    slots = {ours for _, _, ours in FLAGS} | {ours.partition("[")[0] for _, ours, _ in FLOATS}
     return {
         name: (parameter_tree.shown(ik, name), parameter_tree.shown(assumed, name))
         for name in parameter_tree.docs(ik)
-        if name not in slots
+        if name not in PARAMETERS
         and not np.allclose(
             parameter_tree.get(ik, name), parameter_tree.get(assumed, name), rtol=1e-6, atol=0.0
         )

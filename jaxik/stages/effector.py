@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Declared, Leaf, Rule, parameter, switch
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform
 
@@ -23,7 +23,7 @@ ANGLE_BAND = 0.035  # rad, 2 degrees
 class Effector:
     """What the legs are solved for."""
 
-    target_ws: Float[Array, "legs 3"]
+    target_ws: Float[Array, "legs 3"] = place("point")
     """m, of the ankles."""
     rot_ws: Float[Array, "legs 4"]
     """Of the ankles, for the foot rule."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.gate import HARD
 from jaxik.maths.parameter_tree import Leaf, Rule, parameter
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig, Transform, mean_position
 
@@ -106,7 +106,7 @@ class SpeedFadeState:
     """m, how far the body moved by itself in this frame."""
     since: Float[Array, ""]
     """s, since a weight changed or the body last was where it is to be."""
-    hip_height: Float[Array, ""]
+    hip_height: Float[Array, ""] = place("height")
     """m, along up, of the animated hips."""
     fall_speed: Float[Array, ""]
     """m/s, at which the animated hips fell when foot IK was last off."""

@@ -7,8 +7,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.struct import struct
+from jaxik.world import places
 from jaxik.world.frame import Frame, Sensed
-from jaxik.world.skeleton import Rig
+from jaxik.world.skeleton import Rig, Transform
 from jaxik.world.terrain import LegTerrains, Terrain
 
 
@@ -20,9 +21,13 @@ class Inputs:
     terrain: Terrain | LegTerrains
     frame: Frame
     gate: AbstractGate
+    centre_ws: Float[Array, "3"] | None = None
+    """m, where world space has its origin now; None where that has not changed."""
 
     def at(self, frame: Frame, faulty: Bool[Array, " legs"] | None = None) -> "Inputs":
         """The inputs of one frame, with what moves of the terrain where it then is.
+
+        World space has its origin at `places.centre_about` the character from here on.
 
         Args:
             frame: the animation, where numbers that are not finite have been replaced.
@@ -31,7 +36,18 @@ class Inputs:
         rig = self.rig
         if faulty is not None:
             rig = dataclasses.replace(rig, present=rig.present & ~faulty)
-        return Inputs(rig, self.terrain.at(frame.platforms), frame, self.gate)
+        centre_ws = places.centre_about(frame.world_from_model.pos)
+        ground = self.ground(frame.platforms, centre_ws)
+        if centre_ws is not None:
+            frame = places.moved(frame, -centre_ws, ground.up_ws, ground.leg_up_ws)
+        return Inputs(rig, ground, frame, self.gate, centre_ws)
+
+    def ground(
+        self, platforms: Transform, centre_ws: Float[Array, "3"] | None
+    ) -> Terrain | LegTerrains:
+        """The terrain where the platforms are, in world space with its origin at the centre."""
+        ground = self.terrain.at(platforms)
+        return ground if centre_ws is None else ground.moved(-centre_ws)
 
 
 @struct

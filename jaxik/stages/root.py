@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxik.maths import parameter_tree, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.world.frame import rise_of
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import cast
@@ -82,7 +82,7 @@ class RootGround:
 class RootState:
     """The height at which the character was put."""
 
-    height: Float[Array, ""]
+    height: Float[Array, ""] = place("height")
     """m, along up."""
     velocity: Float[Array, ""]
     """m/s, over the ground."""

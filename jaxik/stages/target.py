@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxik.maths import smoothing, vec
 from jaxik.maths.gate import AbstractGate
 from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter, switch
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.world.frame import Contact, Foothold, GroundHits, animated_ankles, foothold
 from jaxik.world.skeleton import Rig
 
@@ -51,11 +51,11 @@ class AbstractInstantTarget(AbstractTarget):
 class TargetState:
     """Smoothed height of each foothold."""
 
-    height: Float[Array, " legs"]
+    height: Float[Array, " legs"] = place("leg height")
     """m, along up."""
     velocity: Float[Array, " legs"]
     """m/s, over the ground; 0 unless it follows as a spring."""
-    point_ws: Float[Array, "legs 3"]
+    point_ws: Float[Array, "legs 3"] = place("point")
     """m, the foothold before smoothing."""
 
 

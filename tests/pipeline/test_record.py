@@ -1,6 +1,7 @@
 """The parameter record: its bytes, CSV text, and the parameters they stand for."""
 
 import math
+import re
 import struct
 
 import jax
@@ -302,23 +303,29 @@ def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
 )
 def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, value, message):
     ik = parameter_tree.replace(jaxik.presets.record(faithful=True), {name: value})
+    lost = f"the record cannot hold {message}; its reader takes the values in brackets"
+    with pytest.raises(ValueError, match=re.escape(f"{lost}. To leave them out nevertheless")):
+        record.from_ik(ik, Record())
     with pytest.warns(UserWarning) as caught:
-        written = record.from_ik(ik, Record())
-    assert [str(warning.message) for warning in caught] == [
-        f"the record cannot hold {message}; its reader takes the values in brackets"
-    ]
+        written = record.from_ik(ik, Record(), drop=True)
+    assert [str(warning.message) for warning in caught] == [lost]
     assert list(record.dropped(ik)) == [name] and record.dropped(record.to_ik(written)) == {}
 
 
 def test_exactly_the_parameters_without_a_slot_are_dropped():
     ik = jaxik.presets.record(faithful=True)
-    leaves = {name: parameter_tree.get(ik, name) for name in parameter_tree.docs(ik)}
+    leaves = {slot.name: slot.value for slot in parameter_tree.slots(ik)}
     other = {n: ~x if x.dtype == bool else x // 2 if x.dtype == jnp.uint32 else x * 0.8 + 0.11
              for n, x in leaves.items()}  # fmt: skip
     other |= {name: 1.0 for name, leaf in leaves.items() if np.isinf(leaf).any()}
     slots = {ours for _, _, ours in record.FLAGS}
     slots |= {ours.partition("[")[0] for _, ours, _ in record.FLOATS}
-    assert set(record.dropped(parameter_tree.replace(ik, other))) == set(leaves) - slots
+    assert slots == record.PARAMETERS
+    ik, dropped = parameter_tree.replace(ik, other), set(leaves) - slots
+    assert set(record.dropped(ik)) == dropped
+    for name, is_on in parameter_tree.options(ik).items():
+        ik, dropped = parameter_tree.with_option(ik, name, not is_on), dropped | {name}
+        assert set(record.dropped(ik)) == dropped
 
 
 def test_a_record_without_a_base_says_what_it_takes_for_the_knee():

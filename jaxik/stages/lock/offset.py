@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, half_life_parameter, parameter, switch
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import SensedMoment
 from jaxik.world.frame import Sensed
 from jaxik.world.skeleton import Rig
@@ -31,9 +31,9 @@ class LockState:
     """m, of the ball or the ankle from where it would be without a lock, world axes."""
     turn: Float[Array, " legs"]
     """rad about up, from the animated heading of the foot to the one it keeps."""
-    foothold: Float[Array, "legs 3"]
+    foothold: Float[Array, "legs 3"] = place("point")
     """m, of the frame before, world space."""
-    ball: Float[Array, "legs 3"]
+    ball: Float[Array, "legs 3"] = place("point")
     """m, likewise."""
     ahead: Float[Array, "legs 3"]
     """Unit, animated heading of the foot, world axes, likewise."""

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import Leaf, parameter, switch
-from jaxik.maths.struct import struct
+from jaxik.maths.struct import place, struct
 from jaxik.stages.inputs import SensedMoment
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import cast
@@ -21,7 +21,7 @@ class PlantState:
     """0 or 1."""
     weight: Float[Array, " legs"]
     """0..1, how much of the planting is applied."""
-    foothold: Float[Array, "legs 3"]
+    foothold: Float[Array, "legs 3"] = place("point")
     """m, world space."""
     clearance: Float[Array, " legs"]
     """m, of that foothold above the ground below it."""

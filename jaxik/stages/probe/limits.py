@@ -3,13 +3,12 @@
 import functools
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import vec
-from jaxik.maths.parameter_tree import Leaf, constant, parameter
+from jaxik.maths.parameter_tree import Leaf, constant, option, parameter
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
@@ -79,10 +78,12 @@ class AbstractLimitedProbe(AbstractProbe):
         high=0.15,
         doc="Distance from a foothold at which ground must go on: half the width of a sole.",
     )
-    limited: bool = eqx.field(default=True, static=True, kw_only=True)
-    """Whether any ground is refused. Static: without limits, no ray is cast for them."""
-    check_support: bool = eqx.field(default=False, static=True, kw_only=True)
-    """Whether narrow ground is refused. Static, because it takes nine times as many rays."""
+    limited: bool = option(
+        True, doc="Whether any ground is refused; without limits no ray is cast for them."
+    )
+    check_support: bool = option(
+        False, doc="Whether narrow ground is refused, which takes nine times as many rays."
+    )
 
     def cast(
         self,
