@@ -1,6 +1,7 @@
 """What `import jaxik` and `import fitting` offer, to Python, to editors and to type checkers."""
 
 import ast
+import pydoc
 import subprocess
 import sys
 import zipfile
@@ -49,12 +50,29 @@ def test_an_unknown_name_is_an_error():
         from jaxik import wings  # type: ignore[attr-defined]  # noqa: F401
 
 
-def test_the_wheel_carries_stubs_and_says_that_it_is_typed(tmp_path):
+def test_the_wheel_carries_stubs_its_types_and_the_files_of_pages(tmp_path):
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     for package in ("jaxik", "fitting"):
         assert {f"{package}/{name}" for name in ("py.typed", "__init__.pyi")} <= names
+    page = ROOT / "fitting" / "report" / "page"
+    files = [path for folder in ("templates", "assets") for path in (page / folder).iterdir()]
+    assert files and {path.relative_to(ROOT).as_posix() for path in files} <= names
+
+
+def test_the_wheel_carries_the_examples_and_stays_small(tmp_path):
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    shipped = {"experiments/uneven_walk.toml", "clips/uneven_walk.npz", "terrains/uneven_walk.ply"}
+    assert {f"fitting/examples/{name}" for name in shipped} <= names
+    assert Path(wheel).stat().st_size < 3e6
+
+
+def test_help_on_the_package_lists_its_public_names():
+    text = pydoc.render_doc(jaxik, renderer=pydoc.plaintext)  # type: ignore[attr-defined]
+    assert "    class FootIK(" in text and "    run(ik: " in text
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from jaxik.maths import quat
 from jaxik.solvers import rotations, two_bone
@@ -64,6 +65,19 @@ def test_gradients_of_a_knee_match_finite_differences(limb, fraction):
     assert_gradients_match(hinge_half_angle, to_hip, to_ankle, hinge, reach)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_hinge_that_is_not_square_to_the_bones_puts_them_the_wanted_distance_apart(seed):
+    rng = np.random.default_rng(seed)
+    to_hip, to_ankle = rng.uniform(-0.5, 0.5, (2, 3))
+    hinge = rng.normal(size=3)
+    hinge /= np.linalg.norm(hinge)
+    turned = Rotation.from_rotvec(rng.uniform(-3, 3) * hinge).apply(to_ankle)
+    reach = np.linalg.norm(turned - to_hip)  # so that some angle does it
+    half = hinge_half_angle(*map(jnp.asarray, (to_hip, to_ankle, hinge, reach)))
+    ankle = quat.rotate(quat.from_half_angle(jnp.asarray(hinge), *half), jnp.asarray(to_ankle))
+    assert_allclose(np.linalg.norm(ankle - to_hip), reach, atol=1e-9)
+
+
 def test_gradients_are_finite_where_a_swing_or_a_knee_has_no_single_answer():
     swings = ((X, -X, Y), (X, -X, X), (X, Y, X), (X, Y, Y), (X, X, X), (0 * X, Y, Z))
     for bent, target, hinge in swings:
@@ -82,3 +96,10 @@ def test_a_limb_straight_to_within_rounding_has_no_gradient_in_its_reach(limb):
         args = [jnp.asarray(x) for x in (to_hip, to_ankle, hinge, reach)]
         gradient = jax.jacfwd(hinge_half_angle, argnums=3)(*args)
         np.testing.assert_array_equal(gradient, 0.0)
+
+
+@pytest.mark.parametrize("hinge", [X, Z, (X + 2.0 * Z) / np.sqrt(5.0)], ids=["x", "z", "between"])
+def test_a_limb_that_is_turned_upside_down_turns_about_its_hinge(hinge):
+    rot = two_bone.swing_rotation(*map(jnp.asarray, (Y, -Y, hinge, 0.0)))
+    assert_allclose(quat.rotate(rot, jnp.asarray(Y)), -Y, atol=1e-12)
+    assert_allclose(quat.rotate(rot, jnp.asarray(hinge)), hinge, atol=1e-12)

@@ -249,3 +249,50 @@ def test_faithful_systems_have_no_fade_of_ours(preset):
     faithful = getattr(jaxik.presets, preset)(faithful=True)
     assert jax.tree.leaves(faithful.fade) == []
     assert isinstance(getattr(jaxik.presets, preset)().fade, SpeedFade)
+
+
+def test_a_foot_that_swings_joins_its_animation_faster_by_its_own_speed():
+    frames = to_frames(wandering(make_rig(), np.random.default_rng(4), 20))
+    ground, rig = to_terrain(planes((0.2, 0.1, -0.12))), to_rig(make_rig())
+    ik = dataclasses.replace(to_ik({}), fade=NoFade())
+    trace = jax.jit(jaxik.run, compiler_options=QUICK)(ik, rig, ground, frames).trace
+    sensed, effector = jax.tree.map(lambda x: x[10], (trace.sensed, trace.advanced.effector))
+    aside = jnp.array([0.0, 0.1, 0.1])
+    effector = dataclasses.replace(effector, target_ws=sensed.ankle_ws + aside)
+    fade, body = SpeedFade(), Transform(jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))
+    state = dataclasses.replace(fade.init(rig), weight=jnp.ones(2), speed=jnp.asarray(0.5))
+
+    def steps(foot_speed: float, weight: float) -> np.ndarray:
+        """How far the weights of the legs move from 1 towards this weight in a frame."""
+        moving = dataclasses.replace(
+            sensed, foot_speed=jnp.full(2, foot_speed), weight=jnp.ones(2), dt=jnp.asarray(1e-3)
+        )
+        now = SensedMoment(moving.dt, jnp.asarray(True), HARD, moving, ground)
+        return 1.0 - np.asarray(fade.legs(now, effector, body, jnp.full(2, weight), state)[1])
+
+    assert (steps(0.0, 0.0) > 1e-4).all() and (steps(2.0, 0.0) < 1.0).all()
+    np.testing.assert_allclose(steps(2.0, 0.0), steps(0.0, 0.0) * (0.5 + 2.0) / 0.5, rtol=1e-6)
+    np.testing.assert_array_equal(steps(2.0, 1.0), 0.0)
+
+
+def test_the_body_is_held_back_for_a_second_after_weights_have_changed():
+    """After that, the rules of the pelvis may move it as they like."""
+    frames = to_frames(wandering(make_rig(), np.random.default_rng(4), 20))
+    ground, rig = to_terrain(planes((0.2, 0.1, -0.12))), to_rig(make_rig())
+    trace = jax.jit(jaxik.run, compiler_options=QUICK)(to_ik({}), rig, ground, frames).trace
+    sensed = jax.tree.map(lambda x: x[10], trace.sensed)
+    sensed = dataclasses.replace(sensed, dt=jnp.asarray(0.01))
+    now = SensedMoment(sensed.dt, jnp.asarray(True), HARD, sensed, ground)
+    fade, weight = SpeedFade(), jnp.ones(2)
+    goal = Transform(jnp.array([0.0, 0.2, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0]))
+
+    def height(since: float) -> float:
+        """m, of the body one frame later, if weights have not changed for so many seconds."""
+        state = dataclasses.replace(
+            fade.init(rig), goal=weight, weight=weight, since=jnp.asarray(since)
+        )
+        return float(fade.body(now, goal, weight, state)[1].pos[1])
+
+    assert height(0.5) == pytest.approx(0.5 * 0.01)
+    assert height(0.95) == pytest.approx(0.5 * 0.01)
+    assert height(1.05) == height(1.95) == pytest.approx(0.2)

@@ -130,6 +130,17 @@ def test_a_slope_is_no_step_however_far_it_goes():
     assert (np.asarray(found) == 1).all()
 
 
+def test_a_ray_from_no_higher_than_a_step_looks_no_further_than_its_first_ground():
+    """Only a ray from further up may have met a table."""
+    steep = quad((-1, -1.6, -1), (1, -1.6, -1), (1, 1.6, 1), (-1, 1.6, 1))
+    floor = quad((-1, -0.9, -1), (1, -0.9, -1), (1, -0.9, 1), (-1, -0.9, 1))
+    ground = to_terrain(PlainTerrain(maths.Y, triangles=np.array(steep + floor)))
+    starts = np.array([[[0.0, height, 0.0]] * 2 for height in (0.05, 0.2, 0.5)])
+    found, point, _ = read(system("FootProbe", max_step_down=2.0), ground, starts)
+    np.testing.assert_array_equal(found, 0.0)
+    np.testing.assert_allclose(point, 0.0, rtol=0, atol=1e-12)
+
+
 def test_infinite_limits_refuse_nothing():
     rng = np.random.default_rng(1)
     starts = rng.uniform(-1.4, 1.4, (100, 2, 3)) * [1, 0, 1] + [0, UP_START, 0]
@@ -192,3 +203,19 @@ def test_a_step_fades_out_as_it_becomes_too_high(preset):
     found = np.array([hit.found[0, 0] for hit in hits])
     assert (found[heights <= 0.3] == 1).all() and (found[heights > 0.4] == 0).all()
     assert np.abs(np.diff(found)).max() < 1.5 * 0.005 / 0.1 + 1e-9
+
+
+def test_a_toe_on_half_accepted_ground_is_between_it_and_the_level_of_the_foot():
+    """The rule of Mec looks for its toe from where it puts the sole."""
+    height, ik = 0.33, system("CornerProbe")
+    frame = jax.tree.map(lambda x: x[:1], to_frames([FRAME]))
+    ground = jax.tree.map(lambda x: x[0], ground_under(ik, to_terrain(level(height)), frame))
+    found, foot_height = np.asarray(ground.ankle.found), float(ik.target.foot_height)
+    assert ((found > 0.05) & (found < 0.95)).all()
+    foot = np.asarray(frame.pose.ankle.pos[0, :, 1] + frame.world_from_model.pos[0, 1])
+    sole = (1 - found) * (foot - foot_height) + found * height
+    weight = np.asarray(ground.toe.found)
+    np.testing.assert_allclose(weight, found**2, rtol=1e-6)
+    np.testing.assert_allclose(
+        ground.toe.point[:, 1], (1 - weight) * sole + weight * height, rtol=1e-9
+    )

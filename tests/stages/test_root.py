@@ -202,3 +202,9 @@ def last_height(half_life: jax.Array, max_speed: jax.Array, speed: jax.Array) ->
 )
 def test_the_root_has_finite_derivatives_on_the_spot_too(numbers):
     finite_jacobian(last_height, *numbers)
+
+
+def test_where_the_ground_ends_the_root_does_not_sink_to_the_end_of_its_ray():
+    edge = terrain.heightfield(jnp.zeros((2, 2)), (20.0, 40.0), (-10.0, 0.0, -38.0))  # to z = 2
+    lifted = heights(edge, glide(), GroundRoot(ray_down=0.2))  # less than a step
+    np.testing.assert_allclose(lifted, 0.0, atol=1e-6)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -42,13 +43,12 @@ def test_the_fields_of_all_rules_have_a_sentence_of_meaning():
     for rules in systems.STAGES.values():
         for rule in rules.values():
             docs = parameter_tree.docs(rule())
-            fields = dataclasses.fields(rule)
-            data = [field.name for field in fields if not field.metadata.get("static")]
-            assert list(docs) == data, rule.__name__
+            assert list(docs) == [field.name for field in dataclasses.fields(rule)], rule.__name__
             for name, sentence in docs.items():
                 assert sentence[0].isupper() and sentence.endswith("."), f"{rule.__name__}.{name}"
             for declaration in parameter_tree.declarations(rule()).values():
                 assert declaration.doc in docs.values()
+                assert declaration.unit and declaration.low < declaration.high < math.inf
 
 
 def test_printing_a_preset_lists_its_rules_and_parameters_with_units():

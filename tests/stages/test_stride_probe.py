@@ -10,6 +10,7 @@ import pytest
 
 import jaxik
 from jaxik import HARD
+from jaxik.maths.gate import AbstractGate, Smooth
 from jaxik.stages.inputs import Inputs
 from reference import characters, maths, sample_poses
 from reference.terrain import Terrain as PlainTerrain
@@ -90,12 +91,12 @@ def swing(fractions: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jax
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
-def heights(ground: Any, frames: jaxik.Frame) -> jax.Array:
+def heights(ground: Any, frames: jaxik.Frame, gate: AbstractGate = HARD) -> jax.Array:
     """Ground height under the left ankle by the probe of `stride`, m (frames)."""
     ik, rig = to_ik({}, "stride"), to_rig(RIG)
 
     def height(frame: jaxik.Frame) -> jax.Array:
-        inputs = Inputs(rig, ground, frame, HARD)
+        inputs = Inputs(rig, ground, frame, gate)
         contact = ik.contact.sense(inputs)
         ground_hits = ik.probe.sense(inputs, contact, ik.target.foot_height)
         return ground_hits.ankle.point[0, 1]
@@ -121,6 +122,15 @@ def test_the_ground_of_a_swing_does_not_jump_and_leads_to_the_next_foothold(grou
     assert 0.1 < height.max() <= highest + 1e-12
     coarse, fine = (np.abs(np.diff(height[::step])).max() for step in (8, 1))
     assert coarse < 0.02 and fine < coarse / 6, "at a jump both would be equally large"
+
+
+def test_a_predicted_stride_hardly_depends_on_decisions_that_are_hardly_blurred():
+    walked = walk(RIG, len(FINE), hz=800.0, known=False, start=(0.0, 0.0, -1.0))
+    ground, frames = to_terrain(STEP_UP), to_frames(walked)
+    hard = np.asarray(heights(ground, frames))
+    assert np.ptp(hard) > 0.2, "the walk goes up the step"
+    blurred = heights(ground, frames, Smooth(1e-5))
+    np.testing.assert_allclose(blurred, hard, rtol=0, atol=1e-5)
 
 
 def test_a_cliff_and_its_edge_do_not_change_the_ground():

@@ -1,6 +1,7 @@
 """Strides scaled with the speed of the character: against NumPy, and feet that do not skate."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxik.maths.gate import HARD, Smooth
 from jaxik.stages.inputs import Inputs
 from jaxik.stages.warp import NoWarp, StrideWarp
 from jaxik.world import terrain
-from jaxik.world.frame import Frame
+from jaxik.world.frame import Frame, Sensed
 from jaxik.world.skeleton import LegPose, Transform
 from jaxik.world.terrain import Terrain
 from reference import maths
@@ -109,6 +110,14 @@ def test_without_a_scale_there_is_no_warp():
     for rule, scale in ((StrideWarp(), None), (NoWarp(), jnp.asarray(1.3))):
         root = Transform.identity()
         assert offsets(rule, root, jnp.zeros((2, 3)), jnp.zeros(3), scale) is None
+
+
+def test_ankles_before_strides_are_scaled_are_where_the_animation_has_them():
+    animated, warp_ws = jnp.arange(6.0).reshape(2, 3), jnp.ones((2, 3))
+    for moved, by in ((animated, None), (animated + warp_ws, warp_ws)):
+        sensed = SimpleNamespace(ankle_ws=moved, warp_ws=by)
+        unscaled = vars(Sensed)["unscaled_ankle_ws"].fget(sensed)
+        np.testing.assert_allclose(unscaled, animated)
 
 
 def slides(clip, stance):
