@@ -1,8 +1,9 @@
-"""Reads NumPy archives that somebody else may have made: plain arrays of a bounded size."""
+"""Reads NumPy files that somebody else may have made: plain arrays of a bounded size."""
 
 import math
 import zipfile
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -33,15 +34,25 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     raise ValueError(f"{path}: its arrays take {size} bytes; wanted {MAX_BYTES} at most")
 
 
+def check_array_file(path: Path) -> None:
+    """ValueError for an `.npy` that is no plain array, or claims to be longer than it is."""
+    with path.open("rb") as file:
+        _check_header(file, path.name, path.stat().st_size)
+
+
 def _check_claim(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """ValueError for an array that says that it is longer than it is: NumPy would make room."""
     with archive.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in HEADERS:
-            raise ValueError(f"{entry.filename} is no plain array")
-        shape, _, dtype = HEADERS[version](file)
-    if (claim := math.prod(shape) * dtype.itemsize) > entry.file_size:
-        raise ValueError(f"{entry.filename} says {claim} bytes and has {entry.file_size}")
+        _check_header(file, entry.filename, entry.file_size)
+
+
+def _check_header(file: IO[bytes], name: str, size: int) -> None:
+    """ValueError for an array that says that it is longer than it is: NumPy would make room."""
+    version = np.lib.format.read_magic(file)
+    if version not in HEADERS:
+        raise ValueError(f"{name} is no plain array")
+    shape, _, dtype = HEADERS[version](file)
+    if (claim := math.prod(shape) * dtype.itemsize) > size:
+        raise ValueError(f"{name} says {claim} bytes and has {size}")
 
 
 def array_names(path: Path) -> list[str]:

@@ -16,17 +16,20 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from fitting.runtime.validation import error_context
+from jaxik.world import body
 
 from .clips import contacts, edit, load_clip
 from .clips.clip import Clip
 from .clips.formats.npz import is_blocks_file
 from .clips.kinematics import local_from_world, world_from_local
 from .clips.leg_geometry import Vectors, bone_rotation, knee_hinges, knee_positions, unit
+from .clips.load import AS_FOUND, ClipOptions
 
 HeightFunction = Callable[[np.ndarray], np.ndarray]
 """Ground heights, m, (points,), below points (points, 3), m."""
 
 LENGTH_TOLERANCE = 1e-4  # m: a bone whose length varies by more is being stretched
+UNEVEN = 0.05  # m, of an adult, between stances: a flat animation and its noise differ by less
 MAX_REACH = 0.9995  # of a leg's length, to which it may be extended
 
 
@@ -80,19 +83,50 @@ def with_rigid_legs(clip: Clip) -> Clip:
     return _rebuild_legs(clip, clip, np.zeros((clip.frame_count, len(rig.joints))))
 
 
-def load_flat_animation(path: Path, floor: float = 0.0) -> Clip:
+def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = AS_FOUND) -> Clip:
     """The animation in a file, ready for foot IK: with rigid legs, and of a blocks file the base.
 
     Args:
         path: the file.
         floor: height of the floor on which it was animated, m; the rig's soles are measured there.
+        options: how the file is read.
 
     Raises:
         ValueError: as `load_clip`, or the clip has no legs.
     """
-    clip = load_clip(path, variant="base" if is_blocks_file(path) else "captured")
+    variant = "base" if is_blocks_file(path) else "captured"
+    clip = load_clip(path, variant=variant, **vars(options))
     with error_context(path):
         return edit.on_floor(with_rigid_legs(clip), floor)
+
+
+def with_remark_if_uneven(clip: Clip) -> Clip:
+    """A clip that is meant to be flat, with a remark if its feet stand at different heights."""
+    if (difference := stance_difference(clip)) <= UNEVEN * body.ratio(clip.rig):
+        return clip
+    remark = (
+        f"its feet stand at heights {100 * difference:.0f} cm apart, as if captured on uneven "
+        "ground, and not animated on a flat floor: foot IK would add the terrain a second time. "
+        "Take the terrain of its capture with the root `auto` (`jaxik terrain` reconstructs it), "
+        "or make the clip the reference of an experiment without a base"
+    )
+    return replace(clip, remarks=(*clip.remarks, remark))
+
+
+def stance_difference(clip: Clip) -> float:
+    """How far apart the heights are at which the ball of a foot stands, m: most of any foot.
+
+    The heights are medians over each stance; the highest and lowest tenth of them are left out.
+    """
+    balls, stance = clip.joints_ws(3), clip.stance_labels()
+    differences = [0.0]
+    for leg in range(stance.shape[1]):
+        runs = contacts.runs(stance[:, leg])
+        heights = [np.median(balls[first : last + 1, leg, 1]) for first, last in runs]
+        if heights:
+            low, high = np.quantile(heights, [0.1, 0.9])
+            differences.append(float(high - low))
+    return max(differences)
 
 
 def ground_heights(
@@ -114,10 +148,15 @@ def ground_heights(
         falls = contacts.footfalls(balls[:, leg], stance[:, leg])
         points = falls.positions_ws
         heights = np.asarray(height_under(points), np.float64)
-        if heights.shape != (len(points),) or not np.isfinite(heights).all():
+        if heights.shape != (len(points),):
+            raise ValueError(f"wanted {len(points)} ground heights; got the shape {heights.shape}")
+        missing = np.flatnonzero(~np.isfinite(heights))
+        if missing.size:
+            x, _, z = points[missing[0]]
             raise ValueError(
-                f"{clip.source}: wanted {len(points)} finite ground heights under the stances of "
-                f"the {name} foot, got {heights}"
+                f"{clip.source}: there is no ground under {missing.size} of the {len(points)} "
+                f"stances of the {name} foot, first at x {x:.2f}, z {z:.2f} m; make the terrain "
+                "larger, or cut the clip with start and end"
             )
         start, end, x = heights[falls.last], heights[falls.next], falls.swing_fraction
         ground[:, leg] = start + (end - start) * x**3 * (10 - 15 * x + 6 * x**2)

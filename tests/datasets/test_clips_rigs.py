@@ -70,9 +70,9 @@ def test_the_trunk_is_the_way_from_the_pelvis_to_the_head(names, parents, trunk)
 def test_the_error_for_a_missing_leg_lists_the_joints():
     with pytest.raises(ValueError, match=r"no pair of legs.*\['Hips', 'Tail'\].*MotionBuilder"):
         find_roles(("Hips", "Tail"), (-1, 0))
-    feet = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot")
+    feet = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot")
     with pytest.raises(ValueError, match="neither toe nor end site: LeftFoot has no child"):
-        find_roles(feet, (-1, 0, 1, 2))
+        find_roles(feet, (-1, 0, 1, 2, 0, 4, 5))
 
 
 def test_any_number_of_legs_can_be_named():
@@ -275,3 +275,12 @@ def test_on_stairs_or_without_a_stance_heights_over_the_sole_are_those_of_feet_s
         assert np.allclose(soles.ball, 0.45 * np.hypot(0.1, 0.05))
         assert np.allclose(soles.ankle - soles.ball, 0.05)
     assert len([remark for remark in walk.remarks if "no level floor" in remark]) == 2
+
+
+def test_a_knee_that_hardly_moves_is_remarked(tmp_path):
+    path = tmp_path / "walk.bvh"
+    path.write_text(BVH)  # whose right knee turns by 5, 9 and 3 degrees
+    (remark,) = [text for text in load_clip(path).remarks if "knee" in text]
+    assert remark.startswith("the right knee hardly moves, so its axis is a guess")
+    path.write_text(BVH.replace("0 15 0 9 0", "0 15 0 29 0"))
+    assert not any("knee" in text for text in load_clip(path).remarks)

@@ -1,5 +1,6 @@
 """Flat animations derived from clips on uneven ground."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,11 @@ from fitting.datasets.flat_animation import (
     flatten_clip,
     ground_heights,
     load_flat_animation,
+    stance_difference,
+    with_remark_if_uneven,
     with_rigid_legs,
 )
+from fitting.datasets.synthetic import walker
 from support.sample_clips import stair_walk, stairs
 
 
@@ -81,7 +85,7 @@ def test_the_ground_height_changes_smoothly_between_stances(walk):
 
 def test_unknown_ground_heights_are_refused(walk):
     with pytest.raises(
-        ValueError, match="finite ground heights under the stances of the left foot"
+        ValueError, match=r"no ground under \d+ of the \d+ stances of the left foot, first at x"
     ):
         flatten_clip(walk, lambda points: np.full(len(points), np.nan))
     with pytest.raises(ValueError, match="the left foot never stands"):
@@ -175,3 +179,19 @@ def test_the_error_for_an_animation_without_legs_names_the_file(walk, tmp_path):
     save_clip(tmp_path / "odd.npz", legless)
     with pytest.raises(ValueError, match=r"odd\.npz: no pair of legs recognised"):
         load_flat_animation(tmp_path / "odd.npz")
+
+
+def test_a_capture_on_uneven_ground_that_is_given_as_flat_is_remarked():
+    stairs = stair_walk()
+    assert stance_difference(stairs) > 0.1
+    (remark,) = set(with_remark_if_uneven(stairs).remarks) - set(stairs.remarks)
+    assert re.match(r"its feet stand at heights \d+ cm apart, as if captured on uneven", remark)
+
+
+def test_a_flat_animation_is_not_remarked():
+    flat = walker.walk(6.0, 30.0)
+    assert stance_difference(flat) < 0.01 and with_remark_if_uneven(flat) is flat
+    random = np.random.default_rng(0).normal(0.0, 0.01, (flat.frame_count, 1, 1))
+    noisy = flat.with_motion(flat.positions_ws + random * [0.0, 1.0, 0.0], flat.rotations_ws)
+    noisy = replace(noisy, stance=flat.stance_labels())
+    assert with_remark_if_uneven(noisy) is noisy

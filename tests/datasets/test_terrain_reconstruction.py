@@ -1,6 +1,7 @@
 """Terrain reconstructed from a clip: stances, the choice of a surface, and the command."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from fitting.datasets.synthetic import gait
 from fitting.datasets.terrain import block_grids, mesh_files, reconstruction, surfaces
 from fitting.datasets.terrain.block_grids import Grid
 from fitting.datasets.terrain.reconstruction import Prediction
+from fitting.report import terrain_report
 from fitting.report.plots import style
 from jaxik.world.surfaces import Mesh
 from support.experiments import ROOT
@@ -38,6 +40,30 @@ def test_stances_are_at_the_balls_with_the_ground_a_sole_below():
     assert (np.diff(stances.first) >= 0).all() and stances.used.all()
     points_ws = np.insert(stances.points, 1, 0.0, axis=1)
     np.testing.assert_allclose(stances.heights, slope(points_ws) - 0.02, atol=0.002)
+
+
+def test_surfaces_are_fitted_to_a_bounded_number_of_stances_evenly_chosen(monkeypatch):
+    monkeypatch.setattr(reconstruction, "MOST_STANCES", 5)
+    terrain = reconstruction.reconstruct(stair_walk(slope, strides=6))
+    count = len(terrain.stances.used)
+    (used,) = np.nonzero(terrain.stances.used)
+    assert count > 8 and len(used) == 5 and used[0] == 0 and used[-1] == count - 1
+    assert np.ptp(np.diff(used)) <= 1
+    assert len(terrain.predictions["plane"].errors) == 5
+    text = terrain_report.count_stances(terrain)
+    assert text == f"{count} stances; surfaces are fitted to 5 of all, evenly chosen"
+
+
+def test_the_memory_for_stances_grows_with_their_number_and_not_its_square():
+    clip = stair_walk(slope, strides=6)
+    repeats = 600
+    motion = (np.concatenate([part] * repeats) for part in (clip.positions_ws, clip.rotations_ws))
+    long = replace(clip.with_motion(*motion), stance=np.tile(clip.stance_labels(), (repeats, 1)))
+    tracemalloc.start()
+    stances = reconstruction.find_stances(long)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(stances.leg) > 5000 and peak < 10 * long.positions_ws.nbytes
 
 
 def lifted(heel: float, leg: int = 0) -> clips.Clip:

@@ -218,3 +218,28 @@ def test_the_slide_is_stored_and_trimmed_with_the_clip_and_may_be_absent(tmp_pat
 def test_impossible_walks_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         walker.walk(**{"seconds": 5.0, **options})
+
+
+def test_a_walk_and_its_standing_feet_face_along_its_path():
+    clip = walker.walk(12.0, FPS, style=walker.WalkStyle(bend=0.6))
+    pelvis_ws = clip.positions_ws[:, clip.rig.pelvis]
+    travel = np.gradient(pelvis_ws[:, [0, 2]], axis=0)
+    yaw = np.arctan2(travel[:, 0], travel[:, 1])
+    assert yaw.min() < -0.3 and yaw.max() > 0.3, "the path is too straight to tell"
+    facing = Rotation.from_quat(clip.rotations_ws[:, clip.rig.pelvis], scalar_first=True)
+    ahead = facing.apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(np.arctan2(ahead[:, 0], ahead[:, 2])[1:-1], yaw[1:-1], atol=1e-4)
+
+    for leg, joints in enumerate(clip.rig.joints):
+        foot = clip.positions_ws[:, joints[3]] - clip.positions_ws[:, joints[2]]
+        foot_yaw = np.arctan2(foot[:, 0], foot[:, 2])
+        rot = Rotation.from_quat(clip.rotations_ws[:, joints[2]], scalar_first=True)
+        left = rot.apply([1.0, 0.0, 0.0])
+        turned = np.arctan2(-left[:, 2], left[:, 0])
+        for first, last in stances(clip, leg):
+            ball = clip.positions_ws[first, joints[3]]
+            nearest = np.argmin(np.linalg.norm((pelvis_ws - ball)[:, [0, 2]], axis=-1))
+            np.testing.assert_allclose(foot_yaw[first:last], yaw[nearest], atol=0.01)
+            np.testing.assert_allclose(turned[first:last], foot_yaw[first:last], atol=1e-9)
+        np.testing.assert_allclose(left[:, 1], 0.0, atol=1e-9)
+        assert np.abs(np.diff(turned)).max() < 0.05, "a foot turns with a jerk"

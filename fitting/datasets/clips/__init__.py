@@ -8,9 +8,9 @@ What is not here: the flat animation below a captured motion (`fitting.datasets.
 the frames that the foot IK pipeline takes (`fitting.datasets.clip_frames`).
 
 Start with `clip.Clip` and `load.load_clip`. To add a file format read `formats`; to add a joint
-naming convention, `joint_roles`.
+naming convention, `joints`.
 """
 
 from .clip import Clip as Clip
-from .formats.npz import save_clip as save_clip
+from .formats.saving import save_clip as save_clip
 from .load import load_clip as load_clip

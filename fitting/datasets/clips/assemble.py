@@ -15,7 +15,8 @@ from jaxik.world.skeleton import Rig
 
 from . import contacts
 from .clip import Clip
-from .joint_roles import Roles, find_roles
+from .joint_roles import Leg, Roles, find_roles
+from .joints.map_files import ADVICE
 from .kinematics import continuous, local_from_world, world_from_local
 from .recording import (
     FASTEST,
@@ -27,7 +28,7 @@ from .recording import (
     Y_UP_FROM_Z_UP,
     Recording,
 )
-from .rigs import measure_rig, measure_soles, relative_size
+from .rigs import measure_rig, measure_soles, relative_size, stiff_knees
 
 HUGE = 1e12  # units of a file, whatever they are
 RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
@@ -81,7 +82,7 @@ def clip_from_recording(
     except ValueError as error:
         if overrides.joints is not None:
             raise ValueError(f"{source}: {error}") from None
-        remarks.append("no legs recognised; name them with joints=...")
+        remarks.append(f"{_first_clause(error)}; {ADVICE}")
     scale = overrides.scale
     if scale is None:
         scale = recording.metres_per_unit or _guess_scale(recording, roles, remarks)
@@ -92,7 +93,7 @@ def clip_from_recording(
     up = overrides.up or recording.up_axis or _guess_up(recording, roles, remarks)
     if up == "z":
         recording = recording.rotated(Y_UP_FROM_Z_UP)
-    rate = overrides.fps or _common_rate(recording.frame_time, remarks)
+    rate = overrides.fps or common_rate(recording.frame_time, remarks)
     if not SLOWEST <= rate <= FASTEST:
         raise ValueError(
             f"{source}: {rate:.4g} frames per second; wanted {SLOWEST:g} to {FASTEST:g}; "
@@ -110,11 +111,13 @@ def clip_from_recording(
             if not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
         rig = measure_rig(roles, positions_ws, rotations_ws, stance)
+        remarks += _guessed_knees(roles, positions_ws, rotations_ws)
         remarks += _guessed_soles(rig, positions_ws, rotations_ws, stance)
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
         float(rate), recording.frame_time, source, float(scale), up,
         roles.dialect if roles else None, rig, remarks=tuple(remarks),
+        rest_rotations_ls=recording.rest_rotations_ls, channels=recording.channels,
     )  # fmt: skip
 
 
@@ -148,12 +151,24 @@ def clip_from_joints(
     positions_ls, _ = local_from_world(motion.parents, motion.positions_ws, rotations_ws)
     roles = find_roles(motion.names, motion.parents, joints)
     rig = measure_rig(roles, motion.positions_ws, rotations_ws, motion.stance)
-    remarks = _guessed_soles(rig, motion.positions_ws, rotations_ws, motion.stance)
+    remarks = _guessed_knees(roles, motion.positions_ws, rotations_ws)
+    remarks += _guessed_soles(rig, motion.positions_ws, rotations_ws, motion.stance)
     return Clip(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
         rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
         stance=motion.stance, remarks=remarks,
     )  # fmt: skip
+
+
+def _guessed_knees(
+    roles: Roles, positions_ws: np.ndarray, rotations_ws: np.ndarray
+) -> tuple[str, ...]:
+    """A remark for each knee whose axis is a guess."""
+    return tuple(
+        f"the {name} knee hardly moves, so its axis is a guess: take a clip in which it bends, or "
+        "do not trust where this knee points"
+        for name in stiff_knees(roles, positions_ws, rotations_ws)
+    )
 
 
 def _guessed_soles(
@@ -189,24 +204,44 @@ def _with_bones(
     Raises:
         ValueError: a bone of a leg is longer than a body's can be.
     """
-    lengths = np.median(np.linalg.norm(recording.positions_ls, axis=-1), axis=0)
     for leg in roles.legs:
-        for bone, joint in (("thigh", leg.joints[1]), ("shin", leg.joints[2])):
-            if lengths[joint] > LONGEST:
+        for bone, length in zip(("thigh", "shin"), _bone_lengths(recording, leg), strict=True):
+            if length > LONGEST:
                 raise ValueError(
-                    f"{source}: the {leg.name} {bone} is {lengths[joint]:.4g} m long; "
-                    f"wanted at most {LONGEST:g}; give another scale=..."
+                    f"{source}: the {leg.name} {bone} is {length:.4g} m long; "
+                    f"wanted at most {LONGEST:g}; give another --scale (scale=... in Python)"
                 )
-            if lengths[joint] < SHORTEST:
+            if length < SHORTEST:
                 remarks.append(
                     f"the {leg.name} {bone} has no length, so there are no legs; "
-                    "name other joints with joints=..."
+                    f"name other joints: {ADVICE}"
                 )
                 return None
     return roles
 
 
-def _common_rate(frame_time: float, remarks: list[str]) -> float:
+def _bone_lengths(recording: Recording, leg: Leg) -> tuple[float, float]:
+    """Thigh and shin in file units; joints between their ends, such as twists, lie along them."""
+    lengths = np.median(np.linalg.norm(recording.positions_ls, axis=-1), axis=0)
+
+    def length(upper: int, lower: int) -> float:
+        chain, above = [lower], recording.parents[lower]
+        while above not in (upper, -1):
+            chain.append(above)
+            above = recording.parents[above]
+        return float(lengths[chain if above == upper else [lower]].sum())
+
+    hip, knee, ankle, _ = leg.joints
+    return length(hip, knee), length(knee, ankle)
+
+
+def _first_clause(error: ValueError) -> str:
+    """What is wrong with the names, without the list of what would be right."""
+    text = str(error)
+    return "no legs recognised" if text.startswith("no pair") else text.partition(f"; {ADVICE}")[0]
+
+
+def common_rate(frame_time: float, remarks: list[str]) -> float:
     """The common frame rate nearest to a frame time, or the exact rate if none is near."""
     rate = 1.0 / frame_time
     common = min(RATES, key=lambda candidate: abs(candidate - rate))
@@ -220,10 +255,9 @@ def _common_rate(frame_time: float, remarks: list[str]) -> float:
 
 def _leg_length(recording: Recording, roles: Roles | None) -> float:
     """Thigh plus shin in file units; without legs, the longest chain from the root to a leaf."""
-    lengths = np.median(np.linalg.norm(recording.positions_ls, axis=-1), axis=0)
     if roles is not None:
-        legs = [lengths[list(leg.joints[1:3])].sum() for leg in roles.legs]
-        return float(np.mean(legs))
+        return float(np.mean([sum(_bone_lengths(recording, leg)) for leg in roles.legs]))
+    lengths = np.median(np.linalg.norm(recording.positions_ls, axis=-1), axis=0)
     reach = np.zeros(len(lengths))
     for joint, parent in enumerate(recording.parents):
         reach[joint] = 0.0 if parent < 0 else reach[parent] + lengths[joint]
@@ -239,7 +273,11 @@ def _guess_scale(recording: Recording, roles: Roles | None, remarks: list[str]) 
     unit = min(UNITS, key=lambda name: abs(np.log(leg * UNITS[name] / body.LEG)))
     metres = leg * UNITS[unit]
     plausible = 1 / PLAUSIBLE_RATIO < metres / body.LEG < PLAUSIBLE_RATIO
-    doubt = "" if roles is not None and plausible else "; doubtful, give scale=..."
+    doubt = (
+        ""
+        if roles is not None and plausible
+        else "; doubtful: give --scale (scale=... in Python) if you know it"
+    )
     remarks.append(f"scale guessed: legs of {leg:.4g} units in {unit} are {metres:.3f} m{doubt}")
     return UNITS[unit]
 
@@ -258,5 +296,7 @@ def _guess_up(recording: Recording, roles: Roles | None, remarks: list[str]) -> 
     ankles = positions[:, [leg.joints[2] for leg in roles.legs]].mean(axis=1)
     rise = np.median(positions[:, roles.pelvis] - ankles, axis=0)
     if max(rise[1], rise[2]) < 0.5 * np.linalg.norm(rise):
-        remarks.append("the pelvis is not above the feet along y or z; give up=...")
+        remarks.append(
+            "the pelvis is not above the feet along y or z; give --up (up=... in Python)"
+        )
     return "z" if rise[2] > rise[1] else "y"

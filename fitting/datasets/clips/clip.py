@@ -15,6 +15,7 @@ from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts
 from .joint_roles import find_roles
+from .joints.map_files import ADVICE
 from .kinematics import continuous, cuts
 from .rigs import left_directions
 
@@ -64,9 +65,13 @@ class Clip:
     """0..1, how much foot IK each leg gets."""
     remarks: tuple[str, ...] = ()
     """Guesses and oddities, for the user."""
+    rest_rotations_ls: Float64[np.ndarray, "joints 4"] | None = None
+    """Rest pose, wxyz, relative to the parents; None where no joint is rotated in it."""
+    channels: tuple[str, ...] | None = None
+    """Of a BVH file, for each joint in the file's order and spelling, with blanks between."""
 
     def __post_init__(self) -> None:
-        for name in ("offsets_ls", "positions_ws", "rotations_ws", *TRACKS):
+        for name in ("offsets_ls", "positions_ws", "rotations_ws", "rest_rotations_ls", *TRACKS):
             if (array := getattr(self, name)) is not None:
                 view = array.view()
                 view.flags.writeable = False
@@ -116,7 +121,7 @@ class Clip:
         """
         if self.measured_rig is None:
             find_roles(self.joint_names, self.parents)  # its error says what is missing
-            raise ValueError(f"{self.source} was loaded without legs; load it with joints=...")
+            raise ValueError(f"{self.source} was loaded without legs; {ADVICE}")
         return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), self.measured_rig)
 
     @property

@@ -191,13 +191,14 @@ def mirror(clip: Clip) -> Clip:
             f"{list(clip.joint_names)}"
         )
     swap = list(other)
-    rig = clip.measured_rig
+    rig, rest = clip.measured_rig, clip.rest_rotations_ls
     legs = partners(rig.names) if rig else ()
     return replace(
         clip,
         offsets_ls=clip.offsets_ls[swap] * MIRROR_VECTOR,
         positions_ws=clip.positions_ws[:, swap] * MIRROR_VECTOR,
         rotations_ws=clip.rotations_ws[:, swap] * MIRROR_ROTATION,
+        rest_rotations_ls=None if rest is None else rest[swap] * MIRROR_ROTATION,
         measured_rig=_mirror_rig(rig, list(legs)) if rig else None,
         stance=None if clip.stance is None else clip.stance[:, list(legs)],
     )

@@ -1,33 +1,22 @@
 """Joint roles: which joint of a skeleton is the pelvis, and which are hip, knee, ankle and toe.
 
-Roles are recognised by joint name, in one of several naming conventions, or named by the caller. To
-support another convention, add a line to `DIALECTS`.
+Roles are recognised by joint name, in one of the naming conventions of `joints.dialects`, or named
+by the caller.
 """
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-SIDES = {"l": 1.0, "r": -1.0}
-LEG_NAMES = {"l": "left", "r": "right"}
-LEG_ROLES = ("hip", "knee", "ankle", "toe")
+from .joints.dialects import DIALECTS, LEG_NAMES, LEG_ROLES, plain, recognise
+from .joints.map_files import ADVICE
 
-# Names of pelvis, hip, knee, ankle and toe, as `plain` spells them. {l} and {left} are replaced by
-# the side: l and r, or left and right.
-DIALECTS = {
-    "ASF": ("root", "{l}femur", "{l}tibia", "{l}foot", "{l}toes"),
-    "cgspeed": ("hips", "{left}hip", "{left}knee", "{left}ankle", "{left}toe"),
-    "MotionBuilder": ("hips", "{left}upleg", "{left}leg", "{left}foot", "{left}toebase"),
-    "Poser": ("hip", "{l}thigh", "{l}shin", "{l}foot", "{l}toe"),
-    "Bandai": ("hips", "upperleg{l}", "lowerleg{l}", "foot{l}", "toes{l}"),
-    "Unreal": ("pelvis", "thigh{l}", "calf{l}", "foot{l}", "ball{l}"),
-    "SMPL": ("pelvis", "{l}hip", "{l}knee", "{l}ankle", "{l}foot"),
-    "jaxik": ("pelvis", "{left}hip", "{left}knee", "{left}ankle", "{left}toe"),
-}
-
+SIDES = {"left": 1.0, "right": -1.0}
 
 # Where no head shows the way, names of the spine's lowest joint, as `plain` spells them.
-SPINES = ("lowerback", "spine", "spine0", "spine1", "spine01", "abdomen", "torso", "chest")
+SPINES = (
+    "lowerback", "spine", "spine0", "spine1", "spine01", "spine001", "abdomen", "torso", "chest"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,7 +55,7 @@ def find_trunk(names: tuple[str, ...], parents: tuple[int, ...], pelvis: int) ->
     Between pelvis and head the spine needs no known name; without a head it is a child of the
     pelvis with a name of `SPINES`.
     """
-    plain_names = [plain(name) for name in names]
+    plain_names = _without_prefix([plain(name) for name in names], pelvis)
     if "head" not in plain_names:
         spines = (
             j for j, name in enumerate(plain_names) if name in SPINES and parents[j] == pelvis
@@ -82,10 +71,14 @@ def find_trunk(names: tuple[str, ...], parents: tuple[int, ...], pelvis: int) ->
     return Trunk(None if spine == head or parents[spine] < 0 else spine, head)
 
 
-def plain(name: str) -> str:
-    """A joint name without namespace, case and separators: `mixamorig:LeftLeg` is `leftleg`."""
-    last = re.split(r"[:|]", name.strip())[-1].lower()
-    return re.sub(r"^mixamorig\d*|[ _.\-]", "", last)
+def _without_prefix(plain_names: list[str], pelvis: int) -> list[str]:
+    """Names without the prefix that the head, or the spine, shares with the pelvis."""
+    for name in plain_names:
+        for word in ("head", *SPINES):
+            prefix = name.removesuffix(word)
+            if prefix != name and prefix and plain_names[pelvis].startswith(prefix):
+                return [text.removeprefix(prefix) for text in plain_names]
+    return plain_names
 
 
 def find_roles(
@@ -103,32 +96,33 @@ def find_roles(
             `toe_l`. A suffix that ends in l or left is a left leg, one in r or right a right leg.
 
     Raises:
-        ValueError: no pair of legs is recognised, or `joints` has wrong roles or unknown names; the
-            message lists what exists.
+        ValueError: no pair of legs is recognised, or several are; or `joints` has wrong roles or
+            unknown names, or one joint in two roles. The message lists what exists.
     """
     if joints is not None:
         return _by_hand(names, parents, joints)
-    index_of = {plain(name): index for index, name in reversed(list(enumerate(names)))}
-    for dialect, (pelvis, *leg_names) in DIALECTS.items():
-        legs = []
-        for letter in SIDES:
-            spelled = [name.format(l=letter, left=LEG_NAMES[letter]) for name in leg_names]
-            hip, knee, ankle, toe = (index_of.get(name) for name in spelled)
-            if hip is not None and knee is not None and ankle is not None:
-                leg = LEG_NAMES[letter]
-                toe = _end_of_foot(names, parents, leg, ankle) if toe is None else toe
-                legs.append(Leg(leg, SIDES[letter], (hip, knee, ankle, toe)))
-        if pelvis in index_of and len(legs) == len(SIDES):
-            return Roles(dialect, index_of[pelvis], tuple(legs))
-    spellings = "; ".join(f"{name}: {', '.join(parts)}" for name, parts in DIALECTS.items())
-    raise ValueError(
-        f"no pair of legs recognised among the joints {list(names)}; wanted, in any case, one of "
-        f"{spellings}; or joints={{'pelvis': ..., 'hip_l': ..., 'knee_l': ..., 'ankle_l': ...}}"
-    )
+    try:
+        match = recognise(names, parents)
+    except ValueError as error:
+        raise ValueError(f"{error}; {ADVICE}") from None
+    if match is None:
+        raise ValueError(
+            f"no pair of legs recognised among the joints {list(names)}; known are the names of "
+            f"{', '.join(DIALECTS)}; for others, {ADVICE}"
+        )
+    legs = []
+    for (name, side), (*bones, toe) in zip(SIDES.items(), (match.left, match.right), strict=True):
+        hip, knee, ankle = bones
+        toe = _end_of_foot(names, parents, name, ankle) if toe is None else toe
+        legs.append(Leg(name, side, (hip, knee, ankle, toe)))
+    return Roles(match.dialect, match.pelvis, tuple(legs))
 
 
 def _by_hand(names: tuple[str, ...], parents: tuple[int, ...], joints: Mapping[str, str]) -> Roles:
     """The roles that the caller named."""
+    joints = {role: name for role, name in joints.items() if name or not role.startswith("toe_")}
+    if empty := [role for role, name in joints.items() if not name]:
+        raise ValueError(f"{empty[0]} is empty; wanted the name of a joint, of {list(names)}")
     suffixes = [role.removeprefix("hip_") for role in joints if role.startswith("hip_")]
     allowed = {"pelvis"} | {f"{role}_{suffix}" for role in LEG_ROLES for suffix in suffixes}
     required = {role for role in allowed if not role.startswith("toe_")}
@@ -141,13 +135,18 @@ def _by_hand(names: tuple[str, ...], parents: tuple[int, ...], joints: Mapping[s
         raise ValueError(f"no joints named {unknown}; there are {list(names)}")
     index_of = {role: names.index(name) for role, name in joints.items()}
     legs = []
+    for role, name in joints.items():
+        others = [other for other in joints if other not in (role, "pelvis")]
+        alike = [other for other in others if joints[other] == name]
+        if alike and role != "pelvis":  # at which a leg may begin
+            raise ValueError(f"the joint {name} is both {role} and {alike[0]}")
     for suffix in suffixes:
         hip, knee, ankle = (index_of[f"{role}_{suffix}"] for role in LEG_ROLES[:3])
         letter = re.sub(r"(?<=l)eft$|(?<=r)ight$", "", suffix)[-1:]
         leg = LEG_NAMES.get(suffix, suffix)
         toe = index_of.get(f"toe_{suffix}")
         toe = _end_of_foot(names, parents, leg, ankle) if toe is None else toe
-        legs.append(Leg(leg, SIDES.get(letter, 0.0), (hip, knee, ankle, toe)))
+        legs.append(Leg(leg, SIDES.get(LEG_NAMES.get(letter, ""), 0.0), (hip, knee, ankle, toe)))
     return Roles("by hand", index_of["pelvis"], tuple(legs))
 
 

@@ -1,7 +1,9 @@
 """`load_clip`: opens a motion file with the reader that its suffix selects."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from fitting.runtime.validation import check_file
 
@@ -9,7 +11,64 @@ from . import formats
 from .assemble import Overrides, clip_from_recording
 from .clip import Clip
 from .formats.asfamc import read_asfamc
+from .formats.gltf.reader import SUFFIXES as GLTF
+from .formats.gltf.reader import read_gltf
 from .formats.npz import read_npz
+from .joints.map_files import read_joint_map
+
+JointMap = Mapping[str, str] | str | Path
+"""Role to joint name, see `joint_roles.find_roles`; or a file that `joints.map_files` reads."""
+
+
+@dataclass(frozen=True)
+class ClipOptions:
+    """What the user knows better than a motion file; None leaves it to be read or guessed.
+
+    The fields are arguments of `load_clip`: `load_clip(path, **vars(options))`.
+    """
+
+    joints: JointMap | None = None
+    """Which joint is which."""
+    scale: float | None = None
+    """Metres per unit of the file."""
+    up: str | None = None
+    """Either "y" or "z"."""
+    asf: Path | None = None
+    """Skeleton of an AMC file."""
+    animation: str | None = None
+    """Which animation of a glTF file."""
+
+    def of_file(self, path: Path) -> "ClipOptions":
+        """Those that a file of this format takes, where several files share the options."""
+        suffix = path.suffix.lower()
+        if suffix == ".npz":
+            return ClipOptions()
+        asf = self.asf if suffix == ".amc" else None
+        return replace(self, asf=asf, animation=self.animation if suffix in GLTF else None)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The options that are not None, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def check_use(self, files: Iterable[Path], where: str) -> None:
+        """Raises ValueError for an option that none of these files takes.
+
+        Args:
+            files: clips that share the options.
+            where: what they belong to, for the message.
+        """
+        taken = {name for file in files for name in self.of_file(file).given}
+        if unused := sorted(set(self.given) - taken):
+            raise ValueError(
+                f"{where}: {unused[0]} is of no use: an .npz states all that itself, only an .amc "
+                "has an .asf, and only a .glb or .gltf an animation to choose"
+            )
+
+
+AS_FOUND = ClipOptions()
+"""All is recognised or guessed."""
 
 
 def load_clip(
@@ -19,21 +78,25 @@ def load_clip(
     scale: float | None = None,
     fps: float | None = None,
     up: str | None = None,
-    joints: Mapping[str, str] | None = None,
+    joints: JointMap | None = None,
     variant: str = "captured",
+    animation: str | None = None,
 ) -> Clip:
-    """Reads a BVH, AMC (with its ASF) or NPZ file as a clip in metres with y up.
+    """Reads a BVH, AMC (with its ASF), glTF, GLB or NPZ file as a clip in metres with y up.
 
     Args:
         path: the file; its suffix selects the format.
         asf: skeleton of an AMC file; None looks for it in the same folder.
         scale: metres per unit of the file. None takes it from the file if it states one (ASF), and
             otherwise the unit that makes the legs most similar to an adult's.
-        fps: frames per second; None takes the file's, rounded to the nearest common rate.
+        fps: frames per second; None takes the file's, rounded to the nearest common rate. A glTF
+            animation is sampled at this rate, and any other plays as fast as it says.
         up: "y" or "z"; None takes the axis along which the pelvis is above the feet.
-        joints: role to joint name, see `joint_roles.find_roles`; None recognises the names.
+        joints: role to joint name, see `joint_roles.find_roles`, or a joint map, see
+            `joints.map_files`; None recognises the names.
         variant: which clip of a file of the `blocks` benchmark: "captured" or "base", the flat
             animation.
+        animation: which animation of a glTF file; None takes the only one.
 
     Returns:
         The clip; its `remarks` list every guess. A file without recognised legs loads, and its
@@ -49,15 +112,23 @@ def load_clip(
     if suffix not in (*formats.READERS, ".npz"):
         raise ValueError(f"{path}: wanted a {', '.join(formats.READERS)} or .npz file")
     check_file(path)
+    if isinstance(joints, str | Path):
+        joints = read_joint_map(Path(joints))
     overrides = Overrides(scale, fps, up, joints)
+    if asf is not None and suffix != ".amc":
+        raise ValueError(f"{path}: only an .amc has its skeleton in an .asf; got {asf}")
     if suffix == ".npz":
-        arguments = {"asf": asf, **vars(overrides)}
+        arguments = {**vars(overrides), "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
             raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
         return read_npz(path, variant)
     if variant != "captured":
         raise ValueError(f"{path}: only blocks .npz files have the variant {variant!r}")
-    if asf is not None and suffix == ".amc":
+    if animation is not None and suffix not in GLTF:
+        raise ValueError(f"{path}: only glTF files have an animation to choose, {animation!r}")
+    if suffix in GLTF:
+        recording = read_gltf(path, animation, fps)
+    elif asf is not None:
         recording = read_asfamc(path, Path(asf))
     else:
         recording = formats.READERS[suffix](path)

@@ -45,6 +45,10 @@ class Recording:
     """Scale, where the file states it; None lets the loader guess it from the legs' length."""
     up_axis: str | None = None
     """Axis that points up, "y" or "z", where the file states it; None lets the loader guess it."""
+    rest_rotations_ls: Float64[np.ndarray, "joints 4"] | None = None
+    """Rotation of each joint in the rest pose, wxyz, relative to its parent; None: unrotated."""
+    channels: tuple[str, ...] | None = None
+    """For each joint the channels of a BVH file, in its order and spelling, with blanks between."""
     remarks: tuple[str, ...] = ()
     """Sentences for the user about anything missing or odd in the file."""
 
@@ -64,11 +68,17 @@ class Recording:
         The joints' own axes change with the world's, so a rest pose without rotations stays one.
         """
         change = Rotation.from_matrix(matrix)
-        old = Rotation.from_quat(self.rotations_ls.reshape(-1, 4), scalar_first=True)
-        new = (change * old * change.inv()).as_quat(scalar_first=True)
+
+        def turned(rotations: np.ndarray) -> np.ndarray:
+            old = Rotation.from_quat(rotations.reshape(-1, 4), scalar_first=True)
+            new = (change * old * change.inv()).as_quat(scalar_first=True)
+            return new.reshape(rotations.shape)
+
+        rest = self.rest_rotations_ls
         return replace(
             self,
             offsets_ls=self.offsets_ls @ matrix.T,
             positions_ls=self.positions_ls @ matrix.T,
-            rotations_ls=new.reshape(self.rotations_ls.shape),
+            rotations_ls=turned(self.rotations_ls),
+            rest_rotations_ls=None if rest is None else turned(rest),
         )

@@ -227,12 +227,36 @@ def knee_axis(leg: LegMotion) -> Float64[np.ndarray, "3"]:
     hinges_ws = knee_hinges(leg.hip, leg.knee, leg.ankle, leg.left_ws)
     knee_rot = _rotation(leg.knee_rot)
     flexing_ls = np.mean(knee_rot.inv().apply(hinges_ws), axis=0)
-    local = _rotation(leg.hip_rot).inv() * knee_rot
-    rotations = (local.mean().inv() * local).as_rotvec()
-    if np.sqrt(np.mean(np.sum(rotations**2, axis=-1))) < KNEE_MOTION:
+    if knee_motion(leg) < KNEE_MOTION:
         return -flexing_ls / np.linalg.norm(flexing_ls)
-    axis = np.linalg.svd(rotations, full_matrices=False)[2][0]
+    axis = np.linalg.svd(_knee_rotations(leg), full_matrices=False)[2][0]
     return -axis if axis @ flexing_ls > 0 else axis
+
+
+def knee_motion(leg: LegMotion) -> float:
+    """Root mean square rotation of the knee about its mean, rad."""
+    return float(np.sqrt(np.mean(np.sum(_knee_rotations(leg) ** 2, axis=-1))))
+
+
+def _knee_rotations(leg: LegMotion) -> Vectors:
+    """Rotations of the knee from its mean, relative to the thigh, as rotation vectors, rad."""
+    local = _rotation(leg.hip_rot).inv() * _rotation(leg.knee_rot)
+    return (local.mean().inv() * local).as_rotvec()
+
+
+def stiff_knees(
+    roles: Roles,
+    positions_ws: Float64[np.ndarray, "frames joints 3"],
+    rotations_ws: Float64[np.ndarray, "frames joints 4"],
+) -> tuple[str, ...]:
+    """Names of the legs whose knees move too little to show their axes."""
+    left_ws = np.zeros((len(positions_ws), 3))  # which is not read
+    motions = (_leg_motion(leg, left_ws, positions_ws, rotations_ws) for leg in roles.legs)
+    return tuple(
+        leg.name
+        for leg, motion in zip(roles.legs, motions, strict=True)
+        if knee_motion(motion) < KNEE_MOTION
+    )
 
 
 def flat_frames(

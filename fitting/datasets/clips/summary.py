@@ -7,8 +7,7 @@ import numpy as np
 
 from . import contacts, edit
 from .clip import Clip
-
-ROLES = ("hip", "knee", "ankle", "toe")
+from .joints.dialects import LEG_ROLES
 
 
 class LegSummary(TypedDict):
@@ -90,7 +89,7 @@ def _joint_map(clip: Clip) -> dict[str, str]:
     rig = clip.rig
     joint_map = {"pelvis": clip.joint_names[rig.pelvis]}
     for name, joints in zip(rig.names, rig.joints, strict=True):
-        for role, joint in zip(ROLES, joints, strict=True):
+        for role, joint in zip(LEG_ROLES, joints, strict=True):
             joint_map[f"{role}_{name}"] = clip.joint_names[joint]
     return joint_map
 
@@ -129,7 +128,7 @@ def as_text(summary: ClipSummary) -> str:
     if summary["legs"]:
         lines.append(f"  map     {summary['dialect']}; pelvis {joint_map['pelvis']}")
     for name, leg in summary["legs"].items():
-        names = ", ".join(f"{role} {joint_map[f'{role}_{name}']}" for role in ROLES)
+        names = ", ".join(f"{role} {joint_map[f'{role}_{name}']}" for role in LEG_ROLES)
         axis = ", ".join(f"{value:.3f}" for value in leg["knee_axis"])
         lines += [
             f"  {name:<7} {names}",

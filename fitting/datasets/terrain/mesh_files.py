@@ -4,6 +4,7 @@ import io
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,10 +16,11 @@ from jaxtyping import ArrayLike, Float, Int
 from trimesh.exchange.load import mesh_formats
 from trimesh.resolvers import FilePathResolver
 
+from fitting.datasets import gltf_checks
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
 
-from . import gltf_checks, heightfield_files
+from . import heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
 WITH_MATERIALS = ("obj", *gltf_checks.KINDS)  # whose images need not be read
@@ -29,13 +31,36 @@ _WORLD_FROM_FILE = {
 }
 
 
+@dataclass(frozen=True)
+class TerrainOptions:
+    """How the numbers of a terrain's file become metres with y up.
+
+    The fields are arguments of `load_terrain`: `load_terrain(path, **vars(options))`.
+    """
+
+    file_up: str = "y"
+    """Up axis of a mesh's file, "y" or "z"."""
+    scale: float | None = None
+    """Metres per unit of the file, or per level of a picture; None is 1, but for a picture."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """m, world space, by which the terrain is then moved."""
+    cell: float | None = None
+    """m, between neighbours of a heightfield whose file does not say it."""
+
+
+AS_IS = TerrainOptions()
+"""The file is in metres, with y up."""
+
+
 def load_terrain(
     path: str | Path,
     *,
     up: ArrayLike | tuple[float, ...] = (0.0, 1.0, 0.0),
     layer: int = 0,
     file_up: str = "y",
-    scale: float = 1.0,
+    scale: float | None = None,
+    offset: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+    cell: float | None = None,
     slack: float = 0.0,
     dtype: DTypeLike | None = None,
 ) -> terrain.Terrain:
@@ -45,14 +70,17 @@ def load_terrain(
     of a single geometry keep the file's order.
 
     Args:
-        path: PLY, OBJ, STL, GLB, OFF or whatever else trimesh reads; or a heightfield as NPZ, whose
-            arrays `heightfield_files` lists.
+        path: PLY, OBJ, STL, GLB, OFF or whatever else trimesh reads; or a heightfield as NPZ, NPY
+            or PNG, see `heightfield_files`.
         up: direction opposite to the rays that probe the ground, and of a heightfield's heights;
             world space, any length.
         layer: 0 to 31, of all triangles.
         file_up: the file's up axis, "y" or "z"; with "z", (x, y, z) becomes (x, z, -y). A
             heightfield has y up.
-        scale: metres per unit of the file; 0.01 for centimetres.
+        scale: metres per unit of the file, 0.01 for centimetres, or per level of a picture; None is
+            1, but for a picture.
+        offset: m, world space, by which the terrain is moved when it is in metres with y up.
+        cell: m, between neighbours of an NPY or PNG.
         slack: m, of a mesh; see `jaxik.world.terrain.mesh`.
         dtype: of the floats; None takes JAX's default.
 
@@ -64,25 +92,33 @@ def load_terrain(
     if file_up not in _WORLD_FROM_FILE:
         known = " or ".join(repr(axis) for axis in _WORLD_FROM_FILE)
         raise ValueError(f"file_up is the file's up axis, {known}; got {file_up!r}")
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale is metres per unit, above 0; got {scale}")
+    for name, value in (("scale", scale), ("cell", cell)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            unit = "metres per unit" if name == "scale" else "in metres"
+            raise ValueError(f"{name} is {unit}, above 0; got {value}")
+    moved = np.asarray(offset, np.float64)
+    if moved.shape != (3,) or not np.isfinite(moved).all():
+        raise ValueError(f"offset is x, y and z in metres; got {offset}")
     path = Path(path)
-    if path.suffix.lower() == heightfield_files.SUFFIX:
+    if path.suffix.lower() in heightfield_files.SUFFIXES:
         if file_up != "y":
             raise ValueError(f"{path}: a heightfield has y up; got file_up {file_up!r}")
-        field = heightfield_files.read_heightfield(path)
+        field = heightfield_files.read_heightfield(path, scale, cell)
         with error_context(path):
             return terrain.heightfield(
-                _as_dtype(scale * field.heights, dtype),
-                scale * field.spacing,
-                scale * field.origin,
+                _as_dtype(field.heights, dtype),
+                field.spacing,
+                field.origin + moved,
                 up=up,
                 layer=layer,
                 interpolation=field.interpolation,
             )
+    if cell is not None:
+        raise ValueError(f"{path}: a mesh has no cell; got {cell:g}")
     vertices, triangles = _read(path)
     with np.errstate(all="ignore"):  # what is not finite, or too far away, is refused below
-        vertices_ws = _as_dtype(scale * vertices @ _WORLD_FROM_FILE[file_up].T, dtype)
+        unit = 1.0 if scale is None else scale
+        vertices_ws = _as_dtype(unit * vertices @ _WORLD_FROM_FILE[file_up].T + moved, dtype)
     with error_context(path):
         return terrain.mesh(vertices_ws, triangles, up=up, layer=layer, slack=slack)
 
@@ -158,7 +194,8 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     kind = path.suffix.lower().removeprefix(".")
     if kind not in formats:
         raise ValueError(
-            f"{path}: wanted a heightfield (.npz) or a mesh that trimesh reads "
+            f"{path}: wanted a heightfield ({', '.join(heightfield_files.SUFFIXES)}) or a mesh "
+            f"that trimesh reads "
             f"({', '.join(formats)}); not {path.suffix!r}"
         )
     options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}

@@ -6,11 +6,12 @@ no other predicts clearly better is chosen.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import KDTree
 
 from fitting.datasets.clips import contacts, edit
 from fitting.datasets.clips.clip import Clip
@@ -26,6 +27,7 @@ SOLE = 0.055  # m, ball joint above the sole: CMU database, subject 03, in his s
 TOE_PITCH, TOE_DEVIATIONS = np.radians(5.0), 3.0 * 1.4826
 NEAR = 0.3  # m, about a foot's length: a stance on toes is not used if a flat one is as near
 MIN_STANCES = 4  # three determine a plane, and one tests it
+MOST_STANCES = 300  # evenly chosen where there are more: all kinds are fitted in some minutes
 WIDEST = 1000.0  # m, between stances
 SURFACE_KINDS = ("plane", "smooth", "blocks")  # from simple to complex
 SurfaceFit = Callable[[Footprints], Surface]
@@ -127,6 +129,8 @@ def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> R
         raise ValueError(
             f"{clip.source}: its stances are up to {extent:.4g} m apart; wanted at most {WIDEST:g}"
         )
+    stances = thin_out(stances)
+    feet = stances.footprints
     grids = block_grids.search(feet)
     fits: dict[str, SurfaceFit] = {
         "plane": surfaces.fit_plane,
@@ -155,11 +159,13 @@ def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
     records = []
     for leg in range(standing.shape[1]):
         for first, last in contacts.runs(standing[:, leg]):
-            good = unmasked.copy()
-            good[:first] = good[last + 1 :] = False
+            beside = slice(max(first - 1, 0), last + 2)  # a frame before and after, for speeds
+            frames = np.arange(beside.start, min(beside.stop, clip.frame_count))
+            good = unmasked[beside] & (first <= frames) & (frames <= last)
             if good.any():
-                flat = flat_frames(ankles[:, leg], balls[:, leg], good)
-                ball, ankle = (np.median(joint[flat, leg], axis=0) for joint in (balls, ankles))
+                here = ankles[beside, leg], balls[beside, leg]
+                flat = flat_frames(here[0], here[1], good)
+                ankle, ball = (np.median(joint[flat], axis=0) for joint in here)
                 foot = ball - ankle
                 pitch = np.arctan2(foot[1], np.linalg.norm(foot[[0, 2]]))
                 records.append((first, leg, last, *ball, *ankle[[0, 2]], pitch))
@@ -172,10 +178,24 @@ def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
         pitch[leg == index] -= np.median(pitch[leg == index])
     toes = -pitch > np.maximum(TOE_PITCH, TOE_DEVIATIONS * np.median(np.abs(pitch)))
     points, ankles = (np.stack(pair, axis=-1) for pair in ((x, z), ankle))
-    distance_to_flat = np.linalg.norm(points[:, None] - points[~toes], axis=-1)
-    used = ~toes | (distance_to_flat > NEAR).all(axis=1)
+    distance_to_flat = np.full(len(points), np.inf)
+    if not toes.all():
+        distance_to_flat, _ = KDTree(points[~toes]).query(points)
+    used = ~toes | (distance_to_flat > NEAR)
     leg, first, last = (column.astype(np.int64) for column in (leg, first, last))
     return Stances(leg, first, last, points, ankles, y - sole, toes, used)
+
+
+def thin_out(stances: Stances) -> Stances:
+    """The stances, of which no more than `MOST_STANCES` are used, chosen evenly in time.
+
+    A surface takes time by the cube of their number, and is fitted without each of them.
+    """
+    used = np.flatnonzero(stances.used)
+    if len(used) <= MOST_STANCES:
+        return stances
+    chosen = used[np.linspace(0, len(used) - 1, MOST_STANCES).round().astype(int)]
+    return replace(stances, used=np.isin(np.arange(len(stances.used)), chosen))
 
 
 def leave_one_out(fit: SurfaceFit, feet: Footprints) -> Prediction:

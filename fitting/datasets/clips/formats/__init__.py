@@ -9,6 +9,8 @@ The suffix and the function go into `READERS` below; `load_clip`, its messages a
 that takes a clip then accept the format. "How to add a clip format" in fitting/README.md has all
 steps, with an example.
 
+`saving.save_clip` writes clips, as `npz` or by the modules named `writer`.
+
 `npz` differs: an archive holds a complete clip, so its reader returns a `Clip`, not a `Recording`.
 """
 
@@ -19,5 +21,11 @@ from fitting.datasets.clips.recording import Recording
 
 from .asfamc import read_asfamc
 from .bvh import read_bvh
+from .gltf.reader import read_gltf
 
-READERS: Mapping[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_asfamc}
+READERS: Mapping[str, Callable[[Path], Recording]] = {
+    ".bvh": read_bvh,
+    ".amc": read_asfamc,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+}

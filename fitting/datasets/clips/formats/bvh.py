@@ -43,6 +43,7 @@ class _Reader:
         self.parents: list[int] = []
         self.offsets: list[list[float]] = []
         self.channels: list[list[tuple[str, str]]] = []  # per joint, of (axis, position | rotation)
+        self.spellings: list[list[str]] = []  # the same, as in the file
 
     def read(self) -> Recording:
         if self._next("HIERARCHY").upper() != "HIERARCHY":
@@ -53,7 +54,8 @@ class _Reader:
         positions_ls, rotations_ls = self._motion(values)
         return Recording(
             tuple(self.names), tuple(self.parents), np.array(self.offsets, np.float64),
-            positions_ls, rotations_ls, frame_time, remarks=remarks,
+            positions_ls, rotations_ls, frame_time, channels=tuple(map(" ".join, self.spellings)),
+            remarks=remarks,
         )  # fmt: skip
 
     def _error(self, what: str) -> ValueError:
@@ -95,6 +97,7 @@ class _Reader:
                 self.offsets[open_joints[-1]] = self._numbers(words[1:], 3, "OFFSET")
             elif keyword == "CHANNELS" and open_joints:
                 self.channels[open_joints[-1]] = self._channels(words)
+                self.spellings[open_joints[-1]] = words[2:]
             elif keyword == "}" and open_joints:
                 open_joints.pop()
             elif keyword == "MOTION" and self.names and not open_joints:
@@ -119,6 +122,7 @@ class _Reader:
         self.parents.append(open_joints[-1] if open_joints else -1)
         self.offsets.append([0.0, 0.0, 0.0])
         self.channels.append([])
+        self.spellings.append([])
         open_joints.append(len(self.names) - 1)
         if not braced and self._next("{") != "{":
             raise self._error(f"wanted {{ after joint {name}")

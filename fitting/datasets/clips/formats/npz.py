@@ -21,6 +21,7 @@ from fitting.runtime import files
 from jaxik.world.skeleton import Rig
 
 from .array_checks import Wanted, check_arrays
+from .bvh import CHANNEL
 
 Arrays = dict[str, np.ndarray]
 
@@ -64,11 +65,14 @@ CLIP_ARRAYS = {
     "fps": FPS,
     "raw_frame_time": Wanted("number", low=1e-6, high=1e4),
     "scale": Wanted("number", low=1e-9, high=1e6),
+    "rest_rotations_ls": Wanted("number", ("joints", 4), unit=True, optional=True),
+    "channels": Wanted("text", ("joints",), optional=True),
     **TRACK_ARRAYS,
 }
 ARRAYS = ("offsets_ls", "positions_ws", "rotations_ws")
 TEXTS = ("source", "up_axis")
 NUMBERS = ("fps", "raw_frame_time", "scale")
+OPTIONAL = ("dialect", "rest_rotations_ls", "channels")
 VARIANTS = {"captured": "", "base": "base_"}  # prefix of their arrays in a blocks file
 BLOCKS_ARRAYS = {
     "fps": FPS,
@@ -81,34 +85,30 @@ BLOCKS_JOINT = Wanted("number", ("frames", 2, 3), low=-FURTHEST, high=FURTHEST)
 BLOCKS_JOINTS = ("hip", "knee", "ankle", "ball")
 
 
-def save_clip(
-    path: str | Path, clip: Clip, *, joints: Mapping[str, np.ndarray] | None = None
-) -> None:
-    """Writes a clip as an NPZ archive, from which `load_clip` restores it exactly.
+def write_npz(path: Path, clip: Clip, joints: Mapping[str, np.ndarray]) -> None:
+    """Writes a clip as an NPZ archive, from which `read_npz` restores it exactly.
 
-    The keys are `format`; the clip's fields by name (`stance`, `mask`, `slide`, `grounded`,
-    `weight` and `dialect` only if they are set); the rig's fields as `rig_<field>`, where
-    `rig_joints` are joint indices of shape (legs, 4). The file appears complete or not at all.
+    The keys are `format`; the clip's fields by name (those that may be None only if they are set);
+    the rig's fields as `rig_<field>`, where `rig_joints` are joint indices of shape (legs, 4).
 
     Args:
         path: file name.
         clip: any clip.
-        joints: further arrays for other programs; `load_clip` ignores them.
+        joints: further arrays for other programs; `read_npz` ignores them.
     """
-    path = Path(path)
     content: Arrays = {
         "format": np.array(FORMAT),
         "joint_names": np.array(clip.joint_names),
         "parents": np.array(clip.parents),
         "remarks": np.array(clip.remarks, dtype=np.str_),
     }
-    for name in (*ARRAYS, *TRACKS, *TEXTS, *NUMBERS, "dialect"):
+    for name in (*ARRAYS, *TRACKS, *TEXTS, *NUMBERS, *OPTIONAL):
         if (value := getattr(clip, name)) is not None:
             content[name] = np.asarray(value)
     if (rig := clip.measured_rig) is not None:
         arrays = ("names", *RIG_ARRAYS, *RIG_JOINTS, *SOLE_ARRAYS)
         content |= {f"rig_{name}": np.asarray(getattr(rig, name)) for name in arrays}
-    content |= joints or {}
+    content |= joints
 
     def fill(temporary: Path) -> None:
         with temporary.open("wb") as file:  # given a name, NumPy would append a suffix
@@ -117,18 +117,11 @@ def save_clip(
     files.write(path, fill)
 
 
-def check_clip_file(path: Path) -> None:
-    """ValueError unless `save_clip` can write here."""
-    if path.suffix.lower() != ".npz":
-        raise ValueError(f"{path}: wanted a name that ends in .npz")
-    files.check_output_file(path)
-
-
 def read_npz(path: Path, variant: str) -> Clip:
     """The clip in an archive.
 
     Args:
-        path: an archive written by `save_clip`, or a `blocks` file.
+        path: an archive written by `write_npz`, or a `blocks` file.
         variant: of a `blocks` file: "captured" or "base".
 
     Raises:
@@ -163,6 +156,7 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
         wanted |= {f"rig_{name}": array for name, array in of_rig.items()}
     sizes = check_arrays(path, content, wanted)
     _check_tree(path, content, sizes["joints"])
+    rest = content.get("rest_rotations_ls")
     return Clip(
         joint_names=tuple(map(str, content["joint_names"])),
         parents=tuple(map(int, content["parents"])),
@@ -176,6 +170,8 @@ def _read_saved_clip(path: Path, content: Arrays) -> Clip:
         measured_rig=_read_rig(content) if "rig_names" in content else None,
         **{name: content[name] for name in TRACK_ARRAYS if name in content},
         remarks=tuple(map(str, content["remarks"])),
+        rest_rotations_ls=rest.astype(np.float64) if rest is not None else None,
+        channels=tuple(map(str, content["channels"])) if "channels" in content else None,
     )
 
 
@@ -190,6 +186,9 @@ def _check_tree(path: Path, content: Arrays, joints: int) -> None:
             f"{path}: parents has {content['parents'][joint]} at [{joint}]; "
             "wanted an earlier joint, or -1 for a root"
         )
+    for channels in content.get("channels", ()):
+        if odd := [word for word in str(channels).split() if not CHANNEL.fullmatch(word)]:
+            raise ValueError(f"{path}: channels has {odd[0]!r}; wanted such as Xposition")
     if "rig_names" not in content:
         return
     named = np.append(content["rig_joints"], content["rig_pelvis"])

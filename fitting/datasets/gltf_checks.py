@@ -1,6 +1,8 @@
 """Checks of glTF files before they are read: what a header claims without bytes to show for it."""
 
 import json
+from collections.abc import Mapping
+from typing import Any
 
 BINARY = "glb"
 KINDS = (BINARY, "gltf")
@@ -25,5 +27,10 @@ def check_claims(kind: str, content: bytes) -> None:
     header = json.loads(content.decode("utf-8"))
     accessors = header.get("accessors", []) if isinstance(header, dict) else []
     for number, accessor in enumerate(accessors):
-        if "bufferView" not in accessor:
-            raise ValueError(f"accessor {number} has {accessor.get('count')} values but no bytes")
+        check_accessor(number, accessor)
+
+
+def check_accessor(number: int, accessor: Mapping[str, Any]) -> None:
+    """ValueError for an accessor that has no bytes in the file."""
+    if "bufferView" not in accessor:
+        raise ValueError(f"accessor {number} has {accessor.get('count')} values but no bytes")

@@ -1,0 +1,259 @@
+"""Writes clips as Biovision BVH files.
+
+A clip that came from a BVH file goes back into its hierarchy: the same joints, offsets, channels,
+axes, unit and frame time. Any other clip gets a standard one: centimetres, y up, and angles in the
+order ZXY. Either way a joint gets further channels where its own cannot hold the motion, as when a
+knee that could only bend has to turn sideways. So joint positions are always exact.
+"""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from fitting.datasets.clips.assemble import common_rate
+from fitting.datasets.clips.clip import Clip
+from fitting.datasets.clips.kinematics import local_from_world
+from fitting.datasets.clips.recording import Y_UP_FROM_Z_UP
+
+STANDARD_SCALE = 0.01  # m per unit of a file
+STANDARD_ORDER = "ZXY"
+SHIFT = 5e-6  # m; a joint that moves further against its parent needs position channels
+TURN = 1e-5  # degrees; a joint that turns further about an axis needs a channel for it
+LENGTH_DIGITS = 7  # after the point, of metres
+ANGLE_DIGITS = 6  # after the point, of degrees
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    offset: Float64[np.ndarray, "3"]
+    channels: list[str]
+    values: Float64[np.ndarray, "frames channels"]
+    is_end: bool
+    """An end site, which the file does not name."""
+
+
+def check_one_root(path: Path, clip: Clip) -> None:
+    """ValueError unless the clip has a single root, as a BVH file has."""
+    roots = [name for name, up in zip(clip.joint_names, clip.parents, strict=True) if up < 0]
+    if len(roots) > 1:
+        raise ValueError(f"{path}: a BVH file has one root; this clip has {roots}")
+
+
+def bvh_text(clip: Clip) -> tuple[str, tuple[str, ...]]:
+    """The content of a BVH file, and the names of joints that got other channels than their own.
+
+    Args:
+        clip: with a single root.
+    """
+    scale, axes = _unit_and_axes(clip)
+    turn = Rotation.from_matrix(axes)
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, clip.positions_ws, clip.rotations_ws
+    )
+    offsets = clip.offsets_ls if clip.channels else np.median(positions_ls, axis=0)
+    own = [_own_channels(clip, joint) for joint in range(len(clip.parents))]
+    orders = [_order(channels) for channels in own]
+    rotations = [
+        turn * Rotation.from_quat(rot, scalar_first=True) * turn.inv()
+        for rot in np.moveaxis(rotations_ls, 1, 0)
+    ]
+    angles = _continuous_angles(orders, rotations)
+    joints = []
+    for joint, name in enumerate(_names(clip)):
+        is_root = clip.parents[joint] < 0
+        offset = np.zeros(3) if is_root and not clip.channels else axes @ offsets[joint]
+        channels, values = _channels(
+            own[joint], positions_ls[:, joint] @ axes.T, offset, orders[joint], angles[:, joint]
+        )
+        lengths = [_is_position(channel) for channel in channels]
+        values = values / np.where(lengths, scale, 1.0)
+        is_end = not channels and _is_end(clip, joint)
+        joints.append(_Joint(name, offset / scale, channels, values, is_end))
+    expected = own if clip.channels is None else map(str.split, clip.channels)
+    changed = tuple(
+        joint.name
+        for joint, channels in zip(joints, expected, strict=True)
+        if joint.channels != channels
+    )
+    return _text(clip, joints, scale), changed
+
+
+def _unit_and_axes(clip: Clip) -> tuple[float, Float64[np.ndarray, "3 3"]]:
+    """Metres per unit of the file, and the rotation matrix from y up to the file's axes."""
+    if clip.channels is None:
+        return STANDARD_SCALE, np.eye(3)
+    return clip.scale, Y_UP_FROM_Z_UP.T if clip.up_axis == "z" else np.eye(3)
+
+
+def _is_position(channel: str) -> bool:
+    return channel.lower().endswith("position")
+
+
+def _is_end(clip: Clip, joint: int) -> bool:
+    """Whether a joint without channels is the end of its parent and not a joint with a name."""
+    parent = clip.parents[joint]
+    is_leaf = joint not in clip.parents
+    return (
+        parent >= 0
+        and is_leaf
+        and clip.joint_names[joint].startswith(f"{clip.joint_names[parent]}_end")
+    )
+
+
+def _own_channels(clip: Clip, joint: int) -> list[str]:
+    """Those of the file that the clip came from, or else the standard ones.
+
+    Angles about one axis twice cannot be found again: such a joint gets the standard order.
+    """
+    standard = [f"{axis}rotation" for axis in STANDARD_ORDER]
+    if clip.channels is not None:
+        channels = clip.channels[joint].split()
+        turns = [channel[0].upper() for channel in channels if not _is_position(channel)]
+        if len(set(turns)) == len(turns):
+            return channels
+        return [*filter(_is_position, channels), *standard]
+    if _is_end(clip, joint):
+        return []
+    positions = [f"{axis}position" for axis in "XYZ"] if clip.parents[joint] < 0 else []
+    return positions + standard
+
+
+def _order(channels: list[str]) -> str:
+    """Three different axes of rotation, as of `Rotation.as_euler`; the joint's own come first."""
+    own = [channel[0].upper() for channel in channels if not _is_position(channel)]
+    return "".join([*own, *(axis for axis in STANDARD_ORDER if axis not in own)])
+
+
+def _continuous_angles(
+    orders: list[str], rotations: list[Rotation]
+) -> Float64[np.ndarray, "frames joints 3"]:
+    """Angles about each joint's axes, degrees, which change as little as possible over the frames.
+
+    Three angles have a second set for the same rotation, and each of them may make whole turns.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Gimbal lock")  # one of its many sets will do
+        first = np.stack(
+            [
+                rot.as_euler(order, degrees=True)
+                for order, rot in zip(orders, rotations, strict=True)
+            ],
+            axis=1,
+        )
+    sets = np.stack([first, first * [1.0, -1.0, 1.0] + 180.0])
+    angles = np.empty_like(first)
+    last = np.zeros(first.shape[1:])
+    for frame in range(len(first)):
+        near = sets[:, frame] - 360.0 * np.round((sets[:, frame] - last) / 360.0)
+        distance = np.abs(near - last).sum(axis=-1, keepdims=True)
+        last = np.where(distance[0] <= distance[1], near[0], near[1])
+        angles[frame] = last
+    return angles
+
+
+def _channels(
+    own: list[str],
+    position: Float64[np.ndarray, "frames 3"],
+    offset: Float64[np.ndarray, "3"],
+    order: str,
+    angles: Float64[np.ndarray, "frames 3"],
+) -> tuple[list[str], Float64[np.ndarray, "frames channels"]]:
+    """The joint's own channels with those that it needs besides, and their values, m and degrees.
+
+    Args:
+        own: channels.
+        position: in the parent's space and the axes of the file, m.
+        offset: likewise, of the rest pose.
+        order: axes of the angles.
+        angles: degrees.
+    """
+    columns = {f"{axis}position": position[:, "XYZ".index(axis)] for axis in "XYZ"}
+    columns |= {f"{axis}rotation": angles[:, order.index(axis)] for axis in order}
+    known = {channel.capitalize() for channel in own}
+    shift = np.abs(position - offset).max(axis=0)
+    moved = [f"{axis}position" for axis, by in zip("XYZ", shift, strict=True) if by > SHIFT]
+    turn = np.abs(angles).max(axis=0)
+    turned = [f"{axis}rotation" for axis, by in zip(order, turn, strict=True) if by > TURN]
+    channels = [
+        *(channel for channel in moved if channel not in known),
+        *own,
+        *(channel for channel in turned if channel not in known),
+    ]
+    values = [columns[channel.capitalize()] for channel in channels]
+    return channels, np.stack(values, axis=1) if values else np.zeros((len(position), 0))
+
+
+def _names(clip: Clip) -> list[str]:
+    """Joint names without what would end them in a file; other files may have blanks in theirs."""
+    blank = "_" if clip.channels is None else " "
+    names: list[str] = []
+    for name in clip.joint_names:
+        name = blank.join(name.split()) or "joint"
+        names.append(name if name not in names else f"{name}_{len(names)}")
+    return names
+
+
+def _text(clip: Clip, joints: list[_Joint], scale: float) -> str:
+    tree = _preorder(clip.parents)
+    is_usual = common_rate(clip.raw_frame_time, []) == clip.fps
+    frame_time = clip.raw_frame_time if is_usual else 1.0 / clip.fps
+    lines = ["HIERARCHY", *_hierarchy(clip, joints, tree), "MOTION"]
+    lines += [f"Frames: {clip.frame_count}", f"Frame Time: {_positional(frame_time)}"]
+    length = f"%.{max(0, LENGTH_DIGITS + int(np.floor(np.log10(scale))))}f"
+    row = " ".join(
+        length if _is_position(channel) else f"%.{ANGLE_DIGITS}f"
+        for joint, _ in tree
+        for channel in joints[joint].channels
+    )
+    values = np.concatenate([joints[joint].values for joint, _ in tree], axis=1)
+    lines += [row % tuple(frame) for frame in values.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _hierarchy(clip: Clip, joints: list[_Joint], tree: list[tuple[int, int]]) -> Iterator[str]:
+    """The lines between HIERARCHY and MOTION."""
+    open_depth = -1
+    for joint, depth in tree:
+        this, indent = joints[joint], "\t" * depth
+        yield from ("\t" * level + "}" for level in range(open_depth, depth - 1, -1))
+        open_depth = depth
+        named = f"{'JOINT' if depth else 'ROOT'} {this.name}"
+        yield f"{indent}{'End Site' if this.is_end else named}"
+        yield f"{indent}{{"
+        yield f"{indent}\tOFFSET {' '.join(map(_ten_digits, this.offset))}"
+        if not this.is_end:
+            yield f"{indent}\t{' '.join(['CHANNELS', str(len(this.channels)), *this.channels])}"
+            if clip.channels is None and joint not in clip.parents:  # the format asks for an end
+                yield from (
+                    f"{indent}\t{line}" for line in ("End Site", "{", "\tOFFSET 0 0 0", "}")
+                )
+    yield from ("\t" * level + "}" for level in range(open_depth, -1, -1))
+
+
+def _preorder(parents: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Each joint with its depth in the tree, children directly after their parents."""
+    children: dict[int, list[int]] = {}
+    for joint, parent in enumerate(parents):
+        children.setdefault(parent, []).append(joint)
+    tree, waiting = [], [(parents.index(-1), 0)]
+    while waiting:
+        joint, depth = waiting.pop()
+        tree.append((joint, depth))
+        waiting += [(child, depth + 1) for child in reversed(children.get(joint, []))]
+    return tree
+
+
+def _ten_digits(value: float) -> str:
+    """A number with ten digits."""
+    return _positional(float(f"{value:.10g}"))
+
+
+def _positional(value: float) -> str:
+    """A number with as many digits as it needs, which never end in a power of ten."""
+    return np.format_float_positional(value + 0.0, trim="-")

@@ -1,0 +1,243 @@
+"""How much ground a terrain has under the feet of a clip; what to do where it has little.
+
+A terrain in another unit, with another axis up, or somewhere else, has no ground where the feet
+stand. Each of these mistakes is undone in turn, and what brings ground under the feet is the likely
+remedy. Lengths are metres, y up.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxik.world.heightfield import Heightfield
+from jaxik.world.surfaces import Mesh
+from jaxik.world.terrain import Terrain
+
+from .clips.clip import Clip
+from .ground_path import SKY, heights_under, step_height
+from .terrain.mesh_files import AS_IS, TerrainOptions
+
+ENOUGH = 0.8  # fraction of stances with ground under them, from which the terrain is in place
+LITTLE = 0.5  # below which there is nothing that could be fitted
+PARTLY = 0.2  # above which the unit is right, and the terrain is too small or aside
+UNITS = (0.01, 0.001, 0.0254, 0.3048)  # m: centimetre, millimetre, inch, foot; by how usual
+FACTORS = tuple(factor for unit in UNITS for factor in (unit, 1.0 / unit))
+
+Points = Float64[np.ndarray, "points 3"]
+
+
+class GroundWarning(UserWarning):
+    """There is little ground under the feet of a clip."""
+
+
+class Box(NamedTuple):
+    """Lowest and highest coordinates, m."""
+
+    low: Float64[np.ndarray, "3"]
+    high: Float64[np.ndarray, "3"]
+
+    def __str__(self) -> str:
+        sides = zip("xyz", self.low, self.high, strict=True)
+        return ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in sides) + " m"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much ground there is under standing feet."""
+
+    clip: str
+    share: float
+    """Fraction of the stance frames with ground at any height; 1 without stances."""
+    feet: Box
+    terrain: Box
+    options: TerrainOptions
+    """With which the terrain was read."""
+    remedy: TerrainOptions | None
+    """With which it has enough ground; None if nothing helps, or nothing needs to."""
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the terrain is in place."""
+        return self.share >= ENOUGH
+
+    def text(self, *, as_keys: bool = False) -> str:
+        """What is wrong, where both are, and the likely remedy, in one line.
+
+        Args:
+            as_keys: whether options are spelled as in experiments, and not as on a command line.
+        """
+        remedy = "no other unit, up axis or offset helps: does the terrain cover the whole path?"
+        if self.remedy is not None:
+            remedy = f"likely remedy: {_changes(self.options, self.remedy, as_keys)}"
+        return (
+            f"{self.clip}: there is ground under {100 * self.share:.1f} % of its standing feet: "
+            f"the feet are at {self.feet}; the terrain is at {self.terrain}; {remedy}"
+        )
+
+
+def require(coverage: Coverage, *, as_keys: bool = True) -> None:
+    """Raises ValueError where there is too little ground for a fit; warns where there is little."""
+    if coverage.share < LITTLE:
+        raise ValueError(coverage.text(as_keys=as_keys))
+    warn(coverage, as_keys=as_keys)
+
+
+def warn(coverage: Coverage, *, as_keys: bool = False) -> None:
+    """Warns where there is little ground."""
+    if not coverage.is_enough:
+        warnings.warn(coverage.text(as_keys=as_keys), GroundWarning, stacklevel=3)
+
+
+def measure(
+    clip: Clip,
+    terrain: Terrain,
+    options: TerrainOptions = AS_IS,
+    reload: Callable[[TerrainOptions], Terrain] | None = None,
+) -> Coverage:
+    """How much ground there is under the standing feet of a clip, and what would bring more.
+
+    Args:
+        clip: on its floor, or captured.
+        terrain: y up.
+        options: with which it was read.
+        reload: reads it with others; None tries no other up axis.
+    """
+    stance, balls = clip.stance_labels(), clip.joints_ws(3)
+    feet = np.concatenate([clip.joints_ws(2), balls], axis=1).reshape(-1, 3)
+    standing = balls[stance]
+    share = _share(terrain, standing) if len(standing) else 1.0
+    remedy = None
+    if share < ENOUGH:
+        ground = _Ground(terrain, options)
+        remedy = _find_remedy(standing, step_height(clip), ground, reload, share < PARTLY)
+    box = Box(feet.min(axis=0), feet.max(axis=0))
+    return Coverage(clip.source, share, box, bounds(terrain), options, remedy)
+
+
+def bounds(terrain: Terrain) -> Box:
+    """The box around all surfaces; infinite around planes and functions."""
+    points = np.concatenate([_extremes(surface) for surface in terrain.surfaces])
+    return Box(points.min(axis=0), points.max(axis=0))
+
+
+class _Ground(NamedTuple):
+    """A terrain, and the options with which it was read."""
+
+    terrain: Terrain
+    options: TerrainOptions
+
+
+def _find_remedy(
+    standing: Points,
+    step: float,
+    ground: _Ground,
+    reload: Callable[[TerrainOptions], Terrain] | None,
+    any_unit: bool,
+) -> TerrainOptions | None:
+    """The first change of the options that brings enough ground under points; None if none does.
+
+    Args:
+        standing: balls of standing feet, m.
+        step: m, difference in height that needs no offset.
+        ground: as it was read.
+        reload: reads it with other options.
+        any_unit: whether other units of length are tried.
+    """
+    grounds = [ground, *_turned(ground, reload)]
+    for other in grounds[1:]:
+        if _share(other.terrain, standing) >= ENOUGH:
+            return other.options
+    grounds.sort(key=lambda each: float(_size(each.terrain)[1]))  # one that stands upright is last
+    for terrain, options in grounds:
+        offset, scale = np.array(options.offset), options.scale or 1.0
+        too_small = (_size(terrain) < np.ptp(standing, axis=0))[[0, 2]].any()
+        for factor in FACTORS if any_unit else ():
+            if factor > 1.0 and not too_small:
+                continue
+            if _share(terrain, (standing - offset) / factor + offset) >= ENOUGH:
+                return replace(options, scale=scale * factor)
+    for terrain, options in grounds:
+        moved = _offset_to(terrain, standing, step)
+        if moved is not None:
+            x, y, z = (float(value) for value in np.round(options.offset + moved, 2))
+            return replace(options, offset=(x, y, z))
+    return None
+
+
+def _turned(
+    ground: _Ground, reload: Callable[[TerrainOptions], Terrain] | None
+) -> Iterator[_Ground]:
+    """The terrain with the other axis of its file up; nothing where that is not possible."""
+    if reload is None:
+        return
+    options = replace(ground.options, file_up="z" if ground.options.file_up == "y" else "y")
+    try:
+        yield _Ground(reload(options), options)
+    except ValueError:  # a heightfield, or a mesh of walls alone
+        return
+
+
+def _size(terrain: Terrain) -> Float64[np.ndarray, "3"]:
+    low, high = bounds(terrain)
+    return high - low
+
+
+def _offset_to(terrain: Terrain, standing: Points, step: float) -> np.ndarray | None:
+    """By how much to move a terrain to have its middle under the feet, m; None if that is no help.
+
+    It is moved in height where it is further from the feet than a step.
+    """
+    low, high = bounds(terrain)
+    if not np.isfinite([low, high]).all():
+        return None
+    lowest, highest = standing.min(axis=0), standing.max(axis=0)
+    offset = ((lowest + highest) - (low + high)) / 2 * [1.0, 0.0, 1.0]
+    heights = heights_under(terrain, standing - offset, SKY)
+    if np.mean(~np.isnan(heights)) < ENOUGH:
+        return None
+    rise = float(np.nanmedian(standing[:, 1] - heights))
+    return offset + [0.0, rise if abs(rise) > step else 0.0, 0.0]
+
+
+def _share(terrain: Terrain, points: Points) -> float:
+    """Fraction of points with ground at any height."""
+    return float(np.mean(~np.isnan(heights_under(terrain, points, SKY))))
+
+
+def _extremes(surface: object) -> Points:
+    """Two corners of the box around a surface, m."""
+    match surface:
+        case Mesh():
+            points = np.asarray(surface.vertices_ws, np.float64)[np.asarray(surface.triangles)]
+            points = points.reshape(-1, 3)
+            offset = 0.0 if surface.offset_ws is None else np.asarray(surface.offset_ws)
+            return np.stack([points.min(axis=0), points.max(axis=0)]) + offset
+        case Heightfield():
+            heights = np.asarray(surface.heights, np.float64)
+            rows, columns = heights.shape
+            x, z = np.asarray(surface.spacing) * [columns - 1, rows - 1]
+            corners = np.array([[0.0, np.nanmin(heights), 0.0], [x, np.nanmax(heights), z]])
+            return np.asarray(surface.origin_ws) + corners @ np.asarray(surface.axes_ws)
+        case _:
+            return np.array([[-np.inf] * 3, [np.inf] * 3])
+
+
+def _changes(old: TerrainOptions, new: TerrainOptions, as_keys: bool) -> str:
+    """The options in which two differ, as a user writes them."""
+    changes = []
+    for field in fields(TerrainOptions):
+        value = getattr(new, field.name)
+        if value == getattr(old, field.name):
+            continue
+        name = field.name if field.name == "file_up" else f"terrain_{field.name}"
+        numbers = [f"{number:.10g}" for number in np.atleast_1d(value)] if name != "file_up" else []
+        if as_keys:
+            text = repr(value).replace("'", '"') if not numbers else ", ".join(numbers)
+            changes.append(f"{name} = {f'[{text}]' if len(numbers) > 1 else text}")
+        else:
+            changes.append(f"--{name.replace('_', '-')} {' '.join(numbers) or value}")
+    return ", ".join(changes) if as_keys else " ".join(changes)

@@ -1,0 +1,273 @@
+"""Clips as BVH, GLB and CSV: they come back as they were, in the user's own skeleton."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from fitting.datasets.clips import Clip, load_clip, save_clip
+from fitting.datasets.clips.edit import mirror, resample
+from fitting.datasets.clips.kinematics import local_from_world, world_from_local
+from fitting.datasets.terrain.mesh_files import load_terrain
+from fitting.datasets.terrain.meshes import Mesh, mesh_of
+from jaxik.world import terrain
+from support.sample_clips import AMC, ASF, BVH, stair_walk
+
+TOLERANCE = 1e-4  # m
+DIALECTS = [
+    "cmu_bvh_max/131_01.bvh",
+    "cmu_bvh_max/scaled_131_01.bvh",
+    "cmu_bvh_mb/cmu_12_01_walk.bvh",
+    "cmu_bvh_poser/03_01.bvh",
+    "mit/pybvh_test1_zup.bvh",
+    "mit/full_precision_frame_time.bvh",
+]
+OPTIONS = {".bvh": ("scale", "up"), ".glb": (), ".npz": ()}
+
+
+@pytest.fixture
+def bvh_file(tmp_path):
+    (tmp_path / "walk.bvh").write_text(BVH)
+    return tmp_path / "walk.bvh"
+
+
+def moved(clip: Clip, seed: int = 0) -> Clip:
+    """The clip with its joints turned and its root moved, all bones as long as they were."""
+    random = np.random.default_rng(seed)
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, clip.positions_ws, clip.rotations_ws
+    )
+    turns = Rotation.from_rotvec(0.4 * random.standard_normal((len(clip.parents), 3)))
+    ends = [joint for joint, name in enumerate(clip.joint_names) if re.search(r"_end\d*$", name)]
+    for joint in set(range(len(clip.parents))) - set(ends):
+        rot = turns[joint] * Rotation.from_quat(rotations_ls[:, joint], scalar_first=True)
+        rotations_ls[:, joint] = rot.as_quat(scalar_first=True)
+    positions_ls[:, 0] += [0.3, 0.2, -0.1]
+    return clip.with_motion(*world_from_local(clip.parents, positions_ls, rotations_ls))
+
+
+def reloaded(path, clip: Clip) -> Clip:
+    """What is read of a file, with the scale and axes that a BVH does not state."""
+    known = {"scale": clip.scale if clip.channels else 0.01, "up": "y"}
+    if clip.channels:
+        known["up"] = clip.up_axis
+    return load_clip(path, **{name: known[name] for name in OPTIONS[path.suffix]})
+
+
+def error(clip: Clip, other: Clip) -> float:
+    """Largest distance, m, between the joints of the first clip and the same ones of the other."""
+    order = [other.joint_names.index(name) for name in clip.joint_names]
+    return float(np.linalg.norm(other.positions_ws[:, order] - clip.positions_ws, axis=-1).max())
+
+
+def hierarchy(text: str) -> list[list[str]]:
+    """The words of each line before the motion, numbers as they compare."""
+    lines = text.replace("\r", "\n").upper().split("MOTION")[0].split("\n")
+    return [
+        [f"{float(word):.5f}" if re.fullmatch(r"-?[\d.]+(E-?\d+)?", word) else word
+         for word in line.replace("-0.00000", "0.00000").split()]
+        for line in lines if line.split()
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_a_bvh_goes_back_into_its_own_hierarchy(mocap, tmp_path, name):
+    clip = load_clip(mocap / "clips" / name).select(slice(0, 50))
+    path, solved = tmp_path / "solved.bvh", moved(clip)
+    save_clip(path, solved)
+    back = reloaded(path, clip)
+    assert error(solved, back) < TOLERANCE
+    assert (back.channels, back.fps, back.raw_frame_time) == (
+        clip.channels, clip.fps, clip.raw_frame_time,
+    )  # fmt: skip
+    original = (mocap / "clips" / name).read_text(errors="replace")
+    assert [line for line in hierarchy(path.read_text()) if line[0] != "OFFSET"] == [
+        line for line in hierarchy(original) if line[0] != "OFFSET"
+    ]
+    np.testing.assert_allclose(back.offsets_ls, clip.offsets_ls, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".bvh", ".glb", ".npz"])
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_joints_come_back_where_they_were(bvh_file, tmp_path, suffix, up):
+    clip = moved(load_clip(bvh_file, up=up))
+    path = tmp_path / f"out{suffix}"
+    save_clip(path, clip)
+    back = reloaded(path, clip)
+    assert back.joint_names == clip.joint_names and back.fps == 120.0
+    assert error(clip, back) < TOLERANCE
+    turn = np.abs(np.sum(back.rotations_ws * clip.rotations_ws, axis=-1))
+    np.testing.assert_allclose(turn, 1.0, atol=1e-6)
+
+
+def test_numbers_of_an_untouched_bvh_are_its_own(bvh_file, tmp_path):
+    save_clip(tmp_path / "out.bvh", load_clip(bvh_file))
+    first, second = (
+        np.array([line.split() for line in path.read_text().splitlines()[-3:]], float)
+        for path in (bvh_file, tmp_path / "out.bvh")
+    )
+    np.testing.assert_allclose(second, first, atol=1e-5)
+    assert hierarchy((tmp_path / "out.bvh").read_text()) == hierarchy(BVH)
+    assert "Frame Time: 0.0083333\n" in (tmp_path / "out.bvh").read_text()
+
+
+def test_a_resampled_clip_is_written_at_its_new_rate(bvh_file, tmp_path):
+    save_clip(tmp_path / "out.bvh", resample(load_clip(bvh_file), 60.0))
+    assert load_clip(tmp_path / "out.bvh").fps == 60.0
+
+
+def test_a_joint_gets_the_channels_that_its_motion_needs_and_a_warning_says_so(tmp_path):
+    hinge = BVH.replace("CHANNELS 3 Xrotation Yrotation Zrotation", "CHANNELS 1 Xrotation")
+    head, _, numbers = hinge.partition("Frame Time: 0.0083333\n")
+    kept = [*range(9), *range(10, 10), 9, *range(12, 18), 18, *range(21, 24)]
+    rows = [[row.split()[column] for column in kept] for row in numbers.splitlines()]
+    path = tmp_path / "hinge.bvh"
+    path.write_text(head + "Frame Time: 0.0083333\n" + "\n".join(map(" ".join, rows)))
+    clip = load_clip(path)
+    save_clip(tmp_path / "same.bvh", clip)
+    assert load_clip(tmp_path / "same.bvh").channels == clip.channels
+    with pytest.warns(UserWarning, match="joints have other channels .*: LeftLeg, RightLeg$"):
+        save_clip(tmp_path / "turned.bvh", moved(clip))
+    back = reloaded(tmp_path / "turned.bvh", clip)
+    knee = clip.joint_names.index("LeftLeg")
+    assert back.channels is not None and back.channels[knee] == "Xrotation Zrotation Yrotation"
+    assert error(moved(clip), back) < TOLERANCE
+    stretched = clip.positions_ws.copy()
+    stretched[1, knee] += [0.0, 0.01, 0.0]
+    with pytest.warns(UserWarning, match="LeftLeg, LeftFoot$"):
+        save_clip(tmp_path / "long.bvh", clip.with_motion(stretched, clip.rotations_ws))
+    assert np.abs(reloaded(tmp_path / "long.bvh", clip).positions_ws - stretched).max() < TOLERANCE
+
+
+def test_angles_do_not_jump_over_whole_turns(bvh_file, tmp_path):
+    clip = load_clip(bvh_file)
+    many = clip.select(np.zeros(200, int))
+    yaw = Rotation.from_euler("y", np.linspace(0.0, 720.0, 200)[:, None], degrees=True)
+    positions_ls, rotations_ls = local_from_world(
+        clip.parents, many.positions_ws, many.rotations_ws
+    )
+    rotations_ls[:, 0] = yaw.as_quat(scalar_first=True)
+    turning = many.with_motion(*world_from_local(clip.parents, positions_ls, rotations_ls))
+    save_clip(tmp_path / "out.bvh", turning)
+    rows = (tmp_path / "out.bvh").read_text().splitlines()[-200:]
+    angles = np.array([row.split() for row in rows], float)[:, 3:6]
+    assert np.abs(np.diff(angles, axis=0)).max() < 4.0
+    assert angles[-1, 2] == pytest.approx(720.0)
+
+
+def test_other_clips_get_a_standard_bvh_in_centimetres(tmp_path):
+    (tmp_path / "walk.asf").write_text(ASF)
+    (tmp_path / "walk.amc").write_text(AMC)
+    for clip in (load_clip(tmp_path / "walk.amc"), stair_walk()):
+        save_clip(tmp_path / "out.bvh", clip)
+        text = (tmp_path / "out.bvh").read_text()
+        assert "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in text
+        back = load_clip(tmp_path / "out.bvh", scale=0.01, up="y")
+        assert error(clip, back) < TOLERANCE and back.fps == clip.fps
+        assert text.count("End Site") == sum(
+            joint not in back.parents for joint in range(len(back.parents))
+        )
+
+
+def test_channels_and_rest_pose_outlive_an_archive_and_a_mirror(bvh_file, tmp_path):
+    clip = load_clip(bvh_file)
+    rest = np.tile([0.8, 0.6, 0.0, 0.0], (len(clip.parents), 1))
+    save_clip(tmp_path / "clip.npz", replace(clip, rest_rotations_ls=rest))
+    back = load_clip(tmp_path / "clip.npz")
+    assert back.channels == clip.channels
+    np.testing.assert_array_equal(back.rest_rotations_ls, rest)
+    np.testing.assert_array_equal(mirror(back).rest_rotations_ls, rest)
+    content = dict(np.load(tmp_path / "clip.npz"))
+    content["channels"][1] = "Xrotation sideways"
+    np.savez(tmp_path / "odd.npz", **content)
+    with pytest.raises(ValueError, match="odd.npz: channels has 'sideways'; wanted such as Xpos"):
+        load_clip(tmp_path / "odd.npz")
+
+
+def test_a_glb_has_the_rest_pose_and_names_of_the_skeleton(bvh_file, tmp_path):
+    clip = load_clip(bvh_file)
+    save_clip(tmp_path / "out.glb", clip)
+    back = load_clip(tmp_path / "out.glb")
+    np.testing.assert_allclose(back.offsets_ls, clip.offsets_ls, atol=1e-6)
+    assert back.rest_rotations_ls is not None
+    np.testing.assert_allclose(np.abs(back.rest_rotations_ls[:, 0]), 1.0)
+    save_clip(tmp_path / "again.glb", back)
+    assert error(clip, load_clip(tmp_path / "again.glb")) < TOLERANCE
+
+
+def test_bind_matrices_undo_the_rest_pose(tmp_path):
+    clip = stair_walk()
+    quarter = Rotation.from_euler("xyz", [[30.0, 40.0, 50.0]] * len(clip.parents), degrees=True)
+    rest = quarter.as_quat(scalar_first=True)
+    save_clip(tmp_path / "out.glb", replace(clip, rest_rotations_ls=rest))
+    content = (tmp_path / "out.glb").read_bytes()
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    view = header["bufferViews"][header["accessors"][0]["bufferView"]]
+    start = content.index(b"BIN\0") + 4 + view["byteOffset"]
+    inverse = np.frombuffer(content, "<f4", 16 * len(clip.parents), start).reshape(-1, 4, 4)
+    positions, rotations = world_from_local(
+        clip.parents, np.array(clip.offsets_ls[None]), rest[None]
+    )
+    matrix = np.tile(np.eye(4), (len(clip.parents), 1, 1))
+    matrix[:, :3, :3] = Rotation.from_quat(rotations[0], scalar_first=True).as_matrix()
+    matrix[:, :3, 3] = positions[0]
+    np.testing.assert_allclose(
+        inverse.transpose(0, 2, 1) @ matrix, np.broadcast_to(np.eye(4), matrix.shape), atol=1e-5
+    )
+
+
+def test_the_ground_lies_beside_the_motion(tmp_path):
+    hill = Mesh(np.array([[0.0, 0, 0], [0, 1, 2], [3, 0, 0]]), np.array([[0, 1, 2]]))
+    save_clip(tmp_path / "out.glb", stair_walk(), ground=hill)
+    save_clip(tmp_path / "bare.glb", stair_walk())
+    assert error(stair_walk(), load_clip(tmp_path / "out.glb")) < TOLERANCE
+    seen = trimesh.load_scene(tmp_path / "out.glb").to_mesh()
+    np.testing.assert_allclose(seen.vertices[seen.faces[0]], hill.vertices)
+    read = mesh_of(load_terrain(tmp_path / "out.glb"))
+    np.testing.assert_allclose(read.vertices[read.faces[0]], hill.vertices)
+    with pytest.raises(ValueError, match="bare.glb"):
+        load_terrain(tmp_path / "bare.glb")
+
+
+def test_the_cells_of_a_heightfield_become_triangles_but_its_holes_do_not():
+    heights = np.arange(6.0).reshape(2, 3) / 10
+    heights[0, 2] = np.nan
+    field = terrain.heightfield(heights, (0.5, 2.0), (1.0, 2.0, 3.0))
+    mesh = mesh_of(field.moved(jnp.array([0.0, 1.0, 0.0])))
+    corners = {tuple(np.round(point, 9)) for face in mesh.faces for point in mesh.vertices[face]}
+    assert corners == {(1, 3.0, 3), (1.5, 3.1, 3), (1, 3.3, 5), (1.5, 3.4, 5)}
+    normals = np.cross(*np.moveaxis(np.diff(mesh.vertices[mesh.faces], axis=1), 1, 0))
+    assert len(mesh.faces) == 2 and (normals[:, 1] > 0).all()
+
+
+def test_a_csv_has_the_time_and_all_joints_by_name(tmp_path):
+    clip = stair_walk()
+    save_clip(tmp_path / "out.csv", clip)
+    with (tmp_path / "out.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[:8] == [
+        "time_s", "root_x_m", "root_y_m", "root_z_m", "root_qw", "root_qx", "root_qy", "root_qz",
+    ]  # fmt: skip
+    table = np.array(rows, float)
+    np.testing.assert_allclose(table[:, 0], np.arange(clip.frame_count) / 60.0, atol=1e-6)
+    column = header.index("left_knee_x_m")
+    knee = clip.positions_ws[:, clip.joint_names.index("left_knee")]
+    np.testing.assert_allclose(table[:, column : column + 3], knee, atol=1e-6)
+
+
+def test_a_clip_that_a_format_cannot_hold_is_refused(tmp_path):
+    clip = stair_walk()
+    with pytest.raises(ValueError, match=r"out.fbx: wanted a name that ends in .npz, .bvh, .glb"):
+        save_clip(tmp_path / "out.fbx", clip)
+    two_roots = replace(clip, parents=(-1, -1, *clip.parents[2:]))
+    with pytest.raises(ValueError, match=r"out.bvh: a BVH file has one root; .*'left_hip'\]"):
+        save_clip(tmp_path / "out.bvh", two_roots)
+    save_clip(tmp_path / "out.glb", two_roots)
+    assert len(load_clip(tmp_path / "out.glb").joint_names) < len(clip.joint_names)
+    assert not (tmp_path / "out.bvh").exists()

@@ -1,0 +1,294 @@
+"""glTF files made by hand: trees, curves, choices, and what is refused.
+
+Files that Blender wrote are in `test_blender`.
+"""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from fitting.datasets.clips import load_clip
+from fitting.datasets.clips.formats.gltf.reader import read_gltf
+from support.gltf_files import Gltf, walker
+
+RAMP = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
+PATH = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [1, 2, 3], [0, 0, 0]])
+QUATS = Rotation.from_euler("xyz", [[0, 0, 0], [90, 0, 0], [0, 80, 0], [10, 20, 170], [0, 0, 0]],
+                            degrees=True)  # fmt: skip
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Writes a file and reads it as a recording."""
+
+    def load(file: Gltf | str, **options):
+        path = tmp_path / "walk.gltf"
+        path.write_text(file if isinstance(file, str) else file.text())
+        return read_gltf(path, **options)
+
+    return load
+
+
+def chain(*names: str) -> list[dict]:
+    """Nodes, each of which is the child of the one before, 1 m along x."""
+    return [
+        {"name": name, "translation": [1.0, 0, 0]}
+        | ({"children": [index + 1]} if index + 1 < len(names) else {})
+        for index, name in enumerate(names)
+    ]
+
+
+def test_a_character_below_a_turned_and_scaled_armature_is_read_in_metres(tmp_path):
+    (tmp_path / "walk.gltf").write_text(walker().text())
+    clip = load_clip(tmp_path / "walk.gltf")
+    assert (clip.fps, clip.frame_count, clip.scale, clip.up_axis) == (30.0, 12, 1.0, "y")
+    assert clip.joint_names[0] == "mixamorig:Hips" and len(clip.joint_names) == 9
+    # The armature's rotation takes x to y, y to z and z to x.
+    hips = clip.positions_ws[:, 0]
+    np.testing.assert_allclose(hips[:, 0], 0.95, atol=1e-6)
+    np.testing.assert_allclose(hips[:, 2], np.arange(12) / 30, atol=1e-6)
+    toe = clip.joint_names.index("mixamorig:RightToeBase")
+    np.testing.assert_allclose(clip.positions_ws[0, toe], [0.03, -0.1, 0.12], atol=1e-6)
+    np.testing.assert_allclose(clip.offsets_ls[1], [0.1, 0.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("fps", [None, 25.0])
+def test_values_between_keys_follow_the_interpolation(load, fps):
+    slopes = np.arange(30.0).reshape(2, 5, 3)
+    spline = np.stack([slopes[0], PATH, slopes[1]], axis=1).reshape(-1, 3)
+    file = Gltf([{"name": "hub", "children": [1, 2, 3, 4]}, {}, {}, {}, {}])
+    file.animate("walk", {
+        (1, "translation"): (RAMP, PATH, "LINEAR"),
+        (2, "translation"): (RAMP, PATH, "STEP"),
+        (3, "translation"): (RAMP, spline, "CUBICSPLINE"),
+        (4, "rotation"): (RAMP, QUATS.as_quat(), "LINEAR"),
+        (0, "rotation"): ([0.0, 0.4], np.tile([0.0, 0, 0, 1], (2, 1)), "LINEAR"),
+    })  # fmt: skip
+    recording = load(file, fps=fps)
+    times = np.arange(11) / 25 if fps else RAMP
+    assert recording.frame_time == pytest.approx(times[1])
+    straight = np.stack([np.interp(times, RAMP, axis) for axis in PATH.T], axis=-1)
+    np.testing.assert_allclose(recording.positions_ls[:, 1], straight, atol=1e-6)
+    steps = PATH[np.floor(times * 10 + 1e-6).astype(int)]
+    np.testing.assert_allclose(recording.positions_ls[:, 2], steps, atol=1e-6)
+    curved = np.empty((len(times), 3))
+    for segment in range(4):  # SciPy knows one slope a key, a file two
+        ends = slice(segment, segment + 2)
+        bounds = np.stack([slopes[1, segment], slopes[0, segment + 1]])
+        inside = (times >= RAMP[segment] - 1e-9) & (times <= RAMP[segment + 1] + 1e-9)
+        hermite = CubicHermiteSpline(RAMP[ends], PATH[ends], bounds)
+        curved[inside] = hermite(times[inside])
+    np.testing.assert_allclose(recording.positions_ls[:, 3], curved, atol=1e-5)
+    turned = Rotation.from_quat(recording.rotations_ls[:, 4], scalar_first=True)
+    expected = Slerp(RAMP, QUATS)(np.minimum(times, 0.4))
+    assert (turned * expected.inv()).magnitude().max() < 1e-6
+
+
+def test_the_rate_is_that_on_which_most_keys_lie(load):
+    times = (np.arange(100) / 23.976).astype(np.float32)
+    still = np.zeros((100, 3))
+    kept = np.unique(np.append(np.random.default_rng(0).permutation(100)[:40], [0, 98, 99]))
+    for keys in (np.arange(100), kept):
+        curve = times[keys], still[keys], "LINEAR"
+        recording = load(Gltf(chain("a", "b")).animate("w", {(0, "translation"): curve}))
+        assert recording.frame_time == pytest.approx(1 / 23.976, rel=1e-5)
+        assert len(recording.positions_ls) == 100 and not recording.remarks
+    odd = {(0, "translation"): ([0.0, 0.0371, 0.13, 2.0], still[:4], "LINEAR")}
+    recording = load(Gltf(chain("a", "b")).animate("w", odd))
+    assert recording.frame_time == pytest.approx(1 / 30) and len(recording.positions_ls) == 61
+    assert recording.remarks == ("its keys follow no frame rate; sampled at 30 Hz",)
+    alone = {(0, "translation"): ([1.0], [[0, 1, 0]], "STEP")}
+    recording = load(Gltf(chain("a", "b")).animate("w", alone))
+    assert recording.positions_ls.shape == (1, 2, 3) and not recording.remarks
+
+
+def test_all_that_is_above_the_skeleton_moves_it(load):
+    nodes = chain("world", "armature", "hips", "knee")
+    nodes[1]["scale"] = [1.0, 2.0, 1.0]
+    turns = Rotation.from_euler("z", [[0.0], [90.0]], degrees=True).as_quat()
+    file = Gltf(nodes, skins=[{"joints": [2, 3]}]).animate("walk", {
+        (0, "rotation"): ([0.0, 0.1], turns, "LINEAR"),
+        (2, "rotation"): ([0.0, 0.1], turns, "LINEAR"),
+        (3, "scale"): ([0.0, 0.1], np.full((2, 3), 7.0), "LINEAR"),
+    })  # fmt: skip
+    recording = load(file)
+    assert recording.names == ("hips", "knee") and recording.parents == (-1, 0)
+    np.testing.assert_allclose(recording.positions_ls[:, 0], [[3, 0, 0], [1, 2, 0]], atol=1e-6)
+    # Stretched along the hips' y by the armature: 1 m along x, then 2 m along what was y.
+    reach = np.linalg.norm(recording.positions_ls[:, 1], axis=-1)
+    np.testing.assert_allclose(reach, [1.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(recording.offsets_ls, [[3, 0, 0], [1, 0, 0]], atol=1e-6)
+
+
+def test_bones_that_are_scaled_to_nothing_keep_the_rotation_of_their_parents(load):
+    file = Gltf(chain("a", "b", "c")).animate(
+        "w",
+        {
+            (0, "rotation"): ([0, 0.1], QUATS.as_quat()[1:3], "LINEAR"),
+            (1, "scale"): ([0, 0.1], np.zeros((2, 3)), "STEP"),
+        },
+    )
+    recording = load(file)
+    np.testing.assert_allclose(recording.positions_ls[:, 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(recording.rotations_ls[:, 1:, 0]), 1.0, atol=1e-6)
+
+
+def test_a_matrix_is_a_transform_too(load):
+    nodes = chain("a", "b")
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = Rotation.from_euler("y", 90, degrees=True).as_matrix(), [0, 5, 0]
+    nodes[0] = {"name": "a", "children": [1], "matrix": turn.T.ravel().tolist()}
+    keys = {(1, "rotation"): ([0.0, 0.1], QUATS.as_quat()[:2], "LINEAR")}
+    recording = load(Gltf(nodes, skins=[{"joints": [0, 1]}]).animate("w", keys))
+    np.testing.assert_allclose(recording.positions_ls[0], [[0, 5, 0], [1, 0, 0]], atol=1e-6)
+    keys |= {(0, "rotation"): ([0.0, 0.1], QUATS.as_quat()[:2], "LINEAR")}
+    with pytest.raises(ValueError, match="walk.gltf: node 0 has a matrix and is animated"):
+        load(Gltf(nodes, skins=[{"joints": [0, 1]}]).animate("w", keys))
+
+
+def test_nodes_without_a_skin_are_joints_if_they_move_or_hang_from_what_moves(load):
+    nodes = [{"name": "scene", "children": [1, 5]}, {"name": "hips", "children": [2, 3]}]
+    nodes += [{"name": "leg", "children": [4]}, {"name": "shirt", "mesh": 0}, {"name": "foot"}]
+    nodes += [{"name": "tree"}]
+    keys = {(1, "rotation"): ([0.0, 0.1], QUATS.as_quat()[:2], "LINEAR")}
+    assert load(Gltf(nodes).animate("w", keys)).names == ("hips", "leg", "foot")
+
+
+def test_the_larger_of_two_skeletons_is_taken_and_equal_names_are_told_apart(load):
+    nodes = chain("hips", "leg", "leg") + [{"name": "prop"}, {}]
+    file = Gltf(nodes, skins=[{"joints": [0, 1, 2]}, {"joints": [3]}, {"joints": [4]}])
+    keys = {(node, "rotation"): ([0.0, 0.1], QUATS.as_quat()[:2], "LINEAR") for node in (0, 3)}
+    recording = load(file.animate("w", keys))
+    assert recording.names == ("hips", "leg", "leg_2")
+    assert recording.remarks == ("1 joints of other skeletons in the file are left out",)
+
+
+def test_one_of_several_animations_is_chosen_by_its_name(tmp_path):
+    file = walker()
+    keys = {(1, "translation"): ([0.0, 0.1], [[0, 0, 90], [0, 0, 80]], "LINEAR")}
+    file.animate("Run", keys).header["animations"].append(
+        {"name": "Smile", "samplers": [], "channels": [{"target": {"node": 1, "path": "weights"}}]}
+    )
+    path = tmp_path / "walk.gltf"
+    path.write_text(file.text())
+    with pytest.raises(ValueError, match="walk.gltf: 2 animations: 'Walk', 'Run'; choose one with"):
+        load_clip(path)
+    with pytest.raises(ValueError, match="no animation 'Smile'; there are 'Walk', 'Run'"):
+        load_clip(path, animation="Smile")
+    assert load_clip(path, animation="Run").frame_count == 2
+    assert load_clip(path, animation="Run", fps=60.0).frame_count == 7
+    (tmp_path / "a.bvh").touch()
+    for other in ("a.bvh", "a.npz"):
+        (tmp_path / other).touch()
+        with pytest.raises(ValueError, match=f"{other}: .*animation"):
+            load_clip(tmp_path / other, animation="Run")
+
+
+def test_normalised_integers_are_fractions(load):
+    file = Gltf(chain("a", "b"))
+    quats = np.round(QUATS.as_quat()[:2] * 32767)
+    output = file.add(quats, "i2", normalized=True)
+    recording = load(file.animate("w", {(0, "rotation"): ([0.0, 0.1], output, "LINEAR")}))
+    turned = Rotation.from_quat(recording.rotations_ls[:, 0], scalar_first=True)
+    assert (turned * QUATS[:2].inv()).magnitude().max() < 1e-4
+
+
+def test_arrays_may_lie_between_each_other_and_in_a_file_beside(tmp_path):
+    file = Gltf(chain("a", "b"))
+    pairs = b"".join(struct.pack("<f3f", t, *point) for t, point in zip(RAMP, PATH, strict=True))
+    file.content = b"\0" * 4 + pairs
+    file.header["bufferViews"] = [
+        {"buffer": 0, "byteOffset": 4, "byteLength": len(pairs), "byteStride": 16}
+    ]
+    common = {"bufferView": 0, "componentType": 5126, "count": 5}
+    file.header["accessors"] = [
+        common | {"type": "SCALAR"}, common | {"type": "VEC3", "byteOffset": 4},
+    ]  # fmt: skip
+    sampler = {"input": 0, "output": 1}
+    channel = {"sampler": 0, "target": {"node": 1, "path": "translation"}}
+    file.header["animations"] = [{"samplers": [sampler], "channels": [channel]}]
+    header = json.loads(file.text())
+    header["buffers"][0]["uri"] = "two%20words.bin"
+    (tmp_path / "two words.bin").write_bytes(file.content)
+    (tmp_path / "walk.gltf").write_text(json.dumps(header))
+    recording = read_gltf(tmp_path / "walk.gltf")
+    assert recording.names == ("b",)
+    np.testing.assert_allclose(recording.positions_ls[:, 0], PATH + [1.0, 0, 0], atol=1e-6)
+    for uri in ("../two%20words.bin", "/etc/passwd", "https://example.org/x.bin", "no.bin", ""):
+        header["buffers"][0]["uri"] = uri
+        (tmp_path / "walk.gltf").write_text(json.dumps(header))
+        with pytest.raises(ValueError, match="walk.gltf: .*(beside this one|no such file)"):
+            read_gltf(tmp_path / "walk.gltf")
+
+
+def changed(path: str, value) -> str:
+    """The walker with one entry of its header changed, by its place."""
+    header = json.loads(walker().text())
+    *place, last = (int(word) if word.isdecimal() else word for word in path.split("."))
+    item = header
+    for key in place:
+        item = item[key]
+    item[last] = value
+    return json.dumps(header)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("accessors.0.sparse", {}, "accessor 0 is sparse, which is not supported"),
+        ("accessors.0.count", 10**9, "accessor 0 has 1000000000 values of 12 bytes in 144 bytes"),
+        ("accessors.0.type", "VEC9", "accessor 0 holds 'VEC9'"),
+        ("accessors.1.type", "VEC4", "accessor 1 has 12 values of 16 bytes in 48 bytes"),
+        ("bufferViews.0.byteLength", 10**6, "bufferView 0 ends at byte 1000000 of a buffer"),
+        ("bufferViews.0.extensions", {"EXT_meshopt_compression": {}}, "is compressed"),
+        ("buffers.0.uri", "data:;base64,%%%", "the uri of buffer 0 is no base64"),
+        ("buffers.0", {}, "buffer 0 has neither a uri nor a binary part"),
+        ("nodes.9.children", [1], "node 1 has two parents"),
+        ("nodes.9.children", [0], "nodes that are their own ancestors"),
+        ("nodes.9.children", [99], "99 among the children of node 9; wanted a whole number below"),
+        ("nodes.2.scale", [1, 2], r"the scale of node 2 is \[1, 2\]; wanted 3 finite numbers"),
+        ("nodes.2.rotation", [0, 0, 0, 0], "the rotation of node 2 is no unit quaternion"),
+        ("nodes.2.scale", [1e25] * 3, "LeftLeg is at"),
+        ("skins.0.joints", [77], "77 among the joints of a skin"),
+        ("animations", [], "no animation that moves nodes"),
+        ("animations.0.samplers.0.interpolation", "SMOOTH", "node 1: interpolation 'SMOOTH'"),
+        ("animations.0.samplers.0.input", 2, "node 1: times have 4 numbers for each key"),
+        ("animations.0.samplers.0.output", 2, "a translation has 12 x 4 numbers for 12 keys"),
+        ("nodes", {}, r"nodes is '\{\}'; wanted a list"),
+    ],
+)
+def test_what_is_no_motion_is_refused_in_one_sentence(path, value, message, tmp_path):
+    (tmp_path / "walk.gltf").write_text(changed(path, value))
+    with pytest.raises(ValueError, match=f"walk.gltf: .*({message})") as error:
+        load_clip(tmp_path / "walk.gltf")
+    assert "\n" not in str(error.value)
+
+
+def test_an_animation_of_a_small_file_may_not_be_endless(load):
+    keys = {(0, "translation"): ([0.0, 1e5], [[0, 0, 0], [1, 0, 0]], "LINEAR")}
+    with pytest.raises(ValueError, match="1e.05 s at 30 frames per second; wanted at most 500000"):
+        load(Gltf(chain("a", "b")).animate("w", keys))
+    assert len(load(Gltf(chain("a", "b")).animate("w", keys), fps=1.0).positions_ls) == 100_001
+
+
+@pytest.mark.parametrize("content", [b"", b"glTF", b"{", b"[]", b"glTF\2\0\0\0\xff\xff\xff\xff"])
+def test_a_file_that_is_not_whole_is_refused(content, tmp_path):
+    for name in ("walk.glb", "walk.gltf"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}: "):
+            load_clip(tmp_path / name)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e20])
+def test_scales_may_be_of_any_size(load, size):
+    nodes = chain("a", "b", "c")
+    for node in nodes[:2]:
+        node["scale"] = [size] * 3
+    keys = {(0, "rotation"): ([0.0, 0.1], QUATS.as_quat()[1:3], "LINEAR")}
+    turned = load(Gltf(nodes).animate("w", keys)).rotations_ls[:, 0]
+    turned = Rotation.from_quat(turned, scalar_first=True)
+    assert (turned * QUATS[1:3].inv()).magnitude().max() < 1e-6
