@@ -32,7 +32,12 @@ class Ablation:
     """By dotted name."""
 
 
-KEYS = {"name": validation.TEXT} | dict.fromkeys(("rules", "parameters", "free"), validation.TABLE)
+KEYS = {
+    "name": validation.TEXT.meaning("What is left out. Needed."),
+    "rules": validation.TABLE.meaning("Other rules, by stage."),
+    "parameters": validation.TABLE.meaning("Fixed at these values, even if they are free else."),
+    "free": validation.TABLE.meaning("Fitted in addition."),
+}
 
 
 def read_ablations(tables: Sequence[object], ik: jaxik.FootIK, where: str) -> tuple[Ablation, ...]:

@@ -3,13 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import jaxik
+from fitting.datasets.clips.load import ClipOptions
+from fitting.datasets.terrain.mesh_files import TerrainOptions
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.sensitivity import FreeTable
-from fitting.problem.free_parameters import FreeParameter, free_parameter
+from fitting.problem.free_parameters import FreeParameter, check_inside, free_parameter
 from fitting.problem.loss import Loss
 from fitting.problem.prior import Priors
 from fitting.problem.space import Space, make_space
@@ -59,6 +62,49 @@ class ClipEntry:
     """What changes along the base; see `track_files`."""
     subject: str | None = None
     """Whom it shows."""
+    joints: Mapping[str, str] | Path | None = None
+    """Which joint of reference and base is which; here and below, an `.npz` needs none of it."""
+    scale: float | None = None
+    """Metres per unit of reference and base."""
+    up: str | None = None
+    """Up axis of reference and base."""
+    asf: Path | None = None
+    """Skeleton of an `.amc`."""
+    animation: str | None = None
+    """Which animation of a glTF file that has several."""
+    terrain_scale: float | None = None
+    """Metres per unit of the terrain's file."""
+    terrain_offset: tuple[float, float, float] | None = None
+    """m, by which the terrain is moved."""
+    terrain_cell: float | None = None
+    """m, between heights of a terrain that does not say it."""
+
+    @staticmethod
+    def reading(clip: ClipOptions, terrain: TerrainOptions) -> dict[str, Any]:
+        """The fields that say how reference, base and terrain are read; paths become absolute."""
+        joints = clip.joints
+        return {
+            "joints": Path(joints).resolve() if isinstance(joints, str | Path) else joints,
+            "scale": clip.scale,
+            "up": clip.up,
+            "asf": None if clip.asf is None else clip.asf.resolve(),
+            "animation": clip.animation,
+            "file_up": terrain.file_up,
+            "terrain_scale": terrain.scale,
+            "terrain_offset": terrain.offset if any(terrain.offset) else None,
+            "terrain_cell": terrain.cell,
+        }
+
+    @property
+    def clip_options(self) -> ClipOptions:
+        """How reference and base are read."""
+        return ClipOptions(self.joints, self.scale, self.up, self.asf, self.animation)
+
+    @property
+    def terrain_options(self) -> TerrainOptions:
+        """How the terrain is read."""
+        offset = self.terrain_offset or (0.0, 0.0, 0.0)
+        return TerrainOptions(self.file_up, self.terrain_scale, offset, self.terrain_cell)
 
 
 @dataclass(frozen=True)
@@ -113,6 +159,10 @@ class Experiment:
     """What `jaxik ablate` leaves out in turn."""
     hierarchy: Hierarchy = Hierarchy()
     """What the clips have in common."""
+    record_only: bool = False
+    """Whether only what the game's record holds is fitted; see `record_only.restrict`."""
+    whole: "Experiment | None" = None
+    """What such an experiment was made of."""
 
     def __post_init__(self) -> None:
         if self.noise.sigmas == "estimated" and self.loss not in ("squares", "student"):
@@ -182,6 +232,29 @@ class Experiment:
         with validation.error_context(f"{self.path} [free]"):
             rig = rig if self.body == "clip" else None
             return [free_parameter(ik, name, rig, **given) for name, given in self.free.items()]
+
+    def check_points(self, rig: jaxik.Rig | None) -> None:
+        """Checks, before anything is compiled, that centres of priors and the start are in range.
+
+        Args:
+            rig: of the first clip.
+
+        Raises:
+            ValueError: one is not, or as `free_parameters`.
+        """
+        parameters = self.free_parameters(self.starting_system(rig), rig)
+        centres = {p.name: self.prior.of(p.name).centre for p in parameters}
+        for table, what, values in (("prior", "centre", centres), ("start", "start", self.start)):
+            with validation.error_context(f"{self.path} [{table}]"):
+                for parameter in parameters:
+                    value = values.get(parameter.name)
+                    if value is not None:
+                        check_inside(parameter, what, value)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether there are centres of priors or a start of the search."""
+        return bool(self.start) or any(self.prior.of(name).centre is not None for name in self.free)
 
     def space(self, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Space[jaxik.FootIK]:
         """The space of the free parameters, with their prior and the start.

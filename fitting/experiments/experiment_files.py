@@ -3,17 +3,20 @@
 preset = "record"                    # a function of jaxik.presets
 faithful = true                      # the original, where the preset differs from it
 body = "clip"                        # its defaults: for the first clip's rig, or for the "adult"
+record_only = true                   # leave out what the game's record has no room for
 rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
 [[clips]]
 reference = "walk.npz"               # the captured motion; paths are relative to this file
 base = "walk_base.npz"               # the flat animation; left out, one is made from the reference
 terrain = "course.ply"
+joints = "map.toml"                  # and scale, up, asf: how clips are read where it is not known
+terrain_scale = 0.01                 # and terrain_offset, terrain_cell, file_up: likewise
 [parameters]                         # fixed values that differ from the preset's
 lock.enabled = true
 [free]                               # {} takes range and scale from the rule
 pelvis.on_gain = {}
 contact.planted_height = { low = 0.05, high = 0.2 }
-[prior]                              # see `prior_tables`, also for [start]
+[prior]                              # see `tables.prior_tables`, also for [start]
 spread = 1.6
 [sigmas]
 ankle = 0.02
@@ -30,20 +33,16 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import tomli_w
 
-from fitting.datasets.ground_path import ROOTS
-from fitting.inference.noise.settings import Correlation, NoiseOptions, Sigmas
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
-from fitting.problem.loss import Loss
-from fitting.problem.scene import WHITENED
 from fitting.runtime import validation
 from fitting.runtime.validation import (
-    Constraint,
     Content,
     Table,
     check_table,
@@ -53,74 +52,24 @@ from fitting.runtime.validation import (
 )
 
 from .ablations import read_ablations
-from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment, FitOptions
+from .experiment import DEFAULT_SIGMAS, Experiment, FitOptions
 from .hierarchies import hierarchy_to_table, read_hierarchy
-from .prior_tables import priors_to_table, read_priors, read_start
-from .systems import BODY, DEFAULT_PRESET, preset_system, read_free_table, with_rules
+from .record_only import restrict
+from .schema.keys import (
+    CORRELATIONS,
+    FIT_KEYS,
+    KINDS,
+    NOISE_KEYS,
+    SAMPLE_KEYS,
+    SEARCH_KEYS,
+    SIGMA_KEYS,
+    TOP_KEYS,
+)
+from .systems import DEFAULT_PRESET, preset_system, read_free_table, with_rules
+from .tables.clip_tables import read_clip
+from .tables.prior_tables import priors_to_table, read_priors, read_start
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
-FILE_KEYS = ("reference", "terrain", "base", "truth", "tracks")
-CLIP_KEYS: dict[str, Constraint] = {
-    **dict.fromkeys((*FILE_KEYS, "label", "subject"), validation.TEXT),
-    **dict.fromkeys(("start", "end"), validation.SECONDS),
-    "file_up": validation.one_of(("y", "z")),
-    "mask_pops": validation.BOOLEAN,
-    "root": validation.one_of(ROOTS),
-}
-KINDS = tuple(kind for kind in DEFAULT_SIGMAS if kind != "correlation")
-SIGMA_KEYS = dict.fromkeys(KINDS, validation.number(1e-9, 1e9, or_inf=True))
-CORRELATIONS = tuple(f"correlation.{kind}" for kind in WHITENED)  # instead of one for all
-SIGMA_KEYS |= dict.fromkeys(("correlation", *CORRELATIONS), validation.CORRELATION)
-
-
-def _constraints(settings: type[Settings]) -> dict[str, Constraint]:
-    return {
-        name: Constraint(declared.range, lambda value, declared=declared: declared.allows(value))
-        for name, declared in describe(settings).items()
-    }
-
-
-def _values(table: Table, settings: type[Settings]) -> Content:
-    return {name: _value(value, describe(settings)[name]) for name, value in table.items()}
-
-
-def _value(value: Any, declared: Setting) -> Any:
-    """A value as its setting holds it: a tuple for a list, and a float unless it is a count."""
-    if isinstance(value, list):
-        return tuple(_value(entry, declared) for entry in value)
-    return float(value) if type(value) is int and not declared.integer else value
-
-
-FIT_KEYS: dict[str, Constraint] = {
-    "starts": validation.count(1, 1000),
-    "max_steps": _constraints(SearchSettings)["max_steps"],
-    "search": validation.TABLE,
-}
-SEARCH_KEYS = {
-    name: constraint
-    for name, constraint in _constraints(SearchSettings).items()
-    if name != "max_steps"  # which is a key of [fit]
-}
-SAMPLE_KEYS = _constraints(SamplerSettings)
-NOISE_KEYS = {
-    "sigmas": validation.one_of(get_args(Sigmas)),
-    "correlation": validation.one_of(get_args(Correlation)),
-}
-TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "noise", "fit", "sample")
-TOP_KEYS: dict[str, Constraint] = {
-    "name": validation.TEXT,
-    "preset": validation.TEXT,
-    "faithful": validation.BOOLEAN,
-    "body": BODY,
-    "loss": validation.one_of(get_args(Loss)),
-    "fps": validation.RATE,
-    "seed": validation.SEED,
-    "independent_every": validation.SECONDS,
-    **dict.fromkeys(TABLES, validation.TABLE),
-    "hierarchy": validation.TABLE,
-    "clips": validation.list_of("[[clips]], one for each clip"),
-    "without": validation.list_of("[[without]], one for each variant"),
-}
 
 
 def load_experiment(path: str | Path) -> Experiment:
@@ -152,7 +101,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
     known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
-    clips = tuple(_clip_entry(entry, path) for entry in content["clips"])
+    clips = tuple(read_clip(entry, path) for entry in content["clips"])
     subjects, hierarchy = [clip.subject for clip in clips], content.get("hierarchy", {})
     tables = {
         "clips": clips,
@@ -168,7 +117,19 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
     top = with_floats(content, ("fps", "independent_every"))
-    return Experiment(**{"path": path, "name": path.stem, **top, **tables})
+    experiment = Experiment(**{"path": path, "name": path.stem, **top, **tables})
+    return restrict(experiment) if experiment.record_only else experiment
+
+
+def _values(table: Table, settings: type[Settings]) -> Content:
+    return {name: _value(value, describe(settings)[name]) for name, value in table.items()}
+
+
+def _value(value: Any, declared: Setting) -> Any:
+    """A value as its setting holds it: a tuple for a list, and a float unless it is a count."""
+    if isinstance(value, list):
+        return tuple(_value(entry, declared) for entry in value)
+    return float(value) if type(value) is int and not declared.integer else value
 
 
 def _noise_options(value: object, where: str) -> NoiseOptions:
@@ -192,25 +153,6 @@ def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSett
     return sampler
 
 
-def _clip_entry(value: object, path: Path) -> ClipEntry:
-    table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
-    entry = with_floats(table, ("start", "end"))
-    for key in ("reference", "terrain"):
-        if key not in table:
-            raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")
-    for key in FILE_KEYS:
-        if key in table:
-            entry[key] = (path.parent / table[key]).resolve()
-            if reason := validation.why_unreadable(entry[key]):
-                raise ValueError(f"{path} [[clips]]: {key} {table[key]!r}: {reason}")
-    if "end" in table and table["end"] <= table.get("start", 0.0):
-        raise ValueError(
-            f"{path} [[clips]]: end is {table['end']}; wanted more than start, which is "
-            f"{table.get('start', 0.0)}"
-        )
-    return ClipEntry(**entry)
-
-
 def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> str:
     """The experiment as TOML with absolute paths, so that the file may lie anywhere.
 
@@ -222,7 +164,7 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     if changed := _changed(search):
         fit_table["search"] = changed
     usual = {key: sampler[key] for key in USUAL_SAMPLE_KEYS}
-    content = dataclasses.asdict(experiment)
+    content = dataclasses.asdict(dataclasses.replace(experiment, whole=None))
     content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
     content["prior"] = priors_to_table(experiment.prior)
     content["hierarchy"] = hierarchy_to_table(experiment.hierarchy)

@@ -15,9 +15,13 @@ from fitting.runtime import validation
 from fitting.runtime.validation import Content, check_table
 
 LEVELS = ("per_subject", "per_clip")
+NAMES = validation.list_of_texts("a list of names of free parameters")
 KEYS = {
-    **dict.fromkeys(LEVELS, validation.list_of_texts("a list of names of free parameters")),
-    "scale_with_body": validation.BOOLEAN,
+    "per_subject": NAMES.meaning("Free parameters of which each subject has its own value."),
+    "per_clip": NAMES.meaning("Free parameters of which each clip has its own value."),
+    "scale_with_body": validation.BOOLEAN.meaning(
+        "Whether lengths, speeds and times follow the legs of each clip's body."
+    ),
 }
 
 

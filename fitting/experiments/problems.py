@@ -14,11 +14,13 @@ import jax
 import numpy as np
 
 import jaxik
+from fitting.datasets import coverage
 from fitting.datasets.clip_frames import frames_from_clip, raised
 from fitting.datasets.clips import Clip, edit, flight, load_clip
-from fitting.datasets.flat_animation import flatten_clip, load_flat_animation
+from fitting.datasets.flat_animation import flatten_clip, load_flat_animation, with_remark_if_uneven
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain import mesh_files
+from fitting.datasets.terrain.mesh_files import TerrainOptions
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
@@ -57,17 +59,40 @@ def make_problem(
 
     Args:
         experiment: what is fitted to what.
-        log: called with a line for each clip, which says where its root is.
+        log: called with lines for each clip: where its root is, and what was guessed or is odd.
 
     Raises:
         ValueError: something in the experiment does not fit its clips or its preset.
     """
+    return problem_from_clips(experiment, load_clips(experiment, log))
+
+
+@in_float64
+def load_clips(
+    experiment: Experiment, log: Callable[[str], object] = _silent
+) -> tuple[ClipData, ...]:
+    """Loads the clips of an experiment, in the order of its entries.
+
+    Args:
+        experiment: what is fitted to what.
+        log: called with lines on each clip: where its root is, jumps, and what was guessed.
+
+    Raises:
+        ValueError: a file cannot be read, or does not fit the others of its clip.
+    """
+    if experiment.has_points:
+        adult = experiment.body == "adult"
+        experiment.check_points(None if adult else _load_rig(experiment.clips[0]))
     data = [load_clip_data(entry, experiment.fps) for entry in experiment.placed_clips()]
     for clip in data:
         log(f"root of {clip.base.source}: {clip.root.reason}")
         if in_the_air := flight.describe(clip.base):
             log(f"{clip.base.source}: {in_the_air}")
-    return problem_from_clips(experiment, data)
+        both = (clip.reference, clip.base)
+        notes = dict.fromkeys((file.source, remark) for file in both for remark in file.remarks)
+        for source, remark in notes:
+            log(f"note on {source}: {remark}")
+    return tuple(data)
 
 
 def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Problem[jaxik.FootIK]:
@@ -102,25 +127,61 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     return Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, independent)
 
 
-def load_clip_data(entry: ClipEntry, fps: float | None) -> ClipData:
-    """Loads one clip of an experiment; `fps` resamples it, None keeps its rate."""
-    terrain = mesh_files.load_terrain(entry.terrain, file_up=entry.file_up)
-    captured = load_clip(entry.reference)
+def _load_rig(entry: ClipEntry) -> jaxik.Rig:
+    """The body of a clip, on which the ranges of parameters depend."""
+    return (_load_reference(entry) if entry.base is None else _load_base(entry.base, entry)).rig
+
+
+def _load_reference(entry: ClipEntry) -> Clip:
+    return load_clip(entry.reference, **vars(entry.clip_options.of_file(entry.reference)))
+
+
+def _load_base(base: Path, entry: ClipEntry) -> Clip:
+    return load_flat_animation(base, options=entry.clip_options.of_file(base))
+
+
+def load_clip_data(entry: ClipEntry, fps: float | None, *, has_file: bool = True) -> ClipData:
+    """Loads one clip of an experiment.
+
+    Warns where there is little ground under the feet.
+
+    Args:
+        entry: of the experiment.
+        fps: Hz, to which it is resampled; None keeps its rate.
+        has_file: whether remedies are spelled as keys of a file, and not as options of a command.
+
+    Raises:
+        ValueError: a file cannot be read, the base does not belong to the reference, or there is
+            hardly any ground under the feet.
+    """
+
+    def load_ground(options: TerrainOptions) -> Terrain:
+        return mesh_files.load_terrain(entry.terrain, **vars(options))
+
+    def check_ground(clip: Clip) -> None:
+        measured = coverage.measure(clip, terrain, entry.terrain_options, load_ground)
+        coverage.require(measured, as_keys=has_file)
+
+    terrain = load_ground(entry.terrain_options)
+    captured = _load_reference(entry)
     if entry.mask_pops:
         with error_context(entry.reference):
             captured = edit.mask_pops(captured)  # before resampling, which would smear a pop
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
+        check_ground(reference)
         base = flatten_clip(reference, mesh_files.height_function(terrain))
         base, root = place_root(base, terrain, entry.root)
         base, tracks = track_files.along(base, entry.tracks, entry.start)
         return ClipData(reference, base, terrain, root, tracks)
-    base = _cut(load_flat_animation(entry.base), entry.base, entry, fps)
+    base = _cut(_load_base(entry.base, entry), entry.base, entry, fps)
     if _outline(base) != _outline(reference):
         raise ValueError(
             f"{entry.base}: the base has {_outline(base)}; the reference has {_outline(reference)}"
         )
-    base, root = place_root(base, terrain, entry.root)
+    check_ground(base)
+    placed, root = place_root(base, terrain, entry.root)
+    base = with_remark_if_uneven(base) if placed is base else placed
     base, tracks = track_files.along(base, entry.tracks, entry.start)
     return ClipData(reference, base, terrain, root, tracks)
 

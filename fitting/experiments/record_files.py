@@ -18,17 +18,21 @@ def read_binary(path: Path) -> record.Record:
         return record.from_bytes(path.read_bytes())
 
 
-def read(path: Path, reading: record.Reading, base: record.Record | None) -> list[record.Record]:
+def read(
+    path: Path, reading: record.Reading, base: record.Record | None, *, drop: bool
+) -> list[record.Record]:
     """The records in a binary, CSV or TOML file.
 
     Args:
         path: the file.
         reading: how the record's fields are meant.
         base: completes a record that is made from parameters.
+        drop: whether parameters that a record cannot hold are left out, with a warning.
 
     Raises:
         ValueError: the file does not exist or cannot be read; the parameters have another preset
-            than `record`, or other rules; a base is given for a record that is complete.
+            than `record`, other rules, or values that a record cannot hold; a base is given for a
+            record that is complete.
     """
     suffix = path.suffix.lower()
     if suffix == ".toml":
@@ -42,7 +46,8 @@ def read(path: Path, reading: record.Reading, base: record.Record | None) -> lis
             raise ValueError(
                 f"{path}: rules {rules}; only those of 'record' with faithful = true make one"
             )
-        return [record.from_ik(ik, base, reading)]
+        with validation.error_context(path):
+            return [record.from_ik(ik, base, reading, drop=drop)]
     if base is not None:
         raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
     if suffix != ".csv" or validation.why_unreadable(path):

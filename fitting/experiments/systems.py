@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from inspect import signature
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, get_args
 
 import equinox as eqx
 import numpy as np
@@ -69,8 +69,14 @@ VALUES: dict[str, tuple[str, Callable[[np.ndarray], bool]]] = {  # of leaves, by
 }
 BODY = validation.one_of(("clip", "adult"))  # whose defaults are meant
 FREE_KEYS: dict[str, validation.Constraint] = {
-    **dict.fromkeys(("low", "high"), validation.NUMBER),
-    **dict.fromkeys(("kind", "scale"), validation.TEXT),
+    "low": validation.NUMBER.meaning("The fit goes no lower; in the parameter's unit."),
+    "high": validation.NUMBER.meaning("The fit goes no higher; in the parameter's unit."),
+    "kind": validation.one_of(get_args(parameter_tree.ParameterKind)).meaning(
+        "A threshold moves a hard decision, so that its derivative is 0."
+    ),
+    "scale": validation.one_of(get_args(parameter_tree.Scale)).meaning(
+        "How the fit steps: evenly, by factors, or as the half-life of a gain."
+    ),
 }
 MOVED_KEYS = {"prior_mean": "centre", "prior_sd": "spread"}  # from [free] to [prior]
 
@@ -120,10 +126,19 @@ def preset_system(
         raise ValueError(f"faithful is {faithful!r}; wanted true or false")
     if not faithful:
         return getattr(presets, str(name))(rig)
-    originals = [n for n in known if "faithful" in signature(getattr(presets, n)).parameters]
-    if name not in originals:
+    if name not in (originals := _names_of_originals()):
         raise ValueError(f"{name!r} has no other original; faithful is for {originals}")
     return getattr(presets, str(name))(rig, faithful=True)
+
+
+def all_presets() -> list[Preset]:
+    """Every preset, and then every original."""
+    originals = [Preset(name, faithful=True) for name in _names_of_originals()]
+    return [*map(Preset, preset_names()), *originals]
+
+
+def _names_of_originals() -> list[str]:
+    return [n for n in preset_names() if "faithful" in signature(getattr(presets, n)).parameters]
 
 
 def _is_preset(value: object) -> bool:

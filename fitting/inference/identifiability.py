@@ -18,6 +18,7 @@ from fitting.problem.space import to_fractions
 from fitting.runtime.precision import in_float64
 
 from .noise import series
+from .optimisation.kept_stages import KeptStages
 from .optimisation.solution import Solution
 from .profiles.heights import usual_rise
 from .profiles.profile import Profile
@@ -85,11 +86,18 @@ def is_determined(profile: Profile, contraction: float) -> bool:
 
 
 @in_float64
-def assess_identifiability(problem: Problem, solution: Solution) -> Identifiability:
+def assess_identifiability(
+    problem: Problem, solution: Solution, kept: KeptStages | None = None
+) -> Identifiability:
     """What the data of a problem determine around its solution.
 
     The contraction of a parameter is `1 - (posterior width / prior width)²`, of 95 % intervals, on
     the scale on which its range is divided evenly.
+
+    Args:
+        problem: what was fitted.
+        solution: its best fit.
+        kept: the stages of profiles that were killed, which go on after them; gets those of these.
 
     Raises:
         ValueError: if the Jacobian at the solution is not finite.
@@ -101,7 +109,7 @@ def assess_identifiability(problem: Problem, solution: Solution) -> Identifiabil
             f" parameters are determined: {solution.message}"
         )
     laplace = _Laplace.around(problem, solution)
-    curves = find_curves(problem, solution)
+    curves = find_curves(problem, solution, kept)
     profiles = curves.profiles()
     names = [space.names[i] for i in laplace.smooth]
     fractions = jax.nn.sigmoid(jnp.asarray(solution.u))

@@ -1,6 +1,6 @@
 """Which parameters change a motion at all: a sweep over every range, before anything is fitted."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -74,21 +74,35 @@ def _reach(
     space: Space, scenes: tuple[Scene, ...], u: Float[np.ndarray, " free"]
 ) -> Float[np.ndarray, " free"]:
     """How far each parameter alone can move any residual from where it is at `u`, in sigmas."""
+    return np.array([np.abs(changes).max() for _, changes in sweep(space, scenes, u)])
+
+
+def sweep(
+    space: Space, scenes: tuple[Scene, ...], u: Float[np.ndarray, " free"]
+) -> Iterator[tuple[Float[np.ndarray, " tried"], Float[np.ndarray, "tried residuals"]]]:
+    """For each parameter alone, its `u` over the range and how the residuals change from `u`.
+
+    Args:
+        space: the parameters.
+        scenes: the clips.
+        u: where all the others stay.
+    """
     dtype = space.start.dtype
     present = np.asarray(space.values(jnp.asarray(u, dtype)))
     log_odds = np.log(FRACTIONS / (1 - FRACTIONS))
     grid = np.stack([space.values(jnp.full(space.size, x, dtype)) for x in log_odds])
-    table = np.tile(present, (space.size, len(FRACTIONS), 1))
-    for i in range(space.size):
-        table[i, :, i] = grid[:, i]
-    values = np.concatenate([present[None], table.reshape(-1, space.size)])
-    candidates = from_values(space, values)
-    first = _residuals(space, scenes, candidates[:1])[0]
-    furthest = []
-    for start in range(1, len(candidates), BATCH):
-        residuals = _residuals(space, scenes, candidates[start : start + BATCH])
-        furthest.append(np.nan_to_num(np.abs(residuals - first)).max(axis=1))
-    return np.concatenate(furthest).reshape(space.size, len(FRACTIONS)).max(axis=1)
+    first = _residuals(space, scenes, from_values(space, present[None]))[0]
+    together = BATCH // len(FRACTIONS)  # parameters in one call of the program
+    for start in range(0, space.size, together):
+        indices = range(start, min(start + together, space.size))
+        table = np.tile(present, (len(indices), len(FRACTIONS), 1))
+        for row, i in enumerate(indices):
+            table[row, :, i] = grid[:, i]
+        candidates = from_values(space, table.reshape(-1, space.size))
+        changes = np.nan_to_num(_residuals(space, scenes, candidates) - first)
+        for row, i in enumerate(indices):
+            tried = slice(row * len(FRACTIONS), (row + 1) * len(FRACTIONS))
+            yield candidates[tried, i], changes[tried]
 
 
 def _residuals(space: Space, scenes: tuple[Scene, ...], candidates: np.ndarray) -> np.ndarray:

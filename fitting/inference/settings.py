@@ -8,7 +8,7 @@ experiment files and error messages read it from there.
 import dataclasses
 from typing import Any
 
-from fitting.runtime.validation import is_within
+from fitting.runtime.validation import Content, is_within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,13 @@ class Setting:
         kind = "whole number" if self.integer else "number"
         limits = f" from {self.low:g} to {self.high:g}"
         return f"a list of {kind}s{limits}" if self.several else f"a {kind}{limits}"
+
+    @property
+    def schema(self) -> Content:
+        """The same as JSON Schema."""
+        kind = "integer" if self.integer else "number"
+        number = {"type": kind, "minimum": self.low, "maximum": self.high}
+        return {"type": "array", "items": number, "minItems": 1} if self.several else number
 
     def allows(self, value: object) -> bool:
         """Whether a setting may have this value."""

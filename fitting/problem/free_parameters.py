@@ -87,6 +87,24 @@ def free_parameter(
     return parameter
 
 
+def check_inside(parameter: FreeParameter, what: str, value: float) -> None:
+    """Checks that a value is one that the parameter can take.
+
+    Args:
+        parameter: whose bounds count.
+        what: the value is, for the error message.
+        value: in the parameter's unit.
+
+    Raises:
+        ValueError: it is outside the bounds.
+    """
+    if not parameter.low <= value <= parameter.high:
+        raise ValueError(
+            f"{parameter.name}: {what} is {value:g}, wanted from {parameter.low:g} to"
+            f" {parameter.high:g}"
+        )
+
+
 def present_value(ik: eqx.Module, name: str) -> float:
     """The value that a system has now: of one leg's element, or the mean over a leaf's elements.
 

@@ -31,7 +31,7 @@ from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
-from .free_parameters import FreeParameter, present_value
+from .free_parameters import FreeParameter, check_inside, present_value
 from .prior import SPREAD, Prior, Priors
 
 OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
@@ -189,11 +189,8 @@ class Space(eqx.Module, Generic[System]):
         """`u` of values, the system's where left out, and not at a bound."""
         present = {}
         for p in self.parameters:
-            value = values.get(p.name)
-            if value is not None and not p.low <= value <= p.high:
-                raise ValueError(
-                    f"{p.name}: {what} is {value:g}, wanted from {p.low:g} to {p.high:g}"
-                )
+            if p.name in values:
+                check_inside(p, what, values[p.name])
             present[p.name] = min(max(present_value(self.system, p.name), p.low), p.high)
         return np.clip(np.asarray(self.pack({**present, **values})), -CENTRE_LIMIT, CENTRE_LIMIT)
 

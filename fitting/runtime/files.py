@@ -2,14 +2,18 @@
 
 A file is written under a temporary name beside it, which says which process writes it. What killed
 processes have left under such names is removed when the next file is written in the same folder.
+Names by 0.1.0 do not say which process it was: those go when the same file is written again, if
+they are old.
 """
 
 import contextlib
 import os
 import platform
 import re
+import stat
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +22,9 @@ from .validation import in_one_line
 LONGEST_STEM = 150  # bytes of it in a temporary name: names have 255 at most
 HOST = re.sub(r"\W", "_", platform.node(), flags=re.ASCII)[:40]
 TEMPORARY = re.compile(rf"\..*\.jaxik-{re.escape(HOST)}-(\d+)-\w+(\.\w+)?")
+
+OWNERS_ONLY = stat.S_IFREG | 0o600  # mode of files that are being written
+NO_LONGER_WRITTEN = 3600.0  # s since the last change, after which a file of 0.1.0 is a dead one's
 
 
 def check_output_file(path: Path) -> None:
@@ -43,6 +50,7 @@ def write(path: Path, fill: Callable[[Path], object]) -> None:
     check_output_file(path)
     try:
         sweep(path.parent)
+        _sweep_first_release(path)
         stem = path.stem.encode()[:LONGEST_STEM].decode(errors="ignore")
         prefix = f".{stem}.jaxik-{HOST}-{os.getpid()}-"
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
@@ -76,6 +84,21 @@ def sweep(folder: Path) -> None:
         if name is not None and not _is_alive(int(name[1])):
             with contextlib.suppress(OSError):  # another process has removed it, or may do so
                 os.unlink(entry.path)
+
+
+def _sweep_first_release(path: Path) -> None:
+    """Removes what processes of 0.1.0 have left of a file: `.NAME`, 8 characters and its suffix.
+
+    Files of other names, those that others may read and those that changed of late stay.
+    """
+    left = re.compile(rf"\.{re.escape(path.stem)}[a-z0-9_]{{8}}{re.escape(path.suffix)}")
+    for entry in os.scandir(path.parent):
+        if left.fullmatch(entry.name):
+            with contextlib.suppress(OSError):
+                status = entry.stat(follow_symlinks=False)
+                is_own = status.st_mode == OWNERS_ONLY
+                if is_own and time.time() - status.st_mtime > NO_LONGER_WRITTEN:
+                    os.unlink(entry.path)
 
 
 def _is_alive(process: int) -> bool:

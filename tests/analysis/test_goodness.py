@@ -106,6 +106,15 @@ def test_outliers_under_squares_are_named():
         assert 1.5 < float(found.sentence.split("Fits, but ")[1].split(" %")[0]) < 4.5
 
 
+def test_what_is_advised_is_accepted_beside_noise_that_is_estimated():
+    for seed in range(SEEDS):
+        found = judge(whiten(simulate(seed), RHO), correlation=RHO, whitened=True)
+        assert "even where the estimate is taken out" in found.sentence
+        assert 'set `correlation = "counted"` in [noise]' in found.sentence
+        found = judge(simulate(seed, outliers=0.03), sigmas_estimated=True)
+        assert 'set `loss = "student"`' in found.sentence
+
+
 def with_bump(play: Playback, kind: str, size: float, frames: slice) -> Playback:
     """A playback with a smooth misfit of so many sigmas, rms in these frames."""
     errors = np.array(play.errors[kind])

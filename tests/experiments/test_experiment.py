@@ -102,13 +102,13 @@ MISTAKES = [
     ({"rest": "[sample]\nwalkers = 5"}, "walkers is 5, wanted an even number from 4"),
     ({"rest": "[sample]\nwalkers = 2"}, "walkers is 2, wanted an even number from 4"),
     ({"rest": "[sample]\nstop_at = 'x'"}, "stop_at is 'x'; wanted a number from 0"),
+    ({"free": "pelvis.on_gain = { kind = 'rough' }"}, "kind is 'rough'; wanted one of"),
 ]
 MISFITS = [  # noticed only when the problem is made
     ({"free": "pelvis.on_gian = {}"}, r"\[free\]: no parameter named 'pelvis.on_gian'; nearest is"),
     ({"free": "pelvis = {}"}, "no parameter named 'pelvis'; nearest is 'pelvis"),
     ({"free": "lock.enabled = {}"}, "no parameter named 'lock.enabled'"),
     ({"free": 'foot."max_pitch[7]" = {}'}, r"no element 'foot.max_pitch\[7\]'"),
-    ({"free": "pelvis.on_gain = { kind = 'rough' }"}, "kind is 'rough', wanted one of"),
     ({"free": "pelvis.on_gain = { low = 0.5, high = 0.1 }"}, "bounds are 0.5 to 0.1"),
     ({"free": "contact.raised_height = { high = 0.05 }"}, r"\[free\]: contact.raised_height stays"),
     (
@@ -163,6 +163,28 @@ def test_a_parameter_or_clip_that_does_not_fit_is_reported(tmp_path, parts, mess
     loaded = experiment_files.load_experiment(write(tmp_path, **parts))
     with pytest.raises(ValueError, match=message):
         problems.make_problem(loaded)
+
+
+@pytest.mark.parametrize("body", ["clip", "adult"])
+@pytest.mark.parametrize(
+    ("rest", "message"),
+    [
+        ("[prior.pelvis]\nlimit = { centre = 2 }", r"\[prior\]: pelvis.limit: centre is 2, wanted"),
+        ("[start]\npelvis.limit = -1", r"\[start\]: pelvis.limit: start is -1, wanted from 0 to"),
+    ],
+)
+def test_a_point_outside_the_range_is_refused_before_clips_are_prepared(
+    tmp_path, monkeypatch, body, rest, message
+):
+    def fail(*_: object) -> None:
+        raise AssertionError("called")
+
+    monkeypatch.setattr(problems, "load_clip_data", fail)
+    if body == "adult":
+        monkeypatch.setattr(problems, "load_flat_animation", fail)
+    path = write(tmp_path, top=f'body = "{body}"', free="pelvis.limit = {}", rest=rest)
+    with pytest.raises(ValueError, match=message):
+        problems.make_problem(experiment_files.load_experiment(path))
 
 
 def test_a_missing_file_or_one_that_is_not_toml_is_rejected(tmp_path):

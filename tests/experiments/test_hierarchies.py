@@ -1,5 +1,6 @@
 """The table [hierarchy] and `leg_length` in files: what is read, written and refused."""
 
+import json
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -120,9 +121,11 @@ def test_a_run_is_applied_to_the_body_of_the_animation(tmp_path, monkeypatch):
     (tmp_path / "parameters.toml").write_text(
         parameter_files.system_to_toml(ik, Preset("ozz"), 0.84)
     )
+    row = {"name": "target.foot_height", "unit": "m", "u": 0.0, "start_sd": 1.0, "value": 0.1}
+    fit = {"parameters": [row | {"determined": True}]}
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
     save_clip(tmp_path / "giant.npz", scaled(load_clip(BASE), 2.0))
     applied = []
-    monkeypatch.setattr(animations.run_folder, "load_fit", lambda run: (None, {"parameters": []}))
     monkeypatch.setattr(animations, "solve", lambda ik, *_, **__: applied.append(ik))
     files = AnimationFiles(tmp_path / "giant.npz", tmp_path / "unused.ply")
     animations.apply(tmp_path, files)

@@ -8,6 +8,7 @@ import pytest
 
 from fitting.experiments import experiment_files, systems
 from fitting.experiments.experiment import Experiment
+from fitting.experiments.schema import keys
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import describe
@@ -41,8 +42,10 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "[sample]": SAMPLE,
 }
 WHERE = [(table, key, *ends) for table, keys in RANGES.items() for key, ends in keys.items()]
-OF_CLIPS = {"start": (0, 1e6), "end": (1e-3, 1e6)}
-WORDS = ("name", "preset", "body", "loss", "faithful")
+OF_CLIPS = {
+    "start": (0, 1e6), "end": (1e-3, 1e6), "terrain_scale": (1e-9, 1e6), "terrain_cell": (1e-3, 1e4)
+}  # fmt: skip
+WORDS = ("name", "preset", "body", "loss", "faithful", "record_only")
 TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "noise", "fit", "sample")
 
 
@@ -105,8 +108,17 @@ def test_every_number_of_the_format_has_a_range_here():
     assert {**SIGMAS, **CORRELATIONS}.keys() == experiment_files.SIGMA_KEYS.keys()
     others = (*WORDS, *TABLES, "hierarchy", "clips", "without")
     assert {*TOP, *others} == experiment_files.TOP_KEYS.keys()
-    texts = (*experiment_files.FILE_KEYS, "label", "subject", "file_up", "mask_pops", "root")
-    assert {*OF_CLIPS, *texts} == experiment_files.CLIP_KEYS.keys()
+    texts = (
+        *keys.FILE_KEYS,
+        "label",
+        "subject",
+        "file_up",
+        "mask_pops",
+        "root",
+        "joints",
+    )
+    texts = (*texts, "up", "terrain_offset", "scale", "animation")
+    assert {*OF_CLIPS, *texts} == keys.CLIP_KEYS.keys()
     for settings in (SearchSettings, SamplerSettings):
         assert all(math.isfinite(declared.high) for declared in describe(settings).values())
 

@@ -197,7 +197,7 @@ def test_a_robust_loss_leaves_no_sigma_open(short):
 
 
 @pytest.mark.slow
-def test_a_run_is_sampled_with_the_noise_that_its_fit_found(tmp_path):
+def test_a_run_is_sampled_with_the_noise_that_its_fit_found(undrawn, tmp_path):
     experiment = load_experiment(OZZ)
     clip = dataclasses.replace(experiment.clips[0], start=2.0, end=3.0)
     sampled = dataclasses.replace(experiment.sample, max_steps=20, walkers=8)

@@ -72,6 +72,46 @@ def test_folders_that_were_made_and_are_empty_are_removed(tmp_path):
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["c"]
 
 
+class Windows:
+    """What Python's msvcrt does to a byte of a file that is locked, until its owner closes it."""
+
+    LK_NBLCK = 2
+
+    def __init__(self):
+        self.owners: dict[int, tuple[int, int]] = {}
+        """Handle: the file, and the place of the byte."""
+
+    def locking(self, handle: int, mode: int, count: int) -> None:
+        assert (mode, count) == (self.LK_NBLCK, 1)
+        byte = (os.fstat(handle).st_ino, os.lseek(handle, 0, os.SEEK_CUR))
+        owners = [owner for owner, owned in self.owners.items() if owned == byte]
+        if any(owner != handle and self.is_open(owner, byte[0]) for owner in owners):
+            raise PermissionError(13, "Permission denied")
+        self.owners[handle] = byte
+
+    def is_open(self, handle: int, file: int) -> bool:
+        try:
+            return os.fstat(handle).st_ino == file
+        except OSError:
+            return False
+
+
+def test_windows_locks_a_byte_beyond_the_text_that_others_read(tmp_path, monkeypatch):
+    windows = Windows()
+    monkeypatch.setitem(sys.modules, "msvcrt", windows)  # type: ignore[arg-type]
+    monkeypatch.setattr(sys, "platform", "win32")
+    for _ in range(2):
+        with claimed(tmp_path):
+            ((_, place),) = windows.owners.values()
+            assert place > claimed_folder.LONGEST_COMMAND + 1000
+            with pytest.raises(ValueError, match=f"in use by process {os.getpid()} on "):
+                with claimed(tmp_path):
+                    pass
+            assert (tmp_path / LOCK).is_file()
+        assert not list(tmp_path.iterdir())
+        windows.owners.clear()
+
+
 def test_a_folder_that_was_there_stays(tmp_path):
     with claimed(tmp_path):
         pass

@@ -126,3 +126,25 @@ def test_what_a_killed_process_was_writing_goes_with_the_next_file(tmp_path):
         assert names(tmp_path) == sorted([growing, "fit.json", *others])
         alive.communicate("")
         assert names(tmp_path) == sorted(["locks.png", "fit.json", *others])
+
+
+def test_what_0_1_0_was_writing_goes_when_the_same_file_is_written_again(tmp_path):
+    old = ".knees3kd82hf0.png"  # tempfile.mkstemp(prefix=f".{path.stem}", suffix=path.suffix)
+    others = {
+        "recent": ".knees_a8dk20f.png",
+        "readable": ".knees9ab2cd3e.png",
+        "longer": ".knees3kd82hf01.png",
+        "capital": ".kneesBACKUP_1.png",
+        "another's": ".locks3kd82hf0.png",
+        "text": ".knees3kd82hf0.txt",
+    }
+    for name in (old, *others.values()):
+        path = tmp_path / name
+        path.write_text("half")
+        path.chmod(0o644 if name == others["readable"] else 0o600)
+        if name != others["recent"]:
+            os.utime(path, (0, 0))
+    files.write_text(tmp_path / "fit.json", "{}")
+    assert names(tmp_path) == sorted([old, "fit.json", *others.values()])
+    files.write_text(tmp_path / "knees.png", "whole")
+    assert names(tmp_path) == sorted(["fit.json", "knees.png", *others.values()])

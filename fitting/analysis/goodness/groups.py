@@ -33,6 +33,8 @@ class Assumed:
     """Degrees of freedom, under the loss `student`."""
     sigmas_estimated: bool = False
     """From the residuals themselves: then their size says nothing."""
+    whitened: bool = False
+    """Whether their correlation was estimated and taken out."""
     parameters: float = 0.0
     """How many parameters the data determine: the degrees of freedom that the fit has used."""
 

@@ -132,10 +132,13 @@ def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -
         width = plain.mean_square * plain.spacing * assumed.independent_fraction
         width *= (1 - given) / (1 + given)
         than = f", not by {given:.2f}" if given else ""
-        findings.append(
-            f"the residuals are correlated ({found:.2f} from one frame to the next{than})"
-        )
-        remedies.append(f"set `correlation = {found:.2f}`")
+        size = f"{found:.2f} from one frame to the next{than}"
+        if assumed.whitened:
+            findings.append("the residuals are correlated even where the estimate is taken out")
+            remedies.append('set `correlation = "counted"` in [noise]')
+        else:
+            findings.append(f"the residuals are correlated ({size})")
+            remedies.append(f"set `correlation = {found:.2f}`")
     text = ""
     if findings:
         text = f"{' and '.join(findings)}: the intervals are {_width(width**0.5)}; "
@@ -148,7 +151,8 @@ def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -
         text += "; " if text else ""
         text += f"{100 * part:.1f} % of the residuals ({names}) are outliers, beyond "
         text += f"{kinds.NEAR:g} standard deviations, where noise has "
-        text += f'{100 * kinds.EXPECTED[kinds.NEAR]:.1f} %: set `loss = "cauchy"`'
+        loss = "student" if assumed.sigmas_estimated else "cauchy"  # which has no sigma to estimate
+        text += f'{100 * kinds.EXPECTED[kinds.NEAR]:.1f} %: set `loss = "{loss}"`'
     return text
 
 

@@ -1,4 +1,4 @@
-"""The finished stages of searches, in a file from which a killed process goes on.
+"""The finished stages of searches and profiles, in a file from which a killed process goes on.
 
 A stage follows from the state before it and from nothing else that changes. So a search that is
 begun again takes the ends of its first stages from the file, in their order, and computes the
@@ -6,7 +6,8 @@ others: what comes out is to the last bit what the search would have found in on
 computed again, where they are needed.
 
 A fit makes several searches: each has its own list of stages, under a digest of all that it follows
-from. The file belongs to one fit, which its identity names; stages of another are not used.
+from. Of the profiles of a solution only the last stage is kept, which holds all before it. The file
+belongs to one fit, which its identity names; stages of another are not used.
 """
 
 import dataclasses
@@ -16,16 +17,20 @@ from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
 import numpy as np
+from jaxtyping import Float
 
 from fitting.problem.digest import digest_with
+from fitting.problem.problem import Problem
 from fitting.runtime import program_key
-from fitting.runtime.storage.declared_types import Finite
+from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import Content, in_one_line
 
 from .solution import Progress
 from .state import Elite, Point, Search, SearchState, Stage, StepsUsedUp
 
+# What a state with the right names and types raises where its numbers make no sense.
+DAMAGES = (ValueError, TypeError, KeyError, OverflowError)
 SECONDS_BETWEEN_WRITES = 1.0  # a kill loses no more than these and the stage that is running
 
 
@@ -62,12 +67,37 @@ class StoredStage(TypedDict):
     """Whether it ended because the start had no steps left."""
 
 
+class StoredPoints(TypedDict):
+    """Points of a profile."""
+
+    u: list[list[Finite]]
+    values: list[list[Finite]]
+    cost: list[float]
+
+
+class StoredProfiles(TypedDict):
+    """The profiles of a solution as they were after some stages."""
+
+    stages: Annotated[int, between(0, 100)]
+    """Finished ones."""
+    curves: list[StoredPoints]
+    """Of each parameter."""
+    plateaus: StoredPoints
+    cliffs: list[Annotated[list[Finite], length(2)]]
+    """At which nothing is tried again: index of the parameter, fraction of its range."""
+    crossed: bool
+    """Whether no further cliff can be crossed."""
+    random: Content
+    """State of the random generator."""
+
+
 class StoredSearches(TypedDict):
     """The content of the file."""
 
     identity: str
     """Of the fit."""
     searches: dict[str, list[StoredStage]]
+    profiles: dict[str, StoredProfiles]
 
 
 FILE = JsonFile(
@@ -76,7 +106,7 @@ FILE = JsonFile(
 
 
 class KeptStages:
-    """The stages of the searches of one fit, in memory and in a file."""
+    """The stages of the searches and profiles of one fit, in memory and in a file."""
 
     def __init__(
         self, path: Path, identity: str, warn: Callable[[str], object] = lambda reason: None
@@ -91,7 +121,11 @@ class KeptStages:
         """
         identity = f"{identity} {program_key.sources()} {dict(program_key.versions())}"
         self.path, self._warn = path, warn
-        self._content: StoredSearches = {"identity": identity, "searches": {}}
+        self._content: StoredSearches = {
+            "identity": identity,
+            "searches": {},
+            "profiles": {},
+        }
         self._written = -np.inf
         if not path.exists():
             return
@@ -110,6 +144,41 @@ class KeptStages:
         """Number of stages, of all searches."""
         return sum(map(len, self._content["searches"].values()))
 
+    @property
+    def profile_count(self) -> int:
+        """Number of stages of profiles."""
+        return sum(stored["stages"] for stored in self._content["profiles"].values())
+
+    def recall_profiles(
+        self,
+        problem: Problem,
+        u: Float[np.ndarray, " free"],
+        restore: Callable[[StoredProfiles], None],
+    ) -> Callable[[StoredProfiles], None]:
+        """Calls `restore` with the profiles of a solution, where some of their stages are stored.
+
+        Args:
+            problem: what was fitted.
+            u: of the solution.
+            restore: takes the profiles over, or raises one of `DAMAGES`.
+
+        Returns:
+            What keeps the profiles, to be called after every stage.
+        """
+        profiles, key = self._content["profiles"], digest_with(problem, u.tolist())[:16]
+        if key in profiles:
+            try:
+                restore(profiles[key])
+            except DAMAGES as error:
+                self._warn(f"{self.path}: damaged ({in_one_line(error)}); the profiles begin anew")
+                del profiles[key]
+
+        def keep(stored: StoredProfiles) -> None:
+            profiles[key] = stored
+            self._write()
+
+        return keep
+
     def attach(self, search: Search, state: SearchState, starts: int) -> Search:
         """The search with its stages recalled from here, and kept here."""
         first = (state.best.u.tolist(), state.random.bit_generator.state)
@@ -118,7 +187,7 @@ class KeptStages:
         try:
             for stage in stages:
                 _check(stage, state)
-        except (ValueError, TypeError, KeyError) as error:
+        except DAMAGES as error:
             self._warn(f"{self.path}: damaged ({in_one_line(error)}); the search begins anew")
             stages.clear()
         lines = [line for stage in stages for line in stage["history"]]
@@ -128,7 +197,7 @@ class KeptStages:
 
     def flush(self) -> None:
         """Writes what is not on disk yet."""
-        if self.count:
+        if self.count or self.profile_count:
             FILE.write(self.path, self._content)
             self._written = time.monotonic()
 
@@ -213,7 +282,7 @@ def _restored(stored: StoredStage, before: SearchState) -> SearchState:
 
 
 def _check(stored: StoredStage, state: SearchState) -> None:
-    """Raises ValueError, TypeError or KeyError for a stage that is none of this search."""
+    """Raises one of `DAMAGES` for a stage that is none of this search."""
     restored, size = _restored(stored, state), len(state.point.u)
     elite = np.empty((0, size)) if restored.elite is None else restored.elite.u
     if {len(restored.point.u), len(restored.best.u), elite.shape[-1]} != {size}:

@@ -6,21 +6,22 @@ are found. At last the ends of the intervals are refined. Whatever lies lower th
 kept: the best point goes back to the fit.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from fitting.inference.optimisation import population
+from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
 from fitting.problem.space import from_fractions, to_fractions
 
-from .conditional import Conditional, Points, Targets, join
+from .conditional import Points, Targets, join
 from .curves import SAME_PLACE, Curves
 from .profile import crossing, low_parts
 from .single_moves import other_plateaus, settle, vary
+from .state import Profiling
 
 GRID = np.concatenate([[0.001], (np.arange(20) + 0.5) / 20, [0.999]])  # fractions of the range
 FOLLOWED = np.concatenate([GRID[:-1:2], GRID[-1:]])  # where curves are followed outwards
@@ -39,42 +40,31 @@ NEAR_PARABOLA = 0.35  # difference of square roots of rises that can be interpol
 NARROW = 0.05  # fraction of a valley's width that its ends are found to
 
 
-@dataclasses.dataclass
-class _Profiling:
-    """What the stages share; they add to the curves."""
+def find_curves(problem: Problem, solution: Solution, kept: KeptStages | None = None) -> Curves:
+    """The profiles' points around a solution.
 
-    conditional: Conditional
-    solution: Points
-    curves: Curves
-    plateaus: Points
-
-    @property
-    def space(self):
-        return self.conditional.problem.space
-
-
-def find_curves(problem: Problem, solution: Solution) -> Curves:
-    """The profiles' points around a solution."""
-    conditional = Conditional.around(problem, solution)
-    start = conditional.points(np.asarray(solution.u)[None])
-    profiling = _Profiling(conditional, start, Curves(problem, start), start[:0])
-    scan(profiling)
-    if any(problem.space.thresholds):
-        profiling.plateaus = other_plateaus(conditional, profiling.curves)
-    follow_outwards(profiling)
-    descend_elsewhere(profiling)
-    refine(profiling)
-    profiling.curves.share()
-    refine(profiling)
-    tried: set[tuple[int, float]] = set()
-    for _ in range(CROSSINGS):
-        if not cross_cliffs(profiling, tried):
-            break
-        refine(profiling)
+    Args:
+        problem: what was fitted.
+        solution: its best fit.
+        kept: the stages of profiles that were killed, which go on after them; gets those of these.
+    """
+    profiling = Profiling.around(problem, solution)
+    keep = None
+    if kept is not None:
+        keep = kept.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
+    try:
+        for stage in STAGES[profiling.stages :]:
+            stage(profiling)
+            profiling.stages += 1
+            if keep is not None:
+                keep(profiling.stored())
+    finally:
+        if kept is not None:
+            kept.flush()
     return profiling.curves
 
 
-def scan(profiling: _Profiling) -> None:
+def scan(profiling: Profiling) -> None:
     """Every parameter over its whole range, the others following by a Gauss-Newton step."""
     conditional, space = profiling.conditional, profiling.space
     index, value = [], []
@@ -90,7 +80,13 @@ def scan(profiling: _Profiling) -> None:
         profiling.curves.add(targets, conditional.points(moved))
 
 
-def follow_outwards(profiling: _Profiling) -> None:
+def find_plateaus(profiling: Profiling) -> None:
+    """Other plateaus of the thresholds, from which all later descents begin as well."""
+    if any(profiling.space.thresholds):
+        profiling.plateaus = other_plateaus(profiling.conditional, profiling.curves)
+
+
+def follow_outwards(profiling: Profiling) -> None:
     """From the solution to either end of each range, as long as the data let the cost stay low."""
     space, curves = profiling.space, profiling.curves
     sides: list[tuple[int, Float[np.ndarray, " values"]]] = []
@@ -120,7 +116,7 @@ def follow_outwards(profiling: _Profiling) -> None:
         active, position = following, position + 1
 
 
-def descend_elsewhere(profiling: _Profiling) -> None:
+def descend_elsewhere(profiling: Profiling) -> None:
     """From the lowest minima of each curve outside the valleys, with no parameter held."""
     curves, conditional = profiling.curves, profiling.conditional
     for i, curve in enumerate(curves.curves):
@@ -136,7 +132,7 @@ def descend_elsewhere(profiling: _Profiling) -> None:
             curves.add(Targets(np.full(len(minima), i), points.values[:, i]), points)
 
 
-def refine(profiling: _Profiling) -> None:
+def refine(profiling: Profiling) -> None:
     """New points where valleys end and between valleys, until the ends are known well enough."""
     curves, tried = profiling.curves, set()
     for number in range(ROUNDS):
@@ -158,17 +154,28 @@ def refine(profiling: _Profiling) -> None:
         curves.add(targets, lowest(profiling, targets, starts))
 
 
-def cross_cliffs(profiling: _Profiling, tried: set[tuple[int, float]]) -> bool:
+def share(profiling: Profiling) -> None:
+    """Every curve gets the points of the others that lie below it."""
+    profiling.curves.share()
+    refine(profiling)
+
+
+def cross(profiling: Profiling) -> None:
+    """Goes on beyond cliffs, unless there was nothing to cross in the round before."""
+    if not profiling.crossed and cross_cliffs(profiling):
+        refine(profiling)
+    else:
+        profiling.crossed = True
+
+
+def cross_cliffs(profiling: Profiling) -> bool:
     """Tries to go on beyond cliffs that end a valley; whether any was crossed.
 
     Behind a cliff another decision holds, so other parameters must move together with this one:
     they are drawn anew within their own intervals and a little beyond.
-
-    Args:
-        profiling: gets the new points.
-        tried: cliffs at which nothing is tried again: parameter and fraction of its range.
     """
     curves, conditional, space = profiling.curves, profiling.conditional, profiling.space
+    tried = profiling.cliffs
     index: list[int] = []
     places: list[float] = []
     starts: list[Points] = []
@@ -213,7 +220,7 @@ def is_cliff(places: np.ndarray, rises: np.ndarray, outside: int, width: float) 
     return bool((rises[further] > CLIFF * parabola).any())
 
 
-def targets_at(profiling: _Profiling, index: np.ndarray, places: Sequence[float]) -> Targets:
+def targets_at(profiling: Profiling, index: np.ndarray, places: Sequence[float]) -> Targets:
     """Targets at fractions of the parameters' ranges."""
     parameters = [profiling.space.parameters[i] for i in index]
     values = [
@@ -224,7 +231,7 @@ def targets_at(profiling: _Profiling, index: np.ndarray, places: Sequence[float]
 
 
 def lowest(
-    profiling: _Profiling, targets: Targets, starts: list[Points], *, settling: bool = False
+    profiling: Profiling, targets: Targets, starts: list[Points], *, settling: bool = False
 ) -> Points:
     """The lowest points at the targets, from these starts and from the other plateaus.
 
@@ -283,3 +290,14 @@ def _next_place(curves: Curves, i: int, inside: int, outside: int, *, bisect: bo
     )
     low, high = (own[inside] + share * (own[outside] - own[inside]) for share in (0.02, 0.98))
     return float(np.clip(place, min(low, high), max(low, high)))
+
+
+STAGES = (
+    scan,
+    find_plateaus,
+    follow_outwards,
+    descend_elsewhere,
+    refine,
+    share,
+    *(cross for _ in range(CROSSINGS)),
+)

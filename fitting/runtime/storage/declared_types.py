@@ -29,7 +29,7 @@ Finite: TypeAlias = Annotated[float, Constraint("a finite number", lambda x: abs
 PLAIN = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
 
 
-def between(low: float, high: float) -> Constraint:
+def between(low: int | float, high: int | float) -> Constraint:
     """Numbers from one to another."""
     return Constraint(f"a number from {low:g} to {high:g}", lambda x: low <= x <= high)
 

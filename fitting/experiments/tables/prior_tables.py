@@ -27,10 +27,14 @@ from fitting.runtime.validation import (
 )
 
 DEFAULT_KEYS: dict[str, validation.Constraint] = {
-    "shape": validation.one_of(get_args(Shape)),
-    "spread": validation.number(*SPREADS),
+    "shape": validation.one_of(get_args(Shape)).meaning(
+        "Distribution of u, the free parameter on its scale; a uniform one has no centre and no"
+        " spread."
+    ),
+    "spread": validation.number(*SPREADS).meaning("Standard deviation of u."),
 }
-KEYS = {**DEFAULT_KEYS, "centre": validation.NUMBER}
+CENTRE = validation.NUMBER.meaning("Median, in the parameter's unit; left out, the system's value.")
+KEYS = {**DEFAULT_KEYS, "centre": CENTRE}
 
 
 def read_priors(table: Table, free: Collection[str], where: str) -> Priors:

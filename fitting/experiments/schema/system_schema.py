@@ -1,0 +1,219 @@
+"""JSON Schema of what experiments say of a system: rules, parameters, and which are free.
+
+A table such as [parameters] may hold what any rule of a stage has. Which rule a file has follows
+from its preset and its [rules], so conditions then allow only the names of that rule.
+"""
+
+import functools
+import json
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+
+import jaxik
+from fitting.experiments import systems
+from fitting.experiments.tables.prior_tables import KEYS as PRIOR_KEYS
+from fitting.problem.prior import SPREAD
+from fitting.runtime.validation import NUMBER, Content
+from jaxik.maths import parameter_tree
+from jaxik.world.arguments import LAYERS
+
+from .tables import closed, named
+
+LEG = r"(\[\d+\])?"  # after the name of a free parameter: of one leg
+VALUES: dict[str, Content] = {  # of one number, by the kind of its leaf
+    "b": {"type": "boolean"},
+    "u": {"type": "integer", "minimum": 0, "maximum": 2**LAYERS - 1},
+    "f": {"type": ["number", "null"]},  # inf, which is no JSON, may come as null
+}
+
+
+class Field(NamedTuple):
+    """A field that rules of a stage have."""
+
+    schema: Content
+    """Of its value."""
+    is_parameter: bool
+    """Whether it may be free."""
+    description: str
+    """Meaning, unit, range and defaults; for each rule, where they differ."""
+
+
+def definitions() -> Content:
+    """What other schemas of this module refer to."""
+    return {
+        "free": named(systems.FREE_KEYS),
+        "prior": named(PRIOR_KEYS),
+        "start": dict(NUMBER.schema),
+    }
+
+
+def rules() -> Content:
+    """The schema of [rules]."""
+    stages = {
+        stage: {"enum": list(known), "description": f"The rule of the stage {stage}."}
+        for stage, known in systems.STAGES.items()
+    }
+    return closed(stages)
+
+
+def parameters() -> Content:
+    """The schema of [parameters]."""
+    return _by_stage(lambda field: field.schema)
+
+
+def of_free_parameters(table: str) -> Content:
+    """The schema of [free], [start] or [prior], without the keys of the table itself."""
+    entry = {"$ref": f"#/$defs/{table}"}
+    return _by_stage(lambda field: entry if field.is_parameter else None, LEG)
+
+
+def prior() -> Content:
+    """The schema of [prior]: keys of its own, and tables of parameters."""
+    own = {key: dict(PRIOR_KEYS[key].schema) for key in ("shape", "spread")}
+    own["shape"]["default"], own["spread"]["default"] = "normal", SPREAD
+    tables = of_free_parameters("prior")
+    return tables | {"properties": own | tables["properties"]}
+
+
+def only_originals() -> Content:
+    """That a faithful preset is one that differs from its original."""
+    names = [preset.name for preset in systems.all_presets() if preset.faithful]
+    faithful = {"properties": {"faithful": {"const": True}}, "required": ["faithful"]}
+    return {"if": faithful, "then": {"properties": {"preset": {"enum": names}}}}
+
+
+def conditions() -> list[Content]:
+    """For each rule: where a file has it, its names are the only ones of the stage."""
+    chosen = {preset: systems.rule_names(_system(preset)) for preset in systems.all_presets()}
+    return [
+        {
+            "if": {
+                "anyOf": [
+                    _nested("rules", stage, {"const": name}),
+                    *(
+                        _by_default(preset, stage)
+                        for preset in chosen
+                        if chosen[preset][stage] == name
+                    ),
+                ]
+            },
+            "then": _only_names(stage, rule()),
+        }
+        for stage, known in systems.STAGES.items()
+        for name, rule in known.items()
+    ]
+
+
+def _by_default(preset: systems.Preset, stage: str) -> Content:
+    """That a file has the rule of a preset."""
+    default = systems.DEFAULT_PRESET
+    required = ["preset"] * (preset.name != default.name) + ["faithful"] * preset.faithful
+    return {
+        "properties": {"preset": {"const": preset.name}, "faithful": {"const": preset.faithful}},
+        "required": required,
+        "not": _nested("rules", stage, {}),
+    }
+
+
+def _nested(table: str, key: str, schema: Content) -> Content:
+    """That a table is there, with a key whose value meets a schema."""
+    inner = {"properties": {key: schema}, "required": [key]}
+    return {"properties": {table: inner}, "required": [table]}
+
+
+def _only_names(stage: str, rule: eqx.Module) -> Content:
+    """That [parameters] and [free] have only fields of this rule in its stage."""
+    fields = [slot.name for slot in parameter_tree.slots(rule)] + [*parameter_tree.options(rule)]
+    tables = {"parameters": (fields, ""), "free": ([*parameter_tree.declarations(rule)], LEG)}
+    properties = {}
+    for table, (names, suffix) in tables.items():
+        name = f"({'|'.join(names)}){suffix}$" if names else "(?!)"
+        others = {"not": {"pattern": rf"^{stage}\.(?!{name})"}}  # in quotes, with their stage
+        properties[table] = {
+            "properties": {stage: {"propertyNames": {"pattern": f"^{name}"}}},
+            "propertyNames": others,
+        }
+    return {"properties": properties}
+
+
+def _by_stage(schema_of: Callable[[Field], Content | None], suffix: str = "") -> Content:
+    """Tables by stage; a name may also stand in quotes with its stage: "foot.max_pitch".
+
+    Args:
+        schema_of: the schema of what stands under the name of a field; None if it may not.
+        suffix: pattern of what may follow a name.
+    """
+    stages, patterns = {}, {}
+    for stage in systems.STAGES:
+        fields, alike = {}, {}  # names by schema
+        for name, field in _fields(stage).items():
+            if (schema := schema_of(field)) is not None:
+                fields[name] = schema | {"description": field.description}
+                alike.setdefault(json.dumps(schema), []).append(name)
+        if fields:
+            names = {f"({'|'.join(names)}){suffix}$": schema for schema, names in alike.items()}
+            schemas = {name: json.loads(schema) for name, schema in names.items()}
+            legs = {f"^{name}": schema for name, schema in schemas.items()} if suffix else {}
+            stages[stage] = closed(fields, legs)
+            patterns |= {rf"^{stage}\.{name}": schema for name, schema in schemas.items()}
+    return closed(stages, patterns)
+
+
+def _fields(stage: str) -> dict[str, Field]:
+    """The fields of all rules of a stage, by name."""
+    rules = {name: rule() for name, rule in systems.STAGES[stage].items()}
+    descriptions: dict[str, dict[str, list[str]]] = {}  # by field and text, the rules
+    fields: dict[str, Field] = {}
+    for rule_name, rule in rules.items():
+        for name, text in _described(stage, rule):
+            descriptions.setdefault(name, {}).setdefault(text, []).append(rule_name)
+            is_parameter = name in parameter_tree.declarations(rule)
+            fields[name] = Field(_value_schema(rule, name), is_parameter, "")
+    for name, texts in descriptions.items():
+        parts = [f"{', '.join(owners)}: {text}" for text, owners in texts.items()]
+        description = next(iter(texts)) if len(texts) == 1 else "\n".join(parts)
+        fields[name] = fields[name]._replace(description=description)
+    return fields
+
+
+def _described(stage: str, rule: eqx.Module) -> Iterator[tuple[str, str]]:
+    """Name and description of each field of a rule."""
+    declared = parameter_tree.declarations(rule)
+    units = {slot.name: slot.unit for slot in parameter_tree.slots(rule)}
+    for name, doc in parameter_tree.docs(rule).items():
+        parts = [doc]
+        if (unit := units.get(name, "1")) != "1":
+            parts.append(f"Unit: {unit}.")
+        if name in declared:
+            parts.append(f"Range: {declared[name].low:g} to {declared[name].high:g}.")
+        yield name, " ".join([*parts, f"Default: {_defaults(stage, rule, name)}."])
+
+
+def _defaults(stage: str, rule: eqx.Module, name: str) -> str:
+    """The values that presets with this rule have under a name; else the rule's own."""
+    presets: dict[str, list[str]] = {}  # by value
+    for preset in systems.all_presets():
+        if type(own := getattr(_system(preset), stage)) is type(rule):
+            text = parameter_tree.shown(own, name)
+            presets.setdefault(text, []).append("faithful " * preset.faithful + preset.name)
+    if not presets:
+        return parameter_tree.shown(rule, name)
+    return "; ".join(f"{value} in {', '.join(names)}" for value, names in presets.items())
+
+
+@functools.cache
+def _system(preset: systems.Preset) -> jaxik.FootIK:
+    return preset.system()
+
+
+def _value_schema(rule: eqx.Module, name: str) -> Content:
+    """The schema of a value: one for all legs, or a list with one a leg; of an option, one."""
+    shapes = {slot.name: slot.shape for slot in parameter_tree.slots(rule)}
+    if name not in shapes:
+        return VALUES["b"]
+    single = VALUES[parameter_tree.get(rule, name).dtype.kind]
+    for size in shapes[name]:
+        single = {"type": "array", "items": single, "minItems": size, "maxItems": size}
+    return {"anyOf": [single, {"type": "array", "items": single, "minItems": 1}]}

@@ -1,0 +1,1 @@
+"""Readers of single tables of an experiment file: [[clips]], [prior] and [start]."""

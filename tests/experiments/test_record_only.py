@@ -1,0 +1,102 @@
+"""Fits of what the game's record holds: nothing is lost between the fit and the bytes."""
+
+import numpy as np
+import pytest
+
+from fitting.cli import main
+from fitting.datasets.clips import load_clip
+from fitting.experiments import experiment_files, record_only
+from fitting.runtime.validation import flatten, read_toml
+from fitting.studies import run_folder
+from jaxik import record
+from jaxik.maths import parameter_tree
+from support import experiments
+
+TOP = 'preset = "record"\nfaithful = true\nbody = "adult"\n'
+FREE = 'foot.max_pitch = {}\nlock.max_speed = {}\n"probe.toe_ls[1]" = {}\n'
+BASE = str(experiments.ROOT / "data/clips/uneven_walk_base.npz")
+GROUND = str(experiments.ROOT / "data/terrains/uneven_walk.ply")
+TRUTH = experiments.ROOT / "data/clips/uneven_walk_truth.toml"
+
+
+def restricted(tmp_path, **parts):
+    parts = {"top": f"{TOP}record_only = true", "free": FREE} | parts
+    return experiment_files.load_experiment(experiments.write(tmp_path, **parts))
+
+
+def test_what_the_record_has_no_room_for_is_neither_free_nor_other_than_its_reader_assumes(
+    tmp_path,
+):
+    other = "[parameters]\nlock.lock_half_life = 0.02\nprobe.limited = true\nfoot.max_roll = 0.2"
+    experiment = restricted(tmp_path, rest=other)
+    assert list(experiment.free) == ["foot.max_pitch", "probe.toe_ls[1]"]
+    assert record_only.left_out(experiment) == ["lock.max_speed"]
+    ik = experiment.starting_system()
+    assert record.dropped(ik) == {} and float(
+        parameter_tree.get(ik, "foot.max_roll")
+    ) == pytest.approx(0.2)
+    aside = record_only.set_aside(experiment)
+    assert aside["lock.lock_half_life"] == ("0.02 s", "0.05 s") and "probe.limited" in aside
+
+
+def test_a_restricted_experiment_is_the_same_when_read_again(tmp_path):
+    of_both = "foot.max_pitch = {0}\nlock.max_speed = {0}\n"
+    rest = f"[prior]\n{of_both.format('{ spread = 1.0 }')}[start]\n{of_both.format(0.4)}"
+    experiment = restricted(tmp_path, rest=rest)
+    assert list(experiment.start) == list(experiment.prior.named) == ["foot.max_pitch"]
+    again = tmp_path / "again.toml"
+    again.write_text(experiment_files.experiment_to_toml(experiment))
+    loaded = experiment_files.load_experiment(again)
+    for field in ("free", "parameters", "start", "prior"):
+        assert getattr(loaded, field) == getattr(experiment, field)
+    assert record_only.left_out(loaded) == []
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"top": "record_only = true"}, "preset = 'record' with faithful = false$"),
+        ({"top": 'preset = "ozz"\nrecord_only = true'}, "preset = 'ozz' with faithful = false$"),
+        ({"rest": '[rules]\npelvis = "SupportPelvis"'}, "others: {'pelvis': 'SupportPelvis'}"),
+        ({"rest": "[hierarchy]\nscale_with_body = true"}, "same for every body"),
+        ({"free": "lock.max_speed = {}"}, r"no room for any of \['lock.max_speed'\]; it has for"),
+        ({"rest": "[parameters]\nfoot.max_roll = [0.1, 0.2]"}, "one value for all legs"),
+    ],
+)
+def test_an_experiment_whose_fit_could_be_no_record_is_refused(tmp_path, parts, message):
+    with pytest.raises(ValueError, match=rf"experiment.toml: .*{message}"):
+        restricted(tmp_path, **parts)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of the knee, and of how the feet are placed
+def test_a_fit_of_the_record_alone_walks_alike_from_its_bytes_and_names_its_price(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    stages = {k: v for k, v in read_toml(TRUTH, "a truth").items() if isinstance(v, dict)}
+    known = flatten({name: table for name, table in stages.items() if name != "noise"}, 2)
+    free = {"foot.max_pitch", "target.rise_half_life"}
+    fixed = "".join(f"{name} = {value}\n" for name, value in known.items() if name not in free)
+    path = experiments.write(
+        tmp_path,
+        top=TOP,
+        free="".join(f"{name} = {{}}\n" for name in sorted(free)),
+        rest=f"[parameters]\n{fixed}[sigmas]\nankle = 0.002\nknee = 0.002\npelvis = 0.002\n"
+        "[fit]\nstarts = 1\n[fit.search]\nagreeing_starts = 1",
+    )
+    main.main(["fit", str(path), "--record-only", "-o", "run"])
+    assert "are free, too" in capsys.readouterr().out
+    summary = (tmp_path / "run" / run_folder.SUMMARY).read_text()
+    assert "not target.rise_half_life: `record to-bytes` loses nothing" in summary
+    (sentence,) = (line for line in summary.splitlines() if line.startswith("Only what the 128"))
+    words = sentence.split("The cost is ")[1]
+    only, whole = float(words.split(";")[0]), float(words.split()[-1].rstrip("."))
+    assert whole < 0.5 * only, "the half-life alone made most of what is left"
+    assert main.main(["record", "to-bytes", "run/parameters.toml", "-o", "game.bin"]) == 0
+    assert main.main(["record", "to-toml", "game.bin", "-o", "back.toml"]) == 0
+    for name, parameters in (("fitted", "run/parameters.toml"), ("game", "back.toml")):
+        words = ["run", BASE, "--terrain", GROUND, "--parameters", parameters]
+        assert main.main([*words, "-o", f"{name}.npz"]) == 0
+    fitted, game = (load_clip(f"{name}.npz").positions_ws for name in ("fitted", "game"))
+    np.testing.assert_allclose(game, fitted, atol=1e-6)
