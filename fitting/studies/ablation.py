@@ -277,7 +277,9 @@ def _digest(entries: Sequence[ClipEntry]) -> str:
     """A digest of all files that a fit reads."""
     digest = hashlib.sha256()
     for entry in entries:
-        for path in (entry.reference, entry.base, entry.terrain, entry.tracks):
+        joints = entry.joints if isinstance(entry.joints, Path) else None
+        paths = (entry.reference, entry.base, entry.terrain, entry.tracks, joints, entry.asf)
+        for path in paths:
             digest.update(b"" if path is None else hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 

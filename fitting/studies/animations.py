@@ -1,6 +1,6 @@
 """A flat animation on a terrain, and what a system makes of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,12 +14,15 @@ from fitting.analysis import placement
 from fitting.analysis.misplacement import Cause, likely_cause
 from fitting.analysis.placement import Placement
 from fitting.analysis.playback import stage_outputs
+from fitting.datasets import coverage
 from fitting.datasets.clip_frames import clip_from_result, frames_from_clip, raised
 from fitting.datasets.clips import Clip
 from fitting.datasets.clips.edit import at_speed
-from fitting.datasets.flat_animation import load_flat_animation
+from fitting.datasets.clips.load import ClipOptions
+from fitting.datasets.coverage import Coverage
+from fitting.datasets.flat_animation import load_flat_animation, with_remark_if_uneven
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
-from fitting.datasets.terrain.mesh_files import load_terrain
+from fitting.datasets.terrain.mesh_files import TerrainOptions, load_terrain
 from fitting.experiments import systems, track_files
 from fitting.runtime import program_cache
 from jaxik.maths import parameter_tree, quat, vec
@@ -35,8 +38,6 @@ class AnimationFiles:
 
     clip: Path
     terrain: Path
-    file_up: str = "y"
-    """Up axis of the terrain's file."""
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
     root: str = "auto"
@@ -45,19 +46,28 @@ class AnimationFiles:
     """Of the root, as a multiple of the clip's; strides are scaled alike."""
     tracks: Path | None = None
     """What changes along the clip; see `experiments.track_files`."""
+    clip_options: ClipOptions = ClipOptions()
+    """How the clip is read."""
+    terrain_options: TerrainOptions = TerrainOptions()
+    """How the terrain is read."""
 
     @cached_property
     def flat_clip(self) -> Clip:
         """The flat animation of the file."""
-        return load_flat_animation(self.clip, self.floor)
+        return load_flat_animation(self.clip, self.floor, self.clip_options)
 
     def load_terrain(self) -> Terrain:
-        """The terrain of the mesh."""
-        return load_terrain(self.terrain, file_up=self.file_up)
+        """The terrain of the file."""
+        return self._load_terrain(self.terrain_options)
 
-    def load_turned_terrain(self) -> Terrain:
-        """The terrain of the mesh with its other axis up."""
-        return load_terrain(self.terrain, file_up="z" if self.file_up == "y" else "y")
+    def coverage(self, terrain: Terrain) -> Coverage:
+        """How much of it is under the feet of the clip."""
+        return coverage.measure(
+            self.flat_clip, terrain, self.terrain_options, reload=self._load_terrain
+        )
+
+    def _load_terrain(self, options: TerrainOptions) -> Terrain:
+        return load_terrain(self.terrain, **vars(options))
 
 
 @dataclass(frozen=True)
@@ -70,8 +80,6 @@ class Animation:
     floor: float = 0.0
     """m, height of the floor on which the clip was animated."""
     root: RootChoice = AS_ANIMATED
-    turned: Callable[[], Terrain] | None = None
-    """Loads the terrain with the other axis of its file up."""
     carried: Float64[np.ndarray, "frames 3"] | None = None
     """m, how far a vehicle has carried terrain and character; clips are in the vehicle's space."""
     speed: float = 1.0
@@ -145,23 +153,34 @@ class Animation:
         if not placed.misplaced:
             return placed, None
         animated = placement.soles(self.placed_clip, *floor)
-        return placed, likely_cause(animated, self.placed_clip, self.terrain, self.turned)
+        return placed, likely_cause(animated, self.placed_clip)
 
 
-def load_animation(files: AnimationFiles) -> Animation:
+def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     """Reads a flat animation and its terrain, and chooses where to put the root.
+
+    Warns where there is little ground under the feet.
+
+    Args:
+        files: where they are.
+        to_fit: whether hardly any ground is an error instead, as it is for a root that follows it.
 
     Raises:
         ValueError: a file does not exist or cannot be read, or the root cannot be put there.
     """
     terrain = files.load_terrain()
     clip = files.flat_clip
+    covered = files.coverage(terrain)
+    if (to_fit or files.root == "ground") and covered.share < coverage.LITTLE:
+        raise ValueError(covered.text())
+    coverage.warn(covered)
     if files.speed != 1.0:
         clip = at_speed(clip, files.speed)
-    clip, root = place_root(clip, terrain, files.root, files.floor)
+    placed, root = place_root(clip, terrain, files.root, files.floor)
+    # Where the clip follows this terrain, its ground has been taken out.
+    clip = with_remark_if_uneven(clip) if placed is clip else placed
     clip, tracks = track_files.along(clip, files.tracks)
-    turned = files.load_turned_terrain
-    return Animation(clip, terrain, files.floor, root, turned, speed=files.speed, tracks=tracks)
+    return Animation(clip, terrain, files.floor, root, speed=files.speed, tracks=tracks)
 
 
 def carried_frames(frames: jaxik.Frame, carried: Float64[np.ndarray, "frames 3"]) -> jaxik.Frame:

@@ -36,7 +36,7 @@ def assess_solution(
         solution: of the problem.
         progress: called as a search goes on.
         on_solution: called with each solution before its assessment, which may fail.
-        kept: the stages of searches that were killed.
+        kept: the stages of searches and profiles that were killed.
 
     Raises:
         ValueError: if the Jacobian at a solution is not finite.
@@ -44,7 +44,7 @@ def assess_solution(
     left: list[float] = []
     while True:
         on_solution(solution)
-        identifiability = assess_identifiability(problem, solution)
+        identifiability = assess_identifiability(problem, solution, kept)
         found_lower = identifiability.improvement > MIN_IMPROVEMENT
         fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
         if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:

@@ -26,6 +26,7 @@ from jaxik.world.terrain import Terrain, cast
 
 from .animations import Animation
 from .frame_rates import RateDifference
+from .run_folder import PARAMETERS
 
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
 
@@ -53,31 +54,62 @@ class Comparison:
 def named_systems(
     options: Iterable[tuple[str, str]], rig: jaxik.Rig | None = None
 ) -> dict[str, jaxik.FootIK]:
-    """Systems by the name of their preset or of their parameter file, in the order of the options.
+    """Systems by the name of their preset, parameter file or run, in the order of the options.
 
     Args:
         options: pairs of `--presets` and names of presets, or of `--parameters` and parameter
-            files, separated by commas.
+            files or folders of runs, separated by commas.
         rig: whose body they are for; None is the adult.
 
     Raises:
         ValueError: there is no system; a name occurs twice; a preset or a file does not exist, or
             a file is wrong.
     """
-    systems: dict[str, jaxik.FootIK] = {}
+    entries = []
     for option, text in options:
         for entry in (part.strip() for part in text.split(",")):
             if not entry:
                 raise ValueError(f"{option} {text!r}: wanted names with commas between them")
-            is_file = option == "--parameters"
-            name = Path(entry).stem if is_file else entry
-            ik = load_system(entry, rig)[0] if is_file else preset_system(entry, rig)
-            if name in (*systems, ANIMATED):
-                raise ValueError(f"{option} {text!r}: there already is a system named {name!r}")
-            systems[name] = ik
+            entries.append((option, entry))
+    files = _file_names([Path(entry) for option, entry in entries if option == "--parameters"])
+    systems: dict[str, jaxik.FootIK] = {}
+    for option, entry in entries:
+        is_file = option == "--parameters"
+        name = files[Path(entry)] if is_file else entry
+        if name in (*systems, ANIMATED):
+            raise ValueError(f"{option} {entry!r}: there already is a system named {name!r}")
+        systems[name] = (
+            load_system(_parameter_file(Path(entry)), rig)[0]
+            if is_file
+            else preset_system(entry, rig)
+        )
     if not systems:
         raise ValueError("nothing to compare; wanted --presets or --parameters")
     return systems
+
+
+def _parameter_file(path: Path) -> Path:
+    """The parameter file at a path, or in the folder of a run."""
+    return path / PARAMETERS if path.is_dir() else path
+
+
+def _file_names(paths: Sequence[Path]) -> dict[Path, str]:
+    """Short names of parameter files: their stem, and of a run's that of its folder.
+
+    Those that would be alike have as many folders before them as it takes.
+    """
+    parts = {}
+    for path in paths:
+        whole = _parameter_file(path).resolve()
+        parts[path] = (
+            whole.parent.parts if whole.name == PARAMETERS else whole.with_suffix("").parts
+        )
+    names = {}
+    for path, own in parts.items():
+        endings = range(1, len(own) + 1)
+        alone = (n for n in endings if sum(x[-n:] == own[-n:] for x in parts.values()) == 1)
+        names[path] = "/".join(own[-next(alone, 1) :])
+    return names
 
 
 def compare(

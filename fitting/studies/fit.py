@@ -17,6 +17,7 @@ from fitting.analysis.goodness.groups import Assumed, Group
 from fitting.analysis.goodness.verdict import Verdict
 from fitting.analysis.playback import Playback
 from fitting.experiments.experiment import Experiment
+from fitting.experiments.problems import ClipData
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.joint import fit_with_noise
 from fitting.inference.noise.model import NoiseModel, noise_of
@@ -133,6 +134,8 @@ class Fit:
     """False if the reference is the motion of another system: then sigmas are tolerances."""
     left: tuple[float, ...] = ()
     """Costs of solutions that were left because their profiles met a lower point."""
+    clips: tuple[ClipData, ...] = ()
+    """The clips of the problem with whole skeletons; without them no motion is shown or saved."""
 
     @cached_property
     def ik(self) -> jaxik.FootIK:
@@ -159,6 +162,7 @@ class Fit:
             independent_fraction=fraction,
             tails=float(self.problem.tails),
             sigmas_estimated=self.experiment.noise.sigmas == "estimated",
+            whitened=self.experiment.noise.correlation == "whitened",
             parameters=float(self.identifiability.contraction.sum()),
         )
 

@@ -3,11 +3,12 @@
 experiment.toml   what was fitted; paths are absolute, except to files of the run itself
 fit.json          the numbers of the fit
 parameters.toml   the fitted system
+base.npz          the flat animation, and fitted.npz the fitted motion; numbered for several clips
 chain.h5          the walkers; posterior.json is their summary
 posterior.nc      the kept draws for ArviZ, if it is installed
 search.json       how far an unfinished fit is
 lower_point.toml  the experiment, to begin at a point that the chain met below the fit
-summary.md, *.png to read
+summary.md, report.html, *.png to read
 
 Each file says in which format it is; one that does not is of an earlier release.
 """
@@ -15,11 +16,13 @@ Each file says in which format it is; one that does not is of an earlier release
 import dataclasses
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 import jaxik
+from fitting.datasets.clips import save_clip
 from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.systems import Preset
@@ -33,11 +36,13 @@ from fitting.runtime.storage.json_files import JsonFile, check_version, write_js
 from fitting.runtime.validation import error_context, flatten, read_toml
 
 from .fit import Fit, FitSummary
+from .motions.fit_motions import saved_clips
 from .posterior.replay_summary import summarise_replay
 from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
+PAGE = "report.html"
 INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
 SEARCH = "search.json"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
@@ -95,7 +100,9 @@ def save_solution(
 
 
 def save_fit(run: Path, fitted: Fit) -> None:
-    """Completes a run's folder, after `save_solution`, with the numbers of its fit."""
+    """Completes a run's folder, after `save_solution`, with the motions and numbers of its fit."""
+    for name, clip in saved_clips(fitted).items():
+        save_clip(run / name, clip)
     FIT_FILE.write(run / FIT, fitted.summary)
 
 
@@ -103,29 +110,22 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
     """The experiment and the numbers of a run.
 
     Raises:
-        ValueError: the folder holds no finished fit.
+        ValueError: the folder holds no finished fit, or a clip of its experiment is gone.
     """
-    if not run.is_dir():
-        raise ValueError(f"{run}: {'a file' if run.exists() else 'no such folder'}; {HINT}")
-    for name in (EXPERIMENT, FIT, PARAMETERS):
-        if not (run / name).is_file():
-            present = sorted(path.name for path in run.iterdir()) or "nothing"
-            raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
-    summary = FIT_FILE.read(run / FIT)
-    with error_context(f"{run / FIT}: not the numbers of a fit"):
-        _check_numbers(summary)
+    _check_files(run, (EXPERIMENT, FIT, PARAMETERS))
+    summary = _load_summary(run)
     _check_toml_format(run / EXPERIMENT)
     return experiment_files.load_experiment(run / EXPERIMENT), summary
 
 
 def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
-    """The fitted system of a run, for the body of a rig.
+    """The fitted system of a run, for the body of a rig; its clips may be gone.
 
     Raises:
         ValueError: the folder holds no finished fit, or its system lacks a fitted parameter.
     """
-    _, summary = load_fit(run)
-    path = run / PARAMETERS
+    _check_files(run, (FIT, PARAMETERS))
+    summary, path = _load_summary(run), run / PARAMETERS
     _check_toml_format(path)
     present = flatten(read_toml(path, "a parameter"), 2)
     names = {row["name"].partition("[")[0] for row in summary["parameters"]}
@@ -133,6 +133,23 @@ def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
         raise ValueError(f"{path}: not the system of this fit: no {', '.join(missing)}; {HINT}")
     ik, _ = parameter_files.load_system(path, rig)
     return ik
+
+
+def _check_files(run: Path, names: Sequence[str]) -> None:
+    """Raises ValueError for a folder that lacks one of these files."""
+    if not run.is_dir():
+        raise ValueError(f"{run}: {'a file' if run.exists() else 'no such folder'}; {HINT}")
+    for name in names:
+        if not (run / name).is_file():
+            present = sorted(path.name for path in run.iterdir()) or "nothing"
+            raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
+
+
+def _load_summary(run: Path) -> FitSummary:
+    summary = FIT_FILE.read(run / FIT)
+    with error_context(f"{run / FIT}: not the numbers of a fit"):
+        _check_numbers(summary)
+    return summary
 
 
 def _check_numbers(summary: FitSummary) -> None:

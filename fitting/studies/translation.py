@@ -19,7 +19,7 @@ import numpy as np
 import jaxik
 from fitting.analysis import difference
 from fitting.datasets import clip_frames, clips
-from fitting.datasets.clips import Clip, edit
+from fitting.datasets.clips import edit
 from fitting.datasets.ground_path import place_root
 from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
@@ -85,8 +85,8 @@ class Translation:
     source: NamedSystem
     target: NamedSystem
     experiment: Experiment
-    motions: tuple[Clip, ...]
-    """Of the source, for each clip."""
+    clips: tuple[ClipData, ...]
+    """Their references are the motions of the source."""
     problem: Problem[jaxik.FootIK]
     free_was_chosen: bool
     """By the user, and not by a sweep over all parameters."""
@@ -201,8 +201,8 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
             raise ValueError(f"no parameter of {target.name} moves anything in these clips")
         experiment = replace(experiment, free={name: experiment.free[name] for name in moving})
         problem = problem_from_clips(experiment, data)
-    motions = tuple(clip.reference for clip in data)
-    return Translation(source, target, experiment, motions, problem, request.free is not None)
+    chosen = request.free is not None
+    return Translation(source, target, experiment, tuple(data), problem, chosen)
 
 
 def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ...]:
@@ -214,7 +214,7 @@ def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ..
             terrain=animation.terrain.resolve(),
             base=animation.clip.resolve(),
             truth=run / SOURCE if same_rules else None,
-            file_up=animation.file_up,
+            **ClipEntry.reading(animation.clip_options, animation.terrain_options),
             label=f"source: {source.name}",
             mask_pops=False,
             root=animation.root,
@@ -225,7 +225,7 @@ def _clip_entries(request: TranslationRequest, run: Path) -> tuple[ClipEntry, ..
 
 def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None) -> ClipData:
     """What the source makes of a clip, as the reference."""
-    animation = load_animation(files)
+    animation = load_animation(files, to_fit=True)
     if fps is not None:
         clip = edit.resample(animation.clip, fps)
         clip, root = place_root(clip, animation.terrain, animation.root.root, animation.floor)
@@ -279,10 +279,21 @@ def is_translation(run: Path) -> bool:
     return (run / SOURCE).is_file()
 
 
+def check_folder(run: Path) -> None:
+    """Checks that a translation can be made here: in a new folder, or where one is unfinished.
+
+    Raises:
+        ValueError: the folder holds something else, or cannot be made.
+    """
+    if not (is_translation(run) and (run / run_folder.SEARCH).is_file()):
+        run_folder.check_new_folder(run)
+
+
 def save_source(run: Path, translation: Translation) -> None:
-    """Starts the folder of the run with the source's motion and parameters."""
+    """Starts the folder of the run with the source's parameters, which name it, and its motion."""
     run.mkdir(parents=True, exist_ok=True)
-    for entry, motion in zip(translation.experiment.clips, translation.motions, strict=True):
-        clips.save_clip(entry.reference, motion, joints=clip_frames.positions_by_role(motion))
     source = translation.source
     files.write_text(run / SOURCE, parameter_files.system_to_toml(source.ik, source.preset))
+    for entry, data in zip(translation.experiment.clips, translation.clips, strict=True):
+        motion = data.reference
+        clips.save_clip(entry.reference, motion, joints=clip_frames.positions_by_role(motion))

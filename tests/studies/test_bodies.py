@@ -13,6 +13,7 @@ from fitting.analysis import measures, placement
 from fitting.datasets.clip_frames import clip_from_result, frames_from_clip
 from fitting.datasets.clips import Clip, edit, load_clip, save_clip
 from fitting.datasets.ground_path import place_root
+from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
@@ -120,7 +121,9 @@ def test_what_is_visible_of_a_foot_is_as_large_as_its_body(walk):
 
 
 def test_an_experiment_is_for_the_body_of_its_clip_unless_it_says_adult(tmp_path):
-    clips, ground = ROOT / "data" / "clips", ROOT / "data" / "terrains" / "uneven_walk.ply"
+    clips, ground = ROOT / "data" / "clips", tmp_path / "floor.ply"
+    corners = np.array([[-100.0, 0.0, -100.0], [-100, 0, 100], [100, 0, 100], [100, 0, -100]])
+    save_mesh(ground, corners, np.array([[0, 1, 2], [0, 2, 3]]))  # wide enough for a giant
     text = f"""
         preset = "record"
         [[clips]]

@@ -102,11 +102,15 @@ def test_a_right_program_is_inside_all_bounds(experiment_file):
 
 
 @pytest.mark.parametrize(
-    ("noise", "shift"), [(3.0, 0.0), (1.0, 2.0)], ids=["three times the noise", "a shift"]
+    ("noise", "shift", "count"),
+    [(3.0, 0.0, 24), (1.0, 2.0, 12)],
+    ids=["three times the noise", "a shift"],
 )
-def test_a_wrong_noise_is_found_by_intervals_and_ranks(experiment_file, monkeypatch, noise, shift):
+def test_a_wrong_noise_is_found_by_intervals_and_ranks(
+    experiment_file, monkeypatch, noise, shift, count
+):
     monkeypatch.setattr(replicates, "simulate", simulation(noise, shift))
-    assessment = calibrate(experiment_file, None, 24, chains=True)
+    assessment = calibrate(experiment_file, None, count, chains=True)
     assert not assessment.inside
     assert "the fit's 95 % intervals" in assessment.outside
     assert {"the ranks of pelvis.on_gain", "the ranks of foot.max_pitch"} <= {*assessment.outside}

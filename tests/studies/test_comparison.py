@@ -95,6 +95,26 @@ def test_wrong_systems_are_rejected(options, message, tmp_path, monkeypatch):
         comparison.named_systems(options)
 
 
+def test_runs_are_named_by_their_folders_and_files_by_as_many_as_tell_them_apart(tmp_path):
+    places = (
+        "walk/parameters.toml",
+        "stairs/parameters.toml",
+        "a/own.toml",
+        "b/own.toml",
+        "c.toml",
+    )
+    for place in places:
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_text('preset = "ozz"\n')
+    files = [str(tmp_path / place) for place in ("walk", *places[1:])]
+    systems = comparison.named_systems([("--parameters", ",".join(files)), ("--presets", "ozz")])
+    assert list(systems) == ["walk", "stairs", "a/own", "b/own", "c", "ozz"]
+    with pytest.raises(ValueError, match="already is a system named 'walk'"):
+        comparison.named_systems([("--parameters", f"{files[0]},{files[0]}/parameters.toml")])
+    with pytest.raises(ValueError, match="parameters.toml: no such file"):
+        comparison.named_systems([("--parameters", str(tmp_path))])
+
+
 # What is measured
 
 

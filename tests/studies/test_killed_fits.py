@@ -16,6 +16,7 @@ import fitting
 from fitting.cli import main
 from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
+from fitting.inference.profiles import profiling
 from fitting.jobs import fits
 from fitting.runtime.storage.claimed_folder import LOCK, claimed
 from fitting.studies import assess, run_folder
@@ -28,7 +29,7 @@ FEW = "[fit]\nstarts = 2\n[fit.search]\nagreeing_starts = 3\n"
 
 
 @pytest.fixture
-def experiment_file(tmp_path, monkeypatch) -> Path:
+def experiment_file(tmp_path, monkeypatch, undrawn) -> Path:
     monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
     return write(tmp_path, clips=CLIP, clip="start = 1.0\nend = 1.5", rest=FEW)
 
@@ -77,6 +78,24 @@ def test_a_killed_fit_goes_on_to_the_fit_of_an_unbroken_one(killed, experiment_f
     assert content(killed / run_folder.FIT) == content(whole / run_folder.FIT)
     for name in (run_folder.PARAMETERS, run_folder.EXPERIMENT):
         assert (killed / name).read_text() == (whole / name).read_text()
+
+
+def test_a_fit_that_was_killed_in_its_profiles_goes_on_after_their_last_stage(
+    killed, experiment_file, monkeypatch
+):
+    stages = list(profiling.STAGES)
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(profiling, "STAGES", [*stages[:4], stop])
+        fitting.fit(experiment_file, killed)
+    whole = fitting.fit(experiment_file)
+    lines: list[str] = []
+    monkeypatch.setattr(profiling, "STAGES", [stop] * 4 + stages[4:])
+    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_: None)
+    again = fitting.fit(experiment_file, killed, log=lines.append)
+    (line,) = [line for line in lines if "goes on after" in line]
+    assert line.endswith(" stages of its search and 4 of its profiles")
+    assert again.parameters == whole.parameters
+    assert not (killed / run_folder.SEARCH).exists()
 
 
 @pytest.mark.parametrize("change", ["seed = 1", 'loss = "huber"'])

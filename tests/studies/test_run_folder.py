@@ -119,6 +119,17 @@ def test_an_unfinished_run_is_rejected(fitted, tmp_path, name, text, message):
         run_folder.load_fit(tmp_path)
 
 
+def test_a_fitted_system_needs_neither_experiment_nor_clips(fitted, tmp_path):
+    save(tmp_path, fitted)
+    whole = run_folder.load_fitted_system(tmp_path)
+    (tmp_path / run_folder.EXPERIMENT).unlink()
+    alone = run_folder.load_fitted_system(tmp_path)
+    assert parameter_tree.get(alone, "pelvis.limit") == parameter_tree.get(whole, "pelvis.limit")
+    (tmp_path / run_folder.FIT).unlink()
+    with pytest.raises(ValueError, match="no fit.json; there is"):
+        run_folder.load_fitted_system(tmp_path)
+
+
 def test_a_missing_or_empty_folder_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="no such folder; `jaxik fit` makes a run"):
         run_folder.load_fit(tmp_path / "no")

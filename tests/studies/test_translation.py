@@ -12,15 +12,17 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.analysis import difference, playback
 from fitting.cli import main, progress
-from fitting.datasets import clip_frames
+from fitting.datasets import clip_frames, clips
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.flat_animation import load_flat_animation
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments import parameter_files, problems, systems
 from fitting.inference import sensitivity
-from fitting.report import difference_report
+from fitting.jobs import fits
+from fitting.report import difference_report, translation_report
 from fitting.report.labels import DIFFERENCES
 from fitting.studies import run_folder, translation
+from fitting.studies.animations import AnimationFiles
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from support import quick
@@ -217,7 +219,7 @@ def test_only_parameters_that_move_the_clip_are_free_by_default(run):
 
 
 def test_an_interrupted_translation_writes_its_best_point(
-    quick_residuals, source, clip, tmp_path, monkeypatch, capsys
+    quick_residuals, undrawn, source, clip, tmp_path, monkeypatch, capsys
 ):
     def interrupt(_) -> str:
         signal.raise_signal(signal.SIGINT)
@@ -231,6 +233,42 @@ def test_an_interrupted_translation_writes_its_best_point(
     assert numbers["message"].startswith("Interrupted after 0 steps")
     assert "Interrupted after 0 steps" in (tmp_path / "run" / run_folder.SUMMARY).read_text()
     assert (tmp_path / "run" / "source.npz").is_file()
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [(clips, "save_clip"), (fits, "load_known_values"), (fits, "assess_solution")],
+    ids=["before its source", "before its fit", "before its profiles"],
+)
+def test_a_translation_that_dies_after_its_search_goes_on_in_its_folder(
+    quick_residuals, clip, source, tmp_path, monkeypatch, module, name
+):
+    class Stop(Exception):
+        pass
+
+    def stop(*_: object, **named: object) -> None:
+        raise Stop
+
+    def translate(folder: str) -> list[str]:
+        lines: list[str] = []
+        animation = AnimationFiles(clip, GROUND)
+        free = dict.fromkeys(quick.TARGETS, {})
+        mine, record = map(translation.load_named_system, (str(source), "record"))
+        request = translation.TranslationRequest(mine, record, (animation,), free)
+        fits.translate(request, tmp_path / folder, log=lines.append)
+        return lines
+
+    monkeypatch.setattr(translation_report, "write", lambda *_: None)
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(module, name, stop)
+        translate("run")
+    assert (tmp_path / "run" / run_folder.SEARCH).is_file()
+    assert any("goes on after" in line for line in translate("run"))
+    translate("whole")
+    for file in (run_folder.PARAMETERS, run_folder.EXPERIMENT, translation.SOURCE, "source.npz"):
+        assert (tmp_path / "run" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
+    with pytest.raises(ValueError, match="there is something in it already"):
+        translate("run")
 
 
 @pytest.mark.parametrize(

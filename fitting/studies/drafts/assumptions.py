@@ -1,0 +1,138 @@
+"""What a first experiment takes for granted of its clips, and how well the clips bear it out."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.datasets import coverage
+from fitting.datasets.clips import Clip, contacts, flight, summary
+from fitting.datasets.terrain import mesh_files
+from fitting.datasets.terrain.reconstruction import Reconstruction
+from fitting.experiments.problems import ClipData
+from jaxik.world import body
+
+FEW_STANCES = 6  # of a foot
+SCATTER = 0.03  # m, of soles above the ground, from which on the two do not belong together
+RELIEF = 0.05  # m between the lowest and the highest stance, below which ground is flat
+
+
+class Assumption(NamedTuple):
+    """Something taken for granted."""
+
+    topic: str
+    text: str
+    """What is assumed, and from what."""
+    advice: str = ""
+    """What to check or to do better; empty where the clip bears it out."""
+
+
+def of_clip(
+    data: ClipData, ground: Reconstruction | None, *, base_is_own: bool
+) -> list[Assumption]:
+    """The assumptions about one clip of an experiment.
+
+    Args:
+        data: the loaded clip.
+        ground: what the terrain was reconstructed from; None for a terrain that was given.
+        base_is_own: whether the flat animation was given, and not made from the capture.
+    """
+    return [
+        *_body(data.reference),
+        *_legs(data.reference),
+        *_ground(data, ground),
+        _base(data, base_is_own=base_is_own),
+    ]
+
+
+def _body(clip: Clip) -> Iterator[Assumption]:
+    length = body.leg_length(clip.rig)
+    text = f"{clip.scale:.6g} m per unit of the file, {clip.up_axis} up: legs {length:.2f} m long"
+    yield Assumption("body", text)
+    for remark in clip.remarks:
+        yield Assumption("file", remark, "see `jaxik inspect`")
+    if text := flight.describe(clip):
+        yield Assumption("air", text)
+
+
+def _legs(clip: Clip) -> Iterator[Assumption]:
+    described = summary.describe(clip)
+    for leg, name in enumerate(clip.rig.names):
+        bend = knee_bend(clip)[:, leg]
+        low, high = np.degrees(np.percentile(bend, [1, 99]))
+        text = f"the {name} knee bends by {low:.0f}° to {high:.0f}°"
+        yield Assumption("knees", text)
+    for name, leg in described["legs"].items():
+        text = (
+            f"the {name} foot stands {leg['contacts']} times, {leg['contact_share']:.0%} of the "
+            f"frames (from the {leg['contacts_from']})"
+        )
+        few = leg["contacts"] < FEW_STANCES
+        yield Assumption(
+            "contacts", text, "few steps determine little: take a longer clip" if few else ""
+        )
+
+
+def knee_bend(clip: Clip) -> Float[np.ndarray, "frames legs"]:
+    """Angle between thigh and shin, rad: 0 in a straight leg."""
+    hip, knee, ankle = (clip.joints_ws(role) for role in range(3))
+    thigh, shin = knee - hip, ankle - knee
+    lengths = np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shin, axis=-1)
+    cosines = np.sum(thigh * shin, axis=-1) / np.maximum(lengths, 1e-12)
+    return np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def _ground(data: ClipData, ground: Reconstruction | None) -> Iterator[Assumption]:
+    heights, soles = _under_stances(data)
+    covered = ~np.isnan(heights)
+    if ground is not None:
+        error = 100 * ground.predictions[ground.chosen].rms
+        text = (
+            f"reconstructed from {int(ground.stances.used.sum())} stances ({ground.chosen}); each "
+            f"is predicted from the others to {error:.1f} cm (rms)"
+        )
+        doubt = "it is not to be trusted; " if 100 * SCATTER < error else ""
+        yield Assumption("ground", text, f"{doubt}better: a scan of the ground, with --terrain")
+    elif not covered.any():
+        yield Assumption("ground", "no foot stands on it", "better: a clip in which the feet stand")
+        return
+    else:
+        gap = (soles - heights)[covered]
+        text = (
+            f"below {covered.mean():.0%} of the stances; soles stand {100 * np.median(gap):.1f} cm "
+            f"above it, give or take {100 * np.std(gap):.1f} cm"
+        )
+        advice = "does this ground belong to this clip?"
+        fits = covered.mean() >= coverage.ENOUGH and np.std(gap) < SCATTER
+        yield Assumption("ground", text, "" if fits else advice)
+    relief = np.ptp(heights[covered]) if covered.any() else 0.0
+    text = f"stances differ by {100 * relief:.0f} cm in height"
+    flat = "foot IK has little to do there; better: clips on steps and slopes"
+    yield Assumption("relief", text, "" if relief >= RELIEF else flat)
+
+
+def _under_stances(data: ClipData) -> tuple[np.ndarray, np.ndarray]:
+    """Heights of ground and sole in the middle of each stance, m; NaN where there is no ground."""
+    clip, height_under = data.reference, mesh_files.height_function(data.terrain)
+    standing, ankles = clip.stance_labels(), clip.joints_ws(2)
+    places = [
+        (sum(run) // 2, leg)
+        for leg in range(standing.shape[1])
+        for run in contacts.runs(standing[:, leg])
+    ]
+    if not places:
+        return np.full(1, np.nan), np.zeros(1)
+    frames, legs = np.array(places).T
+    points = ankles[frames, legs]
+    return height_under(points), points[:, 1] - np.asarray(clip.rig.ankle_height)[legs]
+
+
+def _base(data: ClipData, *, base_is_own: bool) -> Assumption:
+    if base_is_own:
+        return Assumption("base", f"{data.base.source}; its root {data.root.reason}")
+    return Assumption(
+        "base",
+        "made from the capture, with the ground taken out from under the feet",
+        "better: the flat animation that the game plays, with --base",
+    )

@@ -1,0 +1,1 @@
+"""Whole skeletons of what studies are about, for run folders and pages."""

@@ -1,0 +1,72 @@
+"""What it costs to fit only what the game's record holds."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+import jaxik
+from fitting.analysis import playback
+from fitting.analysis.goodness import groups
+from fitting.experiments.record_only import left_out
+from fitting.inference.optimisation.solution import Progress
+from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
+
+from .fit import Fit, search
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordPrice:
+    """A fit of what the record holds, beside one of all that the experiment would have free."""
+
+    left_out: tuple[str, ...]
+    """Free parameters of the experiment that the record has no room for."""
+    cost: float
+    """Of the fit of what the record holds."""
+    whole_cost: float
+    """With all of them free; one search from there, so that it is no lower bound."""
+    errors: Mapping[str, tuple[float, float]]
+    """Root mean square of both by kind of residual; m, rad, ..."""
+
+
+@in_float64
+def measure(fitted: Fit, progress: Callable[[Progress], None] | None = None) -> RecordPrice | None:
+    """Fits what the experiment would have free without the restriction, from where its fit ended.
+
+    Args:
+        fitted: the fit of a restricted experiment.
+        progress: called as the search goes on.
+
+    Returns:
+        None if the restriction left nothing out, or if Ctrl-C ended either search.
+    """
+    names, whole = left_out(fitted.experiment), fitted.experiment.whole
+    if not names or whole is None or fitted.solution.interrupted:
+        return None
+    rig = fitted.problem.data[0].rig
+    space = whole.space(whole.starting_system(rig), rig)
+    problem = dataclasses.replace(fitted.problem, space=space)
+    begin = {**whole.start, **dict(zip(fitted.solution.names, fitted.solution.values, strict=True))}
+    options = dataclasses.replace(whole.fit, starts=1)
+    settings = dataclasses.replace(whole, fit=options)
+    freed = search(problem, settings, progress, np.asarray(space.pack(begin)))
+    if freed.interrupted:
+        return None
+    ik = space.unpack(freed.u)
+    before, after = _errors(fitted.problem, fitted.ik), _errors(problem, ik)
+    errors = {kind: (before[kind], after[kind]) for kind in before}
+    return RecordPrice(tuple(names), fitted.solution.cost, freed.cost, errors)
+
+
+def _errors(problem: Problem[jaxik.FootIK], ik: jaxik.FootIK) -> dict[str, float]:
+    """Root mean square of the errors by kind, over all clips."""
+    squares: dict[str, list[np.ndarray]] = {}
+    for scene in problem.data:
+        play = playback.play(scene, playback.run(ik, scene))
+        for kind in play.fitted_kinds:
+            in_sigmas, _, counts = groups.series(play, kind)
+            sizes = in_sigmas[counts] * float(play.sigmas[kind])
+            squares.setdefault(kind, []).append(sizes**2)
+    return {kind: math.sqrt(np.concatenate(parts).mean()) for kind, parts in squares.items()}
