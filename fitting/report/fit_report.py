@@ -1,4 +1,4 @@
-"""The report of a fit: text for the terminal, and the run's summary.md with its plots."""
+"""The report of a fit: text for the terminal, the run's summary.md with its plots, its page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +20,8 @@ from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, markdown
 from .goodness import goodness_report
 from .identifiability.sections import sections as identifiability_sections
+from .page import fit_page
+from .page.fit_page import Measured
 from .plots import fit_plots, goodness_plots, profile_plots, style, worst_window_plots
 from .uncertainty import priors
 
@@ -44,7 +46,7 @@ def fit_text(fitted: Fit) -> str:
 def write_fit(
     run: Path, fitted: Fit, opening: Sequence[str] = (), details: Sequence[str] = ()
 ) -> None:
-    """Writes the plots of a fit and a new summary.md into the folder of its run.
+    """Writes the plots of a fit, a new summary.md and its page into the folder of its run.
 
     Args:
         run: the folder.
@@ -54,9 +56,10 @@ def write_fit(
     """
     plots: Plots = {}
     worst = ["## The worst two seconds"]
-    before = fitted.problem.space.unpack(fitted.problem.space.pack({}))
+    system = fitted.problem.space.unpack(fitted.problem.space.pack({}))
+    before = [playback.run(system, scene) for scene in fitted.problem.data]
     for index, (scene, after) in enumerate(zip(fitted.problem.data, fitted.playbacks, strict=True)):
-        first = playback.play(scene, playback.run(before, scene))
+        first = playback.play(scene, before[index])
         plots |= _draw_clip(run, fitted, index, first, after)
         worst += _worst_window(run, fitted, index, after)
     plots |= _draw_profiles(run, fitted)
@@ -81,6 +84,8 @@ def write_fit(
         gallery(plots),
     ]
     files.write_text(run / SUMMARY, "\n\n".join(parts) + "\n")
+    if fitted.clips:
+        fit_page.write(run, fitted, Measured(before, clips))
 
 
 def save_plot(run: Path, name: str, caption: str, figure: Figure) -> Plots:

@@ -31,13 +31,13 @@ class PlacementWarning(UserWarning):
 
 
 CAUSES = {
-    "up": "the other axis of the terrain's file is up (--file-up)",
-    "units": "the terrain is in another unit of length: one of its units is {0:.4g} m",
-    "aside": "the terrain does not lie below the path",
+    "missing": "the terrain does not lie below the path (its scale, its up axis or its place)",
+    "units": "the terrain is in another unit of length: one of its units is {0:.4g} m "
+    "(--terrain-scale)",
     "offset": "all feet are {1:.0f} cm too {2}: check the clip's floor (--floor) and the height of "
-    "the terrain",
+    "the terrain (--terrain-offset)",
     "root": "the root stays on the animation's floor where the ground rises (use --root ground)",
-    "unknown": "none of units, up axis, root, floor and offset; look at these frames",
+    "unknown": "none of missing ground, units, root, floor and offset; look at these frames",
 }
 
 

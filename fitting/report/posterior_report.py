@@ -13,6 +13,7 @@ from .fit_report import gallery, save_plot
 from .fit_tables import Truth
 from .formatting import Table, aligned, bullets, interval, markdown, number, percent
 from .goodness import noise_report
+from .page import posterior_section
 from .plots import posterior_plots
 from .uncertainty import band_plots, left_out, predictive
 from .uncertainty.contradictions import contradiction_sentences
@@ -41,7 +42,7 @@ def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
 
 
 def write_posterior(run: Path, sampled: SampledFit) -> None:
-    """Writes the plots of a posterior and its section of summary.md, in place of an older one.
+    """Writes the plots of a posterior, and its part of summary.md and page in place of older ones.
 
     Args:
         run: the folder of the run.
@@ -62,9 +63,11 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
     figure = posterior_plots.chain(posterior, labels, known_values, title)
     plots |= save_plot(run, "chain.png", title, figure)
 
-    parts = [HEADING, *(f"**{line}**" for line in contradiction_sentences(sampled, run))]
-    parts.append(bullets(_health(posterior)))
-    parts.append(markdown(posterior_table(posterior, known_values, units)))
+    contradictions = contradiction_sentences(sampled, run)
+    table = posterior_table(posterior, known_values, units)
+    posterior_section.insert(run, contradictions, _health(posterior), table)
+    parts = [HEADING, *(f"**{line}**" for line in contradictions)]
+    parts += [bullets(_health(posterior)), markdown(table)]
     if posterior.sigmas:
         parts.append("Sigmas of the noise, which were sampled along:")
         parts.append(markdown(noise_report.sigma_table(posterior.sigmas)))

@@ -28,6 +28,19 @@ def check_output_files(mesh: Path) -> None:
         files.check_output_file(path)
 
 
+def check_new_files(mesh: Path) -> None:
+    """Raises ValueError where a file that `write` would write is there already."""
+    for path in (mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)):
+        if path.exists():
+            raise ValueError(f"{path}: is there already; name another folder")
+
+
+def remove(mesh: Path) -> None:
+    """Removes what `write` has written, as far as it is there."""
+    for path in (mesh, mesh.with_suffix(NUMBERS), mesh.with_suffix(FIGURE)):
+        path.unlink(missing_ok=True)
+
+
 def write(mesh: Path, terrain: Reconstruction, clip: Clip, sole: float, margin: float) -> None:
     """Writes the chosen surface as a mesh, and beside it the numbers and a picture.
 
@@ -69,6 +82,8 @@ def count_stances(terrain: Reconstruction) -> str:
     if stances.toes.any():
         used = int((stances.toes & stances.used).sum())
         text += f"; {int(stances.toes.sum())} on toes, {used} of them used"
+    if not (stances.used | stances.toes).all():
+        text += f"; surfaces are fitted to {int(stances.used.sum())} of all, evenly chosen"
     return text
 
 

@@ -53,15 +53,14 @@ def test_feet_within_all_limits_are_no_warning():
             Cause("root"),
             "the root stays on the animation's floor where the ground rises (use --root",
         ),
-        (Cause("up"), "the other axis of the terrain's file is up (--file-up)"),
         (
             Cause("units", 0.01),
             "the terrain is in another unit of length: one of its units is 0.01 m",
         ),
         (Cause("offset", -0.12), "all feet are 12 cm too low: check the clip's floor (--floor)"),
         (Cause("offset", 0.5), "all feet are 50 cm too high"),
-        (Cause("aside"), "the terrain does not lie below the path"),
-        (Cause("unknown"), "none of units, up axis, root, floor and offset"),
+        (Cause("missing"), "the terrain does not lie below the path"),
+        (Cause("unknown"), "none of missing ground, units, root, floor and offset"),
     ],
 )
 def test_feet_off_the_ground_are_a_warning_with_frames_and_the_likely_cause(cause, words):
@@ -73,7 +72,7 @@ def test_feet_off_the_ground_are_a_warning_with_frames_and_the_likely_cause(caus
 
 
 def test_missing_ground_slides_and_pops_are_warnings():
-    (text,) = placement_report.warning_texts(UNKNOWN, Cause("aside"))
+    (text,) = placement_report.warning_texts(UNKNOWN, Cause("missing"))
     assert text.startswith("there is no ground under 100.0 % of the soles; likely cause: ")
     bad = dataclasses.replace(GOOD, slide=0.05, pop=Extreme(0.124, 3, "left"))
     assert placement_report.warning_texts(bad, None) == [

@@ -1,19 +1,25 @@
 """Run folders that need no search: fits with invented numbers."""
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.analysis import playback
+from fitting.analysis.limit_activity import ClipActivity
 from fitting.experiments import experiment_files, problems
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.report.page import fit_page
+from fitting.report.page.fit_page import Measured
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
 
 from .experiments import CLIP, write
 from .profiles import parabolas
 
+LIMITS = {"leg.max_knee_angle": 0.5, "pelvis.limit": 0.0}  # fractions of the frames
 NAMES = ("pelvis.on_gain", "foot.max_pitch")
 
 
@@ -52,6 +58,21 @@ def invented_fit(folder: Path, more: str = "") -> Fit:
         improvement=0.0,
     )
     return Fit(experiment, problem, solution, identifiability)
+
+
+def with_clips(fitted: Fit) -> Fit:
+    """The fit with the clips of its problem, which its page shows."""
+    return dataclasses.replace(fitted, clips=problems.load_clips(fitted.experiment))
+
+
+def write_run(run: Path, fitted: Fit) -> None:
+    """Writes a fit that has its clips, and its page with invented activities."""
+    save(run, fitted)
+    (scene,), foot = fitted.problem.data, np.array([0.5, 0.75])
+    counts = (scene.rig.names, scene.frames.dt.size, 0.2)
+    activity = ClipActivity(*counts, foot, foot, foot, foot, (1, 2), (1, 1), LIMITS)
+    before = playback.run(fitted.problem.space.unpack(fitted.problem.space.pack({})), scene)
+    fit_page.write(run, fitted, Measured([before], [activity]))
 
 
 def save(run: Path, fitted: Fit) -> None:

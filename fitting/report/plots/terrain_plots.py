@@ -44,9 +44,7 @@ def plan(terrain: Reconstruction, margin: float, legs: tuple[str, ...], title: s
     ]
     entries: list[Artist] = [*marks]
     if not terrain.stances.used.all():
-        entries.append(
-            Line2D([], [], color="black", marker="x", linestyle="", label="on toes, not used")
-        )
+        entries.append(Line2D([], [], color="black", marker="x", linestyle="", label="not used"))
     if isinstance(terrain.surface, LevelBlocks):
         entries.append(Patch(facecolor="white", edgecolor=BEFORE, hatch="///", label="not visited"))
     entries += [

@@ -1,0 +1,32 @@
+"""A first experiment: its files, and what it assumes as text for the terminal."""
+
+from fitting.report import terrain_report
+from fitting.report.formatting import aligned
+from fitting.runtime import files
+from fitting.studies.drafts.draft import Draft, Ground
+
+from . import experiment_text
+
+MARGIN = 2.0  # m of ground around the stances, over which a foot may swing
+
+
+def write_ground(ground: Ground) -> None:
+    """Writes ground that was reconstructed, with its numbers and a picture."""
+    terrain_report.write(ground.mesh, ground.terrain, ground.clip, ground.sole, MARGIN)
+
+
+def write(draft: Draft) -> None:
+    """Writes the experiment."""
+    files.write_text(draft.experiment.path, experiment_text.as_toml(draft))
+
+
+def text(draft: Draft) -> str:
+    """What is assumed of each clip, what would be better, and what is free."""
+    parts = []
+    for entry, assumptions in zip(draft.experiment.clips, draft.assumptions, strict=True):
+        rows = [["assumed", "from the clip", "what to check or improve"]]
+        rows += [[topic, said, advice] for topic, said, advice in assumptions]
+        parts += [entry.reference.name, aligned(rows), ""]
+    free = [forecast.name for forecast in draft.forecasts if forecast.is_free]
+    parts.append(f"free: {len(free)} of {len(draft.forecasts)} parameters: {', '.join(free)}")
+    return "\n".join(parts)

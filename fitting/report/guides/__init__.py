@@ -1,0 +1,1 @@
+"""Lists that explain: the parameters of a system, the keys of an experiment file."""

@@ -1,0 +1,123 @@
+// Unpacks what fitting/report/page/motion_data.py has packed.
+
+const FADE = 0.3; // m inside its edge, for an adult, over which the ground appears
+
+function bytesOf(base64) {
+  return Uint8Array.from(atob(base64), (character) => character.charCodeAt(0)).buffer;
+}
+
+class Skeleton {
+  constructor(packed, legs) {
+    Object.assign(this, packed);
+    this.root = new Float32Array(bytesOf(packed.root));
+    this.offsets = new Int16Array(bytesOf(packed.offsets));
+    this.inGround = new Uint8Array(bytesOf(packed.inGround));
+    this.footBones = new Map(); // leg by bone, "parent-child"
+    packed.legs.forEach((joints, leg) => this.footBones.set(`${joints[2]}-${joints[3]}`, leg));
+    this.legCount = legs;
+    this.positions = new Float32Array(3 * packed.points);
+  }
+
+  // All points at a time in frames, linear between two, in `positions`; m.
+  pose(time) {
+    const last = this.root.length / 3 - 1;
+    const first = Math.min(Math.floor(time), last);
+    const second = Math.min(first + 1, last);
+    const part = time - first;
+    const count = 3 * this.points;
+    for (let i = 0; i < count; i++) {
+      const axis = i % 3;
+      const a = this.root[3 * first + axis] + this.quantum * this.offsets[count * first + i];
+      const b = this.root[3 * second + axis] + this.quantum * this.offsets[count * second + i];
+      this.positions[i] = a + part * (b - a);
+    }
+    return this.positions;
+  }
+
+  point(index) {
+    return [...this.positions.subarray(3 * index, 3 * index + 3)];
+  }
+
+  // How far the shown pose reaches below and above its pelvis, m.
+  reach() {
+    const heights = Array.from({ length: this.points }, (_, i) => this.positions[3 * i + 1]);
+    const pelvis = heights[this.pelvis];
+    return [pelvis - Math.min(...heights), Math.max(...heights) - pelvis];
+  }
+
+  // Which feet are in the ground in the frame that is shown.
+  sunkLegs(time) {
+    const frame = Math.min(Math.round(time), this.root.length / 3 - 1);
+    return Array.from({ length: this.legCount }, (_, leg) => this.inGround[this.legCount * frame + leg] > 0);
+  }
+}
+
+class Ground {
+  constructor(packed, size) {
+    Object.assign(this, packed);
+    const steps = new Uint16Array(bytesOf(packed.heights));
+    const { rows, columns, spacing } = packed;
+    const HOLE = 65535;
+    this.size = size;
+    this.positions = new Float32Array(3 * rows * columns);
+    this.normals = new Float32Array(3 * rows * columns);
+    const height = (row, column) => {
+      const inside = row >= 0 && row < rows && column >= 0 && column < columns;
+      const step = inside ? steps[row * columns + column] : HOLE;
+      return step === HOLE ? NaN : packed.low + packed.quantum * step;
+    };
+    const slope = (before, here, after) => {
+      const known = !Number.isNaN(before) + !Number.isNaN(after);
+      if (!known) return 0;
+      const first = Number.isNaN(before) ? here : before;
+      const last = Number.isNaN(after) ? here : after;
+      return (last - first) / (known * spacing);
+    };
+    this.margins = new Float32Array(rows * columns);
+    const triangles = [];
+    this.lowest = Infinity;
+    this.highest = -Infinity;
+    for (let row = 0; row < rows; row++) {
+      for (let column = 0; column < columns; column++) {
+        const i = 3 * (row * columns + column);
+        const here = height(row, column);
+        this.positions.set([column * spacing, here, row * spacing], i);
+        const along = slope(height(row, column - 1), here, height(row, column + 1));
+        const across = slope(height(row - 1, column), here, height(row + 1, column));
+        this.normals.set(normalise([-along, 1, -across]), i);
+        this.margins[i / 3] = Number.isNaN(here) ? 0 : Infinity;
+        if (here < this.lowest) this.lowest = here;
+        if (here > this.highest) this.highest = here;
+        const corners = [i / 3, i / 3 + 1, i / 3 + columns, i / 3 + columns + 1];
+        const known = [here, height(row, column + 1), height(row + 1, column), height(row + 1, column + 1)];
+        if (!known.some(Number.isNaN)) {
+          triangles.push(corners[0], corners[2], corners[1], corners[1], corners[2], corners[3]);
+        }
+      }
+    }
+    this.triangles = new Uint32Array(triangles);
+    this.measureMargins(rows, columns);
+  }
+
+  // Distance from the edge of what is known, as a fraction of the band in which the ground fades.
+  measureMargins(rows, columns) {
+    const step = this.spacing / (FADE * this.size);
+    const margins = this.margins;
+    const at = (row, column) =>
+      row >= 0 && row < rows && column >= 0 && column < columns ? margins[row * columns + column] : 0;
+    const relax = (row, column, d) => {
+      const nearest = Math.min(
+        at(row, column + d) + step, at(row + d, column) + step,
+        at(row + d, column + d) + 1.414 * step, at(row + d, column - d) + 1.414 * step,
+      );
+      const i = row * columns + column;
+      margins[i] = Math.min(margins[i], nearest);
+    };
+    for (let row = 0; row < rows; row++) {
+      for (let column = 0; column < columns; column++) relax(row, column, -1);
+    }
+    for (let row = rows - 1; row >= 0; row--) {
+      for (let column = columns - 1; column >= 0; column--) relax(row, column, 1);
+    }
+  }
+}
