@@ -28,7 +28,7 @@ SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 20"
 
 
 @pytest.fixture
-def experiment_file(tmp_path, monkeypatch) -> Path:
+def experiment_file(tmp_path, monkeypatch, undrawn) -> Path:
     """Half a second of the uneven walk, with residuals that compile at once."""
     monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
     monkeypatch.chdir(tmp_path)
@@ -51,7 +51,8 @@ def test_a_fit_with_an_output_can_be_sampled_from_memory_and_from_disk(experimen
     experiment = fitting.load_experiment(experiment_file)
     fitted = fitting.fit(experiment, run, log=lines.append)
     assert fitted.run == run and lines[0].startswith("fitting 2 parameters of record to 1 clip")
-    assert lines[-1] == f"written to {run}; read {run / run_folder.SUMMARY}"
+    summary, page = run / run_folder.SUMMARY, run / run_folder.PAGE
+    assert lines[-1] == f"written to {run}; read {summary}, or open {page} in a browser"
     first = fitting.sample(fitted)
     assert (run / run_folder.CHAIN).is_file() and (run / run_folder.POSTERIOR).is_file()
     continued = fitting.sample(run, max_steps=30)

@@ -1,13 +1,15 @@
 """The command `jaxik`: runs one command and turns its errors into one line and an exit status."""
 
+import argparse
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from fitting.runtime import xla
 from fitting.runtime.validation import in_one_line
 
+from . import without_jax
 from .parser import make_parser
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
@@ -22,13 +24,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxik: a word with a null byte: {null[0]!r}", file=sys.stderr)
         return MISTAKE
     options = make_parser().parse_args(words)
-    xla.configure_xla()
     try:
-        from . import commands  # imports JAX, for which `--help` should not wait
-
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            status = commands.COMMANDS[options.command](options)
+            status = _function(options.command)(options)
             sys.stdout.flush()
             return status
     except BrokenPipeError:  # the reader, such as `head`, has enough
@@ -40,6 +39,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _function(command: str) -> Callable[[argparse.Namespace], int]:
+    """The function of a command; only imports JAX, which takes seconds, if that needs it."""
+    if command in without_jax.COMMANDS:
+        return without_jax.COMMANDS[command]
+    xla.configure_xla()
+    from . import commands
+
+    return commands.COMMANDS[command]
 
 
 def _with_new_command(words: list[str]) -> list[str]:

@@ -8,14 +8,17 @@ from .parsers.fits import (
     add_ablate,
     add_calibrate,
     add_fit,
+    add_init,
     add_population,
     add_sample,
     add_translate,
 )
+from .parsers.guides import add_completion, add_doctor, add_example, add_parameters, add_schema
 from .parsers.machine import add_bench, add_cache
 from .parsers.options import Parser
 
 EXAMPLES = """examples:
+  jaxik init walk.bvh -o walk                                  a first experiment of your clip
   jaxik fit data/experiments/uneven_walk.toml -o runs/walk     fit, with plots and a summary
   jaxik ablate data/experiments/blocks.toml -o runs/ablation   the fit without each of its rules
   jaxik calibrate data/experiments/ozz.toml -o runs/known      fits of known truths, judged
@@ -31,12 +34,17 @@ EXAMPLES = """examples:
   jaxik record to-toml footik.bin -o footik.toml
   jaxik bench --quick
   jaxik cache                                                  where compiled programs are kept
+  jaxik parameters stride                                      what each one is and does
+  jaxik schema                                                 all keys of an experiment file
+  jaxik example uneven_walk -o walk                            an experiment to begin with
+  jaxik doctor                                                 is this installation all right?
+  jaxik completion bash                                        for the shell's Tab key
 
-exit status: 0 when done, 2 for a mistake in the input, 3 when the search of `fit`, `population` or
-`translate` has not converged, 4 when `fit` has converged but does not fit, 5 when
-`calibrate` finds something outside its bounds, 130 when interrupted with Ctrl-C: `fit` then has
-written the best point so far, `sample` its chain, `ablate`, `calibrate` and `population` each
-finished fit, and `compare --suite` each finished situation.
+exit status: 0 when done, 1 when `doctor` finds a problem, 2 for a mistake in the input, 3 when the
+search of `fit`, `population` or `translate` has not converged, 4 when `fit` has converged but does
+not fit, 5 when `calibrate` finds something outside its bounds, 130 when interrupted with Ctrl-C:
+`fit` then has written the best point so far, `sample` its chain, `ablate`, `calibrate` and
+`population` each finished fit, and `compare --suite` each finished situation.
 `jaxik COMMAND --help` has more examples.
 """
 
@@ -51,8 +59,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
-        add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply, add_run,
-        add_compare, add_translate, add_inspect, add_terrain, add_bench, add_record, add_cache,
+        add_init, add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply,
+        add_run, add_compare, add_translate, add_inspect, add_terrain, add_bench, add_record,
+        add_cache, add_parameters, add_schema, add_example, add_doctor, add_completion,
     ):  # fmt: skip
         add(commands)
     return top

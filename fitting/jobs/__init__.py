@@ -8,10 +8,11 @@ them, so `log=print` shows the same.
 Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
 bits; a system that was made in 32 bits is taken with the values it has there.
 
-`fits` searches: `fit`, `sample`, `ablate` and `translate`. `calibrations` judges what they say:
-`calibrate`. `populations` fits several clips and subjects: `population`. `animations` runs finished
-systems: `solve`, `apply`, `compare` and `run_suite`. `comparisons` compares sampled runs:
-`compare_runs`.
+`drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample`, `ablate` and
+`translate`. `calibrations` judges what they say: `calibrate`. `populations` fits several clips and
+subjects: `population`. `animations` runs finished systems: `solve`, `apply`, `compare` and
+`run_suite`. `comparisons` compares sampled runs: `compare_runs`. `examples`
+copies the experiments that come with the package.
 """
 
 from .animations import apply as apply
@@ -20,6 +21,7 @@ from .animations import run_suite as run_suite
 from .animations import solve as solve
 from .calibrations import calibrate as calibrate
 from .comparisons import compare_runs as compare_runs
+from .drafts import init as init
 from .fits import ablate as ablate
 from .fits import fit as fit
 from .fits import sample as sample

@@ -11,7 +11,9 @@ import numpy as np
 import jaxik
 from fitting.analysis import accuracy
 from fitting.datasets.clips import Clip, flight, load_clip, save_clip
-from fitting.datasets.clips.formats.npz import check_clip_file, is_blocks_file
+from fitting.datasets.clips.formats.npz import is_blocks_file
+from fitting.datasets.clips.formats.saving import check_clip_file
+from fitting.datasets.terrain.meshes import mesh_of
 from fitting.report import comparison_report, fit_tables, placement_report
 from fitting.report.formatting import aligned
 from fitting.report.suite import suite_report
@@ -61,6 +63,7 @@ def compare(
             comparison_report.write(folder, compared)
         table = aligned(comparison_report.transposed(comparison_report.table(compared)))
         where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
+        where += [f"note: {remark}" for remark in loaded.clip.remarks]
         log("\n".join([table, "", *filter(None, where)]))
         if differences:
             log(f"\n{aligned(comparison_report.rate_table(compared))}")
@@ -109,6 +112,7 @@ def apply(
     animation: AnimationFiles,
     output: str | Path | None = None,
     *,
+    with_terrain: bool = False,
     log: Log = silent,
 ) -> Clip:
     """Solves a flat animation with the fitted system of a run; see `solve`.
@@ -117,7 +121,7 @@ def apply(
         ValueError: as `solve`, or the folder holds no finished fit.
     """
     ik = run_folder.load_fitted_system(Path(run), animation.flat_clip.rig)
-    return solve(ik, animation, output, log=log)
+    return solve(ik, animation, output, with_terrain=with_terrain, log=log)
 
 
 @in_float64
@@ -126,6 +130,7 @@ def solve(
     animation: AnimationFiles,
     output: str | Path | None = None,
     *,
+    with_terrain: bool = False,
     log: Log = silent,
 ) -> Clip:
     """Solves a flat animation, and measures how its feet are placed on the ground.
@@ -136,7 +141,8 @@ def solve(
     Args:
         ik: the system.
         animation: the clip, the terrain, and where the root is put.
-        output: .npz file for the solved clip.
+        output: .npz, .bvh, .glb or .csv file for the solved clip; see `save_clip`.
+        with_terrain: whether a .glb gets the terrain beside the skeleton.
         log: called with what the command line prints.
 
     Raises:
@@ -145,20 +151,27 @@ def solve(
     """
     path = None if output is None else Path(output)
     if path is not None:
-        check_clip_file(path)
+        check_clip_file(path, with_ground=with_terrain)
+        if path.exists() and path.samefile(animation.clip):
+            raise ValueError(f"{path}: is the clip that is read; name another file")
     ik, loaded = with_floats(ik, np.float64), load_animation(animation)
+    if path is not None:
+        check_clip_file(path, loaded.clip)
     loaded.check_shapes(ik)
     began = time.perf_counter()
     result, solved = loaded.solve(ik)
     seconds = time.perf_counter() - began
     placement, cause = loaded.assess(solved)
     if path is not None:
-        save_clip(path, solved, joints=placement_report.arrays(solved, placement))
+        joints = placement_report.arrays(solved, placement)
+        ground = mesh_of(loaded.terrain) if with_terrain else None
+        save_clip(path, solved, joints=joints, ground=ground)
     log(placement_report.solved_text(loaded.reached(result), seconds, path))
     where = [
         f"root: {loaded.root.reason}",
         flight.describe(loaded.clip),
         placement_report.trunk_text(result, solved),
+        *(f"note: {remark}" for remark in loaded.clip.remarks),
     ]
     log("\n".join(filter(None, where)) + f"\n\n{placement_report.text(placement)}")
     if is_blocks_file(animation.clip) and animation.speed == 1.0:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,7 +11,8 @@ import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
-from fitting.experiments.problems import make_problem
+from fitting.experiments.problems import ClipData, load_clips, problem_from_clips
+from fitting.experiments.record_only import left_out
 from fitting.inference.noise.model import NoiseModel, with_noise
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Progress, Solution
@@ -18,8 +20,9 @@ from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
+from fitting.report.goodness import record_price_report
 from fitting.runtime.precision import in_float64
-from fitting.studies import ablation, run_folder, translation
+from fitting.studies import ablation, record_price, run_folder, translation
 from fitting.studies.assess import assess_solution
 from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.posterior.replay import replay
@@ -27,6 +30,14 @@ from fitting.studies.sample import SampledFit, log_probability_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
 from .output import Log, log_output, output_folder, silent
+
+
+class Shown(NamedTuple):
+    """What a fit only shows: nothing of it decides what is found."""
+
+    clips: tuple[ClipData, ...]
+    known_values: Mapping[str, float] | None = None
+    """What made a synthetic reference."""
 
 
 @in_float64
@@ -57,17 +68,21 @@ def fit(
         experiment = load_experiment(experiment)
     known_values = load_known_values(experiment)
     with output_folder(output) as run:
-        roots: list[str] = []
-        problem = make_problem(experiment, roots.append)
-        free, preset = len(experiment.free), experiment.preset
-        log("\n".join([f"fitting {free} parameters of {preset} to {len(roots)} clip(s)", *roots]))
+        lines: list[str] = []
+        clips = load_clips(experiment, lines.append)
+        problem = problem_from_clips(experiment, clips)
+        free, count = len(experiment.free), len(clips)
+        heading = f"fitting {free} parameters of {experiment.preset} to {count} clip(s)"
+        log("\n".join([heading, *lines]))
         kept = _kept_stages(run, experiment, problem, log)
         problem, solution = search_with_noise(problem, experiment, progress, kept)
-        fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress, kept)
+        shown = Shown(clips, known_values)
+        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
+        texts, sections = _price_of_record(fitted, progress, log)
         if run is not None:
-            fit_report.write_fit(run, fitted)
+            fit_report.write_fit(run, fitted, sections)
         _remove(kept, fitted)
-        log(f"\n{fit_report.fit_text(fitted)}")
+        log("\n".join(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
 
@@ -98,11 +113,13 @@ def sample(
     if isinstance(fitted, Fit):
         run, experiment, problem = fitted.run, fitted.experiment, fitted.problem
         parameters, known_values = fitted.summary["parameters"], fitted.known_values
+        clips = fitted.clips
     else:
         run = Path(fitted)
         experiment, summary = run_folder.load_fit(run)
         parameters, known_values = summary["parameters"], load_known_values(experiment)
-        problem = make_problem(experiment)
+        clips = load_clips(experiment)
+        problem = problem_from_clips(experiment, clips)
         if "noise" in summary:
             problem = with_noise(problem, NoiseModel(**summary["noise"]))
     if max_steps is not None:
@@ -121,7 +138,7 @@ def sample(
         if run is not None:
             _save_and_report(run, sampled)
             if sampled.has_lower_point and not posterior.interrupted:
-                sampled = _adopt_lower_point(run, problem, sampled, log)
+                sampled = _adopt_lower_point(run, problem, clips, sampled, log)
                 posterior = sampled.posterior
         log(f"\n{posterior_report.posterior_text(sampled, run)}")
         log_output(log, run, run_folder.SUMMARY)
@@ -177,12 +194,12 @@ def translate(
 ) -> Fit:
     """Fits the parameters of one system to the motion of another.
 
-    KeyboardInterrupt (Ctrl-C) ends the search, as in `fit`. The folder is a run: `sample` and
-    `apply` take it.
+    KeyboardInterrupt (Ctrl-C) ends the search, and a second call with the same folder goes on, as
+    in `fit`. The folder is a run: `sample` and `apply` take it.
 
     Args:
         request: which system is fitted to which, and on what.
-        output: a new folder for the run.
+        output: a new folder for the run, or that of a translation that was killed or interrupted.
         progress: called as the search goes on.
         log: called with what the command line prints.
 
@@ -191,22 +208,22 @@ def translate(
     """
     run = None if output is None else Path(output)
     if run is not None:
-        run_folder.check_new_folder(run)
+        translation.check_folder(run)
     with output_folder(run):
         prepared = translation.prepare(request, Path() if run is None else run)
         experiment, problem = prepared.experiment, prepared.problem
         log(
             f"fitting {len(experiment.free)} parameters of {request.target.name} to "
-            f"{request.source.name} on {len(prepared.motions)} clip(s)"
+            f"{request.source.name} on {len(prepared.clips)} clip(s)"
         )
         start = translation.starting_point(problem)
         kept = _kept_stages(run, experiment, problem, log)
         solution = search(problem, experiment, progress, start, kept)
-        known_values = None
+        shown = Shown(prepared.clips)
         if run is not None:
             translation.save_source(run, prepared)
-            known_values = load_known_values(experiment)
-        fitted = _assess_and_save(run, experiment, problem, solution, known_values, progress, kept)
+            shown = Shown(prepared.clips, load_known_values(experiment))
+        fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
         fitted = dataclasses.replace(fitted, has_noise=False)
         differences = translation_report.differences(fitted)
         if run is not None:
@@ -227,8 +244,28 @@ def _kept_stages(
     identity = digest_with(problem, experiment.fit, experiment.seed, experiment.noise)
     kept = KeptStages(run / run_folder.SEARCH, identity, log)
     if kept.count:
-        log(f"a fit that was interrupted here goes on after {kept.count} stages of its search")
+        stages = f"{kept.count} stages of its search"
+        if kept.profile_count:
+            stages += f" and {kept.profile_count} of its profiles"
+        log(f"a fit that was interrupted here goes on after {stages}")
     return kept
+
+
+def _price_of_record(
+    fitted: Fit, progress: Callable[[Progress], None] | None, log: Log
+) -> tuple[list[str], list[str]]:
+    """What it costs to fit only what the record holds: for the terminal, and in Markdown."""
+    experiment = fitted.experiment
+    if not experiment.record_only:
+        return [], []
+    if (names := left_out(experiment)) and not fitted.solution.interrupted:
+        log(f"what the record costs: a search in which {', '.join(names)} are free, too")
+    try:
+        price = record_price.measure(fitted, progress)
+    except KeyboardInterrupt:  # the fit is finished: its report must be written
+        price = None
+    text = record_price_report.text(experiment, price)
+    return ["", text], record_price_report.section(experiment, price)
 
 
 def _remove(kept: KeptStages | None, fitted: Fit) -> None:
@@ -243,7 +280,11 @@ def _save_and_report(run: Path, sampled: SampledFit) -> None:
 
 
 def _adopt_lower_point(
-    run: Path, problem: Problem[jaxik.FootIK], sampled: SampledFit, log: Log
+    run: Path,
+    problem: Problem[jaxik.FootIK],
+    clips: tuple[ClipData, ...],
+    sampled: SampledFit,
+    log: Log,
 ) -> SampledFit:
     """The chain with a fit that went on from its best point, which takes the run's old fit's place.
 
@@ -266,7 +307,8 @@ def _adopt_lower_point(
         fitted = assess_solution(experiment, problem, solution)
     except KeyboardInterrupt:
         return sampled
-    fitted = dataclasses.replace(fitted, known_values=sampled.known_values, run=run)
+    known_values = sampled.known_values
+    fitted = dataclasses.replace(fitted, known_values=known_values, run=run, clips=clips)
     at_solution = log_probability_at(problem, experiment, fitted.solution.u)
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
@@ -286,7 +328,7 @@ def _assess_and_save(
     experiment: Experiment,
     problem: Problem[jaxik.FootIK],
     solution: Solution,
-    known_values: Mapping[str, float] | None,
+    shown: Shown,
     progress: Callable[[Progress], None] | None,
     kept: KeptStages | None,
 ) -> Fit:
@@ -297,7 +339,9 @@ def _assess_and_save(
             run_folder.save_solution(run, experiment, problem, solution)
 
     fitted = assess_solution(experiment, problem, solution, progress, save, kept)
-    fitted = dataclasses.replace(fitted, known_values=known_values, run=run)
+    fitted = dataclasses.replace(
+        fitted, known_values=shown.known_values, clips=shown.clips, run=run
+    )
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

@@ -34,4 +34,6 @@ def output_folder(output: str | Path | None) -> Iterator[Path | None]:
 def log_output(log: Log, folder: Path | None, text: str) -> None:
     """Logs where the results are, and the name of the file to read first."""
     if folder is not None:
-        log(f"written to {folder}; read {folder / text}")
+        page = folder / run_folder.PAGE
+        in_browser = f", or open {page} in a browser" if page.is_file() else ""
+        log(f"written to {folder}; read {folder / text}{in_browser}")

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import h5py
@@ -19,14 +20,16 @@ import pytest
 from fitting.cli import main, progress
 from fitting.cli.parser import make_parser
 from fitting.datasets.clips import formats, load_clip, save_clip
+from fitting.datasets.coverage import GroundWarning
 from fitting.datasets.synthetic import walker
-from fitting.datasets.terrain.mesh_files import save_mesh
+from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
+from fitting.datasets.terrain.meshes import mesh_of
 from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.chain import journal_path
 from fitting.jobs import fits
 from fitting.studies import assess, run_folder
-from support import grounds, quick
+from support import gltf_files, grounds, quick
 from support.experiments import CLIP, ROOT, write
 from support.sample_clips import BVH
 
@@ -40,6 +43,7 @@ BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
 WANTED_CLIP = f"wanted a {', '.join(formats.READERS)} or .npz file"
 SHOWN = "always::fitting.report.placement_report.PlacementWarning"
+pytestmark = pytest.mark.filterwarnings("ignore::fitting.datasets.coverage.GroundWarning")
 ELSEWHERE = r"../../elsewhere $\frac{$"  # no path, and no formula that Matplotlib could draw
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 40"
 
@@ -108,9 +112,10 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
         main.main(["--help"])
     text = capsys.readouterr().out
     assert all(f"jaxik {name}" in text for name in COMMANDS if " " not in name)
-    assert "exit status: 0 when done, 2 for a mistake" in text and "130 when" in text
+    text = " ".join(text.split())
+    assert "exit status: 0 when done, 1 when `doctor` finds a problem, 2 for a mistake" in text
     assert "3 when the search" in text and "4 when `fit` has converged but does not fit" in text
-    assert "5 when\n`calibrate` finds something outside its bounds" in text
+    assert "5 when `calibrate` finds something outside its bounds" in text and "130 when" in text
 
 
 @pytest.mark.parametrize(
@@ -144,6 +149,7 @@ def test_the_names_in_an_experiment_are_no_paths(run, experiment_file):
 def test_a_fit_writes_numbers_tables_and_plots(run):
     names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
     assert names <= tree(run) and {"motion.png", "cost.png"} <= tree(run)
+    assert {run_folder.PAGE, "base.npz", "fitted.npz"} <= tree(run)
     numbers = json.loads((run / run_folder.FIT).read_text())
     assert numbers["converged"] and numbers["experiment"] == ELSEWHERE
     for row in numbers["parameters"]:
@@ -151,7 +157,7 @@ def test_a_fit_writes_numbers_tables_and_plots(run):
 
 
 @pytest.mark.slow
-def test_sampling_continues_its_chain(quick_residuals, run, tmp_path, capsys):
+def test_sampling_continues_its_chain(quick_residuals, undrawn, run, tmp_path, capsys):
     once, twice = (Path(shutil.copytree(run, tmp_path / name)) for name in ("once", "twice"))
     assert main.main(["sample", str(once)]) == 0
     text = capsys.readouterr().out
@@ -171,7 +177,7 @@ def chain_of(run: Path) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_sampling_that_was_killed_ends_with_the_chain_of_an_unbroken_one(
-    quick_residuals, run, tmp_path
+    quick_residuals, undrawn, run, tmp_path
 ):
     killed, whole = (Path(shutil.copytree(run, tmp_path / name)) for name in ("killed", "whole"))
     paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
@@ -200,7 +206,7 @@ def test_a_sampling_that_was_killed_ends_with_the_chain_of_an_unbroken_one(
 
 @pytest.mark.slow
 def test_an_interrupted_fit_writes_its_best_point(
-    quick_residuals, experiment_file, tmp_path, monkeypatch, capsys
+    quick_residuals, undrawn, experiment_file, tmp_path, monkeypatch, capsys
 ):
     def interrupt(report: Progress) -> str:
         signal.raise_signal(signal.SIGINT)
@@ -224,7 +230,7 @@ def test_an_interrupted_fit_writes_its_best_point(
     ],
 )
 def test_the_exit_status_says_what_is_wrong_with_a_fit(
-    quick_residuals, tmp_path, capsys, rest, status, sentence
+    quick_residuals, undrawn, tmp_path, capsys, rest, status, sentence
 ):
     path = write(tmp_path, clips=CLIP, clip="start = 1.0\nend = 1.5", rest=rest)
     assert main.main(["fit", str(path), "-o", str(tmp_path / "run")]) == status
@@ -254,7 +260,7 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_at_the_next_report(capsys):
 
 @pytest.mark.slow
 def test_an_interrupted_sampling_keeps_its_chain(
-    quick_residuals, run, tmp_path, monkeypatch, capsys
+    quick_residuals, undrawn, run, tmp_path, monkeypatch, capsys
 ):
     copy = Path(shutil.copytree(run, tmp_path / "run"))
 
@@ -275,7 +281,7 @@ def test_an_interrupt_before_the_search_writes_nothing(
     def interrupt(*_):
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(fits, "make_problem", interrupt)
+    monkeypatch.setattr(fits, "load_clips", interrupt)
     assert main.main(["fit", str(experiment_file), "-o", str(tmp_path / "run")]) == main.INTERRUPTED
     assert capsys.readouterr().err == "\njaxik fit: interrupted\n" and not tree(tmp_path)
 
@@ -318,6 +324,15 @@ def test_a_wrong_experiment_writes_nothing(parts, message, tmp_path, capsys):
     assert tree(tmp_path) == before
 
 
+def test_the_clip_that_is_read_is_not_written_over(tmp_path, capsys):
+    path = tmp_path / "walk.npz"
+    shutil.copy(BASE, path)
+    before = path.read_bytes()
+    message = error_of(capsys, "run", path, "--terrain", GROUND, "-o", path)
+    assert "is the clip that is read; name another file" in message
+    assert path.read_bytes() == before
+
+
 def test_a_file_in_place_of_the_run_folder_is_rejected(experiment_file, tmp_path, capsys):
     (tmp_path / "file").write_text("kept")
     assert "is a file" in error_of(capsys, "fit", experiment_file, "-o", tmp_path / "file")
@@ -328,7 +343,7 @@ def test_a_file_in_place_of_the_run_folder_is_rejected(experiment_file, tmp_path
 def test_a_folder_without_a_fit_is_rejected(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     line = [words[0], tmp_path, *words[1:]]
-    assert "no experiment.toml; there is nothing; `jaxik fit` makes" in error_of(capsys, *line)
+    assert re.search(r"no \S+; there is nothing; `jaxik fit` makes", error_of(capsys, *line))
     line[1] = tmp_path / "no"
     assert "no such folder" in error_of(capsys, *line)
     assert not tree(tmp_path)
@@ -387,6 +402,38 @@ def test_run_accepts_a_bvh_and_a_parameter_file(tmp_path, capsys):
     assert np.isfinite(solved.positions_ws).all()
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings(SHOWN)
+def test_run_writes_the_motion_on_the_skeleton_that_came_in(tmp_path, capsys):
+    (tmp_path / "step.bvh").write_text(BVH)
+    words = ["run", str(tmp_path / "step.bvh"), "--terrain", GROUND, "-o"]
+    outputs = {suffix: tmp_path / f"out{suffix}" for suffix in (".npz", ".bvh", ".csv")}
+    for path in outputs.values():
+        assert main.main([*words, str(path)]) == 0
+        assert f"written to {path}" in capsys.readouterr().out
+    assert main.main([*words, str(tmp_path / "out.glb"), "--with-terrain"]) == 0
+    solved, before = load_clip(outputs[".npz"]), load_clip(tmp_path / "step.bvh")
+    assert np.abs(solved.positions_ws - before.positions_ws).max() > 0.01
+    bvh = load_clip(outputs[".bvh"], scale=before.scale, up="y")
+    assert (bvh.channels, bvh.raw_frame_time) == (before.channels, before.raw_frame_time)
+    for clip in (bvh, load_clip(tmp_path / "out.glb")):
+        assert clip.joint_names == before.joint_names
+        np.testing.assert_allclose(clip.positions_ws, solved.positions_ws, atol=1e-4)
+    written, read = (mesh_of(load_terrain(path)) for path in (tmp_path / "out.glb", GROUND))
+    assert written.faces.shape == read.faces.shape
+    assert len(outputs[".csv"].read_text().splitlines()) == 1 + before.frame_count
+
+
+def test_inspect_asks_for_one_of_several_animations(tmp_path, capsys):
+    path = tmp_path / "walk.gltf"
+    file = gltf_files.walker()
+    keys = {(1, "translation"): ([0.0, 0.1], [[0, 0, 90], [0, 0, 80]], "LINEAR")}
+    path.write_text(file.animate("Run", keys).text())
+    assert "2 animations: 'Walk', 'Run'; choose one" in error_of(capsys, "inspect", path)
+    assert main.main(["inspect", str(path), "--animation", "Run"]) == 0
+    assert "2 frames" in capsys.readouterr().out
+
+
 def test_poses_that_are_not_finite_are_not_written(tmp_path, capsys):
     (tmp_path / "step.bvh").write_text(BVH)
     (tmp_path / "mad.toml").write_text("pelvis.tick_hz = -inf\nleg.soften = inf\n")
@@ -438,18 +485,21 @@ def test_run_warns_of_a_root_that_stays_below_a_hill_and_names_frames(hill_files
 @pytest.mark.slow
 @pytest.mark.filterwarnings(SHOWN)
 def test_run_names_the_other_up_axis(hill_files, tmp_path, capsys):
+    warnings.filterwarnings("always", category=GroundWarning)  # the module's mark comes first
     words = ["run", hill_files / "walk.npz", "--terrain", hill_files / "hill.ply"]
     words += ["-o", tmp_path / "out.npz", "--file-up", "z"]
     assert main.main([*map(str, words)]) == 0
     output = capsys.readouterr()
     assert "root: as animated: there is no ground below most of its path" in output.out
-    assert "the other axis of the terrain's file is up (--file-up)" in output.err
+    assert "ground under 0.0 % of its standing feet: the feet are at x " in output.err
+    assert "; the terrain is at x " in output.err
+    assert output.err.splitlines()[0].endswith("; likely remedy: --file-up y")
 
 
 def test_run_rejects_a_root_without_ground(hill_files, tmp_path, capsys):
     words = ["run", hill_files / "walk.npz", "--terrain", hill_files / "hill.ply"]
     words += ["-o", tmp_path / "out.npz", "--file-up", "z", "--root", "ground"]
-    assert "there is no ground below most of its path, on which to put" in error_of(capsys, *words)
+    assert error_of(capsys, *words).endswith("m; likely remedy: --file-up y\n")
     assert not tree(tmp_path)
 
 
@@ -470,6 +520,9 @@ MESHES = {"m.ply": "hi", "p.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\n", "t.toml": ""}
         (BASE, "p.obj", "a.npz", [], "p.obj: terrain needs triangles"),
         (BASE, "t.toml", "a.npz", [], "trimesh reads"),
         (BASE, GROUND, "a", [], "a: wanted a name that ends in .npz"),
+        (BASE, GROUND, "a.fbx", [], "a.fbx: wanted a name that ends in .npz, .bvh, .glb, .csv"),
+        (BASE, GROUND, "a.bvh", ["--with-terrain"], "a.bvh: only a .glb can hold the terrain"),
+        (BASE, GROUND, "a.bvh", ["--animation", "Run"], "['animation'] do not apply to .npz clips"),
         (BASE, GROUND, "d.npz", [], "d.npz: cannot be written: it is a folder"),
         (BASE, GROUND, "no/a.npz", [], "there is no folder no"),
         (BASE, GROUND, "a.npz", ["--preset", "recrod"], "no preset named 'recrod'"),

@@ -9,6 +9,7 @@ from fitting.cli.parser import make_parser
 ANIMATION = ["walk.bvh", "--terrain", "hill.ply", "-o", "out"]
 TRANSLATE = ["translate", "--from", "mec", "--to", "record", "--clip", "a", "--terrain", "b"]
 WORDS = {  # that a command needs
+    "init": ["init", "walk.bvh", "-o", "out"],
     "ablate": ["ablate", "e.toml", "-o", "out"],
     "calibrate": ["calibrate", "e.toml", "-o", "out"],
     "sample": ["sample", "run"],
@@ -22,8 +23,12 @@ WORDS = {  # that a command needs
     "record to-toml": ["record", "to-toml", "footik.bin", "-o", "out"],
     "record to-bytes": ["record", "to-bytes", "footik.toml", "-o", "out"],
 }
-OF_ANIMATIONS = {"--floor": ("-1e6", "1e6"), "--speed": ("0.01", "100")}
+OF_CLIPS = {"--scale": ("1e-9", "1e6")}
+OF_TERRAINS = {"--terrain-scale": ("1e-9", "1e6"), "--terrain-cell": ("0.001", "1e4")}
+OF_TERRAINS |= {"--terrain-offset": ("-1e6", "1e6")}
+OF_ANIMATIONS = {"--floor": ("-1e6", "1e6"), "--speed": ("0.01", "100")} | OF_CLIPS | OF_TERRAINS
 RANGES = {
+    "init": OF_CLIPS | OF_TERRAINS,
     "ablate": {"--folds": ("2", "1000")},
     "calibrate": {
         "--replicates": ("1", "100000"), "--workers": ("0", "1024"),
@@ -33,9 +38,9 @@ RANGES = {
     "apply": OF_ANIMATIONS,
     "run": OF_ANIMATIONS,
     "compare": OF_ANIMATIONS | {"--rates": ("1", "1000")},
-    "translate": {"--fps": ("1", "1000")},
-    "inspect": {"--scale": ("1e-9", "1e6")},
-    "terrain": {"--sole": ("0", "10"), "--margin": ("0", "100")},
+    "translate": {"--fps": ("1", "1000")} | OF_CLIPS | OF_TERRAINS,
+    "inspect": OF_CLIPS,
+    "terrain": {"--sole": ("0", "10"), "--margin": ("0", "100")} | OF_CLIPS,
     **{f"record {way}": {"--tick-hz": ("1", "1000")} for way in ("show", "to-toml", "to-bytes")},
 }  # fmt: skip
 OPTIONS = [(command, option) for command, options in RANGES.items() for option in options]
@@ -49,14 +54,19 @@ def beyond(end: str, *, up: bool) -> str:
     return str(int(end) + (1 if up else -1))
 
 
+def words(option: str, value: str) -> list[str]:
+    """An option with its value, as a user types it."""
+    return [option, "0", value, "0"] if option == "--terrain-offset" else [f"{option}={value}"]
+
+
 @pytest.mark.parametrize(("command", "option"), OPTIONS)
 def test_a_number_is_accepted_up_to_the_ends_of_its_range(command, option, capsys):
     low, high = RANGES[command][option]
     for value in (low, high):
-        make_parser().parse_args([*WORDS[command], f"{option}={value}"])
+        make_parser().parse_args([*WORDS[command], *words(option, value)])
     for value in (beyond(low, up=False), beyond(high, up=True), *ODD):
         with pytest.raises(SystemExit, match="2"):
-            make_parser().parse_args([*WORDS[command], f"{option}={value}"])
+            make_parser().parse_args([*WORDS[command], *words(option, value)])
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and len(error) < 1100 and error[:-1].isprintable()
         assert error.startswith(f"jaxik {command}: argument ") and option in error

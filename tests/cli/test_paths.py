@@ -10,12 +10,16 @@ import pytest
 from fitting.cli import main
 from fitting.cli.parser import make_parser
 from support import experiments
+from support.sample_clips import BVH
 
 BASE = experiments.ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = experiments.ROOT / "data" / "terrains" / "uneven_walk.ply"
 ANIMATION = [str(BASE), "--terrain", str(GROUND)]
 FROM_TO = ["--from", "mec", "--to", "record"]
 PLACES: dict[str, tuple[list[str], str]] = {  # words with a place for a path, and its suffix
+    "init": (["init", "{}", "--terrain", str(GROUND), "-o", "out"], ".bvh"),
+    "init --terrain": (["init", str(BASE), "--terrain", "{}", "-o", "out"], ".ply"),
+    "init --base": (["init", *ANIMATION, "--base", "{}", "-o", "out"], ".npz"),
     "fit": (["fit", "{}", "-o", "out"], ".toml"),
     "ablate": (["ablate", "{}", "-o", "out"], ".toml"),
     "calibrate": (["calibrate", "{}", "-o", "out"], ".toml"),
@@ -24,8 +28,21 @@ PLACES: dict[str, tuple[list[str], str]] = {  # words with a place for a path, a
     "apply": (["apply", "{}", *ANIMATION, "-o", "a.npz"], ""),
     "run clip": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".bvh"),
     "run clip npz": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".npz"),
+    "run clip glb": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".glb"),
+    "run clip gltf": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".gltf"),
     "run --terrain": (["run", str(BASE), "--terrain", "{}", "-o", "a.npz"], ".ply"),
     "run --terrain npz": (["run", str(BASE), "--terrain", "{}", "-o", "a.npz"], ".npz"),
+    "run --terrain npy": (["run", str(BASE), "--terrain", "{}", "-o", "a.npz"], ".npy"),
+    "run --joints": (
+        ["run", "walk.bvh", "--joints", "{}", "--terrain", str(GROUND), "-o", "a.npz"],
+        ".toml",
+    ),
+    "inspect --joints": (["inspect", "walk.bvh", "--joints", "{}"], ".toml"),
+    "terrain --joints": (["terrain", "walk.bvh", "--joints", "{}", "-o", "a.ply"], ".toml"),
+    "translate --asf": (
+        ["translate", *FROM_TO, "--clip", "whole.amc", "--asf", "{}", *ANIMATION[1:], "-o", "out"],
+        ".asf",
+    ),
     "run --parameters": (["run", *ANIMATION, "--parameters", "{}", "-o", "a.npz"], ".toml"),
     "run --tracks": (["run", *ANIMATION, "--tracks", "{}", "-o", "a.npz"], ".toml"),
     "compare --parameters": (["compare", *ANIMATION, "--parameters", "{}", "-o", "out"], ".toml"),
@@ -102,6 +119,7 @@ def test_a_path_without_a_file_of_its_kind_costs_one_line(
     monkeypatch.chdir(tmp_path)
     Path("whole.toml").write_text('preset = "record"\nfaithful = true\n')
     Path("whole.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\n")
+    Path("walk.bvh").write_text(BVH)
     words, suffix = PLACES[place]
     if way == "empty" and suffix == ".toml" and place not in ("fit", "ablate", "calibrate"):
         pytest.skip("an empty TOML file is a whole one")
@@ -115,8 +133,10 @@ def test_a_path_without_a_file_of_its_kind_costs_one_line(
 
 
 OUTPUTS: dict[str, tuple[list[str], str]] = {
+    "init": (["init", *ANIMATION, "-o", "{}"], ""),
     "fit": (["fit", "{experiment}", "-o", "{}"], ""),
     "run": (["run", *ANIMATION, "-o", "{}"], ".npz"),
+    "run bvh": (["run", *ANIMATION, "-o", "{}"], ".bvh"),
     "compare": (["compare", *ANIMATION, "--presets", "record", "-o", "{}"], ""),
     "translate": (["translate", *FROM_TO, "--clip", *ANIMATION, "-o", "{}"], ""),
     "terrain": (["terrain", str(BASE), "-o", "{}"], ".ply"),
@@ -125,6 +145,9 @@ OUTPUTS: dict[str, tuple[list[str], str]] = {
     "ablate": (["ablate", "{experiment}", "-o", "{}"], ""),
     "calibrate": (["calibrate", "{experiment}", "-o", "{}"], ""),
     "population": (["population", "{experiment}", "-o", "{}"], ""),
+    "parameters": (["parameters", "-o", "{}"], ".md"),
+    "schema": (["schema", "-o", "{}"], ".json"),
+    "example": (["example", "uneven_walk", "-o", "{}"], ""),
 }
 
 

@@ -1,5 +1,6 @@
 """Words and options of the commands that run systems on flat animations."""
 
+import argparse
 from pathlib import Path
 
 from .options import Commands, add_animation, add_command, add_output, rates
@@ -10,13 +11,13 @@ def add_apply(commands: Commands) -> None:
     apply = add_command(
         commands, "apply", "run a run's fitted parameters on another clip",
         """
-        jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
+        jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.bvh
         jaxik apply runs/walk walk.amc --terrain yard.glb --file-up z --floor -0.03 -o yard.npz
         """,
     )  # fmt: skip
     apply.add_argument("run", type=Path, metavar="RUN", help="folder made by `jaxik fit`")
     add_animation(apply)
-    add_output(apply, "OUT.npz")
+    _add_motion_output(apply)
 
 
 def add_run(commands: Commands) -> None:
@@ -24,15 +25,27 @@ def add_run(commands: Commands) -> None:
     run = add_command(
         commands, "run", "run a preset, or a parameter file, on a clip without fitting",
         """
-        jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz
+        jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.bvh
         jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --parameters footik.toml
+        jaxik run hero.glb --animation Walk --terrain steps.obj -o walk.glb --with-terrain
         """,
     )  # fmt: skip
     add_animation(run)
-    add_output(run, "OUT.npz")
+    _add_motion_output(run)
     system = run.add_mutually_exclusive_group()
     system.add_argument("--preset", default="record", help="of jaxik.presets (default: record)")
     system.add_argument("--parameters", type=Path, metavar="TOML", help="instead of a preset")
+
+
+def _add_motion_output(command: argparse.ArgumentParser) -> None:
+    """Adds the file for the solved motion."""
+    add_output(
+        command, "OUT", "the solved motion: .npz, .glb, .csv, or .bvh, with the channels, unit and "
+        "rate of a .bvh that came in",
+    )  # fmt: skip
+    command.add_argument(
+        "--with-terrain", action="store_true", help="put the terrain into a .glb beside the motion"
+    )
 
 
 def add_compare(commands: Commands) -> None:

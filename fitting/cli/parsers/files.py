@@ -2,7 +2,17 @@
 
 from pathlib import Path
 
-from .options import Commands, add_command, add_output, number
+from .options import (
+    Commands,
+    add_clip_options,
+    add_clip_units,
+    add_command,
+    add_output,
+    number,
+)
+
+TEMPLATE = Path()
+"""What `--joints` is without a file: no name that a file can have."""
 
 
 def add_inspect(commands: Commands) -> None:
@@ -12,12 +22,18 @@ def add_inspect(commands: Commands) -> None:
         """
         jaxik inspect walk.bvh
         jaxik inspect walk.amc --asf skeleton.asf --json
+        jaxik inspect walk.bvh --joints > map.toml     a joint map to be edited, and then used:
+        jaxik inspect walk.bvh --joints map.toml
         """,
     )  # fmt: skip
-    inspect.add_argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc or .npz")
+    inspect.add_argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf or .npz")
     inspect.add_argument("--json", action="store_true", help="as JSON")
-    inspect.add_argument("--asf", type=Path, help="skeleton of an .amc, where it is not beside it")
-    inspect.add_argument("--scale", type=number(1e-9, 1e6), help="metres per unit of the file")
+    group = inspect.add_argument_group("how the clip is read (default: recognised or guessed)")
+    group.add_argument(
+        "--joints", type=Path, nargs="?", const=TEMPLATE, metavar="MAP.toml",
+        help="which joint is which; without a file, print a map of this clip to be edited",
+    )  # fmt: skip
+    add_clip_units(group)
 
 
 def add_terrain(commands: Commands) -> None:
@@ -34,7 +50,9 @@ def add_terrain(commands: Commands) -> None:
         ground.json.
         """,
     )  # fmt: skip
-    terrain.add_argument("clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc or .npz")
+    terrain.add_argument(
+        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf or .npz"
+    )
     add_output(terrain, "MESH", ".ply, .obj or .stl")
     terrain.add_argument(
         "--sole", type=number(0, 10, "metres"), default=0.055, metavar="M",
@@ -51,6 +69,7 @@ def add_terrain(commands: Commands) -> None:
         metavar="M",
         help="of ground around the stances, m",
     )
+    add_clip_options(terrain)
 
 
 def add_record(commands: Commands) -> None:
@@ -85,12 +104,16 @@ def add_record(commands: Commands) -> None:
         jaxik record to-bytes footik.toml --base footik.bin -o edited.bin
 
         With the record that `to-toml` read as the base, and the same options, everything that was
-        not edited comes out unchanged, to the byte.
+        not edited comes out unchanged, to the byte. Parameters for which the record has no room are
+        named, and nothing is written, unless --drop leaves them out.
         """,
     )  # fmt: skip
     to_bytes.add_argument("file", type=Path, help="parameter .toml, or .csv")
     add_output(to_bytes, "BIN")
     to_bytes.add_argument("--base", type=Path, help="record with padding, tail and knee axis")
+    to_bytes.add_argument(
+        "--drop", action="store_true", help="leave out what the record has no room for"
+    )
     for way in (show, to_toml, to_bytes):
         way.add_argument(
             "--length-unit", choices=("auto", "m", "cm"), default="auto",

@@ -3,7 +3,51 @@
 import argparse
 from pathlib import Path
 
-from .options import Commands, add_command, add_output, count, number, rate
+from .options import (
+    Commands,
+    add_clip_options,
+    add_command,
+    add_output,
+    add_terrain_options,
+    count,
+    number,
+    rate,
+)
+
+
+def add_init(commands: Commands) -> None:
+    """`jaxik init`."""
+    init = add_command(
+        commands, "init", "make an experiment of your clips that runs as it is",
+        """
+        jaxik init walk.bvh -o walk
+        jaxik init walk.bvh stairs.bvh --terrain floor.obj stairs.obj --preset stride -o walks
+        jaxik init walk.bvh --terrain ground.ply --record-only -o game
+
+        Looks at the clips, reconstructs the ground where none is given, tries every parameter over
+        its range, and writes experiment.toml with all keys and what they mean. Says what it
+        assumes, what the clips say for it, and what would be better.
+        """,
+    )  # fmt: skip
+    init.add_argument("clips", type=Path, nargs="+", metavar="CLIP", help="captured motion")
+    init.add_argument(
+        "--terrain", type=Path, nargs="+", default=[], metavar="MESH",
+        help="the ground: one for all clips, or one for each (default: reconstructed)",
+    )  # fmt: skip
+    init.add_argument(
+        "--base", type=Path, nargs="+", default=[], metavar="FLAT",
+        help="flat animations, one for each clip (default: made from the clips)",
+    )  # fmt: skip
+    init.add_argument("--preset", default="record", help="what is fitted (default: record)")
+    init.add_argument(
+        "--faithful", action="store_true", help="the original, where the preset differs from it"
+    )
+    init.add_argument(
+        "--record-only", action="store_true", help="only what the game's record has room for"
+    )
+    add_output(init, "DIR", "folder for the experiment")
+    add_clip_options(init)
+    add_terrain_options(init)
 
 
 def add_fit(commands: Commands) -> None:
@@ -12,6 +56,7 @@ def add_fit(commands: Commands) -> None:
         commands, "fit", "fit an experiment's free parameters to its clips",
         """
         jaxik fit data/experiments/uneven_walk.toml -o runs/walk
+        jaxik fit data/experiments/uneven_walk.toml --record-only -o runs/game
 
         Status 0: converged, and fits. 3: not converged. 4: converged, but what is left is no noise
         of the given sigmas; the summary says where. Ctrl-C ends the search; the best point so far
@@ -23,6 +68,10 @@ def add_fit(commands: Commands) -> None:
         "experiment", type=Path, metavar="EXPERIMENT.toml", help="clips, terrain, free parameters"
     )
     add_output(fit, "RUN", "run folder")
+    fit.add_argument(
+        "--record-only", action="store_true",
+        help="leave out what the game's record has no room for, and say what that costs",
+    )  # fmt: skip
 
 
 def add_ablate(commands: Commands) -> None:
@@ -165,7 +214,6 @@ def add_translate(commands: Commands) -> None:
     translate.add_argument(
         "--fps", type=rate, metavar="HZ", help="resample the clips first (default: as they are)"
     )
-    translate.add_argument(
-        "--file-up", choices=("y", "z"), default="y", help="up axis of the meshes"
-    )
+    add_clip_options(translate)
+    add_terrain_options(translate)
     add_output(translate, "DIR")

@@ -1,10 +1,11 @@
 """Options that several commands share, and how a command is added to the parser."""
 
 import argparse
+import re
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn, TypeAlias, TypeVar
+from typing import Any, NoReturn, TypeAlias, TypeVar
 
 from fitting.runtime import validation
 
@@ -14,6 +15,12 @@ Commands: TypeAlias = argparse._SubParsersAction
 
 class Parser(argparse.ArgumentParser):
     """A parser that reports a mistake as the commands do: in one line, with status 2."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(
+            r"-(\.?\d|inf)"
+        )  # argparse takes -1e3 for an option
 
     def error(self, message: str) -> NoReturn:
         """Prints what is wrong with the words, without the usage, and exits."""
@@ -45,16 +52,15 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
     """Adds a flat animation, its terrain, and how they lie."""
     command.add_argument(
         "clip", type=Path, metavar="CLIP", nargs=None if required else "?",
-        help=".bvh, .amc or .npz over flat ground; for a blocks .npz its flat animation",
+        help=".bvh, .amc, .glb, .gltf or .npz over flat ground; of a blocks .npz its base",
     )  # fmt: skip
     command.add_argument(
         "--terrain",
         type=Path,
         required=required,
         metavar="MESH",
-        help=".ply, .obj, .npz, .glb, ...",
+        help=".ply, .obj, .glb, ..., or heights as .npz, .npy, .png",
     )
-    command.add_argument("--file-up", choices=("y", "z"), default="y", help="up axis of the mesh")
     command.add_argument(
         "--floor",
         type=number(-1e6, 1e6, "metres"),
@@ -74,6 +80,52 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
     command.add_argument(
         "--tracks", type=Path, metavar="TOML",
         help="what changes along the clip: grounded, weights of legs, and any parameter",
+    )  # fmt: skip
+    add_clip_options(command)
+    add_terrain_options(command)
+
+
+def add_clip_options(command: argparse.ArgumentParser) -> None:
+    """Adds what the user knows better than a motion file; see `ClipOptions`."""
+    group = command.add_argument_group("how the clip is read (default: recognised or guessed)")
+    group.add_argument(
+        "--joints", type=Path, metavar="MAP.toml",
+        help="which joint is which; `jaxik inspect CLIP --joints` writes a map to be edited",
+    )  # fmt: skip
+    add_clip_units(group)
+
+
+def add_clip_units(group: argparse._ArgumentGroup) -> None:
+    """Adds the options of `add_clip_options` but for the joint map."""
+    group.add_argument(
+        "--scale", type=number(1e-9, 1e6), metavar="M", help="metres per unit of the clip's file"
+    )
+    group.add_argument("--up", choices=("y", "z"), help="up axis of the clip's file")
+    group.add_argument(
+        "--asf", type=Path, metavar="ASF", help="skeleton of an .amc, where it is not beside it"
+    )
+    group.add_argument(
+        "--animation", metavar="NAME", help="which animation of a .glb or .gltf that has several"
+    )
+
+
+def add_terrain_options(command: argparse.ArgumentParser) -> None:
+    """Adds how the numbers of a terrain's file become metres; see `TerrainOptions`."""
+    group = command.add_argument_group("how the terrain is read")
+    group.add_argument(
+        "--file-up", choices=("y", "z"), default="y", help="up axis of its file (default: y)"
+    )
+    group.add_argument(
+        "--terrain-scale", type=number(1e-9, 1e6), metavar="M",
+        help="metres per unit of its file, 0.01 for centimetres (default: 1); of a .png, per level",
+    )  # fmt: skip
+    group.add_argument(
+        "--terrain-offset", type=number(-1e6, 1e6, "metres"), nargs=3, default=(0.0, 0.0, 0.0),
+        metavar=("X", "Y", "Z"), help="then move it, m, y up",
+    )  # fmt: skip
+    group.add_argument(
+        "--terrain-cell", type=number(1e-3, 1e4, "metres"), metavar="M",
+        help="between the heights of a .png or .npy, m",
     )  # fmt: skip
 
 

@@ -1,0 +1,27 @@
+"""One function per command: reads the options, calls the job, prints."""
+
+import argparse
+from collections.abc import Callable
+
+from . import animations, files, fits, guides, machine
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "init": fits.init,
+    "fit": fits.fit,
+    "ablate": fits.ablate,
+    "calibrate": fits.calibrate,
+    "population": fits.population,
+    "sample": fits.sample,
+    "apply": animations.apply,
+    "run": animations.run,
+    "compare": animations.compare,
+    "translate": fits.translate,
+    "inspect": files.inspect,
+    "terrain": files.terrain,
+    "bench": machine.bench,
+    "record": files.convert_record,
+    "cache": machine.cache,
+    "parameters": guides.parameters,
+    "schema": guides.schema,
+    "example": guides.example,
+}

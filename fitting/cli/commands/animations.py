@@ -1,0 +1,118 @@
+"""Commands that run systems on flat animations."""
+
+import argparse
+
+from fitting import jobs
+from fitting.cli import progress
+from fitting.experiments import parameter_files, systems
+from fitting.runtime import cache_folder
+from fitting.runtime.precision import in_float64
+from fitting.studies import comparison
+from fitting.studies.animations import AnimationFiles
+from fitting.studies.suite import situations
+from jaxik import FootIK, Rig
+
+from . import reading, status
+
+
+def apply(options: argparse.Namespace) -> int:
+    """Runs the fitted parameters of a run on a clip."""
+    cache_folder.use_default()
+    jobs.apply(
+        options.run, _animation(options), options.output,
+        with_terrain=options.with_terrain, log=print,
+    )  # fmt: skip
+    return 0
+
+
+@in_float64
+def run(options: argparse.Namespace) -> int:
+    """Runs a preset or a parameter file on a clip."""
+    cache_folder.use_default()
+    animation = _animation(options)
+    rig = animation.flat_clip.rig
+    if options.parameters is not None:
+        ik, _ = parameter_files.load_system(options.parameters, rig)
+    else:
+        ik = systems.preset_system(options.preset, rig)
+    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain, log=print)
+    return 0
+
+
+@in_float64
+def compare(options: argparse.Namespace) -> int:
+    """Runs several systems on a clip or through the suite, or compares runs."""
+    cache_folder.use_default()
+    if options.suite:
+        return _compare_in_suite(options)
+    if options.runs is not None:
+        return _compare_runs(options)
+    _check_comparison(options)
+    animation = _animation(options)
+    requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
+    jobs.compare(
+        requested, animation, options.output,
+        rates=options.rates, during=progress.timed, log=print,
+    )  # fmt: skip
+    return 0
+
+
+def _compare_in_suite(options: argparse.Namespace) -> int:
+    """Runs systems, or else all presets, through made situations."""
+    if options.runs is not None:
+        raise ValueError("--runs and --suite exclude each other")
+    own = {"CLIP": None, "--terrain": None, "--floor": 0.0, "--root": "auto", "--rates": []}
+    own |= {"--speed": 1.0}
+    own |= dict.fromkeys(("--joints", "--scale", "--up", "--asf", "--animation", "--tracks"))
+    own |= {"--file-up": "y", "--terrain-offset": (0.0, 0.0, 0.0)}
+    own |= dict.fromkeys(("--terrain-scale", "--terrain-cell"))
+    for name, unused in own.items():
+        given = getattr(options, name.strip("-").replace("-", "_").lower())
+        if given != unused:
+            raise ValueError(f"{name} is {given}; the suite has animations and grounds of its own")
+    requested = options.systems or [("--presets", ",".join(systems.preset_names()))]
+    comparison.named_systems(requested)  # reports mistakes before anything runs
+    plan = situations.choose(options.only, quick=options.quick)
+
+    def systems_of(rig: Rig) -> dict[str, FootIK]:
+        return comparison.named_systems(requested, rig)
+
+    finished = jobs.run_suite(
+        systems_of, plan, options.output, during=progress.timed, log=progress.print_marked
+    )
+    return status.of_job(interrupted=finished.interrupted)
+
+
+def _compare_runs(options: argparse.Namespace) -> int:
+    """Compares sampled runs by what they predict."""
+    own = {"CLIP": options.clip, "--terrain": options.terrain, "--rates": options.rates}
+    for name, given in own.items():
+        if given:
+            raise ValueError(f"{name} is {given}; runs are compared on the clips of their fits")
+    if options.systems:
+        raise ValueError(f"{options.systems[0][0]} and --runs exclude each other")
+    jobs.compare_runs(options.runs.split(","), options.output, log=print)
+    return 0
+
+
+def _check_comparison(options: argparse.Namespace) -> None:
+    """Raises ValueError for what only the suite takes, or only a comparison on a clip needs."""
+    for name in ("only", "quick"):
+        if getattr(options, name):
+            raise ValueError(f"--{name} belongs to --suite, which is not given")
+    needed = {"CLIP": options.clip, "--terrain": options.terrain, "-o/--output": options.output}
+    if missing := [name for name, given in needed.items() if given is None]:
+        raise ValueError(f"the following are required: {', '.join(missing)}; or --suite, or --runs")
+
+
+def _animation(options: argparse.Namespace) -> AnimationFiles:
+    return AnimationFiles(
+        options.clip,
+        options.terrain,
+        options.floor,
+        options.root,
+        options.speed,
+        options.tracks,
+        reading.clip_options(options),
+        reading.terrain_options(options),
+    )

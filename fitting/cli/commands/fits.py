@@ -1,0 +1,118 @@
+"""Commands that fit and sample."""
+
+import argparse
+
+from fitting import jobs
+from fitting.cli import progress
+from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.record_only import restrict
+from fitting.experiments.systems import Preset
+from fitting.runtime import cache_folder
+from fitting.runtime.precision import in_float64
+from fitting.studies import translation
+from fitting.studies.animations import AnimationFiles
+from fitting.studies.drafts.draft import DraftRequest
+from fitting.studies.translation import TranslationRequest
+
+from . import reading, status
+
+
+def fit(options: argparse.Namespace) -> int:
+    """Fits an experiment."""
+    cache_folder.use_default()
+    experiment = load_experiment(options.experiment)
+    if options.record_only and not experiment.record_only:
+        experiment = restrict(experiment)
+    with progress.ProgressLine(progress.fit_line) as line:
+        fitted = jobs.fit(experiment, options.output, progress=line, log=_print_now)
+    return status.of_fit(fitted)
+
+
+def init(options: argparse.Namespace) -> int:
+    """Makes a first experiment of clips."""
+    cache_folder.use_default()
+    request = DraftRequest(
+        clips=tuple(options.clips),
+        terrains=tuple(options.terrain),
+        bases=tuple(options.base),
+        preset=Preset(options.preset, options.faithful or options.record_only),
+        record_only=options.record_only,
+        reading=reading.clip_options(options),
+        terrain_reading=reading.terrain_options(options),
+    )
+    jobs.init(request, options.output, log=_print_now)
+    return 0
+
+
+def ablate(options: argparse.Namespace) -> int:
+    """Fits an experiment without each of its rules."""
+    cache_folder.use_default()
+    with progress.ProgressLine(progress.fit_line) as line:
+        jobs.ablate(
+            options.experiment, options.output, folds=options.folds, progress=line, log=_print_now
+        )
+    return 0
+
+
+def calibrate(options: argparse.Namespace) -> int:
+    """Fits an experiment to simulated motion; status 5 if something is outside."""
+    cache_folder.use_default()
+    with progress.ProgressLine(progress.calibration_line) as line:
+        assessment = jobs.calibrate(
+            options.experiment,
+            options.output,
+            replicates=options.replicates,
+            chains=options.chains,
+            noise_factor=options.noise_factor,
+            workers=options.workers,
+            scheduler=options.scheduler,
+            progress=line,
+            log=_print_now,
+        )
+    return 0 if assessment.inside else status.OUTSIDE
+
+
+def population(options: argparse.Namespace) -> int:
+    """Fits several clips and subjects as a population."""
+    cache_folder.use_default()
+    with progress.ProgressLine(progress.fit_line) as line:
+        fitted = jobs.population(options.experiment, options.output, progress=line, log=_print_now)
+    return 0 if fitted.converged else status.NOT_CONVERGED
+
+
+def sample(options: argparse.Namespace) -> int:
+    """Samples the posterior of a run, or continues its chain."""
+    cache_folder.use_default()
+    with progress.ProgressLine(progress.sample_line) as line:
+        posterior = jobs.sample(options.run, max_steps=options.max_steps, progress=line, log=print)
+    return status.of_job(interrupted=posterior.interrupted)
+
+
+@in_float64
+def translate(options: argparse.Namespace) -> int:
+    """Fits one system to the motion of another."""
+    cache_folder.use_default()
+    if len(options.clip) != len(options.terrain):
+        raise ValueError(
+            f"{len(options.clip)} clip(s) and {len(options.terrain)} terrain(s); wanted a terrain "
+            "for each clip"
+        )
+    how_clip, how_terrain = reading.clip_options(options), reading.terrain_options(options)
+    how_clip.check_use(options.clip, "--clip")
+    animations = tuple(
+        AnimationFiles(clip, mesh, clip_options=how_clip.of_file(clip), terrain_options=how_terrain)
+        for clip, mesh in zip(options.clip, options.terrain, strict=True)
+    )
+    rig = animations[0].flat_clip.rig
+    source = translation.load_named_system(options.source, "--from", rig)
+    target = translation.load_named_system(options.target, "--to", rig)
+    free = None if options.free is None else translation.read_free(options.free, target.ik, rig)
+    request = TranslationRequest(source, target, animations, free, options.fps)
+    with progress.ProgressLine(progress.fit_line) as line:
+        fitted = jobs.translate(request, options.output, progress=line, log=print)
+    return status.of_fit(fitted)
+
+
+def _print_now(text: str) -> None:
+    """Prints without waiting for a full buffer: the next line may take an hour."""
+    print(text, flush=True)

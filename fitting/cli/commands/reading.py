@@ -1,0 +1,25 @@
+"""How clips and terrain are read, as the options say it."""
+
+import argparse
+
+from fitting.datasets.clips.load import ClipOptions
+from fitting.datasets.terrain.mesh_files import TerrainOptions
+
+
+def clip_options(options: argparse.Namespace) -> ClipOptions:
+    """How the clip is read.
+
+    Args:
+        options: what `parsers.options.add_clip_options` adds.
+    """
+    return ClipOptions(options.joints, options.scale, options.up, options.asf, options.animation)
+
+
+def terrain_options(options: argparse.Namespace) -> TerrainOptions:
+    """How the terrain is read.
+
+    Args:
+        options: what `parsers.options.add_terrain_options` adds.
+    """
+    x, y, z = options.terrain_offset
+    return TerrainOptions(options.file_up, options.terrain_scale, (x, y, z), options.terrain_cell)

@@ -1,0 +1,22 @@
+"""Exit statuses of the commands."""
+
+from fitting.studies.fit import Fit
+
+NOT_CONVERGED = 3  # the search of a fit
+DOES_NOT_FIT = 4  # a fit that has converged
+OUTSIDE = 5  # of its bounds, a calibration
+
+
+def of_job(*, interrupted: bool) -> int:
+    """The exit status of a job whose results are written; an interrupt goes on to `main`."""
+    if interrupted:
+        raise KeyboardInterrupt
+    return 0
+
+
+def of_fit(fitted: Fit) -> int:
+    """The exit status of a search; what a translation leaves over is a result, and no failure."""
+    of_job(interrupted=fitted.solution.interrupted)
+    if not fitted.solution.converged:
+        return NOT_CONVERGED
+    return DOES_NOT_FIT if fitted.has_noise and not fitted.verdict.fits else 0
