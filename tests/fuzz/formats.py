@@ -1,5 +1,6 @@
 """All formats of files that users hand over: a small whole file of each, its loader, its damage."""
 
+import io
 import json
 import tempfile
 import warnings
@@ -10,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.edit import mask_pops
+from fitting.datasets.clips.joints.map_files import template
 from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.experiments import parameter_files, record_files, track_files
 from fitting.experiments.experiment_files import load_experiment
@@ -22,10 +25,11 @@ from fitting.runtime.validation import error_context
 from fitting.studies import run_folder, translation
 from jaxik import presets, record
 from support import experiments
+from support.gltf_files import walker
 from support.records import packed
 from support.sample_clips import AMC, ASF, BVH, stair_walk
 
-from . import soundness
+from . import kept_files, soundness
 from .damage import (
     Random,
     archive_of,
@@ -113,10 +117,10 @@ class Format:
 
 
 @cache
-def clip_archive() -> bytes:
-    """A clip in our own format, with all tracks."""
+def clip_bytes(suffix: str) -> bytes:
+    """A clip as we write it, with all tracks that the format has."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "clip.npz"
+        path = Path(folder) / f"clip{suffix}"
         save_clip(path, mask_pops(stair_walk()).select(slice(0, 20)))
         return path.read_bytes()
 
@@ -151,6 +155,40 @@ def heightfield_archive() -> bytes:
     )
 
 
+def heights_array() -> bytes:
+    """The heights of that heightfield alone."""
+    file = io.BytesIO()
+    np.save(file, np.arange(20.0).reshape(4, 5) / 50)
+    return file.getvalue()
+
+
+def heights_picture() -> bytes:
+    """A heightfield of 16 rows and 12 columns as a picture of 16 bits."""
+    file = io.BytesIO()
+    levels = np.arange(192, dtype=np.uint16).reshape(16, 12) * 300
+    Image.fromarray(levels).save(file, format="PNG")
+    return file.getvalue()
+
+
+def load_heights(path: Path) -> None:
+    """Reads a heightfield that does not say how far its heights are apart, nor how high."""
+    soundness.check_terrain(load_terrain(path, cell=0.5, scale=0.001))
+
+
+def load_with_map(path: Path) -> None:
+    """Reads a clip with a joint map."""
+    soundness.check_clip(load_clip(path.with_name("walk.bvh"), joints=path))
+
+
+def joint_map() -> bytes:
+    """The map that the template of a clip is."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "walk.bvh"
+        path.write_text(BVH)
+        clip = load_clip(path)
+    return template(clip.joint_names, clip.parents, clip.source).encode()
+
+
 def mesh_bytes(kind: str) -> bytes:
     """A hill of 18 triangles as trimesh writes it."""
     x, z = (part.ravel() for part in np.meshgrid(np.arange(4.0), np.arange(4.0)))
@@ -172,7 +210,7 @@ def load_record(path: Path) -> None:
     reading = record.Reading()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        for entry in record_files.read(path, reading, None):
+        for entry in record_files.read(path, reading, None, drop=True):
             with error_context(path):
                 record_files.describe(entry, reading)
                 soundness.check_system(record.to_ik(entry, reading))
@@ -214,13 +252,20 @@ FORMATS: dict[str, Format] = {
         lambda path: soundness.check_clip(load_clip(path.with_suffix(".amc"))),
         beside={"walk.amc": AMC.encode},
     ),
-    "clip, NPZ": clip_format("walk.npz", clip_archive, damage=damage_arrays),
+    "clip, GLB": clip_format("walk.glb", lambda: clip_bytes(".glb"), damage=damage_glb),
+    "clip, glTF": clip_format("walk.gltf", lambda: walker().text().encode(), damage=damage_json),
+    "clip, NPZ": clip_format("walk.npz", lambda: clip_bytes(".npz"), damage=damage_arrays),
     "clip, blocks": clip_format("blocks.npz", blocks_archive, damage=damage_arrays),
     "heightfield": Format(
         "hill.npz",
         heightfield_archive,
         lambda path: soundness.check_terrain(load_terrain(path)),
         damage_arrays,
+    ),
+    "heights, NPY": Format("hill.npy", heights_array, load_heights, damage_bytes),
+    "heights, PNG": Format("hill.png", heights_picture, load_heights, damage_bytes),
+    "joint map": Format(
+        "map.toml", joint_map, load_with_map, damage_toml, beside={"walk.bvh": BVH.encode}
     ),
     "mesh, PLY text": mesh_format("ply_ascii", damage_text),
     "mesh, PLY": mesh_format("ply", damage_bytes),
@@ -273,4 +318,22 @@ FORMATS: dict[str, Format] = {
             "run/parameters.toml": lambda: b"",
         },
     ),
+    "state of a fit": Format(
+        "search.json", lambda: kept_files.solved()[2], kept_files.load_search, damage_json
+    ),
+    "search of a population": Format(
+        "searches/0123abcd.json", kept_files.found_text, kept_files.load_found, damage_json
+    ),
+    "rows of an ablation": Format(
+        "contribution.json", kept_files.rows_text, kept_files.load_rows, damage_json
+    ),
+    **{
+        f"{name} of a calibration": Format(
+            f"{name}/0000.json",
+            lambda content=content: kept_files.text_of(content),
+            kept_files.load_replicate,
+            damage_json,
+        )
+        for name, content in kept_files.REPLICATES.items()
+    },
 }

@@ -9,7 +9,7 @@ import pytest
 from fitting.datasets import archives
 from fitting.datasets.clips import load_clip
 from fuzz.damage import ARRAY_DAMAGES, archive_of
-from fuzz.formats import FORMATS, clip_archive
+from fuzz.formats import FORMATS, clip_bytes
 from fuzz.trial import OUTCOMES, try_to_load
 
 FORM = FORMATS["clip, NPZ"]
@@ -19,7 +19,7 @@ COUNT = 60  # of each kind of damage
 @pytest.fixture(scope="module")
 def content() -> dict[str, np.ndarray]:
     """The arrays of a whole clip."""
-    with np.load(io.BytesIO(clip_archive())) as archive:
+    with np.load(io.BytesIO(clip_bytes(".npz"))) as archive:
         return dict(archive)
 
 

@@ -90,6 +90,11 @@ FOUND: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {  # format, chang
         text(b'terrain = "', b'terrain = "' + 300 * b"x"),
         "refused",
     ),
+    "a random state of a hundred digits": (
+        "state of a fit",
+        text(b'"has_uint32": 0', b'"has_uint32": ' + 100 * b"9"),
+        "refused",
+    ),
 }
 
 

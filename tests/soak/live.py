@@ -77,7 +77,7 @@ def grounds() -> tuple[Terrain, ...]:
 def newborn(ik: jaxik.FootIK, count: int, seed: int) -> Life:
     """Characters before their first frame, each with a life of its own."""
     rig, frames = animation()
-    keys = jax.random.split(jax.random.key(seed), count)
+    keys = jax.random.split(jax.random.key(seed, impl="unsafe_rbg"), count)
     state = jaxik.init(ik, rig)
 
     def one(key: Array) -> Life:

@@ -1,0 +1,139 @@
+"""What studies keep of a folder's work, from which an interrupted call goes on: whole, and read."""
+
+import dataclasses
+import json
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from fitting.analysis.accuracy import Accuracy
+from fitting.inference.optimisation import search
+from fitting.inference.optimisation.kept_stages import KeptStages
+from fitting.inference.optimisation.settings import SearchSettings
+from fitting.inference.optimisation.solution import Solution
+from fitting.inference.optimisation.state import Search, SearchState
+from fitting.inference.profiles.state import Profiling
+from fitting.problem.problem import Problem
+from fitting.runtime.precision import in_float64
+from fitting.studies import ablation
+from fitting.studies.ablation import Row
+from fitting.studies.calibration import calibration
+from fitting.studies.calibration.replicates import DRAWS, LEVELS
+from fitting.studies.hierarchy import kept_searches
+from support.curves import curve_problem
+
+SETTINGS = SearchSettings(descents=2, max_rounds=1, generations=1, population=20, elite=5)
+PARAMETER = {
+    "name": "lean.gain",
+    "kind": "smooth",
+    "unit": "1",
+    "u": 0.5,
+    "start_sd": 0.1,
+    "value": 0.2,
+    "before": 0.1,
+    "low": 0.0,
+    "high": 1.0,
+    "prior": {"shape": "normal", "centre": 0.1, "spread": 1.6, "interval": [0.05, 0.9]},
+    "interval": [0.1, 0.3],
+    "verdict": "two-sided",
+    "valleys": [{"value": 0.2, "rise": 0.0, "interval": [0.1, 0.3], "values": [0.2]}],
+    "contraction": 0.9,
+    "at_bound": "",
+    "determined": True,
+}
+ENDING = {"converged": True, "message": "Converged.", "seconds": 1.5}
+REPLICATES: Mapping[str, Mapping[str, object]] = {
+    calibration.FITS: {
+        "number": 0,
+        "truth_u": [0.4],
+        "truth": [0.21],
+        "truth_levels": [0.3],
+        "truth_valley_cost": 10.0,
+        "cost": 10.5,
+        "starts": 2,
+        "agreeing": 2,
+        "parameters": [PARAMETER],
+        **ENDING,
+    },
+    calibration.CHAINS: {
+        "number": 0,
+        "ranks": {"lean.gain": DRAWS // 2, calibration.LOG_PROBABILITY: 3},
+        "intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)},
+        "draws": DRAWS,
+        **ENDING,
+    },
+}
+
+
+def text_of(content: Mapping[str, object]) -> bytes:
+    """A file of the present format."""
+    return json.dumps({"format": 1, **content}, indent=2).encode()
+
+
+def _refuse(reason: object) -> NoReturn:
+    raise ValueError(reason)
+
+
+@cache
+@in_float64
+def solved() -> tuple[Problem, Solution, bytes]:
+    """A problem, its solution, and the file that the search and the begun profiles leave."""
+    problem = curve_problem()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "search.json"
+        kept = KeptStages(path, "a fit")
+        solution = search.find_best_fit(problem, SETTINGS, starts=1, kept=kept)
+        keep = kept.recall_profiles(problem, solution.u, _refuse)
+        keep(Profiling.around(problem, solution).stored())
+        kept.flush()
+        return problem, solution, path.read_bytes()
+
+
+@in_float64
+def load_search(path: Path) -> None:
+    """Goes on from a file; what a fit only warns of is an error."""
+    problem, solution, _ = solved()
+    kept = KeptStages(path, "a fit", _refuse)
+    first = SearchState.at(np.asarray(problem.space.start), seed=0)
+    attached = kept.attach(Search(problem, SETTINGS), first, 1)
+    assert attached.recall is not None
+    profiling = Profiling.around(problem, solution)
+    kept.recall_profiles(problem, solution.u, profiling.restore)
+    assert all(np.isfinite(curve.values).all() for curve in profiling.curves.curves)
+
+
+def found_text() -> bytes:
+    """The result of a search of a population."""
+    return text_of({"name": "all clips", "u": [0.5, -0.25], "cost": 10.5, **ENDING})
+
+
+def load_found(path: Path) -> None:
+    """As `jaxik population` reads it."""
+    found = kept_searches._read(path, 2)
+    assert found is not None and np.isfinite([*found["u"], found["cost"]]).all()
+
+
+def rows_text() -> bytes:
+    """The rows of an ablation."""
+    names = [field.name for field in dataclasses.fields(Accuracy)]
+    accuracy = Accuracy(**{name: 0.01 * place for place, name in enumerate(names)})
+    row = Row("0123abcd", "locks", 1, accuracy, {"lean.gain": 0.2}, True, "Converged.", 1.5)
+    return text_of({"rows": [dataclasses.asdict(row)]})
+
+
+def load_rows(path: Path) -> None:
+    """As `jaxik ablate` reads them."""
+    for row in ablation.read(path.parent):
+        assert isinstance(row.agreement, Accuracy) and isinstance(row.variant, str)
+
+
+def load_replicate(path: Path) -> None:
+    """As `jaxik calibrate` reads it."""
+    kind = path.parent.name
+    stage = calibration._Stage(path.parents[1], 1, None, print, ["lean.gain"], kind)
+    (result,) = stage.run(_refuse, [None], print)
+    assert result["number"] == 0 and isinstance(result["seconds"], float)

@@ -1,0 +1,84 @@
+"""Mutation testing of jaxik: `PYTHONPATH=tests python -m mutation --count 200 --seed 1`.
+
+Changes a line of the source, in a copy of the checkout, and runs the tests until one fails; then
+the next. Prints how many changes the tests caught and lists those that survived. Results are kept
+in `build/mutation`: the same command goes on where it was interrupted. The exit status is 1 if
+less than 95 % were caught.
+"""
+
+import argparse
+import math
+import os
+import signal
+import sys
+import tempfile
+from pathlib import Path
+
+from .mutants import modules_of, mutants_of, sample
+from .report import OUTCOMES, Result, score, summary
+from .run import Run
+from .workplace import Workplace
+
+ROOT = Path(__file__).resolve().parents[2]
+KEPT = ROOT / "build" / "mutation"
+GOAL = 0.95
+BUDGET = 45.0  # CPU seconds of tests for each mutant in the first round; the second has no limit
+# A changed program is another program, so that mutants may share what is compiled.
+ENVIRONMENT = {
+    "JAX_COMPILATION_CACHE_DIR": str(KEPT / "programs"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+}
+
+
+def print_progress(results: list[Result], seconds: float, last: Result) -> None:
+    """Prints how far the run is, and how long this round will still take."""
+    outcomes = [result.outcome for result in results]
+    counts = ", ".join(f"{outcomes.count(word)} {word}" for word in OUTCOMES)
+    print(
+        f"{len(results)}: {counts}; {seconds / 60:.0f} minutes left"
+        f" ({last.outcome} in {last.seconds:.0f} s: {last.path}:{last.line} {last.by})",
+        flush=True,
+    )
+
+
+def interrupt(number: int, frame: object) -> None:
+    """Ends a run that is asked to end as one that is interrupted from the keyboard."""
+    raise KeyboardInterrupt
+
+
+def main() -> int:
+    """Tests a sample of mutants, or all of some modules; gives the exit status."""
+    parser = argparse.ArgumentParser(prog="mutation", description="Changes code, and tests it.")
+    parser.add_argument("--count", type=int, default=200, help="mutants, of all modules together")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", default=["jaxik"], help="folders or modules")
+    parser.add_argument("--report", type=Path, help="a file for what is printed at the end")
+    parser.add_argument("--retry", action="store_true", help="test survivors again")
+    parser.add_argument("--budget", type=float, help="only so many CPU seconds of tests for each")
+    options = parser.parse_args()
+    KEPT.mkdir(parents=True, exist_ok=True)
+    os.environ.update(ENVIRONMENT)
+    signal.signal(signal.SIGTERM, interrupt)
+    modules = [path for folder in options.only for path in modules_of(ROOT, folder)]
+    mutants = [mutant for path in modules for mutant in mutants_of(ROOT, path)]
+    chosen = sample(mutants, options.count, options.seed)
+    print(f"{len(chosen)} of {len(mutants)} mutants in {len(modules)} modules", flush=True)
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
+        run = Run(Workplace(ROOT, Path(folder)), KEPT, str(options.seed))
+        if options.retry:
+            run.forget_survivors()
+        try:
+            for budget in (options.budget,) if options.budget else (BUDGET, math.inf):
+                run.round(chosen, budget, print_progress)
+        except KeyboardInterrupt:
+            print("Interrupted: the same command goes on from here.")
+        results = run.results_of(chosen)
+    text = summary(results)
+    print(text)
+    if options.report:
+        options.report.write_text(text + "\n", encoding="utf-8")
+    return int(score(results)[0] < GOAL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
