@@ -15,6 +15,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from matplotlib.figure import Figure
 
 from fitting.runtime import xla
 
@@ -27,6 +28,8 @@ if PROGRAMS not in os.environ:
     os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxik-tests-")
     atexit.register(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True)
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
+SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
+jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
 
 # Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
 gc.set_threshold(200_000, 50, 100)
@@ -64,6 +67,12 @@ def optimised() -> Iterator[None]:
     yield
     jax.config.update("jax_disable_most_optimizations", UNOPTIMIZED != "0")
     jax.clear_caches()
+
+
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    """Figures are made but files stay empty, for tests of something else: drawing takes long."""
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **look: Path(path).write_bytes(b""))
 
 
 @pytest.fixture(scope="session")

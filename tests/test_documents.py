@@ -66,6 +66,8 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def check_command(line: str) -> None:
     """Raises AssertionError where a tool, a sub-command, an option or a script does not exist."""
     words = shlex.split(line, comments=True)
+    if ">" in words:
+        words = words[: words.index(">")]
     if not words:
         return
     tool = Path(words[0]).name
