@@ -26,7 +26,9 @@ def add_inspect(commands: Commands) -> None:
         jaxik inspect walk.bvh --joints map.toml
         """,
     )  # fmt: skip
-    inspect.add_argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf or .npz")
+    inspect.add_argument(
+        "clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf, .c3d or .npz"
+    )
     inspect.add_argument("--json", action="store_true", help="as JSON")
     group = inspect.add_argument_group("how the clip is read (default: recognised or guessed)")
     group.add_argument(
@@ -51,7 +53,7 @@ def add_terrain(commands: Commands) -> None:
         """,
     )  # fmt: skip
     terrain.add_argument(
-        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf or .npz"
+        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf, .c3d or .npz"
     )
     add_output(terrain, "MESH", ".ply, .obj or .stl")
     terrain.add_argument(

@@ -52,7 +52,7 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
     """Adds a flat animation, its terrain, and how they lie."""
     command.add_argument(
         "clip", type=Path, metavar="CLIP", nargs=None if required else "?",
-        help=".bvh, .amc, .glb, .gltf or .npz over flat ground; of a blocks .npz its base",
+        help=".bvh, .amc, .glb, .gltf, .c3d or .npz over flat ground; of a blocks .npz its base",
     )  # fmt: skip
     command.add_argument(
         "--terrain",
