@@ -5,7 +5,7 @@ import warnings
 
 from fitting.cli.parsers.files import TEMPLATE
 from fitting.datasets.clips import load_clip, summary
-from fitting.datasets.clips.joints import map_files
+from fitting.datasets.clips.load import draft_joint_map
 from fitting.datasets.terrain.reconstruction import reconstruct
 from fitting.experiments import parameter_files, record_files, systems
 from fitting.report import terrain_report
@@ -20,15 +20,13 @@ from . import reading
 
 def inspect(options: argparse.Namespace) -> int:
     """Prints what a loader understood of a clip, or a joint map of it."""
-    as_template = options.joints == TEMPLATE
-    if as_template:
+    how = reading.clip_options(options)
+    if options.joints == TEMPLATE:
         if options.json:
             raise ValueError("--json is for what was understood, and not for a joint map")
-        options.joints = None
-    clip = load_clip(options.clip, **vars(reading.clip_options(options)))
-    if as_template:
-        print(map_files.template(clip.joint_names, clip.parents, clip.source))
+        print(draft_joint_map(options.clip, how))
         return 0
+    clip = load_clip(options.clip, **vars(how))
     described = summary.describe(clip)
     print(summary.as_json(described) if options.json else summary.as_text(described))
     return 0
