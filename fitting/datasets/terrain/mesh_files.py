@@ -201,7 +201,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
     content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
-        gltf_checks.check_claims(kind, content)
+        content = gltf_checks.checked(kind, content)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
             resolver = FilePathResolver(str(path))
