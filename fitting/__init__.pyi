@@ -21,6 +21,7 @@ from .experiments.systems import register_rule as register_rule
 from .jobs import ablate as ablate
 from .jobs import calibrate as calibrate
 from .jobs import compare as compare
+from .jobs import export as export
 from .jobs import fit as fit
 from .jobs import population as population
 from .jobs import sample as sample
