@@ -17,6 +17,8 @@ from .datasets.flat_animation import load_flat_animation as load_flat_animation
 from .datasets.terrain.mesh_files import load_terrain as load_terrain
 from .experiments.experiment import Experiment as Experiment
 from .experiments.experiment_files import load_experiment as load_experiment
+from .experiments.in_memory.making import clip_entry as clip_entry
+from .experiments.in_memory.making import make_experiment as make_experiment
 from .experiments.systems import register_rule as register_rule
 from .jobs import ablate as ablate
 from .jobs import calibrate as calibrate

@@ -175,7 +175,9 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     if changed := _changed(search):
         fit_table["search"] = changed
     usual = {key: sampler[key] for key in USUAL_SAMPLE_KEYS}
-    content = dataclasses.asdict(dataclasses.replace(experiment, whole=None))
+    named = tuple(dataclasses.replace(entry, loaded=None) for entry in experiment.clips)
+    plain = dataclasses.replace(experiment, clips=named, whole=None, system=None)
+    content = dataclasses.asdict(plain)
     content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
     content["prior"] = priors_to_table(experiment.prior)
     content["hierarchy"] = hierarchy_to_table(experiment.hierarchy)
