@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 import jaxik
-from fitting.experiments.systems import changed_rules
+from fitting.experiments.systems import changed_rules, with_parameters
 from fitting.runtime.validation import check_keys
 from jaxik.maths import parameter_tree
 
@@ -66,7 +66,7 @@ def to_ik(values: Mapping[str, Value], name: str) -> jaxik.FootIK:
         if setting.name in values:
             value = _checked(ik, setting, values[setting.name], original)
             parameters |= dict.fromkeys(setting.ours, value)
-    return parameter_tree.replace(ik, parameters)
+    return with_parameters(ik, parameters, f"settings of {name}")
 
 
 def dropped(ik: jaxik.FootIK, original: Original) -> dict[str, tuple[str, str]]:
