@@ -32,7 +32,7 @@ from .frame_rates import RateDifference
 from .run_folder import PARAMETERS
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    import pandas
 
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
 
@@ -55,7 +55,7 @@ class Comparison(Shown):
     rates: Sequence[RateDifference] = ()
     """At other frame rates, system by system."""
 
-    def table(self) -> "DataFrame":
+    def table(self) -> "pandas.DataFrame":
         """The measures in SI units, a row for each system, as pandas has tables.
 
         Raises:

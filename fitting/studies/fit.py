@@ -38,7 +38,7 @@ from .goodness import GoodnessSummary, summarise
 from .prior_summary import PriorSummary, summarise_priors
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    import pandas
 
 # Walkers start in a ball around the fit. Its width, in u, is the Laplace standard deviation, which
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
@@ -204,7 +204,7 @@ class Fit(Shown):
         """The free parameters in the order of `u`."""
         return _fitted_parameters(self)
 
-    def table(self) -> "DataFrame":
+    def table(self) -> "pandas.DataFrame":
         """The free parameters by name, as pandas has tables; `low95` and `high95` are intervals.
 
         Raises:

@@ -9,8 +9,9 @@ import jaxik
 from fitting.inference.sensitivity import FreeTable
 
 Selector: TypeAlias = Callable[[jaxik.FootIK], object]
-Free: TypeAlias = Iterable[str | Selector] | Mapping[str | Selector, Mapping[str, float | str]]
-"""Names or selectors; a mapping has what overrides the declaration of each (`low`, `high`, ...)."""
+Choice: TypeAlias = str | Selector
+Free: TypeAlias = Choice | Iterable[Choice] | Mapping[Choice, Mapping[str, float | str]]
+"""A name or a selector, or several; a mapping has what overrides the declaration of each."""
 
 
 class _Name(str):
@@ -39,7 +40,7 @@ def free_table(free: Free, ik: jaxik.FootIK) -> FreeTable:
     return table
 
 
-def _names(entry: str | Selector, ik: jaxik.FootIK) -> list[str]:
+def _names(entry: Choice, ik: jaxik.FootIK) -> list[str]:
     """The dotted names of what an entry picks."""
     if isinstance(entry, str):
         return [entry]

@@ -13,7 +13,8 @@ from jaxik.maths import parameter_tree
 
 from .layout import ORIGINALS, SWITCH, Original, Setting
 
-Value: TypeAlias = bool | float | Sequence  # of a setting; a sequence for a vector or several legs
+Value: TypeAlias = bool | int | float | Sequence
+"""Of a setting: a sequence for a vector, or where legs differ."""
 RTOL, ATOL = 1e-6, 1e-9  # within which values are the same
 
 

@@ -26,7 +26,7 @@ from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    import pandas
 
 ROWS = 4096  # of u, whose values are computed at once
 
@@ -128,7 +128,7 @@ class Posterior(Shown):
 
         return to_inference_data(self, space)
 
-    def table(self) -> "DataFrame":
+    def table(self) -> "pandas.DataFrame":
         """The parameters by name, as pandas has tables: mean, sd, median, central intervals.
 
         Raises:

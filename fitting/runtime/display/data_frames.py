@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    import pandas
 
 
-def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> "DataFrame":
+def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> "pandas.DataFrame":
     """A table with a row for each mapping, and a column for each of their keys.
 
     Args:
