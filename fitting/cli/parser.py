@@ -3,7 +3,7 @@
 import argparse
 
 from .parsers.animations import add_apply, add_compare, add_run
-from .parsers.files import add_inspect, add_record, add_terrain
+from .parsers.files import add_export, add_inspect, add_record, add_terrain
 from .parsers.fits import (
     add_ablate,
     add_calibrate,
@@ -32,6 +32,7 @@ EXAMPLES = """examples:
   jaxik inspect walk.bvh
   jaxik terrain walk.bvh -o ground.ply
   jaxik record to-toml footik.bin -o footik.toml
+  jaxik export runs/walk --as unreal -o walk.csv               in a game engine's names and units
   jaxik bench --quick
   jaxik cache                                                  where compiled programs are kept
   jaxik parameters stride                                      what each one is and does
@@ -61,7 +62,7 @@ def make_parser() -> argparse.ArgumentParser:
     for add in (
         add_init, add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply,
         add_run, add_compare, add_translate, add_inspect, add_terrain, add_bench, add_record,
-        add_cache, add_parameters, add_schema, add_example, add_doctor, add_completion,
+        add_export, add_cache, add_parameters, add_schema, add_example, add_doctor, add_completion,
     ):  # fmt: skip
         add(commands)
     return top

@@ -17,14 +17,19 @@ import jaxik
 from fitting.datasets import coverage
 from fitting.datasets.clip_frames import frames_from_clip, raised
 from fitting.datasets.clips import Clip, edit, flight, load_clip
-from fitting.datasets.flat_animation import flatten_clip, load_flat_animation, with_remark_if_uneven
+from fitting.datasets.flat_animation import (
+    as_flat_animation,
+    flatten_clip,
+    load_flat_animation,
+    with_remark_if_uneven,
+)
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain import mesh_files
 from fitting.datasets.terrain.mesh_files import TerrainOptions
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
-from fitting.runtime.precision import in_float64
+from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
@@ -133,10 +138,15 @@ def _load_rig(entry: ClipEntry) -> jaxik.Rig:
 
 
 def _load_reference(entry: ClipEntry) -> Clip:
+    if entry.loaded is not None:
+        return entry.loaded.reference
     return load_clip(entry.reference, **vars(entry.clip_options.of_file(entry.reference)))
 
 
 def _load_base(base: Path, entry: ClipEntry) -> Clip:
+    if entry.loaded is not None and entry.loaded.base is not None:
+        with error_context(base):
+            return as_flat_animation(entry.loaded.base)
     return load_flat_animation(base, options=entry.clip_options.of_file(base))
 
 
@@ -156,6 +166,8 @@ def load_clip_data(entry: ClipEntry, fps: float | None, *, has_file: bool = True
     """
 
     def load_ground(options: TerrainOptions) -> Terrain:
+        if entry.loaded is not None:
+            return with_floats(entry.loaded.terrain, np.float64)
         return mesh_files.load_terrain(entry.terrain, **vars(options))
 
     def check_ground(clip: Clip) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
 from fitting.runtime import cluster
@@ -56,6 +57,7 @@ def calibrate(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
         problem = make_problem(experiment)
         log(f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}")
         observers = Observers(

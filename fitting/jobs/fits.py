@@ -10,6 +10,7 @@ import numpy as np
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.known_values import load_known_values
 from fitting.experiments.problems import ClipData, load_clips, problem_from_clips
 from fitting.experiments.record_only import left_out
@@ -68,6 +69,7 @@ def fit(
         experiment = load_experiment(experiment)
     known_values = load_known_values(experiment)
     with output_folder(output) as run:
+        experiment = with_files(experiment, run)
         lines: list[str] = []
         clips = load_clips(experiment, lines.append)
         problem = problem_from_clips(experiment, clips)
@@ -172,6 +174,7 @@ def ablate(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
 
         def log_row(row: ablation.Row) -> None:
             log(ablation_report.row_text(row))

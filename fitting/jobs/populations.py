@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from fitting.experiments import parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.problems import make_problem
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Progress
@@ -47,6 +48,7 @@ def population(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
         problem = make_problem(experiment)
         log(
             f"fitting {problem.space.size} parameters of {experiment.preset} to "

@@ -120,7 +120,7 @@ def ablate(
     finished = {} if folder is None else {row.key: row for row in read(folder)}
     data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
     splits = list(split(experiment.clips, data, folds))
-    content = _digest(experiment.clips)
+    content = "" if folder is None else _digest(experiment.clips)
     rows: list[Row] = []
     for name, variant in variants.items():
         any_new = False

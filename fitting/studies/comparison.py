@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,8 @@ from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
 from fitting.experiments.parameter_files import load_system
 from fitting.experiments.systems import preset_system
+from fitting.runtime.display.data_frames import data_frame
+from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import vec
@@ -28,11 +31,14 @@ from .animations import Animation
 from .frame_rates import RateDifference
 from .run_folder import PARAMETERS
 
+if TYPE_CHECKING:
+    import pandas
+
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Shown):
     """One clip under several systems, by name; the animation itself comes first."""
 
     title: str
@@ -48,6 +54,15 @@ class Comparison:
     """Of the systems, without the animation; see `Animation.assess`."""
     rates: Sequence[RateDifference] = ()
     """At other frame rates, system by system."""
+
+    def table(self) -> "pandas.DataFrame":
+        """The measures in SI units, a row for each system, as pandas has tables.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        rows = ({"system": name} | vars(measures) for name, measures in self.measures.items())
+        return data_frame(rows, "system")
 
 
 @in_float64

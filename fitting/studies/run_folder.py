@@ -1,6 +1,6 @@
 """A run on disk: a folder with the experiment, the fit, the chain, tables and plots.
 
-experiment.toml   what was fitted; paths are absolute, except to files of the run itself
+experiment.toml   what was fitted; paths are relative, and it says from where they led
 fit.json          the numbers of the fit
 parameters.toml   the fitted system
 base.npz          the flat animation, and fitted.npz the fitted motion; numbered for several clips
@@ -119,20 +119,28 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
 
 
 def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
-    """The fitted system of a run, for the body of a rig; its clips may be gone.
+    """The fitted system of a run, for the body of a rig; all but its parameters may be gone.
 
     Raises:
-        ValueError: the folder holds no finished fit, or its system lacks a fitted parameter.
+        ValueError: the folder has no parameters, those of an unfinished fit, or its system lacks a
+            fitted parameter.
     """
-    _check_files(run, (FIT, PARAMETERS))
-    summary, path = _load_summary(run), run / PARAMETERS
+    _check_files(run, (PARAMETERS,))
+    path = run / PARAMETERS
+    if (run / FIT).exists() or (run / SEARCH).exists():  # without both, the parameters came alone
+        _check_files(run, (FIT,))
+        _check_has_parameters(path, _load_summary(run))
     _check_toml_format(path)
+    ik, _ = parameter_files.load_system(path, rig)
+    return ik
+
+
+def _check_has_parameters(path: Path, summary: FitSummary) -> None:
+    """Raises ValueError for the parameters of another fit."""
     present = flatten(read_toml(path, "a parameter"), 2)
     names = {row["name"].partition("[")[0] for row in summary["parameters"]}
     if missing := sorted(names - set(present)):
         raise ValueError(f"{path}: not the system of this fit: no {', '.join(missing)}; {HINT}")
-    ik, _ = parameter_files.load_system(path, rig)
-    return ik
 
 
 def _check_files(run: Path, names: Sequence[str]) -> None:

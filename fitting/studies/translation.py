@@ -35,7 +35,6 @@ from fitting.problem.problem import Problem
 from fitting.runtime import files, validation
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
-from jaxik.maths import parameter_tree
 
 from . import run_folder
 from .animations import AnimationFiles, load_animation
@@ -181,6 +180,7 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
     rig = data[0].base.rig
     preset = target.preset.system(rig)
     rules = systems.changed_rules(target.ik, preset)
+    start = systems.with_rules(preset, rules, target.name, rig)
     experiment = Experiment(
         path=run / run_folder.EXPERIMENT,
         clips=_clip_entries(request, run),
@@ -190,7 +190,7 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
         name=f"{source.name} to {target.name}",
         fps=request.fps,
         rules=rules,
-        parameters=_changed_values(target.ik, systems.with_rules(preset, rules, target.name, rig)),
+        parameters=systems.changed_values(target.ik, start),
         sigmas=TOLERANCES,
     )
     problem = problem_from_clips(experiment, data)
@@ -235,16 +235,6 @@ def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None
         _, solved = animation.solve(source.ik)
     solved = replace(solved, source=f"{source.name} on {animation.clip.source}")
     return ClipData(solved, animation.clip, animation.terrain, animation.root)
-
-
-def _changed_values(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, object]:
-    """Values in which a system differs from its preset, which has the same rules."""
-    values = {name: np.asarray(parameter_tree.get(ik, name)) for name in systems.leaf_names(ik)}
-    return {
-        name: value.tolist()
-        for name, value in values.items()
-        if not np.array_equal(value, np.asarray(parameter_tree.get(preset, name)))
-    }
 
 
 def _check_moves(source: NamedSystem, problem: Problem[jaxik.FootIK]) -> None:

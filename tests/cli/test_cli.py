@@ -37,7 +37,7 @@ DATA = ROOT / "data"
 COMMANDS = [
     "fit", "ablate", "calibrate", "population", "sample", "apply", "run", "compare", "translate",
     "inspect", "terrain", "bench", "cache", "record", "record show", "record to-toml",
-    "record to-bytes",
+    "record to-bytes", "export",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 
@@ -65,6 +66,19 @@ def test_a_file_that_hides_a_package_is_named(tmp_path):
     (finding,) = installation._names_in(tmp_path)
     assert f"{tmp_path / 'fitting.py'} hides the package fitting" in finding.problem
     assert not list(installation._names_in(ROOT))
+
+
+def test_the_command_itself_is_not_hidden_by_a_file_beside_it(tmp_path):
+    command = Path(sys.executable).with_name("jaxik")
+    if not command.is_file():
+        pytest.skip("jaxik is not installed")
+    for name in ("fitting.py", "jaxik.py"):
+        (tmp_path / name).write_text("raise RuntimeError('of the folder')\n", encoding="utf-8")
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [command, "--help"], env=variables, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "Fits the parameters" in done.stdout, done.stderr
 
 
 @pytest.fixture

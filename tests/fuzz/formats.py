@@ -21,6 +21,7 @@ from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.experiments import parameter_files, record_files, track_files
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
+from fitting.experiments.originals import conversion, settings_files
 from fitting.runtime.validation import error_context
 from fitting.studies import run_folder, translation
 from jaxik import presets, record
@@ -96,6 +97,12 @@ RUN = {
         | {"determined": True}
     ]
 }
+
+
+def settings_of_mec(suffix: str = ".toml") -> bytes:
+    """A table of settings."""
+    values = conversion.to_settings(presets.mec(faithful=True), "mec")
+    return settings_files.settings_text(values, "mec", suffix).encode()
 
 
 @dataclass(frozen=True)
@@ -297,6 +304,23 @@ FORMATS: dict[str, Format] = {
         lambda: parameter_files.system_to_toml(presets.record()).encode(),
         lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
         damage_toml,
+    ),
+    "parameters, JSON": Format(
+        "footik.json",
+        lambda: parameter_files.system_to_json(presets.record()).encode(),
+        lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
+        damage_json,
+    ),
+    "settings": Format(
+        "mec.toml",
+        settings_of_mec,
+        lambda path: soundness.check_system(settings_files.load_settings(path)[0]),
+        damage_toml,
+    ),
+    "settings, CSV": Format(
+        "mec.csv",
+        lambda: settings_of_mec(".csv"),
+        lambda path: soundness.check_system(settings_files.load_settings(path)[0]),
     ),
     "truth": Format(
         "truth.toml",

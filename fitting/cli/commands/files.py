@@ -3,6 +3,7 @@
 import argparse
 import warnings
 
+from fitting import jobs
 from fitting.cli.parsers.files import TEMPLATE
 from fitting.datasets.clips import load_clip, summary
 from fitting.datasets.clips.load import draft_joint_map
@@ -78,5 +79,12 @@ def convert_record(options: argparse.Namespace) -> int:
             )
     else:
         files.write(options.output, lambda path: path.write_bytes(record.to_bytes(only)))
+    print(f"written to {options.output}")
+    return 0
+
+
+def export(options: argparse.Namespace) -> int:
+    """Writes parameters in another form."""
+    jobs.export(options.source, options.output, system=options.system, drop=options.drop)
     print(f"written to {options.output}")
     return 0

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, values_of_rows
+from fitting.runtime.display.data_frames import data_frame
+from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
@@ -22,6 +24,9 @@ from .chain import Chain
 from .chain_file import Identity
 from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
+
+if TYPE_CHECKING:
+    import pandas
 
 ROWS = 4096  # of u, whose values are computed at once
 
@@ -59,7 +64,7 @@ class WalkerStart:
 
 
 @dataclasses.dataclass(frozen=True)
-class Posterior:
+class Posterior(Shown):
     """A sampled posterior. `steps` counts stored steps, each `thin_by` steps of the sampler."""
 
     names: tuple[str, ...]
@@ -122,6 +127,14 @@ class Posterior:
         from .inference_data import to_inference_data
 
         return to_inference_data(self, space)
+
+    def table(self) -> "pandas.DataFrame":
+        """The parameters by name, as pandas has tables: mean, sd, median, central intervals.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(self.summary, "name")
 
     @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
