@@ -248,6 +248,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
     compared = comparison.Comparison(
         "title", tuple(f"leg {leg}" for leg in range(legs)), 30.0,
         np.full((300, legs), np.nan), 0.0,
+        Animation(load_flat_animation(BASE), terrain.plane()), {},
         {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero}, {},
     )  # fmt: skip
     figure = comparison_plots.overview(compared)
