@@ -14,7 +14,7 @@ from fitting.datasets.clips import Clip, flight, save_clip
 from fitting.datasets.clips.formats.saving import check_clip_file
 from fitting.datasets.terrain.meshes import mesh_of
 from fitting.report import comparison_report, fit_tables, placement_report
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, transposed
 from fitting.report.page.comparisons import compare_page, suite_page
 from fitting.report.suite import suite_report
 from fitting.runtime.precision import in_float64, with_floats
@@ -62,7 +62,7 @@ def compare(
         if folder is not None:
             comparison_report.write(folder, compared)
             compare_page.write(folder, compared)
-        table = aligned(comparison_report.transposed(comparison_report.table(compared)))
+        table = aligned(transposed(comparison_report.table(compared)))
         where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
         where += [f"note: {remark}" for remark in loaded.clip.remarks]
         log("\n".join([table, "", *filter(None, where)]))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fitting.datasets.clips import flight
 from fitting.report import comparison_report
-from fitting.report.formatting import Table, percent
+from fitting.report.formatting import Table, percent, transposed
 from fitting.report.labels import MEASURES, meanings
 from fitting.report.page import figures, pictures
 from fitting.report.page.motion_data import MAX_RATE
@@ -89,7 +89,7 @@ def _accuracy(compared: ComparedMotions) -> list[Section]:
 
 
 def _measures(folder: Path, comparison: Comparison) -> Section:
-    table = comparison_report.transposed(comparison_report.table(comparison))
+    table = transposed(comparison_report.table(comparison))
     caption = "Feet and pelvis over the ground, and the measures"
     return Section(
         "Measures",

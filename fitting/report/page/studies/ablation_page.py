@@ -8,6 +8,7 @@ from typing import NamedTuple
 from fitting.experiments.ablations import COMPLETE
 from fitting.experiments.experiment import Experiment
 from fitting.report import ablation_report
+from fitting.report.formatting import transposed
 from fitting.report.labels import ACCURACY, meanings
 from fitting.report.page import asked, pictures
 from fitting.report.page.sentences import listed
@@ -135,6 +136,8 @@ def _rules(rises: Sequence[Rise]) -> list[Finding]:
                 bad=True,
             ),
         ]
+    if len(rises) == 1:
+        return [most, Finding("Nothing else is left out, so nothing is known of other rules.")]
     last = rises[-1]
     return [
         most,
@@ -148,12 +151,12 @@ def _rules(rises: Sequence[Rise]) -> list[Finding]:
 def _figures(folder: Path, experiment: Experiment, rows: Sequence[Row]) -> Section:
     blocks: list[Block] = [
         Text(
-            "Each row is a fit of its own. In brackets: how much a figure rises without the rule. "
+            "Each column is a fit. In brackets: how much a figure rises without the rule. "
             "Measured at the rate of the clips."
         )
     ]
     for part, title in ablation_report.titles(rows).items():
-        blocks.append(Grid(ablation_report.group(rows, part), title, title))
+        blocks.append(Grid(transposed(ablation_report.group(rows, part)), title, title))
     captions = {ablation_report.FIGURE: f"{experiment.name}: all figures without each of its rules"}
     blocks += pictures.embed(folder, captions)
     return Section("With and without each rule", [*blocks, Terms(meanings(ACCURACY))])

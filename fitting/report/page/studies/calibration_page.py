@@ -52,7 +52,7 @@ def write(folder: Path, experiment: Experiment, assessment: Assessment) -> None:
         findings=findings(assessment),
         sections=[*sections, _limits(assessment)],
         asked=[*asked.rows(experiment), ["Simulated motions", f"{assessment.replicates}"]],
-        files=FILES,
+        files=FILES | ({calibration_report.RANKS: "ranks"} if ranks else {}),
     ).write(folder)
 
 
@@ -74,7 +74,7 @@ def _intervals(assessment: Assessment) -> Finding:
         )
     if cover.high - cover.low > WIDE:
         return Finding(
-            f"All is inside its bounds, but {made} prove little, as these bounds are wide: "
+            f"Everything is inside its bounds, but {made} prove little, as these bounds are wide: "
             f"{coverage}.",
             bad=True,
         )
@@ -85,12 +85,14 @@ def _valleys(assessment: Assessment) -> Finding:
     valley = assessment.valley
     text = f"{valley.hits} of {valley.total} fits end where a descent from the truth does"
     wrong, unconverged = len(assessment.wrong_but_converged), len(assessment.unconverged)
+    short = len(assessment.short_chains)
     faults = [
         f"{wrong} of the others say that they converged" if wrong else "",
         f"{unconverged} did not converge" if unconverged else "",
+        f"{short} of the chains did not converge, or are too short" if short else "",
     ]
     details = "; ".join(filter(None, [text, *faults]))
-    return Finding(f"{details}.", bad=bool(wrong or unconverged))
+    return Finding(f"{details}.", bad=any(faults))
 
 
 def _recovery(assessment: Assessment) -> Finding:
