@@ -10,12 +10,12 @@ import numpy as np
 
 import jaxik
 from fitting.analysis import accuracy
-from fitting.datasets.clips import Clip, flight, load_clip, save_clip
-from fitting.datasets.clips.formats.npz import is_blocks_file
+from fitting.datasets.clips import Clip, flight, save_clip
 from fitting.datasets.clips.formats.saving import check_clip_file
 from fitting.datasets.terrain.meshes import mesh_of
 from fitting.report import comparison_report, fit_tables, placement_report
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, transposed
+from fitting.report.page.comparisons import compare_page, suite_page
 from fitting.report.suite import suite_report
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import comparison, frame_rates, run_folder
@@ -43,7 +43,7 @@ def compare(
     Args:
         systems: by name.
         animation: the clip, the terrain, and where the root is put for all systems.
-        output: folder for the table, the numbers and the figure.
+        output: folder for the table, the numbers, the figure and the page.
         rates: Hz, at which each system runs too, to see how much its motion depends on them.
         during: makes a context for the run of each system, from its name.
         log: called with what the command line prints.
@@ -61,7 +61,8 @@ def compare(
         compared = dataclasses.replace(compared, rates=differences)
         if folder is not None:
             comparison_report.write(folder, compared)
-        table = aligned(comparison_report.transposed(comparison_report.table(compared)))
+            compare_page.write(folder, compared)
+        table = aligned(transposed(comparison_report.table(compared)))
         where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
         where += [f"note: {remark}" for remark in loaded.clip.remarks]
         log("\n".join([table, "", *filter(None, where)]))
@@ -90,7 +91,7 @@ def run_suite(
     Args:
         systems_of: makes systems for the body of a rig, by name.
         plan: which situations; see `studies.suite.situations.choose`.
-        output: folder for the table, the numbers and the page of pictures.
+        output: folder for the table, the numbers, the pictures and the page.
         during: makes a context for each situation, from its name.
         log: called with what the command line prints.
 
@@ -101,6 +102,7 @@ def run_suite(
         finished = suite.run_suite(systems_of, plan, during=during)
         if folder is not None:
             suite_report.write(folder, finished)
+            suite_page.write(folder, finished)
         log(suite_report.text(finished))
         log_output(log, folder, suite_report.TABLE)
         return finished
@@ -174,8 +176,8 @@ def solve(
         *(f"note: {remark}" for remark in loaded.clip.remarks),
     ]
     log("\n".join(filter(None, where)) + f"\n\n{placement_report.text(placement)}")
-    if is_blocks_file(animation.clip) and animation.speed == 1.0:
-        errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)
+    if loaded.captured is not None:
+        errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
         log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")
     placement_report.warn(placement, cause)
     return solved

@@ -22,6 +22,7 @@ from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
 from fitting.report.goodness import record_price_report
+from fitting.report.page.studies import ablation_page
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, record_price, run_folder, translation
 from fitting.studies.assess import assess_solution
@@ -182,6 +183,7 @@ def ablate(
         rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)
         if folder is not None:
             ablation_report.write(folder, experiment, rows)
+            ablation_page.write(folder, experiment, rows)
         log(ablation_report.tables_text(rows))
         log_output(log, folder, ablation_report.TABLE)
         return rows

@@ -13,6 +13,7 @@ from fitting.experiments.problems import make_problem
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Progress
 from fitting.report.hierarchy import population_report
+from fitting.report.page.studies import population_page
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
 from fitting.studies import run_folder
@@ -64,6 +65,7 @@ def population(
         if folder is not None:
             _write_systems(folder, fitted)
             population_report.write(folder, fitted)
+            population_page.write(folder, fitted)
         log(f"\n{population_report.population_text(fitted)}")
         log_output(log, folder, population_report.SUMMARY)
         return fitted

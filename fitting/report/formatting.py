@@ -39,3 +39,8 @@ def markdown(table: Table) -> str:
     """A table in Markdown."""
     lines = ["| " + " | ".join(row) + " |" for row in table]
     return "\n".join([lines[0], "|" + " --- |" * len(table[0]), *lines[1:]])
+
+
+def transposed(rows: Table) -> Table:
+    """A table with its rows as columns."""
+    return [list(column) for column in zip(*rows, strict=True)]

@@ -48,6 +48,9 @@ class Comparison(Shown):
     """m, height under the animated ankles, or NaN."""
     groundless: float
     """Fraction of all points of soles that have no ground under them."""
+    animation: Animation
+    clips: Mapping[str, Clip]
+    """As the systems leave it."""
     motions: Mapping[str, Motion]
     measures: Mapping[str, Measures]
     placements: Mapping[str, tuple[Placement, Cause | None]]
@@ -160,7 +163,7 @@ def compare(
 
     soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
     ground = ground_heights(animation.terrain, soles_ws)
-    motions = {name: _motion(solved) for name, solved in clips.items()}
+    motions = {name: motion_of(solved) for name, solved in clips.items()}
     measured = {}
     for index, name in enumerate(clips):
         gaps = measures.gaps(soles_ws[index], ground[index])
@@ -174,6 +177,8 @@ def compare(
         fps=clip.fps,
         ground=ground[0, :, :, 0],
         groundless=float(np.mean(np.isnan(ground))),
+        animation=animation,
+        clips=clips,
         motions=motions,
         measures=measured,
         placements={name: animation.assess(clips[name]) for name in systems},
@@ -196,6 +201,7 @@ def ground_heights(
     return np.where(np.asarray(hit.found) > 0, height, np.nan)
 
 
-def _motion(clip: Clip) -> Motion:
+def motion_of(clip: Clip) -> Motion:
+    """Joints of a clip by their role."""
     joints = positions_by_role(clip)
     return Motion(**{"toe" if role == "ball" else role: at for role, at in joints.items()})

@@ -18,17 +18,10 @@ from fitting.datasets.clips.kinematics import local_from_world, world_from_local
 from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.datasets.terrain.meshes import Mesh, mesh_of
 from jaxik.world import terrain
+from support.reference_clips import BVH_FILES
 from support.sample_clips import AMC, ASF, BVH, stair_walk
 
 TOLERANCE = 1e-4  # m
-DIALECTS = [
-    "cmu_bvh_max/131_01.bvh",
-    "cmu_bvh_max/scaled_131_01.bvh",
-    "cmu_bvh_mb/cmu_12_01_walk.bvh",
-    "cmu_bvh_poser/03_01.bvh",
-    "mit/pybvh_test1_zup.bvh",
-    "mit/full_precision_frame_time.bvh",
-]
 OPTIONS = {".bvh": ("scale", "up"), ".glb": (), ".npz": ()}
 
 
@@ -77,7 +70,7 @@ def hierarchy(text: str) -> list[list[str]]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", DIALECTS)
+@pytest.mark.parametrize("name", BVH_FILES)
 def test_a_bvh_goes_back_into_its_own_hierarchy(mocap, tmp_path, name):
     clip = load_clip(mocap / "clips" / name).select(slice(0, 50))
     path, solved = tmp_path / "solved.bvh", moved(clip)

@@ -35,7 +35,8 @@ def text(suite: Suite) -> str:
     return "\n\n".join(parts)
 
 
-def _missed(suite: Suite) -> list[str]:
+def missed(suite: Suite) -> list[str]:
+    """What is beyond its bound, a line each."""
     return [
         f"{scene.situation.name}, {system}: {miss}"
         for scene in suite.scenes
@@ -46,7 +47,7 @@ def _missed(suite: Suite) -> list[str]:
 
 def _summary(suite: Suite) -> str:
     rows = [[_red(cell) for cell in row] for row in suite_tables.table(suite)]
-    missed = _missed(suite)
+    lines = missed(suite)
     parts = [
         "# Suite of situations",
         f"{suite_tables.count_text(suite).capitalize()}. Animations of "
@@ -60,7 +61,7 @@ def _summary(suite: Suite) -> str:
         "## Bounds",
         bullets(suite_tables.reasons()),
         "## Beyond their bounds",
-        bullets(missed) if missed else "Nothing.",
+        bullets(lines) if lines else "Nothing.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
