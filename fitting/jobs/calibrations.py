@@ -7,6 +7,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
+from fitting.report.formatting import joined
 from fitting.runtime import cluster
 from fitting.runtime.precision import in_float64
 from fitting.studies.calibration import calibration
@@ -71,6 +72,6 @@ def calibrate(
         assessment = assess(made)
         if folder is not None:
             calibration_report.write(folder, experiment, made, assessment)
-        log(f"\n{calibration_report.calibration_text(assessment)}")
+        log(joined(["", calibration_report.calibration_text(assessment)]))
         log_output(log, folder, calibration_report.SUMMARY)
         return assessment

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, joined
 from fitting.report.uncertainty import run_comparison as report
 from fitting.studies.posterior import run_comparison
 from fitting.studies.posterior.run_comparison import ComparedRun
@@ -29,6 +29,6 @@ def compare_runs(
         compared = run_comparison.compare_runs([Path(run) for run in runs])
         if folder is not None:
             report.write(folder, compared)
-        log(f"{aligned(report.table(compared))}\n\n{report.explanation()}")
+        log(joined([aligned(report.table(compared)), report.explanation()], apart=True))
         log_output(log, folder, report.TABLE)
         return compared

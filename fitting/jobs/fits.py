@@ -20,6 +20,7 @@ from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
+from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, record_price, run_folder, translation
@@ -82,7 +83,7 @@ def fit(
         if run is not None:
             fit_report.write_fit(run, fitted, sections)
         _remove(kept, fitted)
-        log("\n".join(["", fit_report.fit_text(fitted), *texts]))
+        log(joined(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
 
@@ -140,7 +141,7 @@ def sample(
             if sampled.has_lower_point and not posterior.interrupted:
                 sampled = _adopt_lower_point(run, problem, clips, sampled, log)
                 posterior = sampled.posterior
-        log(f"\n{posterior_report.posterior_text(sampled, run)}")
+        log(joined(["", posterior_report.posterior_text(sampled, run)]))
         log_output(log, run, run_folder.SUMMARY)
         return posterior
 
@@ -313,7 +314,7 @@ def _adopt_lower_point(
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
     fit_report.write_fit(run, fitted)
-    log(f"\n{fit_report.fit_text(fitted)}")
+    log(joined(["", fit_report.fit_text(fitted)]))
     sampled = dataclasses.replace(
         sampled,
         parameters=fitted.summary["parameters"],

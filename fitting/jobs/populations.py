@@ -11,6 +11,7 @@ from fitting.experiments.experiment_files import experiment_to_toml, load_experi
 from fitting.experiments.problems import make_problem
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Progress
+from fitting.report.formatting import joined
 from fitting.report.hierarchy import population_report
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
@@ -62,7 +63,7 @@ def population(
         if folder is not None:
             _write_systems(folder, fitted)
             population_report.write(folder, fitted)
-        log(f"\n{population_report.population_text(fitted)}")
+        log(joined(["", population_report.population_text(fitted)]))
         log_output(log, folder, population_report.SUMMARY)
         return fitted
 

@@ -1,7 +1,7 @@
 """A first experiment: its files, and what it assumes as text for the terminal."""
 
 from fitting.report import terrain_report
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, joined
 from fitting.runtime import files
 from fitting.studies.drafts.draft import Draft, Ground
 
@@ -29,4 +29,4 @@ def text(draft: Draft) -> str:
         parts += [entry.reference.name, aligned(rows), ""]
     free = [forecast.name for forecast in draft.forecasts if forecast.is_free]
     parts.append(f"free: {len(free)} of {len(draft.forecasts)} parameters: {', '.join(free)}")
-    return "\n".join(parts)
+    return joined(parts)
