@@ -1,6 +1,7 @@
 """Tables and text as rich draws them."""
 
 import re
+from collections.abc import Iterable
 
 from rich import box
 from rich.console import Console
@@ -23,19 +24,42 @@ def draw(console: Console, text: str) -> None:
             # A path that is longer than a line stays whole, so that it can be copied.
             console.print(Text(part), overflow="ignore", crop=False)
         elif not part.is_prose:
-            console.print(_table(part.rows))
+            _draw_table(console, part.rows)
         else:
             _draw_prose(console, part.rows)
 
 
-def _table(rows: list[list[str]]) -> Table:
-    heading, *rest = rows
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style=HEADING)
-    for number, name in enumerate(heading):
-        table.add_column(_marked(name), style=NAME if number == 0 else None, overflow="fold")
-    for row in rest:
-        table.add_row(*map(_marked, row))
-    return table
+def _draw_table(console: Console, rows: list[list[str]]) -> None:
+    """A table, or where it is too wide several, which all begin with the first column."""
+    widths = [_width(column) for column in zip(*rows, strict=True)]
+    wholes, left = [[0]], console.width - widths[0]
+    for number, width in enumerate(widths[1:], 1):
+        if left < width + SPACE and wholes[-1] != [0]:
+            wholes.append([0])
+            left = console.width - widths[0]
+        wholes[-1].append(number)
+        left -= width + SPACE
+    for index, columns in enumerate(wholes):
+        if index:
+            console.print()
+        table = Table(
+            box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False,
+            header_style=HEADING,
+        )  # fmt: skip
+        for column in columns:
+            style, width = NAME if column == 0 else None, widths[column]
+            table.add_column(_marked(rows[0][column]), style=style, min_width=width)
+        for row in rows[1:]:
+            table.add_row(*(_marked(row[column]) for column in columns))
+        console.print(table)
+
+
+def _width(column: Iterable[str]) -> int:
+    """Characters that a column needs: all, or for prose as many as are easy to read."""
+    cells = list(column)
+    widest = max(map(len, cells))
+    longest_word = max((len(word) for cell in cells for word in cell.split()), default=0)
+    return widest if widest <= NARROWEST else max(NARROWEST, longest_word)
 
 
 def _draw_prose(console: Console, rows: list[list[str]]) -> None:

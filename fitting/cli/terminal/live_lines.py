@@ -12,7 +12,6 @@ from rich.progress import (
     Task,
     TaskID,
     TextColumn,
-    TimeElapsedColumn,
 )
 from rich.text import Text
 
@@ -20,7 +19,8 @@ from fitting.runtime.activity import Work
 
 from . import plain_lines
 
-BAR = 16  # columns
+BAR = 8  # columns
+BESIDE = 44  # columns that bar and counts take at most
 DIM = "dim"  # style
 
 
@@ -40,7 +40,8 @@ class LiveLines:
         if self._lines is None:
             self._lines = _Lines(self._console)
             self._lines.start()
-        title = "  " * len(self._going_on) + work.title
+        title, room = "  " * len(self._going_on) + work.title, self._console.width - BESIDE
+        title = title if len(title) <= room else f"{title[: room - 1]}…"
         task = self._lines.add_task(title, total=work.total, completed=work.done, work=work)
         self._going_on.append((work, task))
 
@@ -72,7 +73,6 @@ class _Lines(Progress):
             TextColumn("{task.description}", markup=False),
             _Bar(bar_width=BAR),
             _Pace(),
-            TimeElapsedColumn(),
             console=console,
             transient=True,
             redirect_stdout=sys.stdout.isatty(),  # what goes elsewhere must go there
@@ -94,13 +94,13 @@ class _Bar(BarColumn):
 
 
 class _Pace(ProgressColumn):
-    """How many parts are done, how fast, and how long the rest takes."""
+    """How many parts are done, how fast, how long the rest takes; of other work, its time."""
 
     def render(self, task: Task) -> Text:
         """The text of a line."""
         work: Work = task.fields["work"]
         if work.total is None:
-            return Text()
+            return Text(plain_lines.duration(work.seconds))
         text = f"{work.done} of {work.total}"
         each = work.seconds_each
         if each is None or work.seconds < plain_lines.PATIENCE:

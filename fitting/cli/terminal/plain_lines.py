@@ -52,7 +52,7 @@ class PlainLines:
 
     def changed(self, work: Work) -> None:
         """Called with a new count or note."""
-        if time.monotonic() - self._last >= INTERVAL:
+        if work.done != work.total and time.monotonic() - self._last >= INTERVAL:
             self._report()
 
     def ended(self, work: Work) -> None:
