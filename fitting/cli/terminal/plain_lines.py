@@ -3,9 +3,10 @@
 import threading
 import time
 from types import TracebackType
-from typing import TextIO
 
 from fitting.runtime.activity import Work
+
+from .printing import Stream
 
 PATIENCE = 1.5  # s, after which work is announced; what is shorter says nothing
 INTERVAL = 10.0  # s between reports of what goes on
@@ -21,7 +22,7 @@ class PlainLines:
     since what takes long cannot.
     """
 
-    def __init__(self, stream: TextIO):
+    def __init__(self, stream: Stream):
         self._stream = stream
         self._lock = threading.RLock()
         self._going_on: list[Work] = []

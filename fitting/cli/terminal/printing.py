@@ -3,7 +3,7 @@
 import os
 import sys
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, TextIO
+from typing import IO, TYPE_CHECKING, Protocol, cast, runtime_checkable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -14,12 +14,29 @@ console_in_use: "ContextVar[Console | None]" = ContextVar("console_in_use", defa
 """That of the lines of progress: what is printed by it stays above them."""
 
 
-def can_draw(stream: TextIO) -> bool:
+@runtime_checkable
+class Stream(Protocol):
+    """Where text goes: a file, a pipe, a terminal."""
+
+    def write(self, text: str, /) -> int:
+        """Writes text."""
+        ...
+
+    def flush(self) -> None:
+        """Passes on what was written."""
+        ...
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        ...
+
+
+def can_draw(stream: Stream) -> bool:
     """Whether a stream is a terminal that knows escape codes."""
     return stream.isatty() and os.environ.get("TERM", "").lower() not in INCAPABLE
 
 
-def make_console(stream: TextIO) -> "Console | None":
+def make_console(stream: Stream) -> "Console | None":
     """What draws on a stream; None where nothing can, or where rich cannot be imported."""
     if not can_draw(stream):
         return None
@@ -27,7 +44,9 @@ def make_console(stream: TextIO) -> "Console | None":
         from rich.console import Console
     except ImportError:  # `jaxik doctor` says so, and must be able to
         return None
-    return Console(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False)
+    return Console(
+        file=cast(IO[str], stream), force_terminal=True, highlight=False, markup=False, emoji=False
+    )
 
 
 def show(text: str) -> None:
