@@ -16,6 +16,7 @@ from .parsers.fits import (
 from .parsers.guides import add_completion, add_doctor, add_example, add_parameters, add_schema
 from .parsers.machine import add_bench, add_cache
 from .parsers.options import Parser
+from .terminal.help_texts import help_formatter
 
 EXAMPLES = """examples:
   jaxik init walk.bvh -o walk                                  a first experiment of your clip
@@ -56,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog="jaxik",
         description="Fits the parameters of foot IK to captured motion, with their uncertainty.",
         epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=help_formatter(),
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (

@@ -8,6 +8,7 @@ from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
+from fitting.report.formatting import joined
 from fitting.report.page.studies import calibration_page
 from fitting.runtime import cluster
 from fitting.runtime.precision import in_float64
@@ -75,6 +76,6 @@ def calibrate(
         if folder is not None:
             calibration_report.write(folder, experiment, made, assessment)
             calibration_page.write(folder, experiment, assessment)
-        log(f"\n{calibration_report.calibration_text(assessment)}")
+        log(joined(["", calibration_report.calibration_text(assessment)]))
         log_output(log, folder, calibration_report.SUMMARY)
         return assessment

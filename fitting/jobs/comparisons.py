@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, joined
 from fitting.report.page.comparisons import runs_page
 from fitting.report.uncertainty import run_comparison as report
 from fitting.studies.posterior import run_comparison
@@ -31,6 +31,6 @@ def compare_runs(
         if folder is not None:
             report.write(folder, compared)
             runs_page.write(folder, compared)
-        log(f"{aligned(report.table(compared))}\n\n{report.explanation()}")
+        log(joined([aligned(report.table(compared)), report.explanation()], apart=True))
         log_output(log, folder, report.TABLE)
         return compared

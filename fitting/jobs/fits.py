@@ -21,6 +21,7 @@ from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
+from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
 from fitting.report.page.studies import ablation_page
 from fitting.runtime.precision import in_float64
@@ -85,7 +86,7 @@ def fit(
         if run is not None:
             fit_report.write_fit(run, fitted, sections)
         _remove(kept, fitted)
-        log("\n".join(["", fit_report.fit_text(fitted), *texts]))
+        log(joined(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
 
@@ -143,7 +144,7 @@ def sample(
             if sampled.has_lower_point and not posterior.interrupted:
                 sampled = _adopt_lower_point(run, problem, clips, sampled, log)
                 posterior = sampled.posterior
-        log(f"\n{posterior_report.posterior_text(sampled, run)}")
+        log(joined(["", posterior_report.posterior_text(sampled, run)]))
         log_output(log, run, run_folder.SUMMARY)
         return posterior
 
@@ -318,7 +319,7 @@ def _adopt_lower_point(
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
     fit_report.write_fit(run, fitted)
-    log(f"\n{fit_report.fit_text(fitted)}")
+    log(joined(["", fit_report.fit_text(fitted)]))
     sampled = dataclasses.replace(
         sampled,
         parameters=fitted.summary["parameters"],

@@ -12,6 +12,7 @@ from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.problems import make_problem
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Progress
+from fitting.report.formatting import joined
 from fitting.report.hierarchy import population_report
 from fitting.report.page.studies import population_page
 from fitting.runtime import files
@@ -66,7 +67,7 @@ def population(
             _write_systems(folder, fitted)
             population_report.write(folder, fitted)
             population_page.write(folder, fitted)
-        log(f"\n{population_report.population_text(fitted)}")
+        log(joined(["", population_report.population_text(fitted)]))
         log_output(log, folder, population_report.SUMMARY)
         return fitted
 

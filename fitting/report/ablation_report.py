@@ -12,7 +12,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.runtime import files
 from fitting.studies.ablation import Row
 
-from .formatting import Table, aligned, bullets, markdown, number
+from .formatting import Table, aligned, bullets, joined, markdown, number
 from .labels import ACCURACY, explanations, headings
 from .plots import ablation_plots, style
 from .plots.ablation_plots import variant_name
@@ -40,8 +40,11 @@ def row_text(row: Row) -> str:
 
 def tables_text(rows: Sequence[Row]) -> str:
     """All groups of rows, for the terminal."""
-    groups = [f"\n{title}:\n\n{aligned(group(rows, part))}" for part, title in titles(rows).items()]
-    return "\n".join(groups)
+    groups = [
+        joined(["", f"{title}:", "", aligned(group(rows, part))])
+        for part, title in titles(rows).items()
+    ]
+    return joined(groups)
 
 
 def titles(rows: Sequence[Row]) -> dict[int, str]:

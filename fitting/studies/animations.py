@@ -25,7 +25,7 @@ from fitting.datasets.flat_animation import load_flat_animation, with_remark_if_
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import TerrainOptions, load_terrain
 from fitting.experiments import systems, track_files
-from fitting.runtime import program_cache
+from fitting.runtime import activity, program_cache
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
@@ -180,9 +180,10 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     Raises:
         ValueError: a file does not exist or cannot be read, or the root cannot be put there.
     """
-    terrain = files.load_terrain()
-    clip = files.flat_clip
-    covered = files.coverage(terrain)
+    with activity.announced(f"Reading {files.clip.name} and {files.terrain.name}"):
+        terrain = files.load_terrain()
+        clip = files.flat_clip
+        covered = files.coverage(terrain)
     if (to_fit or files.root == "ground") and covered.share < coverage.LITTLE:
         raise ValueError(covered.text())
     coverage.warn(covered)

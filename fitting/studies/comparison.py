@@ -20,6 +20,7 @@ from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
 from fitting.experiments.parameter_files import load_system
 from fitting.experiments.systems import preset_system
+from fitting.runtime import activity
 from fitting.runtime.display.data_frames import data_frame
 from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
@@ -161,28 +162,29 @@ def compare(
             result, clips[name] = animation.solve(ik)
         reached[name] = animation.reached(result)
 
-    soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
-    ground = ground_heights(animation.terrain, soles_ws)
-    motions = {name: motion_of(solved) for name, solved in clips.items()}
-    measured = {}
-    for index, name in enumerate(clips):
-        gaps = measures.gaps(soles_ws[index], ground[index])
-        feet = FootStates(gaps, clip.stance_labels(), reached[name])
-        measured[name] = measures.measure(
-            motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
+    with activity.announced("Measuring the motions"):
+        soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
+        ground = ground_heights(animation.terrain, soles_ws)
+        motions = {name: motion_of(solved) for name, solved in clips.items()}
+        measured = {}
+        for index, name in enumerate(clips):
+            gaps = measures.gaps(soles_ws[index], ground[index])
+            feet = FootStates(gaps, clip.stance_labels(), reached[name])
+            measured[name] = measures.measure(
+                motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
+            )
+        return Comparison(
+            title=title,
+            legs=clip.rig.names,
+            fps=clip.fps,
+            ground=ground[0, :, :, 0],
+            groundless=float(np.mean(np.isnan(ground))),
+            animation=animation,
+            clips=clips,
+            motions=motions,
+            measures=measured,
+            placements={name: animation.assess(clips[name]) for name in systems},
         )
-    return Comparison(
-        title=title,
-        legs=clip.rig.names,
-        fps=clip.fps,
-        ground=ground[0, :, :, 0],
-        groundless=float(np.mean(np.isnan(ground))),
-        animation=animation,
-        clips=clips,
-        motions=motions,
-        measures=measured,
-        placements={name: animation.assess(clips[name]) for name in systems},
-    )
 
 
 def ground_heights(

@@ -27,6 +27,7 @@ from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.profiles import profile
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED
+from fitting.runtime import activity
 from fitting.runtime.display.data_frames import data_frame
 from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
@@ -150,7 +151,8 @@ class Fit(Shown):
     @cached_property
     def results(self) -> tuple[jaxik.Result, ...]:
         """What the fitted system makes of each clip."""
-        return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
+        with activity.announced("Playing the clips with the fitted system"):
+            return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
 
     @cached_property
     def playbacks(self) -> tuple[Playback, ...]:

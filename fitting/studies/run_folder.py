@@ -30,6 +30,7 @@ from fitting.inference.noise.model import NoiseModel
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 from fitting.runtime.files import TEMPORARY, write_text
 from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.runtime.storage.json_files import JsonFile, check_version, write_json
@@ -101,9 +102,10 @@ def save_solution(
 
 def save_fit(run: Path, fitted: Fit) -> None:
     """Completes a run's folder, after `save_solution`, with the motions and numbers of its fit."""
-    for name, clip in saved_clips(fitted).items():
-        save_clip(run / name, clip)
-    FIT_FILE.write(run / FIT, fitted.summary)
+    with activity.announced("Writing the motions and numbers of the fit"):
+        for name, clip in saved_clips(fitted).items():
+            save_clip(run / name, clip)
+        FIT_FILE.write(run / FIT, fitted.summary)
 
 
 def load_fit(run: Path) -> tuple[Experiment, FitSummary]:

@@ -23,13 +23,18 @@ def doctor(*options: str, folder=ROOT, **environment: str) -> subprocess.Complet
     )
 
 
+def says_no_more(done: subprocess.CompletedProcess[str]) -> bool:
+    """Whether stderr has nothing but what takes long."""
+    return all(line.startswith("Importing ") for line in done.stderr.splitlines())
+
+
 def test_here_all_is_well(tmp_path):
     done = doctor("--quick", folder=tmp_path)
     assert done.returncode == 0, done.stdout
     for subject in ("Python ", "jaxik ", "packages ", "devices ", "XLA flags ", "programs "):
         assert f"  {subject}" in done.stdout
     assert f"jax {metadata.version('jax')}," in done.stdout
-    assert done.stdout.endswith("\nall is well\n") and not done.stderr
+    assert done.stdout.endswith("\nall is well\n") and says_no_more(done)
 
 
 @pytest.mark.slow
@@ -58,7 +63,7 @@ def test_it_runs_where_jax_cannot_be_imported(tmp_path):
     done = doctor("--quick", folder=tmp_path, PYTHONPATH=str(tmp_path))
     assert done.returncode == without_jax.PROBLEMS_FOUND
     assert "jax cannot be imported: no AVX" in done.stdout
-    assert "processor" in done.stdout and not done.stderr
+    assert "processor" in done.stdout and says_no_more(done)
 
 
 def test_a_file_that_hides_a_package_is_named(tmp_path):

@@ -439,7 +439,6 @@ def test_the_command_continues_after_an_interrupt_and_writes_its_tables(
 
     with monkeypatch.context() as patch:
         patch.setattr(progress, "fit_line", interrupt)
-        patch.setattr(progress.time, "monotonic", iter(range(0, 10**9, 20)).__next__)
         assert main.main(words) == main.INTERRUPTED
     assert {path.name for path in (tmp_path / "out").iterdir()} == {ablation.NUMBERS}
     assert len(ablation.read(tmp_path / "out")) == 1

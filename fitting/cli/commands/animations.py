@@ -1,11 +1,12 @@
 """Commands that run systems on flat animations."""
 
 import argparse
+from contextlib import AbstractContextManager
 
 from fitting import jobs
-from fitting.cli import progress
+from fitting.cli.terminal import show
 from fitting.experiments import parameter_files, systems
-from fitting.runtime import cache_folder
+from fitting.runtime import activity, cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import comparison
 from fitting.studies.animations import AnimationFiles
@@ -20,7 +21,7 @@ def apply(options: argparse.Namespace) -> int:
     cache_folder.use_default()
     jobs.apply(
         options.run, _animation(options), options.output,
-        with_terrain=options.with_terrain, log=print,
+        with_terrain=options.with_terrain, log=show,
     )  # fmt: skip
     return 0
 
@@ -35,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         ik, _ = parameter_files.load_system(options.parameters, rig)
     else:
         ik = systems.preset_system(options.preset, rig)
-    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain, log=print)
+    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain, log=show)
     return 0
 
 
@@ -52,7 +53,7 @@ def compare(options: argparse.Namespace) -> int:
     requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
     jobs.compare(
         requested, animation, options.output,
-        rates=options.rates, during=progress.timed, log=print,
+        rates=options.rates, during=_running, log=show,
     )  # fmt: skip
     return 0
 
@@ -77,9 +78,9 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
     def systems_of(rig: Rig) -> dict[str, FootIK]:
         return comparison.named_systems(requested, rig)
 
-    finished = jobs.run_suite(
-        systems_of, plan, options.output, during=progress.timed, log=progress.print_marked
-    )
+    total = len(plan.situations)
+    with activity.announced(f"Running {total} situations", total) as suite:
+        finished = jobs.run_suite(systems_of, plan, options.output, during=suite.part, log=show)
     return status.of_job(interrupted=finished.interrupted)
 
 
@@ -91,7 +92,7 @@ def _compare_runs(options: argparse.Namespace) -> int:
             raise ValueError(f"{name} is {given}; runs are compared on the clips of their fits")
     if options.systems:
         raise ValueError(f"{options.systems[0][0]} and --runs exclude each other")
-    jobs.compare_runs(options.runs.split(","), options.output, log=print)
+    jobs.compare_runs(options.runs.split(","), options.output, log=show)
     return 0
 
 
@@ -103,6 +104,10 @@ def _check_comparison(options: argparse.Namespace) -> None:
     needed = {"CLIP": options.clip, "--terrain": options.terrain, "-o/--output": options.output}
     if missing := [name for name, given in needed.items() if given is None]:
         raise ValueError(f"the following are required: {', '.join(missing)}; or --suite, or --runs")
+
+
+def _running(name: str) -> AbstractContextManager:
+    return activity.announced(f"Compiling and running {name}")
 
 
 def _animation(options: argparse.Namespace) -> AnimationFiles:

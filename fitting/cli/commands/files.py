@@ -5,13 +5,14 @@ import warnings
 
 from fitting import jobs
 from fitting.cli.parsers.files import TEMPLATE
+from fitting.cli.terminal import show
 from fitting.datasets.clips import load_clip, summary
 from fitting.datasets.clips.load import draft_joint_map
 from fitting.datasets.terrain.reconstruction import reconstruct
 from fitting.experiments import parameter_files, record_files, systems
 from fitting.report import terrain_report
-from fitting.report.formatting import aligned
-from fitting.runtime import files
+from fitting.report.formatting import TableText, aligned
+from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik import record
@@ -29,7 +30,10 @@ def inspect(options: argparse.Namespace) -> int:
         return 0
     clip = load_clip(options.clip, **vars(how))
     described = summary.describe(clip)
-    print(summary.as_json(described) if options.json else summary.as_text(described))
+    if options.json:
+        print(summary.as_json(described))
+    else:
+        show(TableText(summary.as_text(described), summary.rows(described), is_prose=True))
     return 0
 
 
@@ -37,12 +41,15 @@ def inspect(options: argparse.Namespace) -> int:
 def terrain(options: argparse.Namespace) -> int:
     """Reconstructs the ground of a clip; writes a mesh, its numbers and a plot."""
     terrain_report.check_output_files(options.output)
-    clip = load_clip(options.clip, **vars(reading.clip_options(options)))
+    with activity.announced(f"Reading {options.clip.name}"):
+        clip = load_clip(options.clip, **vars(reading.clip_options(options)))
     kind = None if options.model == "auto" else options.model
-    ground = reconstruct(clip, sole=options.sole, kind=kind)
-    terrain_report.write(options.output, ground, clip, options.sole, options.margin)
+    with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
+        ground = reconstruct(clip, sole=options.sole, kind=kind)
+    with activity.announced("Drawing and writing the ground"):
+        terrain_report.write(options.output, ground, clip, options.sole, options.margin)
     print(f"{terrain_report.count_stances(ground)}\n")
-    print(aligned(terrain_report.prediction_table(ground)))
+    show(aligned(terrain_report.prediction_table(ground)))
     print(f"\n{terrain_report.describe_surface(ground)}; written to {options.output}")
     return 0
 

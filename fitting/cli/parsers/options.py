@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, TypeVar
 
+from fitting.cli.terminal.help_texts import help_formatter
 from fitting.runtime import validation
 
 Number = TypeVar("Number", int, float)
@@ -37,7 +38,7 @@ def add_command(
         help=summary,
         description=summary[0].upper() + summary[1:] + ".",
         epilog="example:\n" + textwrap.indent(textwrap.dedent(example).strip(), "  "),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=help_formatter(),
     )
 
 

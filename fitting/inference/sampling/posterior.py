@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, values_of_rows
+from fitting.runtime import activity
 from fitting.runtime.display.data_frames import data_frame
 from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
@@ -187,8 +188,9 @@ def sample_posterior(
                 progress(_describe_progress(chain, check, settings.max_steps, elapsed))
 
         outcome = _extend(problem, chain, start, settings, report)
-    at_start = _log_probability(problem, start, walkers)
-    sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
+    with activity.announced("Summing up the chain"):
+        at_start = _log_probability(problem, start, walkers)
+        sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
     return dataclasses.replace(sampled, start_log_probability=at_start)
 
 
@@ -220,16 +222,20 @@ def _extend(
     before = latest = None
     interrupted = False
     try:
-        for length in diagnostics.check_lengths(len(chain), interval, limit):
-            while len(chain) < length:
-                next(steps)
-                if len(chain) % interval == 0:
-                    report(latest)
-            chain.save()
-            before, latest = latest, _check(chain, length)
-            done, _ = diagnostics.verdict(before, latest, names, thin_by, settings.stop_at)
-            if done and length * thin_by >= settings.min_steps:
-                break
+        title = f"Sampling up to {limit * thin_by} steps of {chain.identity.walkers} walkers"
+        with activity.announced(title, limit * thin_by, done=len(chain) * thin_by) as sampling:
+            activity.note("preparing the program of a step")
+            for length in diagnostics.check_lengths(len(chain), interval, limit):
+                while len(chain) < length:
+                    next(steps)
+                    sampling.reach(len(chain) * thin_by)
+                    if len(chain) % interval == 0:
+                        report(latest)
+                chain.save()
+                before, latest = latest, _check(chain, length)
+                done, _ = diagnostics.verdict(before, latest, names, thin_by, settings.stop_at)
+                if done and length * thin_by >= settings.min_steps:
+                    break
     except KeyboardInterrupt:
         if not len(chain):
             raise

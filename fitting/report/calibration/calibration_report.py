@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
-from fitting.report.formatting import aligned, bullets, markdown, percent
+from fitting.report.formatting import aligned, bullets, joined, markdown, percent
 from fitting.report.plots import calibration_plots, style
 from fitting.runtime import files
 from fitting.runtime.storage.json_files import write_json
@@ -81,7 +81,7 @@ def explanation(assessment: Assessment) -> str:
 def calibration_text(assessment: Assessment) -> str:
     """The result of a calibration, for the terminal."""
     tables = [aligned(checks_table(assessment)), aligned(parameter_table(assessment))]
-    return "\n\n".join([sentence(assessment), *tables, *_listed_remarks(assessment)])
+    return joined([sentence(assessment), *tables, *_listed_remarks(assessment)], apart=True)
 
 
 def write(

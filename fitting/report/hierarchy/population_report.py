@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fitting.report.formatting import aligned, bullets, interval, markdown, number
+from fitting.report.formatting import aligned, bullets, interval, joined, markdown, number
 from fitting.report.plots import style
 from fitting.runtime import files
 from fitting.runtime.storage.json_files import write_json
@@ -36,7 +36,7 @@ def found_line(found: Found) -> str:
 def population_text(population: Population) -> str:
     """The result, for the terminal."""
     tables = [aligned(parameter_table(population)), aligned(error_table(population))]
-    return "\n\n".join([*tables, bullets(remarks(population))])
+    return joined([*tables, bullets(remarks(population))], apart=True)
 
 
 def write(folder: Path, population: Population) -> None:

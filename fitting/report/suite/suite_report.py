@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from fitting.report.formatting import aligned, bullets, markdown
+from fitting.report.formatting import aligned, bullets, joined, markdown
 from fitting.report.labels import explanations
 from fitting.report.placement_report import numbers as placement_numbers
 from fitting.report.plots import style, suite_plots
@@ -29,10 +29,10 @@ def write(folder: Path, suite: Suite) -> None:
 
 def text(suite: Suite) -> str:
     """The table, the bounds, and how many cells are within them, for a terminal."""
-    parts = [aligned(suite_tables.table(suite))] if suite.scenes else []
+    parts: list[str] = [aligned(suite_tables.table(suite))] if suite.scenes else []
     parts.append("\n".join([f"bounds ({MISS} is beyond them):", *suite_tables.reasons()]))
     parts.append(suite_tables.count_text(suite))
-    return "\n\n".join(parts)
+    return joined(parts, apart=True)
 
 
 def missed(suite: Suite) -> list[str]:
