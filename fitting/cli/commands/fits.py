@@ -7,6 +7,7 @@ from fitting.cli import progress
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.record_only import restrict
 from fitting.experiments.systems import Preset
+from fitting.jobs.views import Address, FitWatch
 from fitting.runtime import cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import translation
@@ -23,8 +24,18 @@ def fit(options: argparse.Namespace) -> int:
     experiment = load_experiment(options.experiment)
     if options.record_only and not experiment.record_only:
         experiment = restrict(experiment)
-    with progress.ProgressLine(progress.fit_line) as line:
-        fitted = jobs.fit(experiment, options.output, progress=line, log=_print_now)
+    if not options.view:
+        with progress.ProgressLine(progress.fit_line) as line:
+            fitted = jobs.fit(experiment, options.output, progress=line, log=_print_now)
+        return status.of_fit(fitted)
+    address = Address(options.host, options.port)
+    with (
+        progress.ProgressLine(progress.fit_line) as line,
+        FitWatch(options.output, address, line, _print_now) as watch,
+    ):
+        fitted = jobs.fit(
+            experiment, options.output, progress=watch, log=_print_now, loaded=watch.load
+        )
     return status.of_fit(fitted)
 
 

@@ -75,9 +75,10 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
     """
     animated = raised(data.base, data.root.rise)
     solved = {"before": fitted_clip(data, before), "fitted": fitted_clip(data, fitted)}
+    captured = with_soles_of(data.reference, data.base)
     placed = {
         name: _placed(clip, animated, data)
-        for name, clip in {"animated": animated, **solved, "captured": _captured(data)}.items()
+        for name, clip in {"animated": animated, **solved, "captured": captured}.items()
     }
     return ClipMotions(
         **placed,
@@ -90,16 +91,16 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
     )
 
 
-def _captured(data: ClipData) -> Clip:
+def with_soles_of(captured: Clip, flat: Clip) -> Clip:
     """The captured clip with the soles of the flat animation.
 
     Its own are measured as if it stood on a floor; on uneven ground they are not where they seem.
     """
-    rig, flat = data.reference.measured_rig, data.base.measured_rig
-    if rig is None or flat is None:
-        return data.reference
-    soles = {name: getattr(flat, name) for name in SOLES}
-    return replace(data.reference, measured_rig=replace(rig, **soles))
+    own, rig = captured.measured_rig, flat.measured_rig
+    if own is None or rig is None:
+        return captured
+    soles = {name: getattr(rig, name) for name in SOLES}
+    return replace(captured, measured_rig=replace(own, **soles))
 
 
 def _placed(clip: Clip, animated: Clip, data: ClipData) -> PlacedMotion:
