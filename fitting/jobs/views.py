@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -122,7 +122,9 @@ class FitWatch:
     address: Address
     progress: Callable[[Progress], None]
     log: Log = silent
-    _open: Any = field(default=None, repr=False)
+    viewer: Any = field(default=None, repr=False)
+    """The `fitting.viewer.page.Viewer`, once there is one."""
+    _page: ExitStack = field(default_factory=ExitStack, repr=False)
     _problem: Problem[jaxik.FootIK] | None = field(default=None, repr=False)
     _shown: tuple[float, float] = (float("inf"), float("-inf"))  # cost, and when it was shown
 
@@ -131,16 +133,16 @@ class FitWatch:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._open is not None:
-            self._open.__exit__(None, None, None)
+        self._page.close()
 
     def load(
         self, experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
     ) -> None:
         """Opens the page, once the clips are loaded."""
         subject = viewer.subject_of_fit(experiment, problem, clips)
-        self._problem, self._open = problem, opened(subject, self.folder, self.address, self.log)
-        self._viewer = self._open.__enter__()
+        self._problem = problem
+        page = opened(subject, self.folder, self.address, self.log)
+        self.viewer = self._page.enter_context(page)
 
     def __call__(self, progress: Progress) -> None:
         """Shows a point that is better than the one shown, now and then."""
@@ -152,7 +154,7 @@ class FitWatch:
         if progress.best < cost and now - when >= EVERY:
             self._shown = (progress.best, now)
             note = f"The fit goes on: {progress.stage}, best cost {progress.best:.6g}."
-            self._viewer.restart(BEST, self._problem.space.unpack(progress.best_u), note)
+            self.viewer.restart(BEST, self._problem.space.unpack(progress.best_u), note)
 
 
 def _page() -> ModuleType:
