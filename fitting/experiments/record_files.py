@@ -44,7 +44,8 @@ def read(
             )
         if rules := systems.changed_rules(ik, original.system()):
             raise ValueError(
-                f"{path}: rules {rules}; only those of 'record' with faithful = true make one"
+                f"{path}: rules {rules}; only those of 'record' with faithful = true make one; "
+                "`jaxik init --record-only` writes an experiment whose fit has them"
             )
         with validation.error_context(path):
             return [record.from_ik(ik, base, reading, drop=drop)]

@@ -84,7 +84,8 @@ def _check(experiment: Experiment) -> None:
     if own != ORIGINAL:
         raise ValueError(
             "record_only is for preset = 'record' with faithful = true; the experiment has preset "
-            f"= {own.name!r} with faithful = {str(own.faithful).lower()}"
+            f"= {own.name!r} with faithful = {str(own.faithful).lower()}; `jaxik init "
+            "--record-only` writes one that has them"
         )
     ik = experiment.starting_system()
     if rules := changed_rules(ik, ORIGINAL.system()):

@@ -101,8 +101,9 @@ def gallery(plots: Plots) -> str:
 
 def cost_sentence(summary: FitSummary) -> str:
     """Cost before and after, and the effort it took."""
+    noise = " (both with the noise estimated here)" if "noise" in summary else ""
     sentence = (
-        f"Cost {summary['cost_before']:.6g} before, {summary['cost']:.6g} after: "
+        f"Cost {summary['cost_before']:.6g} before, {summary['cost']:.6g} after{noise}: "
         f"{summary['steps']} steps in {summary['seconds']:.1f} s."
     )
     if left := summary["left"]:

@@ -55,8 +55,8 @@ def test_a_restricted_experiment_is_the_same_when_read_again(tmp_path):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"top": "record_only = true"}, "preset = 'record' with faithful = false$"),
-        ({"top": 'preset = "ozz"\nrecord_only = true'}, "preset = 'ozz' with faithful = false$"),
+        ({"top": "record_only = true"}, "preset = 'record' with faithful = false;"),
+        ({"top": 'preset = "ozz"\nrecord_only = true'}, "preset = 'ozz' with faithful = false;"),
         ({"rest": '[rules]\npelvis = "SupportPelvis"'}, "others: {'pelvis': 'SupportPelvis'}"),
         ({"rest": "[hierarchy]\nscale_with_body = true"}, "same for every body"),
         ({"free": "lock.max_speed = {}"}, r"no room for any of \['lock.max_speed'\]; it has for"),

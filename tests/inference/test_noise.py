@@ -128,6 +128,8 @@ def test_the_fit_with_noise_is_the_joint_optimum(short):
     experiment = dataclasses.replace(load_experiment(OZZ), noise=BOTH)
     problem, solution = search_with_noise(short, experiment)
     found = noise_of(problem)
+    before = float(problem.cost(problem.space.pack({})))  # with the noise that was estimated
+    assert solution.cost_before == pytest.approx(before) and solution.cost < before
 
     def objective(x: np.ndarray) -> float:
         u, sigmas, rhos = x[:2], np.exp(x[2:7]), np.tanh(x[7:])

@@ -1,10 +1,11 @@
 """The joint maximum over the parameters and their noise."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jaxik
 from fitting.inference.optimisation.kept_stages import KeptStages
-from fitting.inference.optimisation.search import refine
+from fitting.inference.optimisation.search import cost_before, refine
 from fitting.inference.optimisation.settings import DEFAULTS, SearchSettings
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
@@ -28,7 +29,8 @@ def fit_with_noise(
 
     In turn, the noise is found for the parameters and the parameters for the noise: each raises
     the joint likelihood, which all of it together maximises where neither moves any more. The
-    solution's history and effort are those of all rounds.
+    solution's history and effort are those of all rounds; its cost before the fit is with the
+    noise of the last.
 
     Args:
         problem: with the noise to begin with.
@@ -48,4 +50,5 @@ def fit_with_noise(
             break
         problem = with_noise(problem, noise)
         solution = refine(problem, solution, solution.u, settings, progress, kept)
+        solution = dataclasses.replace(solution, cost_before=cost_before(problem))
     return problem, solution

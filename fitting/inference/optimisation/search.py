@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
-from fitting.runtime.precision import for_other_thread, in_float64
+from fitting.runtime.precision import in_float64
 
 from . import levenberg_marquardt
 from .descent import descend, jacobian_at, point_of, polish
@@ -78,10 +78,10 @@ def find_best_fit(
     search = Search(problem, settings, watch)
     if kept is not None:
         search = kept.attach(search, latest, starts)
-    cost_before, used_up, interrupted = np.inf, False, False
+    before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
-        cost_before, latest = _begin(search, latest, search.array(np.asarray(first)))
+        before, latest = _begin(search, latest, search.array(np.asarray(first)))
         for start in range(starts):
             if agree(ends, settings):
                 break
@@ -100,7 +100,7 @@ def find_best_fit(
             kept.flush()
     agreeing = count_agreeing(ends, settings)
     end = _End(latest, len(ends), agreeing, agree(ends, settings), interrupted, used_up)
-    return _solution(search, end, cost_before)
+    return _solution(search, end, before)
 
 
 @in_float64
@@ -143,6 +143,14 @@ def refine(
         return dataclasses.replace(solution, interrupted=interrupted)
     end = _End(latest, solution.starts, solution.agreeing, solution.agreed, interrupted, used_up)
     return _solution(search, end, solution.cost_before).following(solution)
+
+
+@in_float64
+def cost_before(problem: Problem) -> float:
+    """Cost of the system as it is, with the problem's noise; infinite where it has none."""
+    present = problem.space.pack({})
+    cost = float(levenberg_marquardt.evaluate(HardModel(problem, present), present).cost)
+    return cost if np.isfinite(cost) else np.inf
 
 
 def count_agreeing(ends: Sequence[float], settings: SearchSettings) -> int:
@@ -222,15 +230,11 @@ def _begin(
 ) -> tuple[float, SearchState]:
     """Cost of the system as it is, and the state with the first point evaluated."""
     problem = search.problem
-    present = search.array(np.asarray(problem.space.pack({})))
-    evaluate_present = for_other_thread(levenberg_marquardt.evaluate)
     with ThreadPoolExecutor(1) as thread:  # the two programs compile side by side
-        evaluated = thread.submit(evaluate_present, HardModel(problem, present), present)
-        evaluate(problem, np.asarray(present)[None])
-    before = float(evaluated.result().cost)
+        before = thread.submit(cost_before, problem)
+        evaluate(problem, np.asarray(problem.space.pack({}))[None])
     lm = levenberg_marquardt.evaluate(HardModel(problem, first), first)
-    before = before if np.isfinite(before) else np.inf
-    return before, dataclasses.replace(state, evaluated=lm, best=point_of(lm))
+    return before.result(), dataclasses.replace(state, evaluated=lm, best=point_of(lm))
 
 
 @dataclasses.dataclass
@@ -265,7 +269,7 @@ class _End:
         return self.state.converged and self.agreed and not self.interrupted
 
 
-def _solution(search: Search, end: _End, cost_before: float) -> Solution:
+def _solution(search: Search, end: _End, before: float) -> Solution:
     """The solution of a search that has ended."""
     state = end.state
     u = search.array(state.best.u)
@@ -273,7 +277,7 @@ def _solution(search: Search, end: _End, cost_before: float) -> Solution:
         names=search.problem.space.names,
         u=state.best.u,
         values=np.asarray(search.problem.space.values(u)),
-        cost_before=cost_before,
+        cost_before=before,
         cost=state.best.cost,
         converged=end.converged,
         message=_message(search.settings, end),

@@ -29,4 +29,8 @@ def text(draft: Draft) -> str:
         parts += [entry.reference.name, aligned(rows), ""]
     free = [forecast.name for forecast in draft.forecasts if forecast.is_free]
     parts.append(f"free: {len(free)} of {len(draft.forecasts)} parameters: {', '.join(free)}")
+    if draft.experiment.preset == "record" and not draft.experiment.record_only:
+        parts.append(
+            "what is fitted has more than the game's record holds; for that: --record-only"
+        )
     return "\n".join(parts)

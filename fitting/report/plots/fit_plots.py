@@ -1,6 +1,7 @@
 """Pictures of a fit; each function draws one figure."""
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from .style import (
     whole_and_part,
 )
 
+RISE = 1e-6  # relative, of the lowest cost: more than rounding
 LEG_SPACING = 0.3  # m, smallest distance between two drawn legs
 SIGMA: Any = {"color": "black", "linestyle": "--", "linewidth": 1.3}
 
@@ -187,7 +189,10 @@ def locks(playback: Playback, legs: Sequence[str], title: str) -> Figure:
 
 @styled
 def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
-    """Cost of the fit over time, by stage, and the best so far."""
+    """Cost of the fit over time, by stage, and the best so far.
+
+    Where the best rises, the noise was estimated anew; costs on both sides do not compare.
+    """
     figure = Figure(figsize=(13, 6.5), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots()
@@ -202,8 +207,14 @@ def cost(history: Sequence[Progress], cost_before: float, title: str) -> Figure:
             label=f"stage: {stage}",
         )
     best = [(step.seconds, step.best) for step in history if np.isfinite(step.best)]
-    if best:
-        axes.step(*zip(*best, strict=True), where="post", color="black", label="best so far")
+    costs = [cost for _, cost in best]
+    rises = [i for i in range(1, len(best)) if costs[i] > costs[i - 1] * (1 + RISE)]
+    for begin, end in pairwise([0, *rises, len(best)] if best else []):
+        label = None if begin else "best so far"
+        axes.step(*zip(*best[begin:end], strict=True), where="post", color="black", label=label)
+    for i in rises:
+        label = "noise estimated anew: another cost" if i == rises[0] else None
+        axes.axvline(best[i][0], color="black", linestyle=":", label=label)
     axes.axhline(cost_before, color=BEFORE, linestyle="--", label="preset, before the fit")
     axes.set_yscale("log")
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
