@@ -13,7 +13,7 @@ WINGS = {  # in import order: a wing may import those before it
     "jaxik": ["batching", "maths", "world", "solvers", "stages", "pipeline", "presets", "record"],
     "fitting": [
         "runtime", "datasets", "problem", "inference", "analysis", "experiments", "studies",
-        "report", "jobs", "bench", "cli",
+        "report", "viewer", "jobs", "bench", "cli",
     ],
 }  # fmt: skip
 STAGES = ["inputs", "contact", "root", "warp", "probe", "target", "lean", "lock", "separation"]

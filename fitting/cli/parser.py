@@ -2,7 +2,7 @@
 
 import argparse
 
-from .parsers.animations import add_apply, add_compare, add_run
+from .parsers.animations import add_apply, add_compare, add_run, add_view
 from .parsers.files import add_export, add_inspect, add_record, add_terrain
 from .parsers.fits import (
     add_ablate,
@@ -27,6 +27,7 @@ EXAMPLES = """examples:
   jaxik sample runs/walk                                       its posterior; again to continue
   jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
   jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --preset record
+  jaxik view runs/walk                                         its parameters, live in the browser
   jaxik compare walk.bvh --terrain steps.obj --presets ozz,unreal,mec,record -o compared
   jaxik compare --suite -o suite                               systems in made situations
   jaxik translate --from mec --to record --clip walk.bvh --terrain steps.obj -o translated
@@ -62,8 +63,9 @@ def make_parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
         add_init, add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply,
-        add_run, add_compare, add_translate, add_inspect, add_terrain, add_bench, add_record,
-        add_export, add_cache, add_parameters, add_schema, add_example, add_doctor, add_completion,
+        add_run, add_view, add_compare, add_translate, add_inspect, add_terrain, add_bench,
+        add_record, add_export, add_cache, add_parameters, add_schema, add_example, add_doctor,
+        add_completion,
     ):  # fmt: skip
         add(commands)
     return top

@@ -11,8 +11,9 @@ bits; a system that was made in 32 bits is taken with the values it has there.
 `drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample`, `ablate` and
 `translate`. `calibrations` judges what they say: `calibrate`. `populations` fits several clips and
 subjects: `population`. `animations` runs finished systems: `solve`, `apply`, `compare` and
-`run_suite`. `comparisons` compares sampled runs: `compare_runs`. `exports` writes parameters for
-others: `export`. `examples` copies the experiments that come with the package.
+`run_suite`. `views` shows runs, clips and fits in the browser: `view`, `view_run`. `comparisons`
+compares sampled runs: `compare_runs`. `exports` writes parameters for others: `export`. `examples`
+copies the experiments that come with the package.
 """
 
 from .animations import apply as apply
@@ -29,3 +30,5 @@ from .fits import sample as sample
 from .fits import translate as translate
 from .output import Log as Log
 from .populations import population as population
+from .views import view as view
+from .views import view_run as view_run

@@ -32,7 +32,7 @@ from fitting.studies.posterior.replay import replay
 from fitting.studies.sample import SampledFit, log_probability_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
-from .output import Log, log_output, output_folder, silent
+from .output import Loaded, Log, log_output, output_folder, silent, unwatched
 
 
 class Shown(NamedTuple):
@@ -50,6 +50,7 @@ def fit(
     *,
     progress: Callable[[Progress], None] | None = None,
     log: Log = silent,
+    loaded: Loaded = unwatched,
 ) -> Fit:
     """Fits the free parameters of an experiment to its clips.
 
@@ -62,6 +63,7 @@ def fit(
         output: folder for the run.
         progress: called as the search goes on.
         log: called with what the command line prints.
+        loaded: called with the experiment, its problem and clips, before the search.
 
     Raises:
         ValueError: the experiment is wrong or does not fit its clips or its preset, or the folder
@@ -78,6 +80,7 @@ def fit(
         free, count = len(experiment.free), len(clips)
         heading = f"fitting {free} parameters of {experiment.preset} to {count} clip(s)"
         log("\n".join([heading, *lines]))
+        loaded(experiment, problem, clips)
         kept = _kept_stages(run, experiment, problem, log)
         problem, solution = search_with_noise(problem, experiment, progress, kept)
         shown = Shown(clips, known_values)

@@ -5,15 +5,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
+import jaxik
+from fitting.experiments.experiment import Experiment
+from fitting.experiments.problems import ClipData
+from fitting.problem.problem import Problem
 from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
 
 Log: TypeAlias = Callable[[str], object]
 """Takes a line or a table, as the command line prints it."""
+Loaded: TypeAlias = Callable[[Experiment, Problem[jaxik.FootIK], tuple[ClipData, ...]], object]
+"""Takes what a fit is about, once it is loaded."""
 
 
 def silent(text: str) -> None:
     """Drops a line of the log."""
+
+
+def unwatched(
+    experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
+) -> None:
+    """Looks at nothing of what is loaded."""
 
 
 @contextmanager

@@ -219,6 +219,14 @@ def test_a_posterior_is_sampled_for_all_its_steps(small_problem):
     assert figure.value == timings.samples["chain"][0]
 
 
+def test_a_drag_is_measured_without_its_compilation():
+    timings = measure("view")
+    (figure,) = timings.figures
+    assert figure.at_most == 100.0 and figure.unit == "ms"
+    assert figure.value == pytest.approx(1e3 * np.median(timings.samples["drag"]))
+    assert timings.compile_s["solve"] > 0
+
+
 def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "run", lambda ik, rig, ground, motion: 2 * motion.weight)
     measured = run_suite("scaling")

@@ -14,7 +14,9 @@ WORDS = {  # that a command needs
     "calibrate": ["calibrate", "e.toml", "-o", "out"],
     "sample": ["sample", "run"],
     "apply": ["apply", "run", *ANIMATION],
+    "fit": ["fit", "e.toml", "-o", "out"],
     "run": ["run", *ANIMATION],
+    "view": ["view", *ANIMATION],
     "compare": ["compare", *ANIMATION],
     "translate": [*TRANSLATE, "-o", "out"],
     "inspect": ["inspect", "walk.bvh"],
@@ -27,6 +29,7 @@ OF_CLIPS = {"--scale": ("1e-9", "1e6")}
 OF_TERRAINS = {"--terrain-scale": ("1e-9", "1e6"), "--terrain-cell": ("0.001", "1e4")}
 OF_TERRAINS |= {"--terrain-offset": ("-1e6", "1e6")}
 OF_ANIMATIONS = {"--floor": ("-1e6", "1e6"), "--speed": ("0.01", "100")} | OF_CLIPS | OF_TERRAINS
+OF_PAGES = {"--port": ("0", "65535")}
 RANGES = {
     "init": OF_CLIPS | OF_TERRAINS,
     "ablate": {"--folds": ("2", "1000")},
@@ -36,7 +39,9 @@ RANGES = {
     },
     "sample": {"--max-steps": ("1", "1000000000")},
     "apply": OF_ANIMATIONS,
+    "fit": OF_PAGES,
     "run": OF_ANIMATIONS,
+    "view": OF_ANIMATIONS | OF_PAGES,
     "compare": OF_ANIMATIONS | {"--rates": ("1", "1000")},
     "translate": {"--fps": ("1", "1000")} | OF_CLIPS | OF_TERRAINS,
     "inspect": OF_CLIPS,

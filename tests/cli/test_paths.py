@@ -45,6 +45,9 @@ PLACES: dict[str, tuple[list[str], str]] = {  # words with a place for a path, a
     ),
     "run --parameters": (["run", *ANIMATION, "--parameters", "{}", "-o", "a.npz"], ".toml"),
     "run --tracks": (["run", *ANIMATION, "--tracks", "{}", "-o", "a.npz"], ".toml"),
+    "view run": (["view", "{}"], ""),
+    "view clip": (["view", "{}", "--terrain", str(GROUND)], ".bvh"),
+    "view --parameters": (["view", *ANIMATION, "--parameters", "{}"], ".toml"),
     "compare --parameters": (["compare", *ANIMATION, "--parameters", "{}", "-o", "out"], ".toml"),
     "compare --runs": (["compare", "--runs", "{}", "-o", "out"], ""),
     "translate --from": (
@@ -141,6 +144,7 @@ OUTPUTS: dict[str, tuple[list[str], str]] = {
     "fit": (["fit", "{experiment}", "-o", "{}"], ""),
     "run": (["run", *ANIMATION, "-o", "{}"], ".npz"),
     "run bvh": (["run", *ANIMATION, "-o", "{}"], ".bvh"),
+    "view": (["view", *ANIMATION, "-o", "{}"], ""),
     "compare": (["compare", *ANIMATION, "--presets", "record", "-o", "{}"], ""),
     "translate": (["translate", *FROM_TO, "--clip", *ANIMATION, "-o", "{}"], ""),
     "terrain": (["terrain", str(BASE), "-o", "{}"], ".ply"),

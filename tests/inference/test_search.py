@@ -126,10 +126,12 @@ def test_the_reports_name_the_stages_and_the_best_cost_never_rises():
 
 
 def test_an_interrupt_keeps_the_best_point():
-    best_costs = []
+    best_costs, best_points = [], []
 
     def interrupt_tenth_report(report: search.Progress) -> None:
+        assert isinstance(report, search.Report)
         best_costs.append(report.best)
+        best_points.append(report.best_u)
         if len(best_costs) == 10:
             raise KeyboardInterrupt
 
@@ -138,6 +140,7 @@ def test_an_interrupt_keeps_the_best_point():
     assert not solution.converged
     assert solution.message.startswith("Interrupted after")
     assert solution.cost == min(best_costs) < solution.cost_before
+    assert cost_of(problem, best_points[-1]) == pytest.approx(best_costs[-1])
     assert solution.cost == pytest.approx(cost_of(problem, solution.u))
 
 

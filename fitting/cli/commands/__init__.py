@@ -14,6 +14,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "sample": fits.sample,
     "apply": animations.apply,
     "run": animations.run,
+    "view": animations.view,
     "compare": animations.compare,
     "translate": fits.translate,
     "inspect": files.inspect,

@@ -2,10 +2,13 @@
 
 import argparse
 from contextlib import AbstractContextManager
+from pathlib import Path
 
-from fitting import jobs
+from fitting import jobs, viewer
 from fitting.cli.terminal import show
 from fitting.experiments import parameter_files, systems
+from fitting.experiments.systems import Preset
+from fitting.jobs.views import Address, check_folder
 from fitting.runtime import activity, cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import comparison
@@ -14,6 +17,12 @@ from fitting.studies.suite import situations
 from jaxik import FootIK, Rig
 
 from . import reading, status
+
+OF_CLIPS = {  # options of a clip and a terrain, as they are where they are not used
+    "--floor": 0.0, "--root": "auto", "--speed": 1.0, "--tracks": None, "--joints": None,
+    "--scale": None, "--up": None, "--asf": None, "--animation": None, "--file-up": "y",
+    "--terrain-offset": (0.0, 0.0, 0.0), "--terrain-scale": None, "--terrain-cell": None,
+}  # fmt: skip
 
 
 def apply(options: argparse.Namespace) -> int:
@@ -41,6 +50,36 @@ def run(options: argparse.Namespace) -> int:
 
 
 @in_float64
+def view(options: argparse.Namespace) -> int:
+    """Shows a run, or a preset or a parameter file on a clip, in the browser."""
+    cache_folder.use_default()
+    address = Address(options.host, options.port)
+    if options.terrain is None:
+        _check_run(options)
+        jobs.view_run(options.clip, options.output, address, log=show)
+        return 0
+    folder = options.output or Path()
+    check_folder(folder)
+    animation, preset, given = _animation(options), Preset(options.preset), None
+    if options.parameters is not None:
+        given, preset = parameter_files.load_system(options.parameters, animation.flat_clip.rig)
+    subject = viewer.subject_of_animation(animation, preset, given)
+    jobs.view(subject, folder, address, log=show)
+    return 0
+
+
+def _check_run(options: argparse.Namespace) -> None:
+    """Raises ValueError for options of a clip beside a run, which has clips of its own."""
+    if not options.clip.is_dir() and options.clip.is_file():
+        raise ValueError(f"{options.clip}: a clip needs --terrain; a run is a folder")
+    own = {"--parameters": None, "--preset": "record", **OF_CLIPS}
+    for name, unused in own.items():
+        given = getattr(options, name.strip("-").replace("-", "_"))
+        if given != unused:
+            raise ValueError(f"{name} is {given}; a run has its own clips and system")
+
+
+@in_float64
 def compare(options: argparse.Namespace) -> int:
     """Runs several systems on a clip or through the suite, or compares runs."""
     cache_folder.use_default()
@@ -62,11 +101,7 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
     """Runs systems, or else all presets, through made situations."""
     if options.runs is not None:
         raise ValueError("--runs and --suite exclude each other")
-    own = {"CLIP": None, "--terrain": None, "--floor": 0.0, "--root": "auto", "--rates": []}
-    own |= {"--speed": 1.0}
-    own |= dict.fromkeys(("--joints", "--scale", "--up", "--asf", "--animation", "--tracks"))
-    own |= {"--file-up": "y", "--terrain-offset": (0.0, 0.0, 0.0)}
-    own |= dict.fromkeys(("--terrain-scale", "--terrain-cell"))
+    own = {"CLIP": None, "--terrain": None, "--rates": [], **OF_CLIPS}
     for name, unused in own.items():
         given = getattr(options, name.strip("-").replace("-", "_").lower())
         if given != unused:

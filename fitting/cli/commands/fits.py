@@ -8,6 +8,7 @@ from fitting.cli.terminal import show
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.record_only import restrict
 from fitting.experiments.systems import Preset
+from fitting.jobs.views import Address, FitWatch
 from fitting.runtime import cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import translation
@@ -24,8 +25,16 @@ def fit(options: argparse.Namespace) -> int:
     experiment = load_experiment(options.experiment)
     if options.record_only and not experiment.record_only:
         experiment = restrict(experiment)
-    with progress.ProgressLine(progress.fit_line) as line:
-        fitted = jobs.fit(experiment, options.output, progress=line, log=show)
+    if not options.view:
+        with progress.ProgressLine(progress.fit_line) as line:
+            fitted = jobs.fit(experiment, options.output, progress=line, log=show)
+        return status.of_fit(fitted)
+    address = Address(options.host, options.port)
+    with (
+        progress.ProgressLine(progress.fit_line) as line,
+        FitWatch(options.output, address, line, show) as watch,
+    ):
+        fitted = jobs.fit(experiment, options.output, progress=watch, log=show, loaded=watch.load)
     return status.of_fit(fitted)
 
 

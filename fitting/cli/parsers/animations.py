@@ -3,7 +3,15 @@
 import argparse
 from pathlib import Path
 
-from .options import Commands, add_animation, add_command, add_output, rates
+from .options import (
+    Commands,
+    add_address,
+    add_animation,
+    add_command,
+    add_output,
+    add_placement,
+    rates,
+)
 
 
 def add_apply(commands: Commands) -> None:
@@ -32,9 +40,40 @@ def add_run(commands: Commands) -> None:
     )  # fmt: skip
     add_animation(run)
     _add_motion_output(run)
-    system = run.add_mutually_exclusive_group()
+    _add_system(run)
+
+
+def _add_system(command: argparse.ArgumentParser) -> None:
+    """Adds the system that is run."""
+    system = command.add_mutually_exclusive_group()
     system.add_argument("--preset", default="record", help="of jaxik.presets (default: record)")
     system.add_argument("--parameters", type=Path, metavar="TOML", help="instead of a preset")
+
+
+def add_view(commands: Commands) -> None:
+    """`jaxik view`."""
+    view = add_command(
+        commands, "view", "move parameters in the browser, and see the motion at once",
+        """
+        jaxik view runs/walk                                      before, fitted and captured
+        jaxik view walk.bvh --terrain steps.obj --preset stride
+        jaxik view walk.bvh --terrain steps.obj --parameters footik.toml --port 9000
+
+        Save on the page writes tuned.toml and, where it has room, the record tuned.bin; files
+        that exist stay. Ctrl-C ends it. Needs the extra `view`: pip install "jaxik[view]".
+        """,
+    )  # fmt: skip
+    view.add_argument(
+        "clip", type=Path, metavar="RUN|CLIP",
+        help="folder made by `jaxik fit`; or, with --terrain, a clip as `jaxik run` takes it",
+    )  # fmt: skip
+    add_placement(view, required=False)
+    _add_system(view)
+    view.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="where Save writes (default: the run's folder, or this one)",
+    )  # fmt: skip
+    add_address(view)
 
 
 def _add_motion_output(command: argparse.ArgumentParser) -> None:

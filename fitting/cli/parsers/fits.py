@@ -5,6 +5,7 @@ from pathlib import Path
 
 from .options import (
     Commands,
+    add_address,
     add_clip_options,
     add_command,
     add_output,
@@ -57,6 +58,7 @@ def add_fit(commands: Commands) -> None:
         """
         jaxik fit data/experiments/uneven_walk.toml -o runs/walk
         jaxik fit data/experiments/uneven_walk.toml --record-only -o runs/game
+        jaxik fit data/experiments/uneven_walk.toml --view -o runs/walk   best so far, in a browser
 
         Status 0: converged, and fits. 3: not converged. 4: converged, but what is left is no noise
         of the given sigmas; the summary says where. Ctrl-C ends the search; the best point so far
@@ -72,6 +74,10 @@ def add_fit(commands: Commands) -> None:
         "--record-only", action="store_true",
         help="leave out what the game's record has no room for, and say what that costs",
     )  # fmt: skip
+    fit.add_argument(
+        "--view", action="store_true", help="show the best point so far as `jaxik view` does"
+    )
+    add_address(fit)
 
 
 def add_ablate(commands: Commands) -> None:

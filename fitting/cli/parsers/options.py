@@ -55,6 +55,11 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
         "clip", type=Path, metavar="CLIP", nargs=None if required else "?",
         help=".bvh, .amc, .glb, .gltf, .c3d or .npz over flat ground; of a blocks .npz its base",
     )  # fmt: skip
+    add_placement(command, required=required)
+
+
+def add_placement(command: argparse.ArgumentParser, *, required: bool = True) -> None:
+    """Adds the terrain of a flat animation, and how both lie."""
     command.add_argument(
         "--terrain",
         type=Path,
@@ -127,6 +132,18 @@ def add_terrain_options(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--terrain-cell", type=number(1e-3, 1e4, "metres"), metavar="M",
         help="between the heights of a .png or .npy, m",
+    )  # fmt: skip
+
+
+def add_address(command: argparse.ArgumentParser) -> None:
+    """Adds where a page is served."""
+    command.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS",
+        help="where the page listens (default: 127.0.0.1, for this machine only)",
+    )  # fmt: skip
+    command.add_argument(
+        "--port", type=count(0, 65535), default=8080, metavar="N",
+        help="of the page; the next free one where it is in use, 0 for any (default: 8080)",
     )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ from .kept_stages import KeptStages
 from .models import HardModel
 from .population import evaluate
 from .settings import DEFAULTS, MAX_STARTS, SearchSettings
-from .solution import Progress, Solution
+from .solution import Progress, Report, Solution
 from .state import Point, Search, SearchState, StepsUsedUp
 from .sweep import sweep_and_descend
 
@@ -252,7 +252,7 @@ class _Watch:
     def __call__(self, state: SearchState) -> None:
         self.latest = state
         if self.progress is not None:
-            self.progress(state.history[-1])
+            self.progress(Report(**vars(state.history[-1]), best_u=state.best.u))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,6 +25,13 @@ class Progress:
 
 
 @dataclasses.dataclass(frozen=True)
+class Report(Progress):
+    """A report with the best point so far, which the history does not keep."""
+
+    best_u: Float[np.ndarray, " free"]
+
+
+@dataclasses.dataclass(frozen=True)
 class Solution:
     """The best point of a search, and how the search ended."""
 

@@ -1,0 +1,82 @@
+"""The system as it has been moved so far, with a way back."""
+
+import threading
+from collections.abc import Mapping
+
+import jaxik
+
+PAUSE = 1.0  # s, after which moving the same slider is a new step
+MOST_STEPS = 1000  # that can be undone
+
+
+class Tuning:
+    """A system that is changed step by step; calls may come from several threads.
+
+    Moving one slider, without a pause, is one step, however many values it passes.
+
+    Args:
+        starts: the systems to go back to, by name; it begins with the first.
+    """
+
+    def __init__(self, starts: Mapping[str, jaxik.FootIK]):
+        self.starts = dict(starts)
+        self._ik = next(iter(self.starts.values()))
+        self._undone: list[jaxik.FootIK] = []
+        self._done: list[jaxik.FootIK] = []
+        self._last: tuple[str, float] = ("", -PAUSE)
+        self._lock = threading.RLock()
+
+    @property
+    def ik(self) -> jaxik.FootIK:
+        """The system as it is."""
+        with self._lock:
+            return self._ik
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a step to undo."""
+        return bool(self._done)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is a step to do again."""
+        return bool(self._undone)
+
+    def change(self, ik: jaxik.FootIK, what: str, now: float) -> None:
+        """Takes a changed system.
+
+        Args:
+            ik: the system.
+            what: has changed: the name of a parameter.
+            now: s, on any clock.
+        """
+        with self._lock:
+            before, when = self._last
+            if what != before or now - when > PAUSE:
+                self._done = [*self._done, self._ik][-MOST_STEPS:]
+            self._undone, self._ik, self._last = [], ik, (what, now)
+
+    def reset(self, name: str) -> None:
+        """Goes back to one of the systems to go back to, which is a step of its own."""
+        self.change(self.starts[name], f"reset to {name}", float("inf"))
+
+    def undo(self) -> None:
+        """Goes back a step, if there is one."""
+        self._move(self._done, self._undone)
+
+    def redo(self) -> None:
+        """Does the step again that was undone last, if there is one."""
+        self._move(self._undone, self._done)
+
+    def _move(self, source: list[jaxik.FootIK], target: list[jaxik.FootIK]) -> None:
+        with self._lock:
+            if source:
+                target.append(self._ik)
+                self._ik = source.pop()
+                self._last = ("", -PAUSE)
+
+    def restart(self, name: str, ik: jaxik.FootIK) -> None:
+        """Begins anew with a system to go back to, as a fit that goes on finds better ones."""
+        with self._lock:
+            self.starts[name] = self._ik = ik
+            self._done, self._undone, self._last = [], [], ("", -PAUSE)
