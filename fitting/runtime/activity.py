@@ -34,7 +34,7 @@ class Work:
         """How many parts it has, or has at most; None if that cannot be said."""
         self.done = done
         """Of these parts."""
-        self._done_before = done
+        self._first: tuple[int, float] | None = None
         self.note = ""
         """What it last said of itself, in a line."""
         self.failed = False
@@ -48,9 +48,11 @@ class Work:
 
     @property
     def seconds_each(self) -> float | None:
-        """Of the parts that were done since it began; None before the first one."""
-        done = self.done - self._done_before
-        return self.seconds / done if done > 0 else None
+        """Of its parts; None before the second one, since the first may compile programs."""
+        if self._first is None or self.done <= self._first[0]:
+            return None
+        done, seconds = self._first
+        return (self.seconds - seconds) / (self.done - done)
 
     @property
     def seconds_left(self) -> float | None:
@@ -67,6 +69,8 @@ class Work:
     def reach(self, done: int) -> None:
         """Says how many parts are done."""
         self.done = done
+        if self._first is None:
+            self._first = done, self.seconds
         self.changed()
 
     def changed(self) -> None:

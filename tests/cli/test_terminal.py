@@ -166,6 +166,7 @@ def test_help_has_colours_on_a_terminal_only(words, monkeypatch, capsys):
 
 def work_for_a_while() -> None:
     with watched(), activity.announced("Searching from 4 starts", 4) as searching:
+        searching.reach(1)
         searching.advance()
         activity.note("cost 12.5")
         with activity.announced("Descending"):
@@ -181,7 +182,7 @@ def test_a_terminal_gets_bars_and_results_above_them(monkeypatch):
         work_for_a_while()
     (drawn,) = texts
     text = CODES.sub("", drawn)
-    assert "━" in text and "Searching from 4 starts" in text and "1 of 4, " in text
+    assert "━" in text and "Searching from 4 starts" in text and "2 of 4, " in text
     assert (
         " s each, " in text and " s left" in text and "cost 12.5" in text and "  Descending" in text
     )
@@ -250,8 +251,8 @@ def test_progress_is_reported_every_ten_seconds_with_the_time_left(monkeypatch):
         lines += clock.wait(0.1)
     assert lines == [
         "Fitting ...",
-        "  12.0 s  Fitting, 3 of 10, 28 s left: cost 10",
-        "  22.0 s  Fitting, 6 of 10, 15 s left: cost 20",
+        "  12.0 s  Fitting, 3 of 10, 24 s left: cost 10",
+        "  22.0 s  Fitting, 6 of 10, 14 s left: cost 20",
     ]
 
 

@@ -35,12 +35,14 @@ def test_without_a_watcher_work_only_counts():
     assert (work.done, work.note) == (1, "a note")
 
 
-def test_time_left_is_that_of_parts_that_were_done_since_it_began(monkeypatch):
+def test_time_left_follows_from_the_parts_after_the_first_one(monkeypatch):
     now = 100.0
     monkeypatch.setattr(activity.time, "monotonic", lambda: now)
     with activity.announced("work", 50, done=30) as work:
+        now = 160.0
+        work.reach(31)
         assert work.seconds_left is None
-        now = 120.0
+        now = 178.0
         work.reach(40)
         assert work.seconds_each == 2.0 and work.seconds_left == 20.0
         work.reach(50)
