@@ -192,6 +192,7 @@ def _check_toml_format(path: Path) -> None:
         check_version(path, int(number) if number.isdecimal() else number, FORMAT)
 
 
+@activity.announced("Writing the posterior")
 def save_posterior(run: Path, sampled: SampledFit) -> None:
     """Writes the summary of a posterior, and of what it makes of the prior, beside its chain."""
     posterior = sampled.posterior

@@ -46,6 +46,7 @@ SAMPLE = [
     "Placing 8 walkers",
     "Summing up the chain",
     "Playing 160 draws of the posterior",
+    "Writing the posterior",
     "Drawing the posterior",
 ]
 LONG = {  # what takes long, and how the work is called that must be going on then

@@ -2,6 +2,7 @@
 
 from fitting.inference.sampling.posterior import Posterior
 from fitting.report import comparison_report, fit_tables, posterior_report
+from fitting.report.formatting import transposed
 from fitting.report.plots import comparison_plots, posterior_plots, profile_plots
 from fitting.runtime.display import notebook
 from fitting.studies.comparison import Comparison
@@ -42,7 +43,7 @@ def posterior_html(posterior: Posterior) -> str:
 @notebook.html.register
 def comparison_html(comparison: Comparison) -> str:
     """The measures of each system, and its motion."""
-    rows = comparison_report.transposed(comparison_report.table(comparison))
+    rows = transposed(comparison_report.table(comparison))
     return parts.page(
         f"Comparison: {comparison.title}",
         parts.table(rows),
