@@ -78,7 +78,9 @@ def joint_name(role: str) -> str:
 
 
 def bridge(
-    frames: Int64[np.ndarray, " frames"], known: Int64[np.ndarray, " known"], places: Vectors
+    frames: Int64[np.ndarray, " frames"],
+    known: Int64[np.ndarray, " known"],
+    places: Float64[np.ndarray, "known 3"],
 ) -> Float64[np.ndarray, "frames 3"]:
     """Places in all frames, on straight lines between the known ones; held before and after.
 
