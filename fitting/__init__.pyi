@@ -17,10 +17,13 @@ from .datasets.flat_animation import load_flat_animation as load_flat_animation
 from .datasets.terrain.mesh_files import load_terrain as load_terrain
 from .experiments.experiment import Experiment as Experiment
 from .experiments.experiment_files import load_experiment as load_experiment
+from .experiments.in_memory.making import clip_entry as clip_entry
+from .experiments.in_memory.making import make_experiment as make_experiment
 from .experiments.systems import register_rule as register_rule
 from .jobs import ablate as ablate
 from .jobs import calibrate as calibrate
 from .jobs import compare as compare
+from .jobs import export as export
 from .jobs import fit as fit
 from .jobs import population as population
 from .jobs import sample as sample

@@ -17,6 +17,7 @@ import jax
 import pytest
 from matplotlib.figure import Figure
 
+from fitting.cli.terminal import plain_lines
 from fitting.runtime import xla
 
 xla.configure_xla()  # as the commands do
@@ -30,6 +31,8 @@ if PROGRAMS not in os.environ:
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
 jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
+
+plain_lines.PATIENCE = float("inf")  # what commands print must not depend on how fast they are
 
 # Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
 gc.set_threshold(200_000, 50, 100)

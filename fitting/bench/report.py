@@ -104,7 +104,7 @@ def text(report: Report) -> str:
         parts.append("Compile time, which counts in cold figures only\n" + "\n".join(compiled))
     if notes:
         parts.append("Notes\n" + "\n".join(notes))
-    return "\n\n".join(parts)
+    return formatting.joined(parts, apart=True)
 
 
 def table(report: Report) -> formatting.Table:

@@ -6,11 +6,12 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 
-from fitting.runtime import xla
+from fitting.runtime import activity, xla
 from fitting.runtime.validation import in_one_line
 
 from . import without_jax
 from .parser import make_parser
+from .terminal import watched
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
 MISTAKE, INTERRUPTED = 2, 130  # exit statuses
@@ -27,7 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            status = _function(options.command)(options)
+            with watched():
+                status = _function(options.command)(options)
             sys.stdout.flush()
             return status
     except BrokenPipeError:  # the reader, such as `head`, has enough
@@ -46,7 +48,8 @@ def _function(command: str) -> Callable[[argparse.Namespace], int]:
     if command in without_jax.COMMANDS:
         return without_jax.COMMANDS[command]
     xla.configure_xla()
-    from . import commands
+    with activity.announced("Importing JAX"):
+        from . import commands
 
     return commands.COMMANDS[command]
 

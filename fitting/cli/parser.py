@@ -3,7 +3,7 @@
 import argparse
 
 from .parsers.animations import add_apply, add_compare, add_run, add_view
-from .parsers.files import add_inspect, add_record, add_terrain
+from .parsers.files import add_export, add_inspect, add_record, add_terrain
 from .parsers.fits import (
     add_ablate,
     add_calibrate,
@@ -16,6 +16,7 @@ from .parsers.fits import (
 from .parsers.guides import add_completion, add_doctor, add_example, add_parameters, add_schema
 from .parsers.machine import add_bench, add_cache
 from .parsers.options import Parser
+from .terminal.help_texts import help_formatter
 
 EXAMPLES = """examples:
   jaxik init walk.bvh -o walk                                  a first experiment of your clip
@@ -33,6 +34,7 @@ EXAMPLES = """examples:
   jaxik inspect walk.bvh
   jaxik terrain walk.bvh -o ground.ply
   jaxik record to-toml footik.bin -o footik.toml
+  jaxik export runs/walk --as unreal -o walk.csv               in a game engine's names and units
   jaxik bench --quick
   jaxik cache                                                  where compiled programs are kept
   jaxik parameters stride                                      what each one is and does
@@ -56,13 +58,14 @@ def make_parser() -> argparse.ArgumentParser:
         prog="jaxik",
         description="Fits the parameters of foot IK to captured motion, with their uncertainty.",
         epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=help_formatter(),
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
         add_init, add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply,
         add_run, add_view, add_compare, add_translate, add_inspect, add_terrain, add_bench,
-        add_record, add_cache, add_parameters, add_schema, add_example, add_doctor, add_completion,
+        add_record, add_export, add_cache, add_parameters, add_schema, add_example, add_doctor,
+        add_completion,
     ):  # fmt: skip
         add(commands)
     return top

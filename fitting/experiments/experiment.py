@@ -3,9 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
 
 import jaxik
+from fitting.datasets.clips import Clip
 from fitting.datasets.clips.load import ClipOptions
 from fitting.datasets.terrain.mesh_files import TerrainOptions
 from fitting.inference.noise.settings import NoiseOptions
@@ -17,7 +20,10 @@ from fitting.problem.loss import Loss
 from fitting.problem.prior import Priors
 from fitting.problem.space import Space, make_space
 from fitting.runtime import validation
+from fitting.runtime.display.notebook import Shown
+from fitting.runtime.precision import with_floats
 from jaxik.world import body
+from jaxik.world.terrain import Terrain
 
 from .ablations import Ablation
 from .hierarchies import Hierarchy
@@ -33,6 +39,14 @@ DEFAULT_SIGMAS = {  # what a good fit of captured motion leaves
     "smooth": float("inf"),  # m/s²
     "correlation": 0.0,
 }
+
+
+class LoadedFiles(NamedTuple):
+    """The files of a clip, in memory."""
+
+    reference: Clip
+    terrain: Terrain
+    base: Clip | None = None
 
 
 @dataclass(frozen=True)
@@ -78,6 +92,8 @@ class ClipEntry:
     """m, by which the terrain is moved."""
     terrain_cell: float | None = None
     """m, between heights of a terrain that does not say it."""
+    loaded: LoadedFiles | None = field(default=None, repr=False, compare=False)
+    """What is in memory: then the paths of reference, terrain and base are names, and no files."""
 
     @staticmethod
     def reading(clip: ClipOptions, terrain: TerrainOptions) -> dict[str, Any]:
@@ -117,7 +133,7 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Shown):
     """What is fitted to what.
 
     Raises:
@@ -163,6 +179,8 @@ class Experiment:
     """Whether only what the game's record holds is fitted; see `record_only.restrict`."""
     whole: "Experiment | None" = None
     """What such an experiment was made of."""
+    system: jaxik.FootIK | None = field(default=None, repr=False, compare=False)
+    """With any rules, instead of those of preset and `rules`; for any body as it is."""
 
     def __post_init__(self) -> None:
         if self.noise.sigmas == "estimated" and self.loss not in ("squares", "student"):
@@ -179,6 +197,8 @@ class Experiment:
 
     def preset_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
         """The preset with the experiment's rules, for a rig unless it is meant for the adult."""
+        if self.system is not None:
+            return with_floats(self.system, jnp.result_type(float))
         rig = rig if self.body == "clip" else None
         ik = Preset(self.preset, self.faithful).system(rig)
         return with_rules(ik, self.rules, f"{self.path} [rules]", rig)

@@ -4,6 +4,7 @@ preset = "record"                    # a function of jaxik.presets
 faithful = true                      # the original, where the preset differs from it
 body = "clip"                        # its defaults: for the first clip's rig, or for the "adult"
 record_only = true                   # leave out what the game's record has no room for
+written_in = "/runs/walk"            # where paths start that lead nowhere from this file: of runs
 rules.pelvis = "SupportPelvis"       # rules that differ from the preset's, by stage
 [[clips]]
 reference = "walk.npz"               # the captured motion; paths are relative to this file
@@ -42,6 +43,7 @@ from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Setting, Settings, describe
 from fitting.runtime import validation
+from fitting.runtime.files import relative_path
 from fitting.runtime.validation import (
     Content,
     Table,
@@ -66,7 +68,7 @@ from .schema.keys import (
     TOP_KEYS,
 )
 from .systems import DEFAULT_PRESET, preset_system, read_free_table, with_rules
-from .tables.clip_tables import read_clip
+from .tables.clip_tables import Places, read_clip
 from .tables.prior_tables import priors_to_table, read_priors, read_start
 
 USUAL_SAMPLE_KEYS = ("walkers", "max_steps", "thin_by", "stop_at")  # always written
@@ -84,7 +86,10 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 def parse_experiment(content: Table, path: Path) -> Experiment:
-    """The experiment in a TOML table; relative paths start from the folder of `path`."""
+    """The experiment in a TOML table; relative paths start from the folder of `path`.
+
+    Where one leads nowhere, it starts from where the file was written, if the table says so.
+    """
     check_table(content, TOP_KEYS, f"{path}")
     for key in ("clips", "free"):
         if not content.get(key):
@@ -101,7 +106,8 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
     known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
-    clips = tuple(read_clip(entry, path) for entry in content["clips"])
+    places = Places(path, content.get("written_in"))
+    clips = tuple(read_clip(entry, places) for entry in content["clips"])
     subjects, hierarchy = [clip.subject for clip in clips], content.get("hierarchy", {})
     tables = {
         "clips": clips,
@@ -117,6 +123,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
     top = with_floats(content, ("fps", "independent_every"))
+    top.pop("written_in", None)  # another folder is named when it is written again
     experiment = Experiment(**{"path": path, "name": path.stem, **top, **tables})
     return restrict(experiment) if experiment.record_only else experiment
 
@@ -154,9 +161,13 @@ def _sampler_settings(value: object, free_count: int, where: str) -> SamplerSett
 
 
 def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> str:
-    """The experiment as TOML with absolute paths, so that the file may lie anywhere.
+    """The experiment as TOML.
 
-    Paths inside `folder` are written relative to it: those files move with it.
+    Args:
+        experiment: the experiment.
+        folder: in which the file is going to lie. Paths are relative to it, so that it may be moved
+            together with what they name; it is named itself, so that it may be moved alone. None
+            writes absolute paths.
     """
     fit, sampler = experiment.fit, dataclasses.asdict(experiment.sample)
     fit_table: Content = {"starts": fit.starts, "max_steps": fit.search.max_steps}
@@ -164,7 +175,9 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     if changed := _changed(search):
         fit_table["search"] = changed
     usual = {key: sampler[key] for key in USUAL_SAMPLE_KEYS}
-    content = dataclasses.asdict(dataclasses.replace(experiment, whole=None))
+    named = tuple(dataclasses.replace(entry, loaded=None) for entry in experiment.clips)
+    plain = dataclasses.replace(experiment, clips=named, whole=None, system=None)
+    content = dataclasses.asdict(plain)
     content |= {"fit": fit_table, "sample": usual | _changed(experiment.sample)}
     content["prior"] = priors_to_table(experiment.prior)
     content["hierarchy"] = hierarchy_to_table(experiment.hierarchy)
@@ -173,7 +186,9 @@ def experiment_to_toml(experiment: Experiment, folder: Path | None = None) -> st
     each = {name: content["sigmas"].pop(name) for name in CORRELATIONS if name in content["sigmas"]}
     content["sigmas"] |= nest(each)
     del content["path"]
-    return tomli_w.dumps(_plain(content, folder and folder.resolve()))
+    if folder is not None:
+        content["written_in"] = folder.resolve().as_posix()
+    return tomli_w.dumps(_plain(content, folder))
 
 
 def _changed(settings: Settings) -> Content:
@@ -191,6 +206,4 @@ def _plain(value: Any, folder: Path | None) -> Any:
         return [_plain(entry, folder) for entry in value]
     if not isinstance(value, Path):
         return value
-    if folder is None or not value.is_relative_to(folder):
-        return str(value)
-    return value.relative_to(folder).as_posix()
+    return str(value) if folder is None else relative_path(value, folder)

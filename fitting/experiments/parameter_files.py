@@ -1,4 +1,4 @@
-"""Parameter files: a system as TOML, with a preset, changed rules, and one table per stage.
+"""Parameter files: a system as TOML or JSON, with a preset, changed rules, and one table per stage.
 
 preset = "record"
 faithful = true             # the original, where the preset differs from it
@@ -11,21 +11,30 @@ pelvis = "SupportPelvis"
 lowest_share = 0.4
 """
 
+import json
+import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tomli_w
 
 import jaxik
 from fitting.runtime.validation import (
+    QUOTED,
     TABLE,
+    Content,
     check_keys,
     check_table,
     error_context,
     flatten,
+    in_one_line,
     nest,
     number,
+    read_json,
     read_toml,
+    why_unreadable,
 )
 from jaxik.maths import parameter_tree
 from jaxik.world import body
@@ -54,11 +63,61 @@ def system_to_toml(
         preset: of which it differs.
         leg_length: m, of the body that its numbers are for; None if they fit any body as they are.
     """
+    return tomli_w.dumps(_tables(ik, preset, leg_length))
+
+
+def system_to_json(
+    ik: jaxik.FootIK, preset: Preset = DEFAULT_PRESET, leg_length: float | None = None
+) -> str:
+    """The same as JSON, in which null stands for inf; arguments as for `system_to_toml`."""
+    content = _with_null(_tables(ik, preset, leg_length))
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _tables(ik: jaxik.FootIK, preset: Preset, leg_length: float | None) -> Content:
     values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
     values |= parameter_tree.options(ik)
     rules = changed_rules(ik, preset.system())
     keys = preset.keys() | ({} if leg_length is None else {"leg_length": leg_length})
-    return tomli_w.dumps(keys | ({"rules": rules} if rules else {}) | nest(values))
+    return keys | ({"rules": rules} if rules else {}) | nest(values)
+
+
+def _with_null(value: Any) -> Any:
+    """The value with None for inf, which is no JSON."""
+    if isinstance(value, Mapping):
+        return {key: _with_null(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_with_null(entry) for entry in value]
+    return None if value == math.inf else value
+
+
+def _with_inf(value: Any) -> Any:
+    """The value with inf for None: the reverse of `_with_null`."""
+    if isinstance(value, Mapping):
+        return {key: _with_inf(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_with_inf(entry) for entry in value]
+    return math.inf if value is None else value
+
+
+def _read(path: Path) -> Content:
+    """The tables of a parameter file."""
+    if path.suffix.lower() != ".json":
+        return read_toml(path, "a parameter")
+    if reason := why_unreadable(path):
+        raise ValueError(f"{path}: {reason}, wanted a parameter file")
+    try:
+        content = read_json(path)
+    except ValueError as error:
+        raise ValueError(f"{path}: not JSON: {in_one_line(error, QUOTED)}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: wanted an object with a preset, rules or parameters")
+    return _with_inf(content)
+
+
+def leg_length_of(path: Path) -> float | None:
+    """Leg length, m, of the body that a parameter file is for; None if it fits any as it is."""
+    return _read(path).get("leg_length")
 
 
 def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.FootIK, Preset]:
@@ -77,7 +136,7 @@ def load_system(path: str | Path, rig: jaxik.Rig | None = None) -> tuple[jaxik.F
             parameter is unknown; a value is wrong.
     """
     path = Path(path)
-    content = read_toml(path, "a parameter")
+    content = _read(path)
     if not content:  # the defaults would pass for what somebody has fitted
         raise ValueError(f"{path}: nothing is in it; wanted a preset, rules or parameters")
     preset = Preset(content.pop("preset", DEFAULT_PRESET.name), content.pop("faithful", False))

@@ -17,14 +17,20 @@ import jaxik
 from fitting.datasets import coverage
 from fitting.datasets.clip_frames import frames_from_clip, raised
 from fitting.datasets.clips import Clip, edit, flight, load_clip
-from fitting.datasets.flat_animation import flatten_clip, load_flat_animation, with_remark_if_uneven
+from fitting.datasets.flat_animation import (
+    as_flat_animation,
+    flatten_clip,
+    load_flat_animation,
+    with_remark_if_uneven,
+)
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain import mesh_files
 from fitting.datasets.terrain.mesh_files import TerrainOptions
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
-from fitting.runtime.precision import in_float64
+from fitting.runtime import activity
+from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
@@ -83,7 +89,13 @@ def load_clips(
     if experiment.has_points:
         adult = experiment.body == "adult"
         experiment.check_points(None if adult else _load_rig(experiment.clips[0]))
-    data = [load_clip_data(entry, experiment.fps) for entry in experiment.placed_clips()]
+    data = []
+    count = len(experiment.clips)
+    title = "Reading the clip and its ground" if count == 1 else f"Reading {count} clips"
+    with activity.announced(title, count) as reading:
+        for entry in experiment.placed_clips():
+            data.append(load_clip_data(entry, experiment.fps))
+            reading.advance()
     for clip in data:
         log(f"root of {clip.base.source}: {clip.root.reason}")
         if in_the_air := flight.describe(clip.base):
@@ -114,14 +126,15 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
                 f"{experiment.path} [free]: {both} cannot be free: a track of {clip.base.source} "
                 "sets it in every frame"
             )
-    for entry, clip in zip(experiment.clips, data, strict=True):
-        clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
-        scene = make_scene(clip, experiment.sigmas, entry.label)
-        if (size := experiment.size(scene.rig, rig)) is not None:
-            scene = dataclasses.replace(scene, size=jax.device_put(np.float64(size)))
-        with error_context(f"{experiment.path} [parameters]"):
-            parameter_tree.check_shapes(ik, len(scene.rig.side))
-        scenes.append(scene)
+    with activity.announced("Preparing what is compared"):
+        for entry, clip in zip(experiment.clips, data, strict=True):
+            clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
+            scene = make_scene(clip, experiment.sigmas, entry.label)
+            if (size := experiment.size(scene.rig, rig)) is not None:
+                scene = dataclasses.replace(scene, size=jax.device_put(np.float64(size)))
+            with error_context(f"{experiment.path} [parameters]"):
+                parameter_tree.check_shapes(ik, len(scene.rig.side))
+            scenes.append(scene)
     dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
     independent = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
     return Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, independent)
@@ -133,10 +146,15 @@ def _load_rig(entry: ClipEntry) -> jaxik.Rig:
 
 
 def _load_reference(entry: ClipEntry) -> Clip:
+    if entry.loaded is not None:
+        return entry.loaded.reference
     return load_clip(entry.reference, **vars(entry.clip_options.of_file(entry.reference)))
 
 
 def _load_base(base: Path, entry: ClipEntry) -> Clip:
+    if entry.loaded is not None and entry.loaded.base is not None:
+        with error_context(base):
+            return as_flat_animation(entry.loaded.base)
     return load_flat_animation(base, options=entry.clip_options.of_file(base))
 
 
@@ -156,6 +174,8 @@ def load_clip_data(entry: ClipEntry, fps: float | None, *, has_file: bool = True
     """
 
     def load_ground(options: TerrainOptions) -> Terrain:
+        if entry.loaded is not None:
+            return with_floats(entry.loaded.terrain, np.float64)
         return mesh_files.load_terrain(entry.terrain, **vars(options))
 
     def check_ground(clip: Clip) -> None:

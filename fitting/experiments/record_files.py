@@ -3,6 +3,7 @@
 import csv
 from pathlib import Path
 
+import jaxik
 from fitting.runtime import validation
 from jaxik import record
 from jaxik.maths import parameter_tree
@@ -37,18 +38,7 @@ def read(
     suffix = path.suffix.lower()
     if suffix == ".toml":
         ik, preset = parameter_files.load_system(path)
-        original = systems.Preset("record", faithful=True)
-        if preset.name != original.name:
-            raise ValueError(
-                f"{path}: parameters of {preset.name!r}; only those of 'record' make one"
-            )
-        if rules := systems.changed_rules(ik, original.system()):
-            raise ValueError(
-                f"{path}: rules {rules}; only those of 'record' with faithful = true make one; "
-                "`jaxik init --record-only` writes an experiment whose fit has them"
-            )
-        with validation.error_context(path):
-            return [record.from_ik(ik, base, reading, drop=drop)]
+        return [from_system(ik, preset, path, reading, base, drop=drop)]
     if base is not None:
         raise ValueError(f"{path}: a base completes parameters in a .toml; this is a whole record")
     if suffix != ".csv" or validation.why_unreadable(path):
@@ -60,6 +50,28 @@ def read(
     if not records:
         raise ValueError(f"{path}: the CSV has no row")
     return records
+
+
+def from_system(
+    ik: jaxik.FootIK,
+    preset: systems.Preset,
+    path: Path,
+    reading: record.Reading,
+    base: record.Record | None = None,
+    *,
+    drop: bool,
+) -> record.Record:
+    """The record with the parameters of a system; arguments and errors are those of `read`."""
+    original = systems.Preset("record", faithful=True)
+    if preset.name != original.name:
+        raise ValueError(f"{path}: parameters of {preset.name!r}; only those of 'record' make one")
+    if rules := systems.changed_rules(ik, original.system()):
+        raise ValueError(
+            f"{path}: rules {rules}; only those of 'record' with faithful = true make one; "
+            "`jaxik init --record-only` writes an experiment whose fit has them"
+        )
+    with validation.error_context(path):
+        return record.from_ik(ik, base, reading, drop=drop)
 
 
 def describe(entry: record.Record, reading: record.Reading) -> str:

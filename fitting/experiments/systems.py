@@ -183,6 +183,18 @@ def changed_rules(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:
     return {stage: name for stage, name in rule_names(ik).items() if name != originals[stage]}
 
 
+def changed_values(ik: jaxik.FootIK, other: jaxik.FootIK) -> dict[str, object]:
+    """Values in which a system differs from another one with the same rules, by dotted name."""
+    values = {name: np.asarray(parameter_tree.get(ik, name)) for name in leaf_names(ik)}
+    changed: dict[str, object] = {
+        name: value.tolist()
+        for name, value in values.items()
+        if not np.array_equal(value, np.asarray(parameter_tree.get(other, name)))
+    }
+    options, others = parameter_tree.options(ik), parameter_tree.options(other)
+    return changed | {name: on for name, on in options.items() if on != others[name]}
+
+
 def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK:
     """The system with other values of parameters, conventions, switches and options.
 

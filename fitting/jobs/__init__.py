@@ -12,7 +12,8 @@ bits; a system that was made in 32 bits is taken with the values it has there.
 `translate`. `calibrations` judges what they say: `calibrate`. `populations` fits several clips and
 subjects: `population`. `animations` runs finished systems: `solve`, `apply`, `compare` and
 `run_suite`. `views` shows runs, clips and fits in the browser: `view`, `view_run`. `comparisons`
-compares sampled runs: `compare_runs`. `examples` copies the experiments that come with the package.
+compares sampled runs: `compare_runs`. `exports` writes parameters for others: `export`. `examples`
+copies the experiments that come with the package.
 """
 
 from .animations import apply as apply
@@ -22,6 +23,7 @@ from .animations import solve as solve
 from .calibrations import calibrate as calibrate
 from .comparisons import compare_runs as compare_runs
 from .drafts import init as init
+from .exports import export as export
 from .fits import ablate as ablate
 from .fits import fit as fit
 from .fits import sample as sample

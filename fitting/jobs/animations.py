@@ -10,13 +10,14 @@ import numpy as np
 
 import jaxik
 from fitting.analysis import accuracy
-from fitting.datasets.clips import Clip, flight, load_clip, save_clip
-from fitting.datasets.clips.formats.npz import is_blocks_file
+from fitting.datasets.clips import Clip, flight, save_clip
 from fitting.datasets.clips.formats.saving import check_clip_file
 from fitting.datasets.terrain.meshes import mesh_of
 from fitting.report import comparison_report, fit_tables, placement_report
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, joined, transposed
+from fitting.report.page.comparisons import compare_page, suite_page
 from fitting.report.suite import suite_report
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import comparison, frame_rates, run_folder
 from fitting.studies.animations import AnimationFiles, load_animation
@@ -43,7 +44,7 @@ def compare(
     Args:
         systems: by name.
         animation: the clip, the terrain, and where the root is put for all systems.
-        output: folder for the table, the numbers and the figure.
+        output: folder for the table, the numbers, the figure and the page.
         rates: Hz, at which each system runs too, to see how much its motion depends on them.
         during: makes a context for the run of each system, from its name.
         log: called with what the command line prints.
@@ -60,13 +61,15 @@ def compare(
         differences = frame_rates.measure(systems, loaded, rates, during)
         compared = dataclasses.replace(compared, rates=differences)
         if folder is not None:
-            comparison_report.write(folder, compared)
-        table = aligned(comparison_report.transposed(comparison_report.table(compared)))
+            with activity.announced("Drawing the comparison"):
+                comparison_report.write(folder, compared)
+                compare_page.write(folder, compared)
+        table = aligned(transposed(comparison_report.table(compared)))
         where = [f"root: {loaded.root.reason}", flight.describe(loaded.clip)]
         where += [f"note: {remark}" for remark in loaded.clip.remarks]
-        log("\n".join([table, "", *filter(None, where)]))
+        log(joined([table, "", *filter(None, where)]))
         if differences:
-            log(f"\n{aligned(comparison_report.rate_table(compared))}")
+            log(joined(["", aligned(comparison_report.rate_table(compared))]))
         log_output(log, folder, comparison_report.TABLE)
         for name, (placement, cause) in compared.placements.items():
             placement_report.warn(placement, cause, name)
@@ -90,7 +93,7 @@ def run_suite(
     Args:
         systems_of: makes systems for the body of a rig, by name.
         plan: which situations; see `studies.suite.situations.choose`.
-        output: folder for the table, the numbers and the page of pictures.
+        output: folder for the table, the numbers, the pictures and the page.
         during: makes a context for each situation, from its name.
         log: called with what the command line prints.
 
@@ -100,7 +103,9 @@ def run_suite(
     with output_folder(output) as folder:
         finished = suite.run_suite(systems_of, plan, during=during)
         if folder is not None:
-            suite_report.write(folder, finished)
+            with activity.announced("Drawing the situations"):
+                suite_report.write(folder, finished)
+                suite_page.write(folder, finished)
         log(suite_report.text(finished))
         log_output(log, folder, suite_report.TABLE)
         return finished
@@ -159,9 +164,11 @@ def solve(
         check_clip_file(path, loaded.clip)
     loaded.check_shapes(ik)
     began = time.perf_counter()
-    result, solved = loaded.solve(ik)
+    with activity.announced("Compiling and running the system"):
+        result, solved = loaded.solve(ik)
     seconds = time.perf_counter() - began
-    placement, cause = loaded.assess(solved)
+    with activity.announced("Measuring how the feet are placed"):
+        placement, cause = loaded.assess(solved)
     if path is not None:
         joints = placement_report.arrays(solved, placement)
         ground = mesh_of(loaded.terrain) if with_terrain else None
@@ -173,9 +180,9 @@ def solve(
         placement_report.trunk_text(result, solved),
         *(f"note: {remark}" for remark in loaded.clip.remarks),
     ]
-    log("\n".join(filter(None, where)) + f"\n\n{placement_report.text(placement)}")
-    if is_blocks_file(animation.clip) and animation.speed == 1.0:
-        errors = accuracy.clip_errors(solved, load_clip(animation.clip), loaded.placed_clip)
-        log(f"\n{aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))}")
+    log(joined([*filter(None, where), "", placement_report.text(placement)]))
+    if loaded.captured is not None:
+        errors = accuracy.clip_errors(solved, loaded.captured, loaded.placed_clip)
+        log(joined(["", aligned(fit_tables.accuracy_table(accuracy.summarise([errors])))]))
     placement_report.warn(placement, cause)
     return solved

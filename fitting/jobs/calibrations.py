@@ -5,8 +5,11 @@ from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
+from fitting.report.formatting import joined
+from fitting.report.page.studies import calibration_page
 from fitting.runtime import cluster
 from fitting.runtime.precision import in_float64
 from fitting.studies.calibration import calibration
@@ -56,6 +59,7 @@ def calibrate(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
         problem = make_problem(experiment)
         log(f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}")
         observers = Observers(
@@ -71,6 +75,7 @@ def calibrate(
         assessment = assess(made)
         if folder is not None:
             calibration_report.write(folder, experiment, made, assessment)
-        log(f"\n{calibration_report.calibration_text(assessment)}")
+            calibration_page.write(folder, experiment, assessment)
+        log(joined(["", calibration_report.calibration_text(assessment)]))
         log_output(log, folder, calibration_report.SUMMARY)
         return assessment

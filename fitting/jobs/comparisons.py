@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, joined
+from fitting.report.page.comparisons import runs_page
 from fitting.report.uncertainty import run_comparison as report
 from fitting.studies.posterior import run_comparison
 from fitting.studies.posterior.run_comparison import ComparedRun
@@ -18,7 +19,7 @@ def compare_runs(
 
     Args:
         runs: folders that `fit` and `sample` have filled.
-        output: folder for the table and the numbers.
+        output: folder for the table, the numbers and the page.
         log: called with what the command line prints.
 
     Raises:
@@ -29,6 +30,7 @@ def compare_runs(
         compared = run_comparison.compare_runs([Path(run) for run in runs])
         if folder is not None:
             report.write(folder, compared)
-        log(f"{aligned(report.table(compared))}\n\n{report.explanation()}")
+            runs_page.write(folder, compared)
+        log(joined([aligned(report.table(compared)), report.explanation()], apart=True))
         log_output(log, folder, report.TABLE)
         return compared

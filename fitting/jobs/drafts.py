@@ -5,6 +5,8 @@ from pathlib import Path
 from fitting.experiments.experiment import Experiment
 from fitting.report import terrain_report
 from fitting.report.drafts import draft_report
+from fitting.report.formatting import joined
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.studies.drafts.draft import (
     EXPERIMENT,
@@ -38,7 +40,8 @@ def init(request: DraftRequest, output: str | Path, *, log: Log = silent) -> Exp
     check_request(request)
     if (folder / EXPERIMENT).exists():
         raise ValueError(f"{folder / EXPERIMENT}: is there already; name another folder")
-    clips = request.load()
+    with activity.announced(f"Reading {len(request.clips)} clip(s)"):
+        clips = request.load()
     with output_folder(folder):
         if not request.terrains:
             log("no --terrain: the ground is reconstructed from where the feet stand")
@@ -47,15 +50,17 @@ def init(request: DraftRequest, output: str | Path, *, log: Log = silent) -> Exp
         for mesh in meshes:
             terrain_report.check_new_files(mesh)
         try:
-            for ground in grounds:
-                if ground is not None:
-                    draft_report.write_ground(ground)
-            drafted = draft(request, clips, folder, grounds, log)
+            with activity.announced("Writing and drawing the ground"):
+                for ground in grounds:
+                    if ground is not None:
+                        draft_report.write_ground(ground)
+            drafted = draft(request, clips, folder, grounds)
         except BaseException:  # also Ctrl-C: ground without an experiment is of no use
             for mesh in meshes:
                 terrain_report.remove(mesh)
             raise
         draft_report.write(drafted)
         path = drafted.experiment.path
-        log(f"\n{draft_report.text(drafted)}\n\nwritten to {path}; now: jaxik fit {path} -o RUN")
+        ending = f"written to {path}; now: jaxik fit {path} -o RUN"
+        log(joined(["", draft_report.text(drafted), "", ending]))
         return drafted.experiment

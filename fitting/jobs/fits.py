@@ -10,6 +10,7 @@ import numpy as np
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.known_values import load_known_values
 from fitting.experiments.problems import ClipData, load_clips, problem_from_clips
 from fitting.experiments.record_only import left_out
@@ -17,10 +18,11 @@ from fitting.inference.noise.model import NoiseModel, with_noise
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
-from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import ablation_report, fit_report, posterior_report, translation_report
+from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
+from fitting.report.page.studies import ablation_page
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation, record_price, run_folder, translation
 from fitting.studies.assess import assess_solution
@@ -29,6 +31,7 @@ from fitting.studies.posterior.replay import replay
 from fitting.studies.sample import SampledFit, log_probability_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
+from .kept import kept_stages, remove
 from .output import Loaded, Log, log_output, output_folder, silent, unwatched
 
 
@@ -70,6 +73,7 @@ def fit(
         experiment = load_experiment(experiment)
     known_values = load_known_values(experiment)
     with output_folder(output) as run:
+        experiment = with_files(experiment, run)
         lines: list[str] = []
         clips = load_clips(experiment, lines.append)
         problem = problem_from_clips(experiment, clips)
@@ -77,15 +81,15 @@ def fit(
         heading = f"fitting {free} parameters of {experiment.preset} to {count} clip(s)"
         log("\n".join([heading, *lines]))
         loaded(experiment, problem, clips)
-        kept = _kept_stages(run, experiment, problem, log)
+        kept = kept_stages(run, experiment, problem, log)
         problem, solution = search_with_noise(problem, experiment, progress, kept)
         shown = Shown(clips, known_values)
         fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
         texts, sections = _price_of_record(fitted, progress, log)
         if run is not None:
             fit_report.write_fit(run, fitted, sections)
-        _remove(kept, fitted)
-        log("\n".join(["", fit_report.fit_text(fitted), *texts]))
+        remove(kept, fitted)
+        log(joined(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
 
@@ -143,7 +147,7 @@ def sample(
             if sampled.has_lower_point and not posterior.interrupted:
                 sampled = _adopt_lower_point(run, problem, clips, sampled, log)
                 posterior = sampled.posterior
-        log(f"\n{posterior_report.posterior_text(sampled, run)}")
+        log(joined(["", posterior_report.posterior_text(sampled, run)]))
         log_output(log, run, run_folder.SUMMARY)
         return posterior
 
@@ -175,6 +179,7 @@ def ablate(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
 
         def log_row(row: ablation.Row) -> None:
             log(ablation_report.row_text(row))
@@ -182,6 +187,7 @@ def ablate(
         rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)
         if folder is not None:
             ablation_report.write(folder, experiment, rows)
+            ablation_page.write(folder, experiment, rows)
         log(ablation_report.tables_text(rows))
         log_output(log, folder, ablation_report.TABLE)
         return rows
@@ -220,7 +226,7 @@ def translate(
             f"{request.source.name} on {len(prepared.clips)} clip(s)"
         )
         start = translation.starting_point(problem)
-        kept = _kept_stages(run, experiment, problem, log)
+        kept = kept_stages(run, experiment, problem, log)
         solution = search(problem, experiment, progress, start, kept)
         shown = Shown(prepared.clips)
         if run is not None:
@@ -231,27 +237,11 @@ def translate(
         differences = translation_report.differences(fitted)
         if run is not None:
             translation_report.write(run, prepared, fitted, differences)
-        _remove(kept, fitted)
+        remove(kept, fitted)
         log(f"\n{solution.message} {fitted.verdict.sentence}\n")
         log(translation_report.translation_text(prepared, differences))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
-
-
-def _kept_stages(
-    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
-) -> KeptStages | None:
-    """The finished stages of a fit that was killed in this folder, and room for those of this."""
-    if run is None:
-        return None
-    identity = digest_with(problem, experiment.fit, experiment.seed, experiment.noise)
-    kept = KeptStages(run / run_folder.SEARCH, identity, log)
-    if kept.count:
-        stages = f"{kept.count} stages of its search"
-        if kept.profile_count:
-            stages += f" and {kept.profile_count} of its profiles"
-        log(f"a fit that was interrupted here goes on after {stages}")
-    return kept
 
 
 def _price_of_record(
@@ -269,12 +259,6 @@ def _price_of_record(
         price = None
     text = record_price_report.text(experiment, price)
     return ["", text], record_price_report.section(experiment, price)
-
-
-def _remove(kept: KeptStages | None, fitted: Fit) -> None:
-    """Removes the stages of a fit that is finished; an interrupted one goes on from them."""
-    if kept is not None and not fitted.solution.interrupted:
-        kept.remove()
 
 
 def _save_and_report(run: Path, sampled: SampledFit) -> None:
@@ -316,7 +300,7 @@ def _adopt_lower_point(
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
     fit_report.write_fit(run, fitted)
-    log(f"\n{fit_report.fit_text(fitted)}")
+    log(joined(["", fit_report.fit_text(fitted)]))
     sampled = dataclasses.replace(
         sampled,
         parameters=fitted.summary["parameters"],

@@ -8,10 +8,13 @@ import jax.numpy as jnp
 from fitting.experiments import parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import experiment_to_toml, load_experiment
+from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.problems import make_problem
 from fitting.experiments.systems import Preset
 from fitting.inference.optimisation.solution import Progress
+from fitting.report.formatting import joined
 from fitting.report.hierarchy import population_report
+from fitting.report.page.studies import population_page
 from fitting.runtime import files
 from fitting.runtime.precision import in_float64
 from fitting.studies import run_folder
@@ -47,6 +50,7 @@ def population(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
         problem = make_problem(experiment)
         log(
             f"fitting {problem.space.size} parameters of {experiment.preset} to "
@@ -62,7 +66,8 @@ def population(
         if folder is not None:
             _write_systems(folder, fitted)
             population_report.write(folder, fitted)
-        log(f"\n{population_report.population_text(fitted)}")
+            population_page.write(folder, fitted)
+        log(joined(["", population_report.population_text(fitted)]))
         log_output(log, folder, population_report.SUMMARY)
         return fitted
 

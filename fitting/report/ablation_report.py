@@ -12,7 +12,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.runtime import files
 from fitting.studies.ablation import Row
 
-from .formatting import Table, aligned, bullets, markdown, number
+from .formatting import Table, aligned, bullets, joined, markdown, number
 from .labels import ACCURACY, explanations, headings
 from .plots import ablation_plots, style
 from .plots.ablation_plots import variant_name
@@ -35,13 +35,16 @@ def row_text(row: Row) -> str:
         f"{ACCURACY[key].heading} {ACCURACY[key].format(getattr(row.agreement, key))}"
         for key in SHOWN
     )
-    return f"{_row_name(row)}: {figures}; {row.seconds:.0f} s"
+    return f"{row_name(row)}: {figures}; {row.seconds:.0f} s"
 
 
 def tables_text(rows: Sequence[Row]) -> str:
     """All groups of rows, for the terminal."""
-    groups = [f"\n{title}:\n\n{aligned(group(rows, part))}" for part, title in titles(rows).items()]
-    return "\n".join(groups)
+    groups = [
+        joined(["", f"{title}:", "", aligned(group(rows, part))])
+        for part, title in titles(rows).items()
+    ]
+    return joined(groups)
 
 
 def titles(rows: Sequence[Row]) -> dict[int, str]:
@@ -92,37 +95,38 @@ def _summary(experiment: Experiment, rows: Sequence[Row]) -> str:
     ]
     for part, title in titles(rows).items():
         parts += [f"## {title}", markdown(group(rows, part))]
-    parts += [f"![All figures]({FIGURE})", "## What is left out", _changes(experiment)]
-    parts += ["## Fitted values, on everything", markdown(_values(rows))]
+    parts += [f"![All figures]({FIGURE})", "## What is left out", bullets(changes(experiment))]
+    parts += ["## Fitted values, on everything", markdown(values(rows))]
     if unconverged := [row for row in rows if not row.converged]:
         parts.append("Fits that did not converge:")
-        parts.append(bullets([f"{_row_name(row)}: {row.message}" for row in unconverged]))
+        parts.append(bullets([f"{row_name(row)}: {row.message}" for row in unconverged]))
     parts += ["## What the columns mean", explanations(ACCURACY)]
     return "\n\n".join(parts) + "\n"
 
 
-def _changes(experiment: Experiment) -> str:
-    """What each variant changes, as a list."""
+def changes(experiment: Experiment) -> list[str]:
+    """What each variant changes, a line each."""
     lines = []
     for ablation in experiment.without:
         changes = [f"`{stage}` is `{name}`" for stage, name in ablation.rules.items()]
         changes += [f"`{name}` = {value}" for name, value in ablation.parameters.items()]
         lines.append(f"**{ablation.name}**: {', '.join(changes)}")
-    return bullets(lines) or "Nothing."
+    return lines or ["Nothing."]
 
 
-def _values(rows: Sequence[Row]) -> Table:
+def values(rows: Sequence[Row]) -> Table:
     """A row for each parameter, a column for each variant; a dash where it is not free."""
     everything = [row for row in rows if not row.part]
     names = list(dict.fromkeys(name for row in everything for name in row.values))
     table = [["parameter", *(variant_name(row.variant) for row in everything)]]
     for name in names:
-        values = [row.values.get(name) for row in everything]
-        table.append([f"`{name}`", *("–" if v is None else number(v) for v in values)])
+        fitted = [row.values.get(name) for row in everything]
+        table.append([f"`{name}`", *("–" if v is None else number(v) for v in fitted)])
     return table
 
 
-def _row_name(row: Row) -> str:
+def row_name(row: Row) -> str:
+    """A variant, and what was held out."""
     split = f"part {row.part} held out" if row.part else "everything"
     return f"{variant_name(row.variant)}, {split}"
 

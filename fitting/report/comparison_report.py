@@ -43,11 +43,6 @@ def table(comparison: Comparison) -> Table:
     return [["system", *headings(MEASURES)], *rows]
 
 
-def transposed(rows: Table) -> Table:
-    """The table with its rows as columns, which fits a terminal."""
-    return [list(column) for column in zip(*rows, strict=True)]
-
-
 def rate_table(comparison: Comparison) -> Table:
     """How far each system is from its motion at the clip's rate, rms and largest, in mm."""
     heading = [f"mm from {comparison.fps:g} Hz", "at", *JOINTS, "largest"]

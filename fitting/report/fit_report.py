@@ -10,14 +10,14 @@ from matplotlib.figure import Figure
 from fitting.analysis import limit_activity, playback, worst_window
 from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.playback import Playback
-from fitting.runtime import files
+from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.studies.assess import MIN_IMPROVEMENT
 from fitting.studies.fit import Fit, FitSummary
 from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report
-from .formatting import aligned, bullets, markdown
+from .formatting import aligned, bullets, joined, markdown
 from .goodness import goodness_report
 from .identifiability.sections import sections as identifiability_sections
 from .page import fit_page
@@ -39,7 +39,7 @@ def fit_text(fitted: Fit) -> str:
         parts += ["", aligned(fit_tables.gain_table(rows))]
     if truth:
         parts += ["", fit_tables.recovered(rows, truth)]
-    return "\n".join(parts)
+    return joined(parts)
 
 
 @in_float64
@@ -57,19 +57,23 @@ def write_fit(
     plots: Plots = {}
     worst = ["## The worst two seconds"]
     system = fitted.problem.space.unpack(fitted.problem.space.pack({}))
-    before = [playback.run(system, scene) for scene in fitted.problem.data]
+    with activity.announced("Playing the clips with the system before the fit"):
+        before = [playback.run(system, scene) for scene in fitted.problem.data]
     for index, (scene, after) in enumerate(zip(fitted.problem.data, fitted.playbacks, strict=True)):
-        first = playback.play(scene, before[index])
-        plots |= _draw_clip(run, fitted, index, first, after)
-        worst += _worst_window(run, fitted, index, after)
-    plots |= _draw_profiles(run, fitted)
-    title = f"{fitted.experiment.name}: cost of the fit over time"
-    figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
-    plots |= save_plot(run, "cost.png", title, figure)
-    clips = [
-        limit_activity.measure(fitted.ik, scene, result)
-        for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
-    ]
+        with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
+            first = playback.play(scene, before[index])
+            plots |= _draw_clip(run, fitted, index, first, after)
+            worst += _worst_window(run, fitted, index, after)
+    with activity.announced("Drawing the curves of the parameters"):
+        plots |= _draw_profiles(run, fitted)
+        title = f"{fitted.experiment.name}: cost of the fit over time"
+        figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
+        plots |= save_plot(run, "cost.png", title, figure)
+    with activity.announced("Measuring where limits are in effect"):
+        clips = [
+            limit_activity.measure(fitted.ik, scene, result)
+            for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
+        ]
     parts = [
         *_result(fitted),
         *opening,
@@ -85,7 +89,8 @@ def write_fit(
     ]
     files.write_text(run / SUMMARY, "\n\n".join(parts) + "\n")
     if fitted.clips:
-        fit_page.write(run, fitted, Measured(before, clips))
+        with activity.announced("Writing the page"):
+            fit_page.write(run, fitted, Measured(before, clips))
 
 
 def save_plot(run: Path, name: str, caption: str, figure: Figure) -> Plots:

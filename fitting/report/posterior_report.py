@@ -5,13 +5,13 @@ from pathlib import Path
 
 from fitting.inference.sampling.diagnostics import ParameterSummary
 from fitting.inference.sampling.posterior import Posterior
-from fitting.runtime import files
+from fitting.runtime import activity, files
 from fitting.studies.run_folder import SUMMARY
 from fitting.studies.sample import SampledFit
 
 from .fit_report import gallery, save_plot
 from .fit_tables import Truth
-from .formatting import Table, aligned, bullets, interval, markdown, number, percent
+from .formatting import Table, aligned, bullets, interval, joined, markdown, number, percent
 from .goodness import noise_report
 from .page import posterior_section
 from .plots import posterior_plots
@@ -38,7 +38,7 @@ def posterior_text(sampled: SampledFit, run: Path | None = None) -> str:
     if known_values:
         count = covered(posterior, known_values, posterior.names)
         parts += ["", f"The 95 % intervals contain the true values of {count} parameters."]
-    return "\n".join(parts)
+    return joined(parts)
 
 
 def write_posterior(run: Path, sampled: SampledFit) -> None:
@@ -54,14 +54,15 @@ def write_posterior(run: Path, sampled: SampledFit) -> None:
     units = {name: row["unit"] for name, row in rows.items()}
     labels = [f"{name}, {units[name]}" if units[name] != "1" else name for name in posterior.names]
     values = {name: row["value"] for name, row in rows.items()}
-    title = f"{experiment.name}: posterior of the parameters"
-    figure = posterior_plots.corner(
-        posterior, labels, values, known_values, title, space=sampled.space
-    )
-    plots = save_plot(run, "corner.png", title, figure)
-    title = f"{experiment.name}: walkers"
-    figure = posterior_plots.chain(posterior, labels, known_values, title)
-    plots |= save_plot(run, "chain.png", title, figure)
+    with activity.announced("Drawing the posterior"):
+        title = f"{experiment.name}: posterior of the parameters"
+        figure = posterior_plots.corner(
+            posterior, labels, values, known_values, title, space=sampled.space
+        )
+        plots = save_plot(run, "corner.png", title, figure)
+        title = f"{experiment.name}: walkers"
+        figure = posterior_plots.chain(posterior, labels, known_values, title)
+        plots |= save_plot(run, "chain.png", title, figure)
 
     contradictions = contradiction_sentences(sampled, run)
     table = posterior_table(posterior, known_values, units)

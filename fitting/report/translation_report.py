@@ -18,7 +18,7 @@ from fitting.studies.translation import Translation
 from jaxik.maths import parameter_tree
 
 from . import difference_report, fit_report
-from .formatting import aligned, bullets, markdown, number
+from .formatting import aligned, bullets, joined, markdown, number
 from .plots import difference_plots, style
 
 NUMBERS = "translation.json"
@@ -41,7 +41,7 @@ def translation_text(translation: Translation, clips: Sequence[Difference]) -> s
     for phase, remainders in phases.items():
         parts += ["", f"{phase.capitalize()}:"]
         parts.append(aligned(difference_report.table(remainders, source)))
-    return "\n".join([*parts, "", *difference_report.shortcomings(clips, source, target)])
+    return joined([*parts, "", *difference_report.shortcomings(clips, source, target)])
 
 
 @in_float64

@@ -39,6 +39,14 @@ def check_output_file(path: Path) -> None:
         raise ValueError(f"{path}: cannot be written: there is no folder {path.parent}")
 
 
+def relative_path(path: Path, folder: Path) -> str:
+    """A path from a folder, with slashes; whole where there is none, as on another drive."""
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
 def write(path: Path, fill: Callable[[Path], object]) -> None:
     """Calls `fill` with a temporary file in the same folder, then moves that file to `path`.
 

@@ -28,6 +28,7 @@ from fitting.experiments.problems import ClipData, load_clip_data, problem_from_
 from fitting.experiments.systems import leaf_names
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.settings import SamplerSettings
+from fitting.runtime import activity
 from fitting.runtime.storage.declared_types import Finite, checked
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import error_context
@@ -118,28 +119,32 @@ def ablate(
         with error_context(name):
             _check(variant)
     finished = {} if folder is None else {row.key: row for row in read(folder)}
-    data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
+    with activity.announced("Reading the clips"):
+        data = [load_clip_data(entry, None) for entry in experiment.placed_clips()]
     splits = list(split(experiment.clips, data, folds))
-    content = _digest(experiment.clips)
+    content = "" if folder is None else _digest(experiment.clips)
     rows: list[Row] = []
-    for name, variant in variants.items():
-        any_new = False
-        for part, one_split in enumerate(splits, 1):
-            key = _key(variant, one_split.name, content)
-            row = finished.pop(key, None)
-            if row is None:
-                any_new = True
-                label = f"{name}, {one_split.name}"
-                with error_context(label):
-                    row = _fit(variant, one_split, labelled(progress, label))
-                row = replace(row, key=key, variant=name, part=part % len(splits))
-                _write(folder, [*rows, row, *finished.values()])
-                if on_row is not None:
-                    on_row(row)
-            # The variant may have another name by now.
-            rows.append(replace(row, variant=name, part=part % len(splits)))
-        if any_new:
-            jax.clear_caches()  # no other variant can use these programs
+    count = len(variants) * len(splits)
+    with activity.announced(f"Fitting {len(variants)} variants", count) as fitting:
+        for name, variant in variants.items():
+            any_new = False
+            for part, one_split in enumerate(splits, 1):
+                key = _key(variant, one_split.name, content)
+                row = finished.pop(key, None)
+                if row is None:
+                    any_new = True
+                    label = f"{name}, {one_split.name}"
+                    with error_context(label):
+                        row = _fit(variant, one_split, labelled(progress, label))
+                    row = replace(row, key=key, variant=name, part=part % len(splits))
+                    _write(folder, [*rows, row, *finished.values()])
+                    if on_row is not None:
+                        on_row(row)
+                # The variant may have another name by now.
+                rows.append(replace(row, variant=name, part=part % len(splits)))
+                fitting.advance()
+            if any_new:
+                jax.clear_caches()  # no other variant can use these programs
     _write(folder, rows)
     return rows
 
@@ -232,12 +237,13 @@ def _fit(variant: Experiment, data: Split, progress: Callable[[Progress], None] 
         values = dict(zip(solution.names, map(float, solution.values), strict=True))
         converged, message, seconds = solution.converged, solution.message, solution.seconds
     first = data.measured[0][0].base.rig
-    accuracy = summarise(
-        [
-            _errors(_for_body(ik, variant.size(clip.base.rig, first)), clip, frames)
-            for clip, frames in data.measured
-        ]
-    )
+    with activity.announced("Measuring how far it is from the capture"):
+        accuracy = summarise(
+            [
+                _errors(_for_body(ik, variant.size(clip.base.rig, first)), clip, frames)
+                for clip, frames in data.measured
+            ]
+        )
     return Row("", "", 0, accuracy, values, converged, message, seconds)
 
 

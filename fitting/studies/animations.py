@@ -12,19 +12,20 @@ from jaxtyping import Float64
 import jaxik
 from fitting.analysis import placement
 from fitting.analysis.misplacement import Cause, likely_cause
-from fitting.analysis.placement import Placement
+from fitting.analysis.placement import Placement, Soles
 from fitting.analysis.playback import stage_outputs
 from fitting.datasets import coverage
 from fitting.datasets.clip_frames import clip_from_result, frames_from_clip, raised
-from fitting.datasets.clips import Clip
+from fitting.datasets.clips import Clip, load_clip
 from fitting.datasets.clips.edit import at_speed
+from fitting.datasets.clips.formats.npz import is_blocks_file
 from fitting.datasets.clips.load import ClipOptions
 from fitting.datasets.coverage import Coverage
 from fitting.datasets.flat_animation import load_flat_animation, with_remark_if_uneven
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import TerrainOptions, load_terrain
 from fitting.experiments import systems, track_files
-from fitting.runtime import program_cache
+from fitting.runtime import activity, program_cache
 from jaxik.maths import parameter_tree, quat, vec
 from jaxik.world import body
 from jaxik.world.terrain import Terrain, moving
@@ -88,6 +89,8 @@ class Animation:
     """Parameters that change along the clip, (frames, ...) by dotted name."""
     given_frames: jaxik.Frame | None = None
     """The clip as the pipeline's input, where that does not follow from the clip alone."""
+    captured: Clip | None = None
+    """The motion over this terrain from which the flat animation was made, where it is known."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
@@ -143,17 +146,26 @@ class Animation:
 
     def assess(self, solved: Clip) -> tuple[Placement, Cause | None]:
         """How the feet of a solved clip are placed; why, if they are off the ground."""
-        # Soles and slides are those of the animation at its own speed: with a faster root its
-        # standing feet skate, which is to be measured and not to be excused.
-        own = at_speed(self.clip, 1.0 / self.speed)
-        floor = own, self.terrain, self.floor
-        placed = placement.assess(
-            placement.soles(solved, *floor), solved, self.placed_clip, own_speed=own
-        )
+        _, placed = self.place(solved)
         if not placed.misplaced:
             return placed, None
-        animated = placement.soles(self.placed_clip, *floor)
-        return placed, likely_cause(animated, self.placed_clip)
+        return placed, likely_cause(self._soles(self.placed_clip), self.placed_clip)
+
+    def place(self, solved: Clip) -> tuple[Soles, Placement]:
+        """The soles of a solved clip over the ground, and how its feet are placed."""
+        soles = self._soles(solved)
+        return soles, placement.assess(soles, solved, self.placed_clip, own_speed=self._own_speed)
+
+    @property
+    def _own_speed(self) -> Clip:
+        """The animation at its own speed, by which soles and slides are judged.
+
+        With a faster root its standing feet skate, which is to be measured and not to be excused.
+        """
+        return at_speed(self.clip, 1.0 / self.speed)
+
+    def _soles(self, solved: Clip) -> Soles:
+        return placement.soles(solved, self._own_speed, self.terrain, self.floor)
 
 
 def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
@@ -168,9 +180,10 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     Raises:
         ValueError: a file does not exist or cannot be read, or the root cannot be put there.
     """
-    terrain = files.load_terrain()
-    clip = files.flat_clip
-    covered = files.coverage(terrain)
+    with activity.announced(f"Reading {files.clip.name} and {files.terrain.name}"):
+        terrain = files.load_terrain()
+        clip = files.flat_clip
+        covered = files.coverage(terrain)
     if (to_fit or files.root == "ground") and covered.share < coverage.LITTLE:
         raise ValueError(covered.text())
     coverage.warn(covered)
@@ -179,8 +192,24 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     placed, root = place_root(clip, terrain, files.root, files.floor)
     # Where the clip follows this terrain, its ground has been taken out.
     clip = with_remark_if_uneven(clip) if placed is clip else placed
+    captured = _captured(files, placed)
     clip, tracks = track_files.along(clip, files.tracks)
-    return Animation(clip, terrain, files.floor, root, speed=files.speed, tracks=tracks)
+    return Animation(
+        clip, terrain, files.floor, root, speed=files.speed, tracks=tracks, captured=captured
+    )
+
+
+def _captured(files: AnimationFiles, placed: Clip) -> Clip | None:
+    """The captured motion of an animation, where the file of the clip has it.
+
+    A file of the blocks benchmark does, and so does a clip that follows the terrain, from which the
+    ground was taken out. At another speed neither goes where it was captured.
+    """
+    if files.speed != 1.0:
+        return None
+    if is_blocks_file(files.clip):
+        return load_clip(files.clip)
+    return None if placed is files.flat_clip else files.flat_clip
 
 
 def carried_frames(frames: jaxik.Frame, carried: Float64[np.ndarray, "frames 3"]) -> jaxik.Frame:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,9 @@ from fitting.datasets.clip_frames import positions_by_role
 from fitting.datasets.clips import Clip
 from fitting.experiments.parameter_files import load_system
 from fitting.experiments.systems import preset_system
+from fitting.runtime import activity
+from fitting.runtime.display.data_frames import data_frame
+from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import vec
@@ -28,11 +32,14 @@ from .animations import Animation
 from .frame_rates import RateDifference
 from .run_folder import PARAMETERS
 
+if TYPE_CHECKING:
+    import pandas
+
 ANIMATED = "as animated"  # the name of the animation itself, without foot IK
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Shown):
     """One clip under several systems, by name; the animation itself comes first."""
 
     title: str
@@ -42,12 +49,24 @@ class Comparison:
     """m, height under the animated ankles, or NaN."""
     groundless: float
     """Fraction of all points of soles that have no ground under them."""
+    animation: Animation
+    clips: Mapping[str, Clip]
+    """As the systems leave it."""
     motions: Mapping[str, Motion]
     measures: Mapping[str, Measures]
     placements: Mapping[str, tuple[Placement, Cause | None]]
     """Of the systems, without the animation; see `Animation.assess`."""
     rates: Sequence[RateDifference] = ()
     """At other frame rates, system by system."""
+
+    def table(self) -> "pandas.DataFrame":
+        """The measures in SI units, a row for each system, as pandas has tables.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        rows = ({"system": name} | vars(measures) for name, measures in self.measures.items())
+        return data_frame(rows, "system")
 
 
 @in_float64
@@ -143,26 +162,29 @@ def compare(
             result, clips[name] = animation.solve(ik)
         reached[name] = animation.reached(result)
 
-    soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
-    ground = ground_heights(animation.terrain, soles_ws)
-    motions = {name: _motion(solved) for name, solved in clips.items()}
-    measured = {}
-    for index, name in enumerate(clips):
-        gaps = measures.gaps(soles_ws[index], ground[index])
-        feet = FootStates(gaps, clip.stance_labels(), reached[name])
-        measured[name] = measures.measure(
-            motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
+    with activity.announced("Measuring the motions"):
+        soles_ws = np.stack([measures.soles(solved) for solved in clips.values()])
+        ground = ground_heights(animation.terrain, soles_ws)
+        motions = {name: motion_of(solved) for name, solved in clips.items()}
+        measured = {}
+        for index, name in enumerate(clips):
+            gaps = measures.gaps(soles_ws[index], ground[index])
+            feet = FootStates(gaps, clip.stance_labels(), reached[name])
+            measured[name] = measures.measure(
+                motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
+            )
+        return Comparison(
+            title=title,
+            legs=clip.rig.names,
+            fps=clip.fps,
+            ground=ground[0, :, :, 0],
+            groundless=float(np.mean(np.isnan(ground))),
+            animation=animation,
+            clips=clips,
+            motions=motions,
+            measures=measured,
+            placements={name: animation.assess(clips[name]) for name in systems},
         )
-    return Comparison(
-        title=title,
-        legs=clip.rig.names,
-        fps=clip.fps,
-        ground=ground[0, :, :, 0],
-        groundless=float(np.mean(np.isnan(ground))),
-        motions=motions,
-        measures=measured,
-        placements={name: animation.assess(clips[name]) for name in systems},
-    )
 
 
 def ground_heights(
@@ -181,6 +203,7 @@ def ground_heights(
     return np.where(np.asarray(hit.found) > 0, height, np.nan)
 
 
-def _motion(clip: Clip) -> Motion:
+def motion_of(clip: Clip) -> Motion:
+    """Joints of a clip by their role."""
     joints = positions_by_role(clip)
     return Motion(**{"toe" if role == "ball" else role: at for role, at in joints.items()})

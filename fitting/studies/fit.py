@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal, NotRequired, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Annotated, Literal, NotRequired, TypeAlias, TypedDict
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +27,9 @@ from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.profiles import profile
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED
+from fitting.runtime import activity
+from fitting.runtime.display.data_frames import data_frame
+from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
 from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
@@ -34,6 +37,9 @@ from jaxik.maths import parameter_tree, smoothing
 
 from .goodness import GoodnessSummary, summarise
 from .prior_summary import PriorSummary, summarise_priors
+
+if TYPE_CHECKING:
+    import pandas
 
 # Walkers start in a ball around the fit. Its width, in u, is the Laplace standard deviation, which
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
@@ -119,7 +125,7 @@ class FitSummary(TypedDict):
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit:
+class Fit(Shown):
     """A fitted experiment."""
 
     experiment: Experiment
@@ -145,7 +151,8 @@ class Fit:
     @cached_property
     def results(self) -> tuple[jaxik.Result, ...]:
         """What the fitted system makes of each clip."""
-        return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
+        with activity.announced("Playing the clips with the fitted system"):
+            return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
 
     @cached_property
     def playbacks(self) -> tuple[Playback, ...]:
@@ -198,6 +205,20 @@ class Fit:
     def parameters(self) -> list[FittedParameter]:
         """The free parameters in the order of `u`."""
         return _fitted_parameters(self)
+
+    def table(self) -> "pandas.DataFrame":
+        """The free parameters by name, as pandas has tables; `low95` and `high95` are intervals.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        hidden = ("u", "start_sd", "prior", "valleys", "interval")
+        rows = (
+            {key: value for key, value in row.items() if key not in hidden}
+            | dict(zip(("low95", "high95"), row["interval"], strict=True))
+            for row in self.parameters
+        )
+        return data_frame(rows, "name")
 
     @cached_property
     @in_float64

@@ -1,6 +1,6 @@
 """A run on disk: a folder with the experiment, the fit, the chain, tables and plots.
 
-experiment.toml   what was fitted; paths are absolute, except to files of the run itself
+experiment.toml   what was fitted; paths are relative, and it says from where they led
 fit.json          the numbers of the fit
 parameters.toml   the fitted system
 base.npz          the flat animation, and fitted.npz the fitted motion; numbered for several clips
@@ -30,6 +30,7 @@ from fitting.inference.noise.model import NoiseModel
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 from fitting.runtime.files import TEMPORARY, write_text
 from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.runtime.storage.json_files import JsonFile, check_version, write_json
@@ -101,9 +102,10 @@ def save_solution(
 
 def save_fit(run: Path, fitted: Fit) -> None:
     """Completes a run's folder, after `save_solution`, with the motions and numbers of its fit."""
-    for name, clip in saved_clips(fitted).items():
-        save_clip(run / name, clip)
-    FIT_FILE.write(run / FIT, fitted.summary)
+    with activity.announced("Writing the motions and numbers of the fit"):
+        for name, clip in saved_clips(fitted).items():
+            save_clip(run / name, clip)
+        FIT_FILE.write(run / FIT, fitted.summary)
 
 
 def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
@@ -119,20 +121,28 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
 
 
 def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
-    """The fitted system of a run, for the body of a rig; its clips may be gone.
+    """The fitted system of a run, for the body of a rig; all but its parameters may be gone.
 
     Raises:
-        ValueError: the folder holds no finished fit, or its system lacks a fitted parameter.
+        ValueError: the folder has no parameters, those of an unfinished fit, or its system lacks a
+            fitted parameter.
     """
-    _check_files(run, (FIT, PARAMETERS))
-    summary, path = _load_summary(run), run / PARAMETERS
+    _check_files(run, (PARAMETERS,))
+    path = run / PARAMETERS
+    if (run / FIT).exists() or (run / SEARCH).exists():  # without both, the parameters came alone
+        _check_files(run, (FIT,))
+        _check_has_parameters(path, _load_summary(run))
     _check_toml_format(path)
+    ik, _ = parameter_files.load_system(path, rig)
+    return ik
+
+
+def _check_has_parameters(path: Path, summary: FitSummary) -> None:
+    """Raises ValueError for the parameters of another fit."""
     present = flatten(read_toml(path, "a parameter"), 2)
     names = {row["name"].partition("[")[0] for row in summary["parameters"]}
     if missing := sorted(names - set(present)):
         raise ValueError(f"{path}: not the system of this fit: no {', '.join(missing)}; {HINT}")
-    ik, _ = parameter_files.load_system(path, rig)
-    return ik
 
 
 def _check_files(run: Path, names: Sequence[str]) -> None:

@@ -32,10 +32,9 @@ from fitting.inference.optimisation.sweep import sweep
 from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
-from fitting.runtime import files, validation
+from fitting.runtime import activity, files, validation
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
-from jaxik.maths import parameter_tree
 
 from . import run_folder
 from .animations import AnimationFiles, load_animation
@@ -177,10 +176,12 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
         for named in (request.source, request.target)
     )
     run = run.resolve()
-    data = [_source_motion(source, files, request.fps) for files in request.animations]
+    with activity.announced(f"Running {source.name} on {len(request.animations)} clip(s)"):
+        data = [_source_motion(source, files, request.fps) for files in request.animations]
     rig = data[0].base.rig
     preset = target.preset.system(rig)
     rules = systems.changed_rules(target.ik, preset)
+    start = systems.with_rules(preset, rules, target.name, rig)
     experiment = Experiment(
         path=run / run_folder.EXPERIMENT,
         clips=_clip_entries(request, run),
@@ -190,13 +191,15 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
         name=f"{source.name} to {target.name}",
         fps=request.fps,
         rules=rules,
-        parameters=_changed_values(target.ik, systems.with_rules(preset, rules, target.name, rig)),
+        parameters=systems.changed_values(target.ik, start),
         sigmas=TOLERANCES,
     )
     problem = problem_from_clips(experiment, data)
-    _check_moves(source, problem)
+    with activity.announced(f"Measuring what {source.name} moves"):
+        _check_moves(source, problem)
     if request.free is None:
-        moving = sensitivity.measure_sensitivity(target.ik, experiment.free, problem.data)
+        with activity.announced(f"Trying {len(experiment.free)} parameters over their ranges"):
+            moving = sensitivity.measure_sensitivity(target.ik, experiment.free, problem.data)
         if not moving:
             raise ValueError(f"no parameter of {target.name} moves anything in these clips")
         experiment = replace(experiment, free={name: experiment.free[name] for name in moving})
@@ -237,16 +240,6 @@ def _source_motion(source: NamedSystem, files: AnimationFiles, fps: float | None
     return ClipData(solved, animation.clip, animation.terrain, animation.root)
 
 
-def _changed_values(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, object]:
-    """Values in which a system differs from its preset, which has the same rules."""
-    values = {name: np.asarray(parameter_tree.get(ik, name)) for name in systems.leaf_names(ik)}
-    return {
-        name: value.tolist()
-        for name, value in values.items()
-        if not np.array_equal(value, np.asarray(parameter_tree.get(preset, name)))
-    }
-
-
 def _check_moves(source: NamedSystem, problem: Problem[jaxik.FootIK]) -> None:
     """Raises ValueError if the source leaves every clip as it is."""
     for scene in problem.data:
@@ -263,14 +256,15 @@ def starting_point(problem: Problem[jaxik.FootIK]) -> np.ndarray:
     values over their ranges first does not.
     """
     u = np.asarray(problem.space.pack({}))
-    cost = float(evaluate(problem, u[None]).cost[0])
-    search = Search(problem, SearchSettings(min_sweep_gain=MIN_SWEEP_GAIN))
-    state = SearchState.at(u, cost)
-    for _ in range(MAX_SWEEPS):
-        before = state.point
-        state = sweep(search, state)
-        if state.point is before:
-            break
+    with activity.announced("Moving single parameters over their ranges"):
+        cost = float(evaluate(problem, u[None]).cost[0])
+        search = Search(problem, SearchSettings(min_sweep_gain=MIN_SWEEP_GAIN))
+        state = SearchState.at(u, cost)
+        for _ in range(MAX_SWEEPS):
+            before = state.point
+            state = sweep(search, state)
+            if state.point is before:
+                break
     return state.point.u
 
 

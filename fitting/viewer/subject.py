@@ -29,7 +29,7 @@ from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.program_cache import cached
 from fitting.studies import run_folder
 from fitting.studies.animations import AnimationFiles, load_animation
-from fitting.studies.motions.fit_motions import with_soles_of
+from fitting.studies.motions.placed_motion import with_soles_of
 from jaxik.world.terrain import Terrain
 
 DEFAULT, FITTED, GIVEN = "default", "fitted", "given"  # systems to go back to

@@ -28,6 +28,7 @@ from fitting.experiments import problems
 from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.chain import journal_path
 from fitting.jobs import fits
+from fitting.runtime import activity
 from fitting.studies import assess, run_folder
 from support import gltf_files, grounds, quick
 from support.experiments import CLIP, ROOT, write
@@ -37,7 +38,7 @@ DATA = ROOT / "data"
 COMMANDS = [
     "fit", "ablate", "calibrate", "population", "sample", "apply", "run", "compare", "translate",
     "inspect", "terrain", "bench", "cache", "record", "record show", "record to-toml",
-    "record to-bytes",
+    "record to-bytes", "export",
 ]  # fmt: skip
 BASE = str(DATA / "clips" / "uneven_walk_base.npz")
 GROUND = str(DATA / "terrains" / "slope.ply")
@@ -241,7 +242,7 @@ def test_the_exit_status_says_what_is_wrong_with_a_fit(
     assert status == 3 or numbers["goodness"]["fits"] is False
 
 
-def test_an_interrupt_swallowed_by_a_hook_is_raised_at_the_next_report(capsys):
+def test_an_interrupt_swallowed_by_a_hook_is_raised_at_the_next_report():
     def show(_) -> str:
         try:
             signal.raise_signal(signal.SIGINT)
@@ -250,9 +251,9 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_at_the_next_report(capsys):
         return "going on"
 
     report = Progress("start", 0, 0, 1.0, 1.0, 0.0)
-    with progress.ProgressLine(show) as line:
+    with activity.announced("Searching") as work, progress.ProgressLine(show) as line:
         line(report)
-        assert capsys.readouterr().err == "going on\n"
+        assert work.note == "going on"
         with pytest.raises(KeyboardInterrupt):
             line(report)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -580,7 +581,8 @@ def test_a_closed_pipe_is_no_error(tmp_path):
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     os.close(writer)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    assert all(line.startswith("Importing JAX") for line in done.stderr.splitlines())
 
 
 # Old words

@@ -69,6 +69,10 @@ PLACES: dict[str, tuple[list[str], str]] = {  # words with a place for a path, a
     "record show csv": (["record", "show", "{}"], ".csv"),
     "record show toml": (["record", "show", "{}"], ".toml"),
     "record to-toml": (["record", "to-toml", "{}", "-o", "a.toml"], ".bin"),
+    **{
+        f"export {suffix}": (["export", "{}", "-o", "a.toml"], suffix)
+        for suffix in (".toml", ".json", ".csv", ".bin", "")
+    },
     "record to-bytes --base": (
         ["record", "to-bytes", "whole.toml", "--base", "{}", "-o", "a.bin"],
         ".bin",
@@ -145,6 +149,8 @@ OUTPUTS: dict[str, tuple[list[str], str]] = {
     "translate": (["translate", *FROM_TO, "--clip", *ANIMATION, "-o", "{}"], ""),
     "terrain": (["terrain", str(BASE), "-o", "{}"], ".ply"),
     "record to-toml": (["record", "to-toml", "whole.bin", "-o", "{}"], ".toml"),
+    "export": (["export", "whole.bin", "-o", "{}"], ".toml"),
+    "export --as": (["export", "whole.bin", "--as", "mec", "-o", "{}"], ".csv"),
     "bench --json": (["bench", "--quick", "--only", "legs", "--json", "{}"], ".json"),
     "ablate": (["ablate", "{experiment}", "-o", "{}"], ""),
     "calibrate": (["calibrate", "{experiment}", "-o", "{}"], ""),

@@ -69,6 +69,14 @@ def test_blender_sees_our_joints_where_they_are(folder, walk, name, scale):
     assert error_of(walk, folder, name, scale) < TOLERANCE
 
 
+def test_the_bones_that_blender_draws_follow_our_joints(folder, walk):
+    with np.load(folder / "body.npz") as body:
+        vertices = body["vertices"]
+    joints = walk.positions_ws[-1, sorted({parent for parent in walk.parents if parent >= 0})]
+    off = np.linalg.norm(vertices - joints[:, None], axis=-1).min(axis=1)
+    assert len(joints) == 7 and off.max() < TOLERANCE
+
+
 @pytest.mark.parametrize(
     ("name", "scale"),
     [("exported.bvh", 0.01), ("exported.glb", 1.0), ("dressed.glb", 1.0), ("dressed.gltf", 1.0)],

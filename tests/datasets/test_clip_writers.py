@@ -13,21 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import Clip, load_clip, save_clip
 from fitting.datasets.clips.edit import mirror, resample
+from fitting.datasets.clips.formats.gltf.bones import bone_mesh
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
 from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.datasets.terrain.meshes import Mesh, mesh_of
 from jaxik.world import terrain
+from support.reference_clips import BVH_FILES
 from support.sample_clips import AMC, ASF, BVH, stair_walk
 
 TOLERANCE = 1e-4  # m
-DIALECTS = [
-    "cmu_bvh_max/131_01.bvh",
-    "cmu_bvh_max/scaled_131_01.bvh",
-    "cmu_bvh_mb/cmu_12_01_walk.bvh",
-    "cmu_bvh_poser/03_01.bvh",
-    "mit/pybvh_test1_zup.bvh",
-    "mit/full_precision_frame_time.bvh",
-]
 OPTIONS = {".bvh": ("scale", "up"), ".glb": (), ".npz": ()}
 
 
@@ -76,7 +70,7 @@ def hierarchy(text: str) -> list[list[str]]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", DIALECTS)
+@pytest.mark.parametrize("name", BVH_FILES)
 def test_a_bvh_goes_back_into_its_own_hierarchy(mocap, tmp_path, name):
     clip = load_clip(mocap / "clips" / name).select(slice(0, 50))
     path, solved = tmp_path / "solved.bvh", moved(clip)
@@ -222,14 +216,29 @@ def test_bind_matrices_undo_the_rest_pose(tmp_path):
     )
 
 
+def test_bones_lead_from_joint_to_joint_and_are_closed_outwards():
+    places = np.array([[0.0, 1, 0], [0.2, 1, 0], [0.2, 0.5, 0.1], [0.2, 0.5, 0.1]])
+    vertices, faces, owners = bone_mesh(places, (-1, 0, 1, 2))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight and mesh.volume > 0 and owners.tolist() == [0] * 6 + [1] * 6
+    np.testing.assert_allclose(vertices[[0, 5, 6, 11]], places[[0, 1, 1, 2]])
+    for point in (vertices[1:5], vertices[7:11]):
+        assert np.ptp(point, axis=0).max() < 0.1
+    lonely, _, owners = bone_mesh(places[:1], (-1,))
+    assert np.ptp(lonely[:, 1]) == pytest.approx(0.1) and set(owners) == {0}
+
+
 def test_the_ground_lies_beside_the_motion(tmp_path):
     hill = Mesh(np.array([[0.0, 0, 0], [0, 1, 2], [3, 0, 0]]), np.array([[0, 1, 2]]))
     save_clip(tmp_path / "out.glb", stair_walk(), ground=hill)
     save_clip(tmp_path / "bare.glb", stair_walk())
     assert error(stair_walk(), load_clip(tmp_path / "out.glb")) < TOLERANCE
-    seen = trimesh.load_scene(tmp_path / "out.glb").to_mesh()
-    np.testing.assert_allclose(seen.vertices[seen.faces[0]], hill.vertices)
-    read = mesh_of(load_terrain(tmp_path / "out.glb"))
+    seen = trimesh.load_scene(tmp_path / "out.glb")
+    assert sorted(seen.geometry) == ["body", "terrain"]
+    ground = seen.geometry["terrain"]
+    np.testing.assert_allclose(ground.vertices[ground.faces[0]], hill.vertices)
+    read = mesh_of(load_terrain(tmp_path / "out.glb"))  # without the character
+    assert len(read.faces) == 1
     np.testing.assert_allclose(read.vertices[read.faces[0]], hill.vertices)
     with pytest.raises(ValueError, match="bare.glb"):
         load_terrain(tmp_path / "bare.glb")

@@ -9,17 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import Clip, load_clip
 from fitting.datasets.clips.recording import Y_UP_FROM_Z_UP
+from support.reference_clips import AMC_FILES, BVH_FILES
 
 TOLERANCE = 1e-4  # of body height, and of a rotation matrix
-FILES = [
-    *(f"cmu_asfamc/{name}.amc" for name in ("01_01", "02_01", "02_03", "03_01", "03_03")),
-    "cmu_bvh_max/131_01.bvh",
-    "cmu_bvh_max/scaled_131_01.bvh",
-    "cmu_bvh_mb/cmu_12_01_walk.bvh",
-    "cmu_bvh_poser/03_01.bvh",
-    "mit/pybvh_test1_zup.bvh",
-    "mit/full_precision_frame_time.bvh",
-]
+FILES = [*AMC_FILES, *BVH_FILES]
 
 
 @pytest.fixture(scope="module")

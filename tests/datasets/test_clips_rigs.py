@@ -13,7 +13,7 @@ from fitting.datasets.clips.contacts import detect_stances, runs
 from fitting.datasets.clips.formats.bvh import read_bvh
 from fitting.datasets.clips.joint_roles import Trunk, find_roles, find_trunk, partners
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
-from fitting.datasets.clips.rigs import LegMotion, knee_axis, measure_soles
+from fitting.datasets.clips.rigs import LegMotion, foot_axes, knee_axis, measure_soles
 from jaxik.maths import quat
 from jaxik.world.skeleton import Transform, forward_kinematics
 from support.sample_clips import BVH, stair_walk
@@ -284,3 +284,10 @@ def test_a_knee_that_hardly_moves_is_remarked(tmp_path):
     assert remark.startswith("the right knee hardly moves, so its axis is a guess")
     path.write_text(BVH.replace("0 15 0 9 0", "0 15 0 29 0"))
     assert not any("knee" in text for text in load_clip(path).remarks)
+
+
+def test_a_foot_of_one_point_below_a_pelvis_on_its_side_points_along_z():
+    still, upright = np.zeros((2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
+    left_ws = np.tile([0.0, 1.0, 0.0], (2, 1))
+    leg = LegMotion(still, still, still, still, upright, upright, upright, left_ws)
+    np.testing.assert_allclose(foot_axes(leg, np.ones(2, bool)), [1.0, 0.0, 0.0, 0.0], atol=1e-12)

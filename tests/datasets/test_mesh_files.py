@@ -195,3 +195,11 @@ def test_arguments_out_of_range_are_refused(tmp_path, arguments, message):
     ramp().export(tmp_path / "ramp.ply")
     with pytest.raises(ValueError, match=message):
         mesh_files.load_terrain(tmp_path / "ramp.ply", **arguments)
+
+
+def test_a_written_mesh_far_from_the_origin_keeps_a_tenth_of_a_millimetre(tmp_path):
+    vertices = np.array([[0.0123, 0.4567, 0.0], [1.0, 0.0, 0.8901], [0.0, 0.2345, 1.0]])
+    for away in (0.0, 50_000.0):
+        mesh_files.save_mesh(tmp_path / "hill.ply", vertices + away, np.array([[0, 1, 2]]))
+        read = trimesh.load_scene(tmp_path / "hill.ply", process=False).to_mesh()
+        np.testing.assert_allclose(read.vertices - away, vertices, atol=5e-5 + 1e-9)

@@ -45,7 +45,7 @@ WHERE = [(table, key, *ends) for table, keys in RANGES.items() for key, ends in 
 OF_CLIPS = {
     "start": (0, 1e6), "end": (1e-3, 1e6), "terrain_scale": (1e-9, 1e6), "terrain_cell": (1e-3, 1e4)
 }  # fmt: skip
-WORDS = ("name", "preset", "body", "loss", "faithful", "record_only")
+WORDS = ("name", "written_in", "preset", "body", "loss", "faithful", "record_only")
 TABLES = ("free", "prior", "start", "rules", "parameters", "sigmas", "noise", "fit", "sample")
 
 

@@ -21,10 +21,12 @@ from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.experiments import parameter_files, record_files, track_files
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.known_values import load_known_values
+from fitting.experiments.originals import conversion, settings_files
 from fitting.runtime.validation import error_context
 from fitting.studies import run_folder, translation
 from jaxik import presets, record
 from support import experiments
+from support.c3d_files import WIDTHS, both_sides, plug_in_gait, write_c3d
 from support.gltf_files import walker
 from support.records import packed
 from support.sample_clips import AMC, ASF, BVH, stair_walk
@@ -97,6 +99,12 @@ RUN = {
 }
 
 
+def settings_of_mec(suffix: str = ".toml") -> bytes:
+    """A table of settings."""
+    values = conversion.to_settings(presets.mec(faithful=True), "mec")
+    return settings_files.settings_text(values, "mec", suffix).encode()
+
+
 @dataclass(frozen=True)
 class Format:
     """A kind of file."""
@@ -123,6 +131,16 @@ def clip_bytes(suffix: str) -> bytes:
         path = Path(folder) / f"clip{suffix}"
         save_clip(path, mask_pops(stair_walk()).select(slice(0, 20)))
         return path.read_bytes()
+
+
+@cache
+def capture_bytes() -> bytes:
+    """A file of markers, of which one is not seen in a frame."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "walk.c3d"
+        places = plug_in_gait(stair_walk().select(slice(0, 12)))
+        places["LTHI"][4] = np.nan
+        return write_c3d(path, places, measures=both_sides(WIDTHS), channels=2).read_bytes()
 
 
 def blocks_archive() -> bytes:
@@ -254,6 +272,7 @@ FORMATS: dict[str, Format] = {
     ),
     "clip, GLB": clip_format("walk.glb", lambda: clip_bytes(".glb"), damage=damage_glb),
     "clip, glTF": clip_format("walk.gltf", lambda: walker().text().encode(), damage=damage_json),
+    "clip, C3D": clip_format("walk.c3d", capture_bytes, damage=damage_bytes),
     "clip, NPZ": clip_format("walk.npz", lambda: clip_bytes(".npz"), damage=damage_arrays),
     "clip, blocks": clip_format("blocks.npz", blocks_archive, damage=damage_arrays),
     "heightfield": Format(
@@ -285,6 +304,23 @@ FORMATS: dict[str, Format] = {
         lambda: parameter_files.system_to_toml(presets.record()).encode(),
         lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
         damage_toml,
+    ),
+    "parameters, JSON": Format(
+        "footik.json",
+        lambda: parameter_files.system_to_json(presets.record()).encode(),
+        lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
+        damage_json,
+    ),
+    "settings": Format(
+        "mec.toml",
+        settings_of_mec,
+        lambda path: soundness.check_system(settings_files.load_settings(path)[0]),
+        damage_toml,
+    ),
+    "settings, CSV": Format(
+        "mec.csv",
+        lambda: settings_of_mec(".csv"),
+        lambda path: soundness.check_system(settings_files.load_settings(path)[0]),
     ),
     "truth": Format(
         "truth.toml",

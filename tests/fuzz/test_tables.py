@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fuzz.formats import FORMATS
 from fuzz.trial import OUTCOMES, try_to_load
 
-NAMES = ("experiment", "parameters", "free parameters", "tracks")
+NAMES = ("experiment", "parameters", "settings", "free parameters", "tracks")
 TEXTS = st.one_of(
     st.text(max_size=20),
     st.sampled_from(["lean.gain", "foot", "record", "left", "clip", "normal", "linear", "given"]),

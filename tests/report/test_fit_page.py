@@ -15,7 +15,7 @@ from fitting.datasets import ground_patch
 from fitting.datasets.clips import load_clip
 from fitting.problem.scene import legs_ws
 from fitting.report import worst_window_report
-from fitting.report.page import motion_data, posterior_section, rendering, sentences
+from fitting.report.page import fit_page, motion_data, posterior_section, rendering, sentences
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
 from fitting.studies.motions import fit_motions
@@ -87,7 +87,7 @@ def test_the_page_says_what_was_found(page, fitted):
         assert f"{row['value']:.4g}" in page.text
         assert "{:.4g} to {:.4g}".format(*row["interval"]) in page.text
     assert "The clips determine 1 of 2 parameters; foot.max_pitch stays open." in page.text
-    assert fitted.verdict.sentence in page.text
+    assert fitted.verdict.sentence.replace("`", "") in page.text
     (play,) = fitted.playbacks
     window = worst_window.find_worst_window(play)
     for line in worst_window_report.describe(play, window, ("left", "right")):
@@ -101,9 +101,12 @@ def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
     (tmp_path / run_folder.PAGE).write_text(page)
     for count in (1, 2):
         lines = [f"chain {count} <b>"]
-        posterior_section.insert(tmp_path, ["contradiction"], lines, [["parameter"], ["x"]])
+        posterior_section.insert(
+            tmp_path, ["`jaxik fit` <i>: **run** it"], lines, [["parameter"], ["x"]]
+        )
     sampled = Page(tmp_path / run_folder.PAGE)
     assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
+    assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
     assert sampled.headings.count("h2 Posterior") == 1
     assert sampled.data == Page(run / run_folder.PAGE).data
     (tmp_path / run_folder.PAGE).write_text("of another kind")
@@ -166,20 +169,33 @@ def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
 def test_a_long_clip_is_shown_with_fewer_frames(fitted, monkeypatch):
     (data,) = fitted.clips
     motions = fit_motions.clip_motions(data, fitted.results[0], fitted.results[0])
-    assert motion_data.steps_between_frames([motions]) == [1]  # 30 Hz
+    (play,) = fitted.playbacks
+    shown = fit_page.shown(motions, "captured", worst_window.find_worst_window(play))
+    (whole,) = motion_data.pack([shown])
+    assert motion_data.steps_between_frames([shown]) == [1]  # 30 Hz
+    assert motion_data.steps_between_frames([shown], -1) == [8]  # one frame of seven is left
     monkeypatch.setattr(motion_data, "MAX_RATE", 15.0)
-    assert motion_data.steps_between_frames([motions]) == [2]
-    monkeypatch.setattr(motion_data, "MAX_BYTES", 1_000)
-    (step,) = motion_data.steps_between_frames([motions])
-    assert step > 2
-    labels = dict.fromkeys(motion_data.shown(motions), "")
-    packed, whole = (motion_data.pack(motions, n, labels) for n in (step, 1))
-    assert packed["frames"] == -(-whole["frames"] // step)
+    assert motion_data.steps_between_frames([shown]) == [2]
+    ground = 2 * motions.ground.heights.size
+    spent = motion_data.MAX_BYTES - ground - 600  # by pictures
+    (packed,) = motion_data.pack([shown], spent)
+    step = -(-whole["frames"] // packed["frames"])
+    assert step > 2, "grounds and pictures count"
     skeletons = packed["skeletons"][3], whole["skeletons"][3]
     few, all_ = (points(c, s) for c, s in zip((packed, whole), skeletons, strict=True))
     np.testing.assert_allclose(few, all_[::step], atol=1e-4)
     marks = [array(s["inGround"], "u1").any() for s in skeletons]
     assert marks[0] == marks[1]  # what happens between two frames is kept
+
+
+def test_many_grounds_are_coarser_and_stay_where_they_are():
+    heights = np.arange(60_000.0).reshape(200, 300)
+    patch = ground_patch.GroundPatch(np.zeros(2), 0.1, heights)
+    (alone,) = motion_data.coarse_grounds([patch])
+    assert alone.heights.shape == heights.shape and alone.spacing == patch.spacing
+    coarse = motion_data.coarse_grounds([patch] * 40)
+    assert sum(2 * each.heights.size for each in coarse) < 1.02 * motion_data.MAX_GROUND_BYTES
+    assert coarse[0].heights[3, 4] == heights[9, 12] and coarse[0].spacing == pytest.approx(0.3)
 
 
 def test_a_run_keeps_its_flat_animation_and_its_fitted_motion(run, fitted):

@@ -1,4 +1,4 @@
-"""The page of a fit in a browser: it opens from disk, draws, plays, and fits a phone."""
+"""Pages in a browser: they open from disk, draw, play, and fit a phone."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -6,9 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+from fitting.report import comparison_report
+from fitting.report.page import rendering
+from fitting.report.page.comparisons import compare_page, runs_page
 from fitting.studies import run_folder
-from support import runs
+from fitting.studies.posterior.run_comparison import ComparedRun
+from support import comparisons, runs
+from support.pages import Page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -17,6 +23,10 @@ STILL = """(() => {
   const pixels = still.getContext("2d").getImageData(0, 0, still.width, still.height).data;
   return Array.from(pixels.filter((_, i) => i % 1237 === 0));
 })()"""
+RUNS = [
+    ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}),
+    ComparedRun("b", -15.0, 2.0, 5.0, 1.0, 4.0, 2, {1: -15.0}),
+]
 PHONE = {"width": 390, "height": 844}
 DESKTOP = {"width": 1280, "height": 900}
 
@@ -34,6 +44,24 @@ def path(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def comparison_path(tmp_path_factory) -> Path:
+    """The page of two systems that are 10 cm apart, the lower one watched."""
+    folder = tmp_path_factory.mktemp("compared")
+    compared = comparisons.invented_comparison(comparisons.walk())
+    Image.new("RGB", (1700, 900), "white").save(folder / comparison_report.FIGURE)
+    compare_page.write(folder, compared)
+    return folder / run_folder.PAGE
+
+
+@pytest.fixture(scope="module")
+def plain_path(tmp_path_factory) -> Path:
+    """A page without a view."""
+    folder = tmp_path_factory.mktemp("plain")
+    runs_page.write(folder, RUNS)
+    return folder / run_folder.PAGE
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(
@@ -45,10 +73,13 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def open_page(browser, path) -> Iterator[Callable[..., Any]]:
-    """Opens the page from disk; at the end, nothing has gone wrong and nothing was loaded."""
-    contexts, events = [], []
+    """Opens a page from disk; at the end, nothing has gone wrong and nothing was loaded."""
+    contexts, events, opened_pages = [], [], [path]
 
-    def opened(viewport: dict[str, int] = DESKTOP, **settings: Any) -> Any:
+    def opened(
+        viewport: dict[str, int] = DESKTOP, path: Path = path, view: bool = True, **settings: Any
+    ) -> Any:
+        opened_pages.append(path)
         context = browser.new_context(viewport=viewport, offline=True, **settings)
         contexts.append(context)
         page = context.new_page()
@@ -56,13 +87,16 @@ def open_page(browser, path) -> Iterator[Callable[..., Any]]:
         page.on("pageerror", lambda error: events.append(str(error)))
         page.on("request", lambda request: events.append(request.url))
         page.goto(path.as_uri())
-        page.wait_for_function("document.getElementById('view').dataset.ankles")
+        if view:
+            page.wait_for_function("document.getElementById('view').dataset.ankles")
         return page
 
     yield opened
     for context in contexts:
         context.close()
-    assert [event for event in events if event not in (path.as_uri(), "data:,")] == []
+    loaded = {page.as_uri() for page in opened_pages}
+    own = [event for event in events if event not in loaded and not event.startswith("data:")]
+    assert own == []
 
 
 def shown(page: Any) -> dict[str, str]:
@@ -99,6 +133,23 @@ def test_the_view_is_drawn_and_changes_with_the_legend_and_the_camera(open_page)
         shown(page)
         pictures.append(view.screenshot())
     assert len({bytes(picture) for picture in pictures}) >= len(pictures) - 1  # corner is the first
+
+
+def test_all_bones_throw_a_shadow_however_many_there_are(open_page, path, tmp_path):
+    data = Page(path).data
+    bones = data["clips"][0]["skeletons"][-1]["bones"]
+    bones[:0] = 70 * bones[:1]
+    crowded = tmp_path / "crowded.html"
+    whole = path.read_text()
+    start = whole.index(">", whole.index('id="data"')) + 1
+    end = whole.index("</script>", start)
+    crowded.write_text(whole[:start] + str(rendering.as_json(data)) + whole[end:])
+    pictures = []
+    for shown_path in (path, crowded):
+        page = open_page(path=shown_path)
+        shown(page)
+        pictures.append(page.locator("#view").screenshot())
+    assert pictures[0] == pictures[1]
 
 
 def test_it_plays_by_keyboard_and_stops_at_the_end(open_page):
@@ -138,6 +189,47 @@ def test_it_is_dark_where_the_system_is_and_the_button_changes_that(open_page):
     page.evaluate("dispatchEvent(new Event('beforeprint'))")
     pixels = page.evaluate(STILL)
     assert len(set(pixels)) > 20 and sum(pixels) > 120 * len(pixels)  # a picture, and light
+
+
+def test_the_slider_of_a_comparison_moves_the_feet_of_the_system_that_is_watched(
+    open_page, comparison_path
+):
+    page = open_page(path=comparison_path)
+    before = shown(page)
+    drag_to(page, 4)
+    after = shown(page)
+    assert (before["frame"], after["frame"]) == ("0", "4") and before["ankles"] != after["ankles"]
+    assert after["watched"] == "motion deep" and page.locator("#alert").is_visible()
+    assert after["shown"] == "motion close captured motion deep"
+    heights = [ankle_heights(after)]
+    page.locator("#watched").select_option("motion close")
+    heights.append(ankle_heights(shown(page)))
+    apart = [high - low for low, high in zip(*heights, strict=True)]
+    assert apart == pytest.approx([comparisons.DEEP] * 2, abs=2e-4)
+    assert page.locator("#alert").is_hidden()
+    page.locator(".to-worst").nth(1).click()
+    assert shown(page)["watched"] == "motion deep"
+
+
+def ankle_heights(view: dict[str, str]) -> list[float]:
+    return [float(ankle.split(",")[1]) for ankle in view["ankles"].split()]
+
+
+def test_a_comparison_fits_a_phone_with_its_picture_in_a_frame_of_its_own(
+    open_page, comparison_path
+):
+    page = open_page(PHONE, path=comparison_path)
+    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
+    assert page.locator("figure img").bounding_box()["width"] > PHONE["width"]
+
+
+def test_a_page_without_a_view_is_read_in_both_themes(open_page, plain_path):
+    page = open_page(PHONE, path=plain_path, view=False, color_scheme="dark")
+    assert page.locator(".findings li").count() == 3
+    assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+    page.locator("#theme").click()
+    assert page.evaluate("document.documentElement.dataset.theme") == "light"
+    assert page.evaluate("document.documentElement.scrollWidth") == PHONE["width"]
 
 
 def test_without_webgl_the_rest_can_be_read(browser, path):

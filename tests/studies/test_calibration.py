@@ -27,10 +27,12 @@ from fitting.problem.residuals import residuals_of_scenes as residuals_of_motion
 from fitting.problem.simulation import simulate as simulate_motion
 from fitting.report.calibration import calibration_report, calibration_tables
 from fitting.report.plots import calibration_plots
+from fitting.studies import run_folder
 from fitting.studies.calibration import calibration, replicates
 from fitting.studies.calibration.assessment import Assessment, assess, summarise
 from fitting.studies.calibration.calibration import Calibration, CalibrationProgress, Observers
 from support.experiments import CLIP, ROOT, write
+from support.pages import Page
 
 SIGMA = 0.02
 FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
@@ -341,6 +343,9 @@ def test_the_command_writes_a_report_and_ends_with_status_0(experiment_file, tmp
     assert summary.startswith("# hill: calibration\n\nCalibrated: on 3 simulated motions")
     for picture in ("ranks.png", "recovery.png"):
         assert f"({picture})" in summary and (out / picture).stat().st_size > 10_000
+    page = Page(out / run_folder.PAGE)
+    assert "but 3 simulated motions prove little, as these bounds are wide" in page.text
+    assert page.elements.count("img") == 2 and "h2 Ranks" in page.headings
     numbers = json.loads((out / "calibration.json").read_text())
     assert set(NUMBERS) <= numbers.keys() and numbers["experiment"] == "hill"
     assert numbers["inside"] is True and len(numbers["ranks"]["pelvis.on_gain"]["ranks"]) == 3
@@ -357,6 +362,9 @@ def test_what_is_outside_is_named_and_ends_with_status_5(
     assert "Not calibrated: on 8 simulated motions, outside their bounds: the fit's 95 %" in printed
     assert "**no**, too few" in printed
     assert not (tmp_path / "out" / "ranks.png").exists(), "there are no chains"
+    page = Page(tmp_path / "out" / run_folder.PAGE)
+    assert "hill Not calibrated ◐ Of 8 simulated motions, outside their bounds: the" in page.text
+    assert "No posterior was sampled" in page.text and "no, too few" in page.text
 
 
 def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(

@@ -19,11 +19,12 @@ from fitting.report import comparison_report
 from fitting.report.labels import MEASURES
 from fitting.report.plots import comparison_plots, style
 from fitting.runtime import program_cache
-from fitting.studies import comparison
+from fitting.studies import comparison, run_folder
 from fitting.studies.animations import Animation
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support.experiments import ROOT
+from support.pages import Page
 
 SHOWN = "always::fitting.report.placement_report.PlacementWarning"
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings(SHOWN)]
@@ -186,10 +187,15 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
 # What is written
 
 
-def test_the_folder_holds_a_table_its_numbers_and_a_figure(compared):
+def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
     assert {path.name for path in compared.iterdir()} == {
-        comparison_report.TABLE, comparison_report.NUMBERS, comparison_report.FIGURE
+        run_folder.PAGE, comparison_report.TABLE, comparison_report.NUMBERS,
+        comparison_report.FIGURE,
     }  # fmt: skip
+    page = Page(compared / run_folder.PAGE)
+    (clip,) = page.data["clips"]
+    labels = [skeleton["label"] for skeleton in clip["skeletons"]]
+    assert clip["frames"] == 61 and labels == ["flat animation", "still", "record"]
     text, systems = (compared / comparison_report.TABLE).read_text(), numbers(compared)
     assert text.startswith("# walk.npz on uneven_walk.ply\n\n61 frames, 2.00 s at 30 Hz.")
     assert f"]({comparison_report.FIGURE})" in text and "have no ground" not in text
@@ -248,6 +254,7 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
     compared = comparison.Comparison(
         "title", tuple(f"leg {leg}" for leg in range(legs)), 30.0,
         np.full((300, legs), np.nan), 0.0,
+        Animation(load_flat_animation(BASE), terrain.plane()), {},
         {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero}, {},
     )  # fmt: skip
     figure = comparison_plots.overview(compared)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import equinox as eqx
@@ -19,10 +20,12 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.jobs import populations
 from fitting.problem.problem import Problem
 from fitting.report.hierarchy import population_plots, population_report, population_tables
+from fitting.studies import run_folder
 from fitting.studies.hierarchy import kept_searches, population
 from fitting.studies.hierarchy.population import Population, clip_names
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, write
+from support.pages import Page
 
 SIGMA = 0.02
 FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
@@ -264,6 +267,10 @@ def test_the_command_writes_a_report_and_parameters(walks, tmp_path, capsys):
     assert summary.startswith("# walks: clips and their population\n\n- `pelvis.on_gain` differs ")
     assert "from 3 clips only." in summary and "A clip that is left out is predicted to" in summary
     assert "(population.png)" in summary and (out / "population.png").stat().st_size > 10_000
+    page = Page(out / run_folder.PAGE)
+    assert "too few to say much of spreads: pelvis.on_gain differs between them." in page.text
+    assert "All 7 searches and the fit of the population converged." in page.text
+    assert page.elements.count("img") == 1 and "uneven_walk from 1 s (ann)" in page.text
     numbers = json.loads((out / "population.json").read_text())
     assert numbers["converged"] and numbers["subjects"] == list(SUBJECTS)
     assert [row["name"] for row in numbers["parameters"]] == ["pelvis.on_gain", "foot.max_pitch"]
@@ -281,6 +288,8 @@ def test_what_has_not_converged_is_said_and_ends_with_status_3(quick, tmp_path, 
     path = write_walks(tmp_path, TABLE + "[fit]\nstarts = 1\n[fit.search]\ndescents = 1\n")
     assert main.main(["population", str(path), "-o", str(tmp_path / "out")]) == 3
     assert "**Not converged**: all clips: Not converged: stopped" in capsys.readouterr().out
+    page = Page(tmp_path / "out" / run_folder.PAGE)
+    assert re.search(r"walks \d not converged ◐ \d of the searches did not converge", page.text)
 
 
 @pytest.fixture

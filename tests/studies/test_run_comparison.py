@@ -16,6 +16,7 @@ from fitting.inference.sampling import blocks
 from fitting.inference.sampling.blocks import BlockLogLikelihood
 from fitting.studies import run_folder
 from fitting.studies.posterior.run_comparison import compare_runs
+from support.pages import Page
 
 pytest.importorskip("arviz_stats")
 GOOD = np.array([-3.0, -2.0, -4.0, -3.5, -2.5, -3.0])
@@ -62,6 +63,8 @@ def test_the_command_prints_and_writes_the_table(tmp_path, capsys, monkeypatch):
     assert "elpd of clip 2" in lines[0]
     text = (tmp_path / "compared" / "runs.md").read_text()
     assert "| a | " in text and "expected log predictive density" in text
+    page = Page(tmp_path / "compared" / run_folder.PAGE)
+    assert "b predicts best; a is 6.0 ± 0.8 below." in page.text
     rows = json.loads((tmp_path / "compared" / "runs.json").read_text())
     assert [row["name"] for row in rows] == ["b", "a"]
     assert main.main(["compare", "--runs", "a,b"]) == 0

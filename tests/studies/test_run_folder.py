@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.studies import run_folder
 from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
 from jaxik.maths import parameter_tree
+from support.experiments import write
 from support.runs import NAMES, invented_fit, save
 
 
@@ -53,6 +56,62 @@ def test_the_experiment_in_a_run_does_not_need_its_original_file(fitted, tmp_pat
         assert getattr(again, name) == getattr(fitted.experiment, name), name
     assert again.sample == fitted.experiment.sample
     assert again.sigmas == {"body": math.inf, "correlation": 0.4}
+
+
+def project(folder: Path) -> Path:
+    """An experiment beside files for its clip, and a run of it, in `folder`; returns the run."""
+    (folder / "data").mkdir(parents=True)
+    for name in ("walk.npz", "steps.ply"):
+        (folder / "data" / name).touch()
+    clip = 'reference = "data/walk.npz"\nterrain = "data/steps.ply"\n'
+    path = write(folder, clips=f"[[clips]]\n{clip}")
+    experiment, run = experiment_files.load_experiment(path), folder / "runs" / "walk"
+    run.mkdir(parents=True)
+    text = experiment_files.experiment_to_toml(experiment, run)
+    (run / run_folder.EXPERIMENT).write_text(text, encoding="utf-8")
+    return run
+
+
+def terrain_of(run: Path) -> Path:
+    (clip,) = experiment_files.load_experiment(run / run_folder.EXPERIMENT).clips
+    return clip.terrain
+
+
+def test_a_run_and_its_data_may_be_moved_together(tmp_path):
+    run = project(tmp_path / "first")
+    assert 'terrain = "../../data/steps.ply"' in (run / run_folder.EXPERIMENT).read_text()
+    (tmp_path / "first").rename(tmp_path / "second")
+    assert terrain_of(tmp_path / "second/runs/walk") == tmp_path / "second/data/steps.ply"
+
+
+def test_a_run_may_be_moved_alone(tmp_path):
+    run = project(tmp_path / "first")
+    moved = run.rename(tmp_path / "alone")
+    assert terrain_of(moved) == tmp_path / "first/data/steps.ply"
+    (tmp_path / "first/data/steps.ply").unlink()
+    with pytest.raises(ValueError) as refused:
+        terrain_of(moved)
+    places = [tmp_path.parent / "data/steps.ply", tmp_path / "first/data/steps.ply"]
+    assert all(str(place) in str(refused.value) for place in places)
+
+
+def test_a_file_beside_the_moved_run_is_preferred_to_the_old_one(tmp_path):
+    run = project(tmp_path / "first")
+    shutil.copytree(tmp_path / "first", tmp_path / "copy")
+    assert terrain_of(tmp_path / "copy" / run.relative_to(tmp_path / "first")) == (
+        tmp_path / "copy/data/steps.ply"
+    )
+
+
+def test_paths_to_another_drive_are_whole(tmp_path, monkeypatch):
+    def no_path(*_: object) -> str:
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr(os.path, "relpath", no_path)
+    run = project(tmp_path / "first")
+    whole = (tmp_path / "first/data/steps.ply").as_posix()
+    assert f'terrain = "{whole}"' in (run / run_folder.EXPERIMENT).read_text()
+    assert terrain_of(run.rename(tmp_path / "alone")) == Path(whole)
 
 
 def test_estimated_noise_and_correlations_by_kind_survive_in_a_run(fitted, tmp_path):
@@ -125,9 +184,14 @@ def test_a_fitted_system_needs_neither_experiment_nor_clips(fitted, tmp_path):
     (tmp_path / run_folder.EXPERIMENT).unlink()
     alone = run_folder.load_fitted_system(tmp_path)
     assert parameter_tree.get(alone, "pelvis.limit") == parameter_tree.get(whole, "pelvis.limit")
-    (tmp_path / run_folder.FIT).unlink()
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    shutil.copy(tmp_path / run_folder.PARAMETERS, moved)
+    alone = run_folder.load_fitted_system(moved)
+    assert parameter_tree.get(alone, "pelvis.limit") == parameter_tree.get(whole, "pelvis.limit")
+    (moved / run_folder.SEARCH).write_text("{}")
     with pytest.raises(ValueError, match="no fit.json; there is"):
-        run_folder.load_fitted_system(tmp_path)
+        run_folder.load_fitted_system(moved)
 
 
 def test_a_missing_or_empty_folder_is_rejected(tmp_path):

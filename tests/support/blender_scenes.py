@@ -40,6 +40,16 @@ def save_heads(path: Path) -> None:
     np.savez(path.with_name(path.name + ".npz"), names=names, heads=np.stack([x, z, -y], axis=-1))
 
 
+def save_body(path: Path) -> None:
+    """Writes where the vertices of the mesh on the skeleton are in the last frame, m, y up."""
+    skinned = [thing for thing in bpy.data.objects if thing.find_armature() == armature()]
+    (body,) = skinned
+    moved = body.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    places = [moved.matrix_world @ vertex.co for vertex in moved.to_mesh().vertices]
+    x, y, z = np.array(places, np.float64).T
+    np.savez(path, vertices=np.stack([x, z, -y], axis=-1))
+
+
 def dress(skeleton) -> None:
     """Hangs a skinned mesh with a morph on the skeleton, and both below a turned, scaled node."""
     bpy.ops.mesh.primitive_cube_add(size=0.2)
@@ -63,6 +73,7 @@ def main(bvh: Path, glb: Path, folder: Path) -> None:
     begin()
     bpy.ops.import_scene.gltf(filepath=str(glb))
     save_heads(folder / "imported.glb")
+    save_body(folder / "body.npz")
     begin()
     bpy.ops.import_anim.bvh(filepath=str(bvh), frame_start=1)
     save_heads(folder / "imported.bvh")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 LOADING = ("src", "href", "srcset", "poster", "action", "data")  # attributes that name a file
+INLINE = {"code", "strong", "a", "span"}  # within a sentence
 EMPTY = {"meta", "link", "br", "img", "input", "line", "rect", "circle"}  # never closed
 
 
@@ -27,7 +28,7 @@ class Page(HTMLParser):
     @property
     def text(self) -> str:
         """All that is read, without styles and scripts."""
-        return re.sub(r"\s+", " ", " ".join(self.texts))
+        return re.sub(r"\s+", " ", "".join(self.texts))
 
     @property
     def data(self) -> Any:
@@ -38,13 +39,20 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append(tag)
+        self.separate(tag)
         self.loads += [value or "" for name, value in attrs if name in LOADING]
         if tag not in EMPTY:
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
+        self.separate(tag)
         if tag not in EMPTY:
             assert self.open.pop() == tag, f"</{tag}> closes something else"
+
+    def separate(self, tag: str) -> None:
+        """Puts a space between the texts of two elements, if they are no parts of a sentence."""
+        if tag not in INLINE:
+            self.texts.append(" ")
 
     def handle_data(self, data: str) -> None:
         if "style" in self.open or "script" in self.open:

@@ -21,6 +21,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "terrain": files.terrain,
     "bench": machine.bench,
     "record": files.convert_record,
+    "export": files.export,
     "cache": machine.cache,
     "parameters": guides.parameters,
     "schema": guides.schema,

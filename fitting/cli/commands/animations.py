@@ -1,14 +1,15 @@
 """Commands that run systems on flat animations."""
 
 import argparse
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from fitting import jobs, viewer
-from fitting.cli import progress
+from fitting.cli.terminal import show
 from fitting.experiments import parameter_files, systems
 from fitting.experiments.systems import Preset
 from fitting.jobs.views import Address, check_folder
-from fitting.runtime import cache_folder
+from fitting.runtime import activity, cache_folder
 from fitting.runtime.precision import in_float64
 from fitting.studies import comparison
 from fitting.studies.animations import AnimationFiles
@@ -29,7 +30,7 @@ def apply(options: argparse.Namespace) -> int:
     cache_folder.use_default()
     jobs.apply(
         options.run, _animation(options), options.output,
-        with_terrain=options.with_terrain, log=print,
+        with_terrain=options.with_terrain, log=show,
     )  # fmt: skip
     return 0
 
@@ -44,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
         ik, _ = parameter_files.load_system(options.parameters, rig)
     else:
         ik = systems.preset_system(options.preset, rig)
-    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain, log=print)
+    jobs.solve(ik, animation, options.output, with_terrain=options.with_terrain, log=show)
     return 0
 
 
@@ -55,7 +56,7 @@ def view(options: argparse.Namespace) -> int:
     address = Address(options.host, options.port)
     if options.terrain is None:
         _check_run(options)
-        jobs.view_run(options.clip, options.output, address, log=_print_now)
+        jobs.view_run(options.clip, options.output, address, log=show)
         return 0
     folder = options.output or Path()
     check_folder(folder)
@@ -63,7 +64,7 @@ def view(options: argparse.Namespace) -> int:
     if options.parameters is not None:
         given, preset = parameter_files.load_system(options.parameters, animation.flat_clip.rig)
     subject = viewer.subject_of_animation(animation, preset, given)
-    jobs.view(subject, folder, address, log=_print_now)
+    jobs.view(subject, folder, address, log=show)
     return 0
 
 
@@ -91,7 +92,7 @@ def compare(options: argparse.Namespace) -> int:
     requested = comparison.named_systems(options.systems, animation.flat_clip.rig)
     jobs.compare(
         requested, animation, options.output,
-        rates=options.rates, during=progress.timed, log=print,
+        rates=options.rates, during=_running, log=show,
     )  # fmt: skip
     return 0
 
@@ -112,9 +113,9 @@ def _compare_in_suite(options: argparse.Namespace) -> int:
     def systems_of(rig: Rig) -> dict[str, FootIK]:
         return comparison.named_systems(requested, rig)
 
-    finished = jobs.run_suite(
-        systems_of, plan, options.output, during=progress.timed, log=progress.print_marked
-    )
+    total = len(plan.situations)
+    with activity.announced(f"Running {total} situations", total) as suite:
+        finished = jobs.run_suite(systems_of, plan, options.output, during=suite.part, log=show)
     return status.of_job(interrupted=finished.interrupted)
 
 
@@ -126,7 +127,7 @@ def _compare_runs(options: argparse.Namespace) -> int:
             raise ValueError(f"{name} is {given}; runs are compared on the clips of their fits")
     if options.systems:
         raise ValueError(f"{options.systems[0][0]} and --runs exclude each other")
-    jobs.compare_runs(options.runs.split(","), options.output, log=print)
+    jobs.compare_runs(options.runs.split(","), options.output, log=show)
     return 0
 
 
@@ -140,6 +141,10 @@ def _check_comparison(options: argparse.Namespace) -> None:
         raise ValueError(f"the following are required: {', '.join(missing)}; or --suite, or --runs")
 
 
+def _running(name: str) -> AbstractContextManager:
+    return activity.announced(f"Compiling and running {name}")
+
+
 def _animation(options: argparse.Namespace) -> AnimationFiles:
     return AnimationFiles(
         options.clip,
@@ -151,8 +156,3 @@ def _animation(options: argparse.Namespace) -> AnimationFiles:
         reading.clip_options(options),
         reading.terrain_options(options),
     )
-
-
-def _print_now(text: str) -> None:
-    """Prints without waiting for a full buffer: the command goes on until it is ended."""
-    print(text, flush=True)

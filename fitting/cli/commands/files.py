@@ -3,14 +3,16 @@
 import argparse
 import warnings
 
+from fitting import jobs
 from fitting.cli.parsers.files import TEMPLATE
+from fitting.cli.terminal import show
 from fitting.datasets.clips import load_clip, summary
-from fitting.datasets.clips.joints import map_files
+from fitting.datasets.clips.load import draft_joint_map
 from fitting.datasets.terrain.reconstruction import reconstruct
 from fitting.experiments import parameter_files, record_files, systems
 from fitting.report import terrain_report
-from fitting.report.formatting import aligned
-from fitting.runtime import files
+from fitting.report.formatting import TableText, aligned
+from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik import record
@@ -20,17 +22,18 @@ from . import reading
 
 def inspect(options: argparse.Namespace) -> int:
     """Prints what a loader understood of a clip, or a joint map of it."""
-    as_template = options.joints == TEMPLATE
-    if as_template:
+    how = reading.clip_options(options)
+    if options.joints == TEMPLATE:
         if options.json:
             raise ValueError("--json is for what was understood, and not for a joint map")
-        options.joints = None
-    clip = load_clip(options.clip, **vars(reading.clip_options(options)))
-    if as_template:
-        print(map_files.template(clip.joint_names, clip.parents, clip.source))
+        print(draft_joint_map(options.clip, how))
         return 0
+    clip = load_clip(options.clip, **vars(how))
     described = summary.describe(clip)
-    print(summary.as_json(described) if options.json else summary.as_text(described))
+    if options.json:
+        print(summary.as_json(described))
+    else:
+        show(TableText(summary.as_text(described), summary.rows(described), is_prose=True))
     return 0
 
 
@@ -38,12 +41,15 @@ def inspect(options: argparse.Namespace) -> int:
 def terrain(options: argparse.Namespace) -> int:
     """Reconstructs the ground of a clip; writes a mesh, its numbers and a plot."""
     terrain_report.check_output_files(options.output)
-    clip = load_clip(options.clip, **vars(reading.clip_options(options)))
+    with activity.announced(f"Reading {options.clip.name}"):
+        clip = load_clip(options.clip, **vars(reading.clip_options(options)))
     kind = None if options.model == "auto" else options.model
-    ground = reconstruct(clip, sole=options.sole, kind=kind)
-    terrain_report.write(options.output, ground, clip, options.sole, options.margin)
+    with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
+        ground = reconstruct(clip, sole=options.sole, kind=kind)
+    with activity.announced("Drawing and writing the ground"):
+        terrain_report.write(options.output, ground, clip, options.sole, options.margin)
     print(f"{terrain_report.count_stances(ground)}\n")
-    print(aligned(terrain_report.prediction_table(ground)))
+    show(aligned(terrain_report.prediction_table(ground)))
     print(f"\n{terrain_report.describe_surface(ground)}; written to {options.output}")
     return 0
 
@@ -80,5 +86,12 @@ def convert_record(options: argparse.Namespace) -> int:
             )
     else:
         files.write(options.output, lambda path: path.write_bytes(record.to_bytes(only)))
+    print(f"written to {options.output}")
+    return 0
+
+
+def export(options: argparse.Namespace) -> int:
+    """Writes parameters in another form."""
+    jobs.export(options.source, options.output, system=options.system, drop=options.drop)
     print(f"written to {options.output}")
     return 0

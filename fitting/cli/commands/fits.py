@@ -4,6 +4,7 @@ import argparse
 
 from fitting import jobs
 from fitting.cli import progress
+from fitting.cli.terminal import show
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.record_only import restrict
 from fitting.experiments.systems import Preset
@@ -26,16 +27,14 @@ def fit(options: argparse.Namespace) -> int:
         experiment = restrict(experiment)
     if not options.view:
         with progress.ProgressLine(progress.fit_line) as line:
-            fitted = jobs.fit(experiment, options.output, progress=line, log=_print_now)
+            fitted = jobs.fit(experiment, options.output, progress=line, log=show)
         return status.of_fit(fitted)
     address = Address(options.host, options.port)
     with (
         progress.ProgressLine(progress.fit_line) as line,
-        FitWatch(options.output, address, line, _print_now) as watch,
+        FitWatch(options.output, address, line, show) as watch,
     ):
-        fitted = jobs.fit(
-            experiment, options.output, progress=watch, log=_print_now, loaded=watch.load
-        )
+        fitted = jobs.fit(experiment, options.output, progress=watch, log=show, loaded=watch.load)
     return status.of_fit(fitted)
 
 
@@ -51,7 +50,7 @@ def init(options: argparse.Namespace) -> int:
         reading=reading.clip_options(options),
         terrain_reading=reading.terrain_options(options),
     )
-    jobs.init(request, options.output, log=_print_now)
+    jobs.init(request, options.output, log=show)
     return 0
 
 
@@ -60,7 +59,7 @@ def ablate(options: argparse.Namespace) -> int:
     cache_folder.use_default()
     with progress.ProgressLine(progress.fit_line) as line:
         jobs.ablate(
-            options.experiment, options.output, folds=options.folds, progress=line, log=_print_now
+            options.experiment, options.output, folds=options.folds, progress=line, log=show
         )
     return 0
 
@@ -78,7 +77,7 @@ def calibrate(options: argparse.Namespace) -> int:
             workers=options.workers,
             scheduler=options.scheduler,
             progress=line,
-            log=_print_now,
+            log=show,
         )
     return 0 if assessment.inside else status.OUTSIDE
 
@@ -87,7 +86,7 @@ def population(options: argparse.Namespace) -> int:
     """Fits several clips and subjects as a population."""
     cache_folder.use_default()
     with progress.ProgressLine(progress.fit_line) as line:
-        fitted = jobs.population(options.experiment, options.output, progress=line, log=_print_now)
+        fitted = jobs.population(options.experiment, options.output, progress=line, log=show)
     return 0 if fitted.converged else status.NOT_CONVERGED
 
 
@@ -95,7 +94,7 @@ def sample(options: argparse.Namespace) -> int:
     """Samples the posterior of a run, or continues its chain."""
     cache_folder.use_default()
     with progress.ProgressLine(progress.sample_line) as line:
-        posterior = jobs.sample(options.run, max_steps=options.max_steps, progress=line, log=print)
+        posterior = jobs.sample(options.run, max_steps=options.max_steps, progress=line, log=show)
     return status.of_job(interrupted=posterior.interrupted)
 
 
@@ -120,10 +119,5 @@ def translate(options: argparse.Namespace) -> int:
     free = None if options.free is None else translation.read_free(options.free, target.ik, rig)
     request = TranslationRequest(source, target, animations, free, options.fps)
     with progress.ProgressLine(progress.fit_line) as line:
-        fitted = jobs.translate(request, options.output, progress=line, log=print)
+        fitted = jobs.translate(request, options.output, progress=line, log=show)
     return status.of_fit(fitted)
-
-
-def _print_now(text: str) -> None:
-    """Prints without waiting for a full buffer: the next line may take an hour."""
-    print(text, flush=True)

@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+from fitting.cli.terminal import show
 from fitting.experiments import systems
 from fitting.experiments.schema.experiment_schema import experiment_schema
 from fitting.jobs import examples
@@ -47,7 +48,7 @@ def example(options: argparse.Namespace) -> int:
         if options.output is not None:
             raise ValueError("-o needs the NAME of an experiment; `jaxik example` lists them")
         rows = [[name, title] for name, title in examples.names().items()]
-        print(aligned([["name", "experiment"], *rows]))
+        show(aligned([["name", "experiment"], *rows]))
         return 0
     folder = Path(options.name).name if options.output is None else options.output
     path = examples.copy(options.name, Path(folder), _schema_as_json())
@@ -66,7 +67,7 @@ def _width(output: Path | None) -> int:
 
 def _print_or_write(text: str, output: Path | None) -> int:
     if output is None:
-        print(text)
+        show(text)
     else:
         files.write_text(output, text + "\n")
         print(f"written to {output}")

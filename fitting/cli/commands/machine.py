@@ -1,6 +1,7 @@
 """Commands about this machine."""
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +9,9 @@ from fitting.bench import report as bench_report
 from fitting.bench import runner, suite
 from fitting.bench.sizes import FULL, QUICK
 from fitting.cli import progress
-from fitting.runtime import cache_folder
+from fitting.cli.terminal import show
+from fitting.report.guides.layout import wrapped
+from fitting.runtime import activity, cache_folder
 from fitting.runtime.validation import in_one_line
 
 from . import status
@@ -19,10 +22,11 @@ def bench(options: argparse.Namespace) -> int:
     chosen = suite.choose(suite.BENCHMARKS, options.only, options.quick)
     plot = bench_report.check_output_files(options.json, options.plot)
     sizes = QUICK if options.quick else FULL
-    with progress.ProgressLine(str) as line:
-        report = runner.run_benchmarks(chosen, sizes, options.quick, progress.print_line, line)
+    title = f"Running {len(chosen)} benchmarks"
+    with activity.announced(title), progress.ProgressLine(str) as line:
+        report = runner.run_benchmarks(chosen, sizes, options.quick, _print_line, line)
     written = bench_report.write(report, options.json, plot)
-    print(bench_report.text(report))
+    show(bench_report.text(report))
     for path in written:
         print(f"written to {path}")
     return status.of_job(interrupted=report.interrupted)
@@ -39,15 +43,24 @@ def cache(options: argparse.Namespace) -> int:
             path.unlink(missing_ok=True)
         print(f"removed {len(traced)} traced and {len(compiled)} compiled, {size}, from {folder}")
         return 0
-    print(f"place              {folder}")
-    print(f"traced programs    {len(traced)} ({_megabytes(traced)})")
-    print(f"compiled programs  {len(compiled)} ({_megabytes(compiled)})")
     try:
         cache_folder.traced()
-        print("used               yes")
+        used = "yes"
     except (cache_folder.SwitchedOffError, OSError) as error:
-        print(f"used               no: {in_one_line(error)}")
+        used = f"no: {in_one_line(error)}"
+    rows = [
+        ["place", f"{folder}"],
+        ["traced programs", f"{len(traced)} ({_megabytes(traced)})"],
+        ["compiled programs", f"{len(compiled)} ({_megabytes(compiled)})"],
+        ["used", used],
+    ]
+    show(wrapped(rows, max(len(cell) for row in rows for cell in row) + 100))
     return 0
+
+
+def _print_line(line: str) -> None:
+    """Prints a line on stderr that stays."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def _megabytes(paths: Sequence[Path]) -> str:

@@ -6,7 +6,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
+from fitting.cli.terminal import show
 from fitting.report.guides.layout import wrapped
+from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
 from . import machine
@@ -36,7 +38,7 @@ def print_findings(findings: Iterator[Finding], width: int) -> int:
     problems = []
     for finding in findings:
         mark = "!" if finding.problem else " "
-        print(wrapped([[f"{mark} {finding.subject:<18}", finding.fact]], width), flush=True)
+        show(wrapped([[f"{mark} {finding.subject:<18}", finding.fact]], width))
         if finding.problem:
             problems.append(finding)
     print()
@@ -66,14 +68,15 @@ def _in_other_process(options: Sequence[str]) -> Iterator[Finding]:
 
     The process does not take packages from the folder in which the command runs.
     """
-    if "--quick" not in options:
-        print("self-test: up to half a minute ...", file=sys.stderr, flush=True)
     command = [sys.executable, "-P", "-m", WITH_JAX, *options]
     environment = os.environ | {"PYTHONWARNINGS": "ignore"}
+    title = "Importing JAX" if "--quick" in options else "Self-test, up to half a minute"
     try:
-        done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=LONGEST, check=False
-        )
+        with activity.announced(title):
+            done = subprocess.run(
+                command, env=environment, capture_output=True, text=True, timeout=LONGEST,
+                check=False,
+            )  # fmt: skip
     except subprocess.TimeoutExpired:
         problem = f"no result after {LONGEST:g} s"
         yield Finding("JAX", "too slow", problem, "close other programs, or try --quick")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
 from .findings import Finding
@@ -58,7 +59,8 @@ def _packages(subject: str, requirements: list[Requirement], remedy: str) -> Fin
     """The versions of packages; a problem where one is missing, too old or cannot be imported."""
     versions = {requirement.name: _version(requirement.name) for requirement in requirements}
     fact = ", ".join(f"{name} {version or 'missing'}" for name, version in versions.items())
-    problems = [_problem(requirement, versions[requirement.name]) for requirement in requirements]
+    with activity.announced(f"Importing {subject}"):
+        problems = [_problem(entry, versions[entry.name]) for entry in requirements]
     return Finding(subject, fact, "; ".join(filter(None, problems)), remedy)
 
 

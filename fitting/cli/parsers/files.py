@@ -26,7 +26,9 @@ def add_inspect(commands: Commands) -> None:
         jaxik inspect walk.bvh --joints map.toml
         """,
     )  # fmt: skip
-    inspect.add_argument("clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf or .npz")
+    inspect.add_argument(
+        "clip", type=Path, metavar="CLIP", help=".bvh, .amc, .glb, .gltf, .c3d or .npz"
+    )
     inspect.add_argument("--json", action="store_true", help="as JSON")
     group = inspect.add_argument_group("how the clip is read (default: recognised or guessed)")
     group.add_argument(
@@ -51,7 +53,7 @@ def add_terrain(commands: Commands) -> None:
         """,
     )  # fmt: skip
     terrain.add_argument(
-        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf or .npz"
+        "clip", type=Path, metavar="CLIP", help="captured: .bvh, .amc, .glb, .gltf, .c3d or .npz"
     )
     add_output(terrain, "MESH", ".ply, .obj or .stl")
     terrain.add_argument(
@@ -132,3 +134,32 @@ def add_record(commands: Commands) -> None:
             default=30.0,
             help="rate of the gains' ticks (default: 30)",
         )
+
+
+def add_export(commands: Commands) -> None:
+    """`jaxik export`."""
+    export = add_command(
+        commands, "export", "write parameters as TOML, JSON, the game's record, or settings",
+        """
+        jaxik export runs/walk -o walk.json               parameters under our names
+        jaxik export runs/walk -o footik.bin              the game's record, or as .csv
+        jaxik export runs/walk --as unreal -o walk.csv    settings under Unreal's names, in cm
+        jaxik export walk.csv -o parameters.toml          and back
+
+        What a record or settings cannot hold is named, and nothing is written, unless --drop leaves
+        it out. Settings are those of ozz's foot IK sample, of Unreal's character or of Mec's
+        inspector, as .toml, .json or .csv.
+        """,
+    )  # fmt: skip
+    export.add_argument(
+        "source", type=Path, metavar="SOURCE",
+        help="folder of a run, parameter .toml or .json, record .bin or .csv, or settings",
+    )  # fmt: skip
+    add_output(export, "FILE", ".toml, .json, .csv or .bin")
+    export.add_argument(
+        "--as", dest="system", choices=("ozz", "unreal", "mec"),
+        help="write the settings of this system (default: parameters, or a record)",
+    )  # fmt: skip
+    export.add_argument(
+        "--drop", action="store_true", help="leave out what the record or settings cannot hold"
+    )

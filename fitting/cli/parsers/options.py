@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, TypeVar
 
+from fitting.cli.terminal.help_texts import help_formatter
 from fitting.runtime import validation
 
 Number = TypeVar("Number", int, float)
@@ -37,7 +38,7 @@ def add_command(
         help=summary,
         description=summary[0].upper() + summary[1:] + ".",
         epilog="example:\n" + textwrap.indent(textwrap.dedent(example).strip(), "  "),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=help_formatter(),
     )
 
 
@@ -52,7 +53,7 @@ def add_animation(command: argparse.ArgumentParser, *, required: bool = True) ->
     """Adds a flat animation, its terrain, and how they lie."""
     command.add_argument(
         "clip", type=Path, metavar="CLIP", nargs=None if required else "?",
-        help=".bvh, .amc, .glb, .gltf or .npz over flat ground; of a blocks .npz its base",
+        help=".bvh, .amc, .glb, .gltf, .c3d or .npz over flat ground; of a blocks .npz its base",
     )  # fmt: skip
     add_placement(command, required=required)
 

@@ -107,16 +107,20 @@ def clip_from_recording(
         joints = [leg.joints for leg in roles.legs]
         balls_ws = positions_ws[:, [leg[3] for leg in joints]]
         stance = contacts.detect_stances(balls_ws, rate, relative_size(positions_ws, joints))
+        if (known := recording.mask) is not None:  # nothing is measured on a guess
+            seen_ws, turned_ws, stance = positions_ws[known], rotations_ws[known], stance[known]
+        else:
+            seen_ws, turned_ws = positions_ws, rotations_ws
         for leg, stands in zip(roles.legs, stance.T, strict=True):
             if not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
-        rig = measure_rig(roles, positions_ws, rotations_ws, stance)
-        remarks += _guessed_knees(roles, positions_ws, rotations_ws)
-        remarks += _guessed_soles(rig, positions_ws, rotations_ws, stance)
+        rig = measure_rig(roles, seen_ws, turned_ws, stance)
+        remarks += _guessed_knees(roles, seen_ws, turned_ws)
+        remarks += _guessed_soles(rig, seen_ws, turned_ws, stance)
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
         float(rate), recording.frame_time, source, float(scale), up,
-        roles.dialect if roles else None, rig, remarks=tuple(remarks),
+        roles.dialect if roles else None, rig, mask=recording.mask, remarks=tuple(remarks),
         rest_rotations_ls=recording.rest_rotations_ls, channels=recording.channels,
     )  # fmt: skip
 

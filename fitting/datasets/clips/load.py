@@ -11,10 +11,11 @@ from . import formats
 from .assemble import Overrides, clip_from_recording
 from .clip import Clip
 from .formats.asfamc import read_asfamc
+from .formats.c3d import draft_marker_map, joint_name, read_c3d
 from .formats.gltf.reader import SUFFIXES as GLTF
 from .formats.gltf.reader import read_gltf
 from .formats.npz import read_npz
-from .joints.map_files import read_joint_map
+from .joints.map_files import read_joint_map, template
 
 JointMap = Mapping[str, str] | str | Path
 """Role to joint name, see `joint_roles.find_roles`; or a file that `joints.map_files` reads."""
@@ -82,7 +83,7 @@ def load_clip(
     variant: str = "captured",
     animation: str | None = None,
 ) -> Clip:
-    """Reads a BVH, AMC (with its ASF), glTF, GLB or NPZ file as a clip in metres with y up.
+    """Reads a BVH, AMC (with its ASF), glTF, GLB, C3D or NPZ file as a clip in metres with y up.
 
     Args:
         path: the file; its suffix selects the format.
@@ -93,7 +94,8 @@ def load_clip(
             animation is sampled at this rate, and any other plays as fast as it says.
         up: "y" or "z"; None takes the axis along which the pelvis is above the feet.
         joints: role to joint name, see `joint_roles.find_roles`, or a joint map, see
-            `joints.map_files`; None recognises the names.
+            `joints.map_files`; None recognises the names. Of a C3D file it names markers, see
+            `formats.c3d.reader.read_c3d`.
         variant: which clip of a file of the `blocks` benchmark: "captured" or "base", the flat
             animation.
         animation: which animation of a glTF file; None takes the only one.
@@ -126,10 +128,33 @@ def load_clip(
         raise ValueError(f"{path}: only blocks .npz files have the variant {variant!r}")
     if animation is not None and suffix not in GLTF:
         raise ValueError(f"{path}: only glTF files have an animation to choose, {animation!r}")
-    if suffix in GLTF:
+    if suffix == ".c3d":
+        recording = read_c3d(path, joints, scale)
+        if joints is not None:  # which named markers
+            overrides = replace(overrides, joints={role: joint_name(role) for role in joints})
+    elif suffix in GLTF:
         recording = read_gltf(path, animation, fps)
     elif asf is not None:
         recording = read_asfamc(path, Path(asf))
     else:
         recording = formats.READERS[suffix](path)
     return clip_from_recording(recording, path.name, overrides)
+
+
+def draft_joint_map(path: Path, options: ClipOptions) -> str:
+    """A joint map of a clip to be edited, with the best guess and all that it can name.
+
+    Args:
+        path: the file.
+        options: how it is read; a map among them is of no use.
+
+    Raises:
+        ValueError: as of `load_clip`, or the file is an NPZ, which takes no map.
+    """
+    if path.suffix.lower() == ".npz":
+        raise ValueError(f"{path}: an .npz states which joint is which, and takes no joint map")
+    if path.suffix.lower() == ".c3d":
+        check_file(path)
+        return draft_marker_map(path)
+    clip = load_clip(path, **vars(replace(options, joints=None)))
+    return template(clip.joint_names, clip.parents, clip.source)

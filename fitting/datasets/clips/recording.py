@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 INCH = 0.0254  # m
@@ -49,6 +49,8 @@ class Recording:
     """Rotation of each joint in the rest pose, wxyz, relative to its parent; None: unrotated."""
     channels: tuple[str, ...] | None = None
     """For each joint the channels of a BVH file, in its order and spelling, with blanks between."""
+    mask: Bool[np.ndarray, " frames"] | None = None
+    """False where the joints are a guess, as a marker was not seen; None where no frame is."""
     remarks: tuple[str, ...] = ()
     """Sentences for the user about anything missing or odd in the file."""
 

@@ -280,11 +280,12 @@ def flat_frames(
 def foot_axes(leg: LegMotion, flat: Bool[np.ndarray, " frames"]) -> Float64[np.ndarray, "4"]:
     """`ankle_from_foot`, wxyz: x left, y up and z forward of a flat foot, averaged over `flat`.
 
-    A foot without length points where the pelvis does.
+    A foot without length points where the pelvis does; along z if that points straight up or down.
     """
     foot = leg.toe[flat] - leg.ankle[flat]
     has_length = np.linalg.norm(foot[:, [0, 2]], axis=-1, keepdims=True) > 1e-3
     forward = unit(np.where(has_length, foot, np.cross(leg.left_ws[flat], UP)) * [1.0, 0.0, 1.0])
+    forward = np.where(forward.any(axis=-1, keepdims=True), forward, [0.0, 0.0, 1.0])
     up = np.broadcast_to(UP, forward.shape)
     axes = np.stack([np.cross(up, forward), up, forward], axis=-1)
     mean = (_rotation(leg.ankle_rot[flat]).inv() * Rotation.from_matrix(axes)).mean()

@@ -114,33 +114,52 @@ def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
     }
 
 
-def as_text(summary: ClipSummary) -> str:
-    """The summary as text for a terminal."""
+def rows(summary: ClipSummary) -> list[list[str]]:
+    """A heading of one cell, and below it rows of a subject, which may be empty, and its text."""
     joints, joint_map = summary["joints"], summary["joint_map"]
     lines = [
-        f"{summary['file']}: {summary['frames']} frames, {summary['seconds']:.2f} s at "
-        f"{summary['fps']:g} Hz (frame time {summary['raw_frame_time']:g} s is "
-        f"{summary['raw_fps']:.6g} Hz)",
-        f"  scale   {summary['scale']:.6g} m per unit, {summary['up_axis']} up; "
-        f"body {summary['body_height']:.3f} m high",
-        f"  joints  {len(joints)}: {', '.join(joints)}",
+        [
+            f"{summary['file']}: {summary['frames']} frames, {summary['seconds']:.2f} s at "
+            f"{summary['fps']:g} Hz (frame time {summary['raw_frame_time']:g} s is "
+            f"{summary['raw_fps']:.6g} Hz)"
+        ],
+        [
+            "scale",
+            f"{summary['scale']:.6g} m per unit, {summary['up_axis']} up; "
+            f"body {summary['body_height']:.3f} m high",
+        ],
+        ["joints", f"{len(joints)}: {', '.join(joints)}"],
     ]
     if summary["legs"]:
-        lines.append(f"  map     {summary['dialect']}; pelvis {joint_map['pelvis']}")
+        lines.append(["map", f"{summary['dialect']}; pelvis {joint_map['pelvis']}"])
     for name, leg in summary["legs"].items():
         names = ", ".join(f"{role} {joint_map[f'{role}_{name}']}" for role in LEG_ROLES)
         axis = ", ".join(f"{value:.3f}" for value in leg["knee_axis"])
         lines += [
-            f"  {name:<7} {names}",
-            f"          thigh {leg['thigh']:.3f} m, shin {leg['shin']:.3f} m, "
-            f"foot {leg['foot']:.3f} m; knee opens about ({axis})",
-            f"          ankle {leg['ankle_height']:.3f} m and ball {leg['ball_height']:.3f} m over "
-            "the sole",
-            f"          stands {leg['contacts']} times, {leg['contact_share']:.0%} of the frames "
-            f"(from the {leg['contacts_from']})",
+            [name, names],
+            [
+                "",
+                f"thigh {leg['thigh']:.3f} m, shin {leg['shin']:.3f} m, "
+                f"foot {leg['foot']:.3f} m; knee opens about ({axis})",
+            ],
+            [
+                "",
+                f"ankle {leg['ankle_height']:.3f} m and ball {leg['ball_height']:.3f} m over "
+                "the sole",
+            ],
+            [
+                "",
+                f"stands {leg['contacts']} times, {leg['contact_share']:.0%} of the frames "
+                f"(from the {leg['contacts_from']})",
+            ],
         ]
-    lines += [f"  note    {warning}" for warning in summary["warnings"]]
-    return "\n".join(lines)
+    return lines + [["note", warning] for warning in summary["warnings"]]
+
+
+def as_text(summary: ClipSummary) -> str:
+    """The summary as text for a pipe."""
+    (heading,), *rest = rows(summary)
+    return "\n".join([heading, *(f"  {subject:<7} {text}" for subject, text in rest)])
 
 
 def as_json(summary: ClipSummary) -> str:

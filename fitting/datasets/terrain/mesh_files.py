@@ -23,6 +23,7 @@ from jaxik.world import terrain
 from . import heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
+FAR = 512.0  # m; further from the origin, 32 bits do not hold a tenth of a millimetre
 WITH_MATERIALS = ("obj", *gltf_checks.KINDS)  # whose images need not be read
 # A file with z up is rotated about x, as glTF exporters do: (x, y, z) becomes (x, z, -y).
 _WORLD_FROM_FILE = {
@@ -152,9 +153,10 @@ def save_mesh(
     if Path(path).suffix.lower() != ".ply":
         trimesh.Trimesh(vertices, faces, process=False).export(path)
         return
+    number = "float" if np.abs(vertices).max(initial=0.0) < FAR else "double"
     lines = [
         "ply", "format ascii 1.0", f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property {number} {axis}" for axis in "xyz"),
         f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
         *(" ".join(f"{value:.4f}" for value in vertex) for vertex in np.round(vertices, 4) + 0.0),
         *(f"3 {a} {b} {c}" for a, b, c in faces),
@@ -201,7 +203,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
     content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
-        gltf_checks.check_claims(kind, content)
+        content = gltf_checks.checked(kind, content)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
             resolver = FilePathResolver(str(path))

@@ -134,6 +134,10 @@ TABLES = {
 }
 TOP_KEYS: dict[str, Constraint] = {
     "name": validation.TEXT.meaning("Title of the experiment; left out, the file's name."),
+    "written_in": validation.TEXT.meaning(
+        "Where the file was written: paths start there that lead nowhere from the file itself, as"
+        " after moving a run alone."
+    ),
     "preset": validation.TEXT.meaning("The system that is fitted."),
     "faithful": validation.BOOLEAN.meaning(
         "Whether the preset is the original, where the preset differs from it."

@@ -9,6 +9,7 @@ from fitting.inference.optimisation.search import cost_before, refine
 from fitting.inference.optimisation.settings import DEFAULTS, SearchSettings
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 
 from .model import likeliest_noise, noise_of, with_noise
 from .settings import NoiseOptions
@@ -45,7 +46,8 @@ def fit_with_noise(
     for _ in range(MAX_ROUNDS):
         if solution.interrupted:
             break
-        noise = likeliest_noise(problem, solution.u, options)
+        with activity.announced("Estimating the noise"):
+            noise = likeliest_noise(problem, solution.u, options)
         if noise.change_from(noise_of(problem)) < TOLERANCE:
             break
         problem = with_noise(problem, noise)

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
 from . import levenberg_marquardt
@@ -81,16 +82,19 @@ def find_best_fit(
     before, used_up, interrupted = np.inf, False, False
     ends: list[float] = []
     try:
-        before, latest = _begin(search, latest, search.array(np.asarray(first)))
-        for start in range(starts):
-            if agree(ends, settings):
-                break
-            state = dataclasses.replace(latest, start=start, start_steps=0)
-            try:
-                latest, costs = search_from(search, state, None if ends else first)
-            except StepsUsedUp as error:
-                latest, costs, used_up = error.state, [error.state.point.cost], True
-            ends += costs
+        with activity.announced("Preparing the programs of the search"):
+            before, latest = _begin(search, latest, search.array(np.asarray(first)))
+        with activity.announced(f"Searching from up to {starts} starts", starts) as searching:
+            for start in range(starts):
+                if agree(ends, settings):
+                    break
+                state = dataclasses.replace(latest, start=start, start_steps=0)
+                try:
+                    latest, costs = search_from(search, state, None if ends else first)
+                except StepsUsedUp as error:
+                    latest, costs, used_up = error.state, [error.state.point.cost], True
+                ends += costs
+                searching.advance()
     except KeyboardInterrupt:
         latest, interrupted = watch.latest or latest, True
         if not np.isfinite(latest.best.cost):
@@ -131,7 +135,8 @@ def refine(
         search = kept.attach(search, latest, 0)
     used_up = interrupted = False
     try:
-        latest = _polish(search, latest)
+        with activity.announced("Descending from there"):
+            latest = _polish(search, latest)
     except StepsUsedUp as error:
         latest, used_up = error.state, True
     except KeyboardInterrupt:

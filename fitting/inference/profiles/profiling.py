@@ -16,6 +16,7 @@ from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
 from fitting.problem.space import from_fractions, to_fractions
+from fitting.runtime import activity
 
 from .conditional import Points, Targets, join
 from .curves import SAME_PLACE, Curves
@@ -53,11 +54,15 @@ def find_curves(problem: Problem, solution: Solution, kept: KeptStages | None = 
     if kept is not None:
         keep = kept.recall_profiles(problem, np.asarray(solution.u), profiling.restore)
     try:
-        for stage in STAGES[profiling.stages :]:
-            stage(profiling)
-            profiling.stages += 1
-            if keep is not None:
-                keep(profiling.stored())
+        title = f"Following {problem.space.size} parameters over their ranges"
+        with activity.announced(title, len(STAGES)) as following:
+            for stage in STAGES[profiling.stages :]:
+                activity.note(stage.__name__.replace("_", " "))
+                stage(profiling)
+                profiling.stages += 1
+                following.reach(profiling.stages)
+                if keep is not None:
+                    keep(profiling.stored())
     finally:
         if kept is not None:
             kept.flush()

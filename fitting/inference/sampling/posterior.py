@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,9 @@ from jaxtyping import Array, Float
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, values_of_rows
+from fitting.runtime import activity
+from fitting.runtime.display.data_frames import data_frame
+from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
 
 from . import diagnostics
@@ -22,6 +25,9 @@ from .chain import Chain
 from .chain_file import Identity
 from .islands import Island
 from .settings import DEFAULTS, SamplerSettings
+
+if TYPE_CHECKING:
+    import pandas
 
 ROWS = 4096  # of u, whose values are computed at once
 
@@ -59,7 +65,7 @@ class WalkerStart:
 
 
 @dataclasses.dataclass(frozen=True)
-class Posterior:
+class Posterior(Shown):
     """A sampled posterior. `steps` counts stored steps, each `thin_by` steps of the sampler."""
 
     names: tuple[str, ...]
@@ -123,6 +129,14 @@ class Posterior:
 
         return to_inference_data(self, space)
 
+    def table(self) -> "pandas.DataFrame":
+        """The parameters by name, as pandas has tables: mean, sd, median, central intervals.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(self.summary, "name")
+
     @property
     def summary(self) -> list[diagnostics.ParameterSummary]:
         """One row per parameter, of the values that are kept."""
@@ -174,8 +188,9 @@ def sample_posterior(
                 progress(_describe_progress(chain, check, settings.max_steps, elapsed))
 
         outcome = _extend(problem, chain, start, settings, report)
-    at_start = _log_probability(problem, start, walkers)
-    sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
+    with activity.announced("Summing up the chain"):
+        at_start = _log_probability(problem, start, walkers)
+        sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
     return dataclasses.replace(sampled, start_log_probability=at_start)
 
 
@@ -207,16 +222,20 @@ def _extend(
     before = latest = None
     interrupted = False
     try:
-        for length in diagnostics.check_lengths(len(chain), interval, limit):
-            while len(chain) < length:
-                next(steps)
-                if len(chain) % interval == 0:
-                    report(latest)
-            chain.save()
-            before, latest = latest, _check(chain, length)
-            done, _ = diagnostics.verdict(before, latest, names, thin_by, settings.stop_at)
-            if done and length * thin_by >= settings.min_steps:
-                break
+        title = f"Sampling up to {limit * thin_by} steps of {chain.identity.walkers} walkers"
+        with activity.announced(title, limit * thin_by, done=len(chain) * thin_by) as sampling:
+            activity.note("preparing the program of a step")
+            for length in diagnostics.check_lengths(len(chain), interval, limit):
+                while len(chain) < length:
+                    next(steps)
+                    sampling.reach(len(chain) * thin_by)
+                    if len(chain) % interval == 0:
+                        report(latest)
+                chain.save()
+                before, latest = latest, _check(chain, length)
+                done, _ = diagnostics.verdict(before, latest, names, thin_by, settings.stop_at)
+                if done and length * thin_by >= settings.min_steps:
+                    break
     except KeyboardInterrupt:
         if not len(chain):
             raise

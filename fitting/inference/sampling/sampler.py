@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 from fitting.runtime.program_cache import cached
 from jaxik import lanes
 
@@ -119,7 +120,10 @@ def steps(
             [np.asarray(log_probabilities(problem, jnp.asarray(half)), float) for half in halves]
         )
 
-    last = chain.last or _start(identity, evaluate, centres, widths)
+    last = chain.last
+    if last is None:
+        with activity.announced(f"Placing {identity.walkers} walkers"):
+            last = _start(identity, evaluate, centres, widths)
     sampler = emcee.EnsembleSampler(
         identity.walkers,
         problem.space.size,

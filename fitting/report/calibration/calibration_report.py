@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
-from fitting.report.formatting import aligned, bullets, markdown, percent
+from fitting.report.formatting import aligned, bullets, joined, markdown, percent
 from fitting.report.plots import calibration_plots, style
 from fitting.runtime import files
 from fitting.runtime.storage.json_files import write_json
@@ -23,6 +23,16 @@ from .calibration_tables import checks_table, parameter_table
 NUMBERS, SUMMARY = "calibration.json", "summary.md"
 RANKS, RECOVERY = "ranks.png", "recovery.png"
 LISTED = 20  # replicates, at most, where some are named
+CAME_BACK = (
+    f"A parameter came back if its fitted value is within {percent(NEAR, 0)} of its range from the "
+    "truth; counted where the fit called it determined, which promises less, so that this is not "
+    "checked."
+)
+RANKED = (
+    f"The number of {DRAWS} independent draws of the posterior that are below the truth. All ranks "
+    "are equally likely where the posterior is right. A hump means a posterior that is too wide, a "
+    "trough one that is too narrow, a slope one that is shifted."
+)
 
 
 def fit_line(fitted: ReplicateFit) -> str:
@@ -58,10 +68,20 @@ def sentence(assessment: Assessment) -> str:
     return f"Not calibrated: on {made}, outside their bounds: {outside}. {coverage}"
 
 
+def explanation(assessment: Assessment) -> str:
+    """What was done, and what the bounds are."""
+    return (
+        "Truths were drawn from the prior, motion was simulated from them with the noise that the "
+        "experiment assumes, and each was fitted as `jaxik fit` does. Bounds are those of the "
+        f"probability behind a share, at {percent(assessment.level, 2)} each, so that with "
+        f"{percent(FAMILY_LEVEL, 0)} a program whose claims are true is inside all of them."
+    )
+
+
 def calibration_text(assessment: Assessment) -> str:
     """The result of a calibration, for the terminal."""
     tables = [aligned(checks_table(assessment)), aligned(parameter_table(assessment))]
-    return "\n\n".join([sentence(assessment), *tables, *_remarks(assessment)])
+    return joined([sentence(assessment), *tables, *_listed_remarks(assessment)], apart=True)
 
 
 def write(
@@ -75,19 +95,12 @@ def write(
     parts = [
         f"# {experiment.name}: calibration",
         sentence(assessment),
-        f"Truths were drawn from the prior, motion was simulated from them with the noise that the "
-        f"experiment assumes, and each was fitted as `jaxik fit` does. Bounds are those of the "
-        f"probability behind a share, at {percent(assessment.level, 2)} each, so that with "
-        f"{FAMILY_LEVEL:.0%} a program whose claims are true is inside all of them.".replace(
-            "95%", "95 %"
-        ),
+        explanation(assessment),
         markdown(checks_table(assessment)),
-        *_remarks(assessment),
+        *_listed_remarks(assessment),
         "## Parameters",
         markdown(parameter_table(assessment)),
-        f"A parameter came back if its fitted value is within {percent(NEAR, 0)} of its range from "
-        f"the truth; counted where the fit called it determined, which promises less, so that this "
-        f"is not checked.",
+        CAME_BACK,
         f"![Fitted against true values]({RECOVERY})",
     ]
     if assessment.ranks:
@@ -95,17 +108,20 @@ def write(
         style.save(folder / RANKS, calibration_plots.ranks(assessment.ranks, title))
         parts += [
             "## Ranks",
-            f"The number of {DRAWS} independent draws of the posterior that are below the truth. "
-            f"All ranks are equally likely where the posterior is right. A hump means a posterior "
-            f"that is too wide, a trough one that is too narrow, a slope one that is shifted.",
+            RANKED,
             f"![Ranks]({RANKS})",
         ]
     files.write_text(folder / SUMMARY, "\n\n".join(parts) + "\n")
 
 
-def _remarks(assessment: Assessment) -> list[str]:
-    """What the tables do not say, as a list; nothing if there is nothing to say."""
-    remarks = {
+def _listed_remarks(assessment: Assessment) -> list[str]:
+    lines = remarks(assessment)
+    return [bullets(lines)] if lines else []
+
+
+def remarks(assessment: Assessment) -> list[str]:
+    """What the tables do not say, a sentence each; nothing if there is nothing to say."""
+    sentences = {
         f"A fit is in the right valley if its cost is at most {SAME_VALLEY:g} above where a descent"
         f" from the truth ends; {percent(IN_VALLEY, 0)} should be. Replicates in another valley": (
             assessment.wrong
@@ -116,8 +132,7 @@ def _remarks(assessment: Assessment) -> list[str]:
             assessment.short_chains
         ),
     }
-    lines = [f"{words}: {_numbers(found)}." for words, found in remarks.items() if found]
-    return [bullets(lines)] if lines else []
+    return [f"{words}: {_numbers(found)}." for words, found in sentences.items() if found]
 
 
 def _numbers(found: tuple[int, ...]) -> str:

@@ -1,7 +1,7 @@
 """A first experiment: its files, and what it assumes as text for the terminal."""
 
 from fitting.report import terrain_report
-from fitting.report.formatting import aligned
+from fitting.report.formatting import aligned, joined
 from fitting.runtime import files
 from fitting.studies.drafts.draft import Draft, Ground
 
@@ -33,4 +33,4 @@ def text(draft: Draft) -> str:
         parts.append(
             "what is fitted has more than the game's record holds; for that: --record-only"
         )
-    return "\n".join(parts)
+    return joined(parts)

@@ -1,6 +1,5 @@
 """The file of a first experiment: every key with its meaning, those left out as comments."""
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import jaxik
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.schema.experiment_schema import experiment_schema
 from fitting.inference.choice import Forecast
+from fitting.runtime import files
 from fitting.runtime.validation import Content
 from fitting.studies.drafts.draft import Draft
 from jaxik.world.body import scaled_declarations
@@ -26,6 +26,7 @@ def as_toml(draft: Draft) -> str:
     experiment, schema = draft.experiment, experiment_schema()["properties"]
     folder = experiment.path.parent
     top = {name: getattr(experiment, name) for name in TOP}
+    top["written_in"] = folder.resolve().as_posix()
     noise = {"sigmas": experiment.noise.sigmas, "correlation": experiment.noise.correlation}
     parts = [OPENING.format(name=experiment.path.name), "", *_keys(top, _plain_keys(schema))]
     for entry in experiment.clips:
@@ -87,18 +88,10 @@ def _of_clip(entry: ClipEntry, folder: Path) -> dict[str, Any]:
     for name, default in vars(ClipEntry(Path(), Path())).items():
         value = getattr(entry, name)
         if isinstance(value, Path):
-            values[name] = _relative(value, folder)
+            values[name] = files.relative_path(value, folder)
         elif value != default:
             values[name] = value
     return values
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """A path from a folder, with slashes; whole where there is none, as on another drive."""
-    try:
-        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-    except ValueError:
-        return path.resolve().as_posix()
 
 
 def _value(value: Any) -> str:

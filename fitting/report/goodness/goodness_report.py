@@ -1,7 +1,7 @@
 """Goodness of fit: its text for the terminal, and its section of the run's summary.md."""
 
 from fitting.analysis.goodness import groups
-from fitting.report.formatting import Table, aligned, markdown, percent
+from fitting.report.formatting import Table, aligned, joined, markdown, percent
 from fitting.studies.fit import Fit
 
 from . import goodness_tables, noise_report
@@ -23,7 +23,7 @@ TOLERANCES = (
 
 def text(fitted: Fit) -> str:
     """The verdict and the sizes of the residuals, for the terminal."""
-    return f"{fitted.verdict.sentence}\n\n{aligned(_size_table(fitted))}"
+    return joined([fitted.verdict.sentence, aligned(_size_table(fitted))], apart=True)
 
 
 def section(fitted: Fit) -> list[str]:

@@ -2,7 +2,7 @@
 
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.record_only import left_out, set_aside
-from fitting.report.formatting import Table, aligned, markdown, number
+from fitting.report.formatting import Table, aligned, joined, markdown, number
 from fitting.report.labels import RESIDUALS
 from fitting.studies.record_price import RecordPrice
 
@@ -11,7 +11,7 @@ def text(experiment: Experiment, price: RecordPrice | None) -> str:
     """The price, for the terminal."""
     if price is None:
         return _sentence(experiment, price)
-    return f"{_sentence(experiment, price)}\n\n{aligned(_table(price))}"
+    return joined([_sentence(experiment, price), aligned(_table(price))], apart=True)
 
 
 def section(experiment: Experiment, price: RecordPrice | None) -> list[str]:

@@ -2,13 +2,13 @@
 
 import textwrap
 
-from fitting.report.formatting import Table
+from fitting.report.formatting import Table, TableText
 
 NARROWEST = 28  # characters of prose beside the other columns; else it goes below them
 INDENT = "    "
 
 
-def wrapped(table: Table, width: int) -> str:
+def wrapped(table: Table, width: int) -> TableText:
     """A table as lines of at most this many characters, where no single cell is wider.
 
     Args:
@@ -33,4 +33,4 @@ def wrapped(table: Table, width: int) -> str:
         else:
             lines.append(head.rstrip())
             lines += textwrap.wrap(prose, width, initial_indent=INDENT, subsequent_indent=INDENT)
-    return "\n".join(lines).strip("\n")
+    return TableText("\n".join(lines).strip("\n"), table, is_prose=True)

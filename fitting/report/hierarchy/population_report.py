@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fitting.report.formatting import aligned, bullets, interval, markdown, number
+from fitting.report.formatting import aligned, bullets, interval, joined, markdown, number
 from fitting.report.plots import style
 from fitting.runtime import files
 from fitting.runtime.storage.json_files import write_json
@@ -15,6 +15,17 @@ from .population_tables import CM, error_table, mean_error, parameter_table
 
 NUMBERS, SUMMARY, FIGURE = "population.json", "summary.md", "population.png"
 FEW = 5  # clips or subjects, from which little is known of a spread
+PARAMETERS = (
+    "Intervals are those of 95 %. **Fitted alone** is a fit of one clip, and **pooled** one of all "
+    "clips with the same values. In the population, what varies is normal around the centre, in "
+    "`u`, the coordinate of the prior; the spread is its standard deviation there. What a clip "
+    "leaves open comes from the others."
+)
+ERRORS = (
+    "Distance of pelvis, knees and ankles from the captured ones, rms over joints and frames. "
+    "**Left out** is the error of a clip that had no part in the fit: with the values pooled over "
+    "the others, and with those that the population of the others expects of it."
+)
 
 
 def found_line(found: Found) -> str:
@@ -25,7 +36,7 @@ def found_line(found: Found) -> str:
 def population_text(population: Population) -> str:
     """The result, for the terminal."""
     tables = [aligned(parameter_table(population)), aligned(error_table(population))]
-    return "\n\n".join([*tables, *_remarks(population)])
+    return joined([*tables, bullets(remarks(population))], apart=True)
 
 
 def write(folder: Path, population: Population) -> None:
@@ -36,36 +47,31 @@ def write(folder: Path, population: Population) -> None:
     write_json(folder / NUMBERS, population.summary)
     parts = [
         f"# {title}",
-        *_remarks(population),
+        bullets(remarks(population)),
         "## Parameters",
         markdown(parameter_table(population)),
-        "Intervals are those of 95 %. *Fitted alone* is a fit of one clip, and *pooled* one of all "
-        "clips with the same values. In the population, what varies is normal around the centre, "
-        "in `u`, the coordinate of the prior; the spread is its standard deviation there. What a "
-        "clip leaves open comes from the others.",
+        PARAMETERS,
         f"![Clips and their population]({FIGURE})",
         "## Errors",
         markdown(error_table(population)),
-        "Distance of pelvis, knees and ankles from the captured ones, rms over joints and frames. "
-        "*Left out* is the error of a clip that had no part in the fit: with the values pooled "
-        "over the others, and with those that the population of the others expects of it.",
+        ERRORS,
     ]
     files.write_text(folder / SUMMARY, "\n\n".join(parts) + "\n")
 
 
-def _remarks(population: Population) -> list[str]:
-    """What was found, as a list."""
+def remarks(population: Population) -> list[str]:
+    """What was found, a sentence each."""
     lines = [f"**Not converged**: {line}" for line in population.unconverged]
     lines += [
         _difference(population, row) for row in population.parameters if row["spread"] is not None
     ]
-    lines.append(_prediction(population))
+    lines.append(prediction(population))
     if (leg_length := population.leg_length) is not None:
         lines.append(
             f"Values are those of a body with legs of {number(leg_length)} m; those of each clip's "
             "body are dynamically similar."
         )
-    return [bullets(lines)]
+    return lines
 
 
 def _difference(population: Population, row: ParameterEstimates) -> str:
@@ -85,7 +91,7 @@ def _difference(population: Population, row: ParameterEstimates) -> str:
     return f"`{row['name']}` {words}{few}."
 
 
-def _prediction(population: Population) -> str:
+def prediction(population: Population) -> str:
     """How well a clip is predicted from the others."""
     by_population, by_pooled, alone = (
         f"{CM * mean_error(population, key):.2f} cm"

@@ -9,6 +9,7 @@ from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.missing_motion import describe_missing_motion
 from fitting.report.fit_tables import verdict
 from fitting.report.formatting import Table, bullets, interval, markdown, number, percent
+from fitting.runtime import activity
 from fitting.studies.fit import Fit, FittedParameter
 from jaxik.maths import parameter_tree
 
@@ -49,10 +50,12 @@ def sections(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
     if names:
         parts.append("What a clip would have to show to determine the rest:")
         parts.append(markdown(missing_table(fitted, clips)))
-    evidence = {
-        name: find_evidence(fitted.problem, fitted.solution.u, profile)
-        for name, profile in known.profiles.items()
-    }
+    evidence = {}
+    title = f"Finding what determines {len(known.profiles)} parameters"
+    with activity.announced(title, len(known.profiles)) as finding:
+        for name, profile in known.profiles.items():
+            evidence[name] = find_evidence(fitted.problem, fitted.solution.u, profile)
+            finding.advance()
     if any(evidence.values()):
         parts.append(
             "What determines each parameter: when it leaves its interval, the cost rises, most of "

@@ -6,12 +6,12 @@ from dataclasses import astuple, dataclass
 
 from fitting.analysis.accuracy import Accuracy
 from fitting.analysis.limit_activity import ClipActivity
+from fitting.analysis.placement import Placement
 from fitting.report import fit_tables, placement_report
 from fitting.report.fit_tables import Truth, verdict
 from fitting.report.formatting import Table, interval, number
 from fitting.report.labels import ACCURACY, headings
 from fitting.studies.fit import FittedParameter
-from fitting.studies.motions.fit_motions import ClipMotions
 
 NO_CORRECTION = ("bone_length",)  # figures that say nothing of how close two motions are
 
@@ -98,22 +98,20 @@ def limit_table(clips: Sequence[ClipActivity]) -> tuple[Table, list[str]]:
 
 
 def accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
-    """How far the motions before and after the fit are from the captured one."""
-    table = [["difference from the captured motion", "before", "fitted"]]
-    both = zip(astuple(accuracies["before"]), astuple(accuracies["fitted"]), strict=True)
-    rows = zip(ACCURACY.items(), headings(ACCURACY), both, strict=True)
-    for (key, column), heading, values in rows:
+    """How far motions are from the captured one; a column for each, by name."""
+    table = [["difference from the captured motion", *accuracies]]
+    values = zip(*map(astuple, accuracies.values()), strict=True)
+    rows = zip(ACCURACY.items(), headings(ACCURACY), values, strict=True)
+    for (key, column), heading, row in rows:
         if key not in NO_CORRECTION:
-            table.append([heading, *map(column.format, values)])
+            table.append([heading, *map(column.format, row)])
     return table
 
 
-def placement_table(clip: ClipMotions) -> Table:
-    """How the feet of each motion are placed on the ground."""
-    motions = (clip.animated, clip.before, clip.fitted, clip.captured)
-    tables = [placement_report.table(motion.placement) for motion in motions]
-    heading = tables[0][0][0]
-    table = [[heading, "flat animation", "before", "fitted", "captured"]]
+def placement_table(placements: Mapping[str, Placement]) -> Table:
+    """How the feet of motions are placed on the ground; a column for each, by name."""
+    tables = [placement_report.table(placement) for placement in placements.values()]
+    table = [[tables[0][0][0], *placements]]
     for rows in zip(*(table[1:] for table in tables), strict=True):
         cells = [" · ".join(filter(None, (share, place))) for _, share, place in rows]
         table.append([rows[0][0], *cells])

@@ -1,7 +1,6 @@
 """The page of a fit: `report.html` in its run's folder."""
 
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 import jaxik
 from fitting.analysis import worst_window
 from fitting.analysis.limit_activity import ClipActivity
+from fitting.analysis.placement import Placement
 from fitting.analysis.worst_window import WorstWindow
 from fitting.datasets.clips import flight
 from fitting.report import fit_tables, worst_window_report
@@ -22,7 +22,8 @@ from fitting.studies.motions.fit_motions import ClipMotions
 from fitting.studies.run_folder import PAGE
 from jaxik.maths import parameter_tree
 
-from . import figures, motion_data, rendering, sentences
+from . import asked, figures, motion_data, rendering, sentences
+from .motion_data import ShownClip, ShownMotion
 
 
 class Measured(NamedTuple):
@@ -46,22 +47,25 @@ def write(run: Path, fitted: Fit, measured: Measured) -> None:
         worst_window_report.describe(play, window, scene.rig.names)
         for play, window, scene in zip(fitted.playbacks, windows, fitted.problem.data, strict=True)
     ]
-    data = {"clips": _packed(fitted, motions, windows)}
-    rendering.write(run / PAGE, "fit.html", data, **content)
-
-
-def _packed(
-    fitted: Fit, motions: Sequence[ClipMotions], windows: Sequence[WorstWindow]
-) -> list[dict[str, Any]]:
-    clips = []
-    steps = motion_data.steps_between_frames(motions)
     labels = [scene.reference.label for scene in fitted.problem.data]
-    for clip, step, label, window in zip(motions, steps, labels, windows, strict=True):
-        names = {"animated": "flat animation", "before": "before the fit", "fitted": "fitted"}
-        worst = {"start": window.start // step, "end": window.end // step}
-        packed = motion_data.pack(clip, step, names | {"captured": label})
-        clips.append({"worst": worst, **packed})
-    return clips
+    clips = [shown(*each) for each in zip(motions, labels, windows, strict=True)]
+    rendering.write(run / PAGE, "fit.html", motion_data.pack(clips), **content)
+
+
+def shown(clip: ClipMotions, label: str, window: WorstWindow) -> ShownClip:
+    """What the page shows of one clip; `label` is what it calls the captured motion."""
+    worst = window.start, window.end
+    return ShownClip(
+        {
+            "animated": ShownMotion("flat animation", clip.animated, motion_data.ANIMATED),
+            "before": ShownMotion("before the fit", clip.before, motion_data.BEFORE),
+            "captured": ShownMotion(label, clip.captured, motion_data.CAPTURED, visible=True),
+            "fitted": ShownMotion("fitted", clip.fitted, motion_data.FITTED, True, worst),
+        },
+        clip.stance,
+        clip.ground,
+        watched="fitted",
+    )
 
 
 def _content(
@@ -84,14 +88,14 @@ def _content(
         "good": summary["converged"] and fitted.verdict.fits,
         "findings": sentences.findings(fitted, motions, accuracies),
         "technical": f"{summary['message']} {summary['goodness']['sentence']}",
-        "asked": _asked(fitted),
+        "requested": _asked(fitted),
         "rows": rows,
         "recovered": fit_tables.recovered(summary["parameters"], fitted.known_values)
         if fitted.known_values
         else "",
         "cost": (f"{summary['cost_before']:.6g}", f"{summary['cost']:.6g}"),
         "accuracy": figures.accuracy_table(accuracies),
-        "placements": [figures.placement_table(clip) for clip in motions],
+        "placements": [figures.placement_table(_placements(clip)) for clip in motions],
         "names": [entry.reference.name for entry in fitted.experiment.clips],
         "visible": f"{100 * motions[0].fitted.placement.visible:.2g} cm",
         "missing": missing_table(fitted, activities)[1:],
@@ -99,18 +103,21 @@ def _content(
         "limits": limits,
         "idle": idle,
         "remarks": _remarks(fitted),
-        "version": metadata.version("jaxik"),
     }
+
+
+def _placements(clip: ClipMotions) -> dict[str, Placement]:
+    motions = {"flat animation": clip.animated, "before": clip.before}
+    motions |= {"fitted": clip.fitted, "captured": clip.captured}
+    return {name: motion.placement for name, motion in motions.items()}
 
 
 def _asked(fitted: Fit) -> Table:
     """What the experiment asks for."""
     experiment = fitted.experiment
-    rules = [f"{stage} by {rule}" for stage, rule in experiment.rules.items()]
-    preset = experiment.preset + (", faithful to its original" if experiment.faithful else "")
     sigmas = fitted.playbacks[0].sigmas
     rows = [
-        ["System", ", ".join([preset, *rules])],
+        ["System", asked.system(experiment)],
         ["Free parameters", f"{len(experiment.free)}"],
     ]
     for number, (clip, entry) in enumerate(zip(fitted.clips, experiment.clips, strict=True), 1):
@@ -124,8 +131,7 @@ def _asked(fitted: Fit) -> Table:
         )
     kinds = [f"{kind} {float(sigmas[kind]):.3g}" for kind in fitted.playbacks[0].fitted_kinds]
     rows.append(["Noise, m and rad", ", ".join(kinds)])
-    rows.append(["Loss and seed", f"{experiment.loss}, {experiment.seed}"])
-    return rows
+    return [*rows, asked.loss_and_seed(experiment)]
 
 
 def _remarks(fitted: Fit) -> list[str]:

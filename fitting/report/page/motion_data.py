@@ -6,56 +6,147 @@ path. Ground is in steps of a 65,534th of its range.
 """
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from fitting.datasets.ground_patch import GroundPatch
-from fitting.studies.motions.fit_motions import ClipMotions, PlacedMotion
+from fitting.report.plots import style
+from fitting.studies.motions.placed_motion import PlacedMotion
 from jaxik.world import body
 
 MAX_RATE = 60.0  # frames per second that are shown
-MAX_BYTES = 4_000_000  # of all motions of a page, before base64 makes them a third longer
+MAX_BYTES = 5_500_000  # of all motions, grounds and pictures, before base64 adds a third
+MAX_GROUND_BYTES = 900_000  # of these, of the grounds
 LARGEST = 32_767  # of a 16-bit integer
 HOLE = 65_535  # in place of a height, where there is no ground
 
 
-def steps_between_frames(clips: Sequence[ClipMotions]) -> list[int]:
-    """How many frames of each clip make one on the page, for a page that is small enough."""
-    steps = [max(1, int(np.ceil(clip.captured.clip.fps / MAX_RATE - 0.01))) for clip in clips]
-    sizes = [sum(2 * _points(motion).size for motion in shown(clip).values()) for clip in clips]
-    while sum(size / step for size, step in zip(sizes, steps, strict=True)) > MAX_BYTES:
+class Look(NamedTuple):
+    """How a skeleton is drawn."""
+
+    colour: str
+    """As `#rrggbb`."""
+    radius: float
+    """Of its bones, m for an adult."""
+    opacity: float = 1.0
+    """Below 1 it is a shell of glass."""
+
+
+ANIMATED = Look(style.SLIDING, 0.012)
+BEFORE = Look(style.BEFORE, 0.015)
+CAPTURED = Look(style.CAPTURED, 0.034, 0.1)  # around what should be inside it
+FITTED = Look(style.AFTER, 0.02)
+
+
+@dataclass(frozen=True)
+class ShownMotion:
+    """A motion as the page shows it."""
+
+    label: str
+    motion: PlacedMotion
+    look: Look
+    visible: bool = False
+    """At first; the legend shows and hides it."""
+    worst: tuple[int, int] | None = None
+    """First and last frame of its worst seconds; None for one that cannot be watched."""
+
+
+@dataclass(frozen=True)
+class ShownClip:
+    """What the page shows of one clip."""
+
+    motions: Mapping[str, ShownMotion]
+    """By a key that is the same in all clips."""
+    stance: Bool[np.ndarray, "frames legs"]
+    ground: GroundPatch
+    watched: str
+    """Key of the motion that is watched at first."""
+
+    @property
+    def reference(self) -> PlacedMotion:
+        """The motion that gives frame rate, body and direction: the first one, as it was played."""
+        return next(iter(self.motions.values())).motion
+
+
+def pack(clips: Sequence[ShownClip], spent: int = 0) -> list[dict[str, Any]]:
+    """All clips of a page, with so few frames and so coarse a ground that it stays small.
+
+    Args:
+        clips: what is shown.
+        spent: bytes of the page's pictures.
+    """
+    grounds = coarse_grounds([clip.ground for clip in clips])
+    room = MAX_BYTES - spent - sum(map(_ground_bytes, grounds))
+    steps = steps_between_frames(clips, room)
+    return [
+        _pack_clip(clip, ground, step)
+        for clip, ground, step in zip(clips, grounds, steps, strict=True)
+    ]
+
+
+def steps_between_frames(clips: Sequence[ShownClip], room: int = MAX_BYTES) -> list[int]:
+    """How many frames of each clip make one on the page, for motions of so many bytes in all."""
+    frames = [len(clip.stance) for clip in clips]
+    steps = [max(1, math.ceil(clip.reference.clip.fps / MAX_RATE - 0.01)) for clip in clips]
+    sizes = [sum(_motion_bytes(shown.motion) for shown in clip.motions.values()) for clip in clips]
+    while sum(size / step for size, step in zip(sizes, steps, strict=True)) > room:
+        if all(step >= count for step, count in zip(steps, frames, strict=True)):
+            break  # one frame is left of each
         steps = [2 * step for step in steps]
     return steps
 
 
-def shown(clip: ClipMotions) -> dict[str, PlacedMotion]:
-    """The motions by the names under which the page has them, the most important one last."""
+def coarse_grounds(grounds: Sequence[GroundPatch]) -> list[GroundPatch]:
+    """The grounds, all with so few heights that together they take `MAX_GROUND_BYTES` at most."""
+    every = 1
+    while sum(map(_ground_bytes, grounds)) > MAX_GROUND_BYTES * every**2:
+        every += 1
+    return [
+        GroundPatch(ground.corner, every * ground.spacing, ground.heights[::every, ::every])
+        for ground in grounds
+    ]
+
+
+def _ground_bytes(ground: GroundPatch) -> int:
+    return 2 * ground.heights.size
+
+
+def _motion_bytes(motion: PlacedMotion) -> int:
+    frames, legs = motion.in_ground.shape
+    return 2 * _points(motion).size + frames * (12 + legs)
+
+
+def _pack_clip(clip: ShownClip, ground: GroundPatch, step: int) -> dict[str, Any]:
+    reference = clip.reference.clip
+    corner = np.append(ground.corner, _lowest(ground, clip.reference))[[0, 2, 1]]
     return {
-        "animated": clip.animated,
-        "before": clip.before,
-        "captured": clip.captured,
-        "fitted": clip.fitted,
+        "rate": reference.fps / step,
+        "frames": len(range(0, reference.frame_count, step)),
+        "size": float(body.ratio(reference.rig)),
+        "legs": list(reference.rig.names),
+        "forward": _travel(reference.positions_ws[:, reference.rig.pelvis]),
+        "stance": _bytes(_any_of(clip.stance, step)),
+        "watched": clip.watched,
+        "skeletons": [
+            {"key": key, **_pack_look(shown, step), **_pack_motion(shown.motion, step, corner)}
+            for key, shown in clip.motions.items()
+        ],
+        "ground": _pack_ground(ground, corner),
     }
 
 
-def pack(clip: ClipMotions, step: int, labels: Mapping[str, str]) -> dict[str, Any]:
-    """One clip with every `step`-th frame; `labels` are what the page calls the motions."""
-    captured = clip.captured.clip
-    corner = np.append(clip.ground.corner, _lowest(clip))[[0, 2, 1]]
+def _pack_look(shown: ShownMotion, step: int) -> dict[str, Any]:
+    worst = shown.worst
     return {
-        "rate": captured.fps / step,
-        "frames": len(range(0, captured.frame_count, step)),
-        "size": float(body.ratio(captured.rig)),
-        "legs": list(captured.rig.names),
-        "forward": _travel(captured.positions_ws[:, captured.rig.pelvis]),
-        "stance": _bytes(_any_of(clip.stance, step)),
-        "skeletons": [
-            {"key": key, "label": labels[key], **_pack_motion(motion, step, corner)}
-            for key, motion in shown(clip).items()
-        ],
-        "ground": _pack_ground(clip.ground, corner),
+        "label": shown.label,
+        **shown.look._asdict(),
+        "visible": shown.visible,
+        "worst": None if worst is None else {"start": worst[0] // step, "end": worst[1] // step},
     }
 
 
@@ -102,10 +193,10 @@ def _pack_ground(ground: GroundPatch, corner: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _lowest(clip: ClipMotions) -> float:
-    """Height of the lowest known ground, m, or else of the lowest captured joint."""
-    heights = clip.ground.heights
-    return float(np.nanmin(heights if np.isfinite(heights).any() else clip.captured.soles_ws))
+def _lowest(ground: GroundPatch, motion: PlacedMotion) -> float:
+    """Height of the lowest known ground, m, or else of the lowest sole of a motion."""
+    known = np.isfinite(ground.heights)
+    return float(np.nanmin(ground.heights if known.any() else motion.soles_ws))
 
 
 def _travel(pelvis: np.ndarray) -> list[float]:

@@ -1,20 +1,23 @@
 """Fills a page's template; styles, scripts and data become part of the one file."""
 
 import json
+import re
+from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import resources
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from fitting.report.plots import style
 from fitting.runtime import files
 
 PACKAGE = "fitting.report.page"
 STYLES = ("page.css", "viewer.css")
-SCRIPTS = (  # in the order in which they use each other
+SCRIPTS = ("theme.js",)
+VIEWER_SCRIPTS = (  # in the order in which they use each other
     "matrices.js",
     "skeletons.js",
     "shaders.js",
@@ -27,26 +30,27 @@ COLOURS = {  # of the plots, as variables of the style sheet
     "captured": style.CAPTURED,
     "fitted": style.AFTER,
     "before": style.BEFORE,
-    "animated": style.SLIDING,
     "determined": style.PRIOR,
 }
 
 
-def render(template: str, data: Any, **content: Any) -> str:
+def render(template: str, clips: Sequence[Mapping[str, Any]], **content: Any) -> str:
     """A page as HTML. What is not marked as HTML is escaped.
 
     Args:
         template: name of the file in `templates`.
-        data: for the scripts, as JSON holds it.
+        clips: what the view shows, as `motion_data.pack` gives it; none for a page without a view.
         content: the template's variables.
     """
+    scripts = (*SCRIPTS, *VIEWER_SCRIPTS) if clips else SCRIPTS
     return fragment(
         template,
         **content,
-        data=as_json(data),
+        data=as_json({"clips": clips}),
         colours=COLOURS,
+        version=metadata.version("jaxik"),
         style=Markup(_assets(STYLES)),
-        script=Markup(_assets(SCRIPTS)),
+        script=Markup(_assets(scripts)),
     )
 
 
@@ -55,9 +59,16 @@ def fragment(template: str, **content: Any) -> str:
     return _environment().get_template(template).render(**content)
 
 
-def write(path: Path, template: str, data: Any, **content: Any) -> None:
+def write(path: Path, template: str, clips: Sequence[Mapping[str, Any]], **content: Any) -> None:
     """Writes a page; see `render`."""
-    files.write_text(path, render(template, data, **content))
+    files.write_text(path, render(template, clips, **content))
+
+
+def prose(text: str) -> Markup:
+    """A sentence or a cell as HTML: what Markdown marks as code or as strong is so."""
+    html = str(escape(text))
+    html = re.sub(r"`([^`]+)`", r"<code>\1</code>", html)
+    return Markup(re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", html))
 
 
 def as_json(data: Any) -> Markup:
@@ -68,13 +79,15 @@ def as_json(data: Any) -> Markup:
 
 @cache
 def _environment() -> Environment:
-    return Environment(
+    environment = Environment(
         loader=PackageLoader(PACKAGE),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["prose"] = prose
+    return environment
 
 
 def _assets(names: tuple[str, ...]) -> str:

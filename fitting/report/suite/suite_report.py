@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from fitting.report.formatting import aligned, bullets, markdown
+from fitting.report.formatting import aligned, bullets, joined, markdown
 from fitting.report.labels import explanations
 from fitting.report.placement_report import numbers as placement_numbers
 from fitting.report.plots import style, suite_plots
@@ -29,13 +29,14 @@ def write(folder: Path, suite: Suite) -> None:
 
 def text(suite: Suite) -> str:
     """The table, the bounds, and how many cells are within them, for a terminal."""
-    parts = [aligned(suite_tables.table(suite))] if suite.scenes else []
+    parts: list[str] = [aligned(suite_tables.table(suite))] if suite.scenes else []
     parts.append("\n".join([f"bounds ({MISS} is beyond them):", *suite_tables.reasons()]))
     parts.append(suite_tables.count_text(suite))
-    return "\n\n".join(parts)
+    return joined(parts, apart=True)
 
 
-def _missed(suite: Suite) -> list[str]:
+def missed(suite: Suite) -> list[str]:
+    """What is beyond its bound, a line each."""
     return [
         f"{scene.situation.name}, {system}: {miss}"
         for scene in suite.scenes
@@ -46,7 +47,7 @@ def _missed(suite: Suite) -> list[str]:
 
 def _summary(suite: Suite) -> str:
     rows = [[_red(cell) for cell in row] for row in suite_tables.table(suite)]
-    missed = _missed(suite)
+    lines = missed(suite)
     parts = [
         "# Suite of situations",
         f"{suite_tables.count_text(suite).capitalize()}. Animations of "
@@ -60,7 +61,7 @@ def _summary(suite: Suite) -> str:
         "## Bounds",
         bullets(suite_tables.reasons()),
         "## Beyond their bounds",
-        bullets(missed) if missed else "Nothing.",
+        bullets(lines) if lines else "Nothing.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 

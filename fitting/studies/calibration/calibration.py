@@ -25,7 +25,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
-from fitting.runtime import cluster
+from fitting.runtime import activity, cluster
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import Content, error_context
 
@@ -179,12 +179,15 @@ class _Stage:
                 results[number] = self._read(number)
         missing = [number for number in range(self.replicates) if number not in results]
         computed = self._compute_here if self.client is None else self._compute_on_cluster
-        for number, result in computed(make, arguments, missing):
-            if self.folder is not None:
-                self._path(number).parent.mkdir(parents=True, exist_ok=True)
-                FILES[self.name].write(self._path(number), result)
-            results[number] = result
-            on_result(result)
+        title = f"Making the {self.name} of {self.replicates} replicates"
+        with activity.announced(title, self.replicates, done=len(results)) as making:
+            for number, result in computed(make, arguments, missing):
+                if self.folder is not None:
+                    self._path(number).parent.mkdir(parents=True, exist_ok=True)
+                    FILES[self.name].write(self._path(number), result)
+                results[number] = result
+                on_result(result)
+                making.advance()
         return [results[number] for number in range(self.replicates)]
 
     def _compute_here(

@@ -1,6 +1,6 @@
 """From clips, and whatever ground and animations there are for them, to a first experiment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from fitting.experiments.systems import DEFAULT_PRESET, Preset, preset_system
 from fitting.inference.choice import Forecast, choose_free
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.sensitivity import all_parameters
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 
@@ -123,7 +124,8 @@ def reconstruct_grounds(
     for i, clip in enumerate(clips):
         number = "" if names.count(names[i]) == 1 else f"_{i + 1}"
         with error_context("no --terrain, so the ground is reconstructed"):
-            terrain = reconstruct(clip)
+            with activity.announced(f"Reconstructing the ground of {names[i]}"):
+                terrain = reconstruct(clip)
         grounds.append(Ground(folder / f"ground_{names[i]}{number}.ply", terrain, clip))
     return tuple(grounds)
 
@@ -134,7 +136,6 @@ def draft(
     clips: Sequence[Clip],
     folder: Path,
     grounds: tuple[Ground | None, ...],
-    log: Callable[[str], object],
 ) -> Draft:
     """Chooses what to fit, and says what is assumed.
 
@@ -143,7 +144,6 @@ def draft(
         clips: that are loaded of it.
         folder: where the experiment is going to lie.
         grounds: of `reconstruct_grounds`, whose meshes are written.
-        log: called with a line before what takes long.
 
     Raises:
         ValueError: a file cannot be read, or nothing that could be free moves these clips.
@@ -161,7 +161,8 @@ def draft(
         noise=NoiseOptions(sigmas="estimated", correlation="whitened"),
         record_only=request.record_only,
     )
-    data = [load_clip_data(entry, experiment.fps, has_file=False) for entry in entries]
+    with activity.announced("Reading the clips and their ground"):
+        data = [load_clip_data(entry, experiment.fps, has_file=False) for entry in entries]
     rig = data[0].base.rig
     ik = experiment.starting_system(rig)
     candidates = {
@@ -170,8 +171,8 @@ def draft(
         if not request.record_only or name in PLACES
     }
     problem = problem_from_clips(replace(experiment, free=candidates), data)
-    log(f"trying {len(candidates)} parameters over their ranges")
-    forecasts = choose_free(problem.space.system, candidates, problem.data)
+    with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
+        forecasts = choose_free(problem.space.system, candidates, problem.data)
     free = {f.name: candidates[f.name] for f in forecasts if f.is_free}
     if not free:
         raise ValueError(

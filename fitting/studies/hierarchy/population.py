@@ -20,6 +20,7 @@ from fitting.inference.hierarchy.population_fit import (
 )
 from fitting.inference.optimisation.solution import Progress
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
 from .estimates import ParameterEstimates, summarise
@@ -157,15 +158,19 @@ def fit_clips_and_population(
     alone_u, pooled_u = np.array([found["u"] for found in alone]), np.array(pooled["u"])
     rounds = _Rounds(progress)
     starts = [np.tile(pooled_u, (len(clips), 1)), alone_u]
-    fit = fit_population(problems, grouping, starts, rounds.of("population"))
+    with activity.announced("Fitting the population"):
+        fit = fit_population(problems, grouping, starts, rounds.of("population"))
     errors, others = [], []
     for c, name in enumerate(clips):
         rest = f"{EVERYTHING} but {name}"
         others.append(searches.fit(rest, without_clip(pooled_problem, c))[1])
         others_u = np.array(others[c]["u"])
-        expected = predict(problems, grouping, fit, others_u, c, rounds.of(f"{rest}, population"))
-        points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
-        errors.append(ClipErrors(name, *(error_at(problems[c], u) for u in points)))
+        with activity.announced(f"Predicting {name} from the others"):
+            expected = predict(
+                problems, grouping, fit, others_u, c, rounds.of(f"{rest}, population")
+            )
+            points = (alone_u[c], pooled_u, fit.clips[c], others_u, expected)
+            errors.append(ClipErrors(name, *(error_at(problems[c], u) for u in points)))
     levels = [experiment.hierarchy.level(name) for name in names]
     return Population(
         experiment=experiment,

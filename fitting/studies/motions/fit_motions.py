@@ -4,15 +4,14 @@ The run folder keeps two of them, the flat animation and the fitted motion.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 
 import jaxik
-from fitting.analysis import accuracy, measures, placement
+from fitting.analysis import accuracy, placement
 from fitting.analysis.accuracy import Accuracy, Errors
-from fitting.analysis.placement import Placement
 from fitting.datasets import ground_patch
 from fitting.datasets.clip_frames import clip_from_result, raised
 from fitting.datasets.clips import Clip
@@ -21,19 +20,7 @@ from fitting.experiments.problems import ClipData
 from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit
 
-SOLES = ("ankle_height", "ball_height", "ankle_from_foot")  # of a rig: where the soles are
-
-
-@dataclass(frozen=True)
-class PlacedMotion:
-    """A motion, and how its feet are placed on the ground."""
-
-    clip: Clip
-    soles_ws: Float64[np.ndarray, "frames legs 2 3"]
-    """m, below ankles and balls."""
-    in_ground: Bool[np.ndarray, "frames legs"]
-    """Where a sole is visibly in the ground, as `placement` counts it."""
-    placement: Placement
+from .placed_motion import PlacedMotion, place, with_soles_of
 
 
 @dataclass(frozen=True)
@@ -74,8 +61,8 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
         fitted: what the fitted system makes of it.
     """
     animated = raised(data.base, data.root.rise)
-    solved = {"before": fitted_clip(data, before), "fitted": fitted_clip(data, fitted)}
     captured = with_soles_of(data.reference, data.base)
+    solved = {"before": fitted_clip(data, before), "fitted": fitted_clip(data, fitted)}
     placed = {
         name: _placed(clip, animated, data)
         for name, clip in {"animated": animated, **solved, "captured": captured}.items()
@@ -91,22 +78,9 @@ def clip_motions(data: ClipData, before: jaxik.Result, fitted: jaxik.Result) -> 
     )
 
 
-def with_soles_of(captured: Clip, flat: Clip) -> Clip:
-    """The captured clip with the soles of the flat animation.
-
-    Its own are measured as if it stood on a floor; on uneven ground they are not where they seem.
-    """
-    own, rig = captured.measured_rig, flat.measured_rig
-    if own is None or rig is None:
-        return captured
-    soles = {name: getattr(rig, name) for name in SOLES}
-    return replace(captured, measured_rig=replace(own, **soles))
-
-
 def _placed(clip: Clip, animated: Clip, data: ClipData) -> PlacedMotion:
     feet = placement.soles(clip, data.base, data.terrain)
-    placed = placement.assess(feet, clip, animated)
-    return PlacedMotion(clip, measures.soles(clip), feet.gap < -placed.visible, placed)
+    return place(clip, feet, placement.assess(feet, clip, animated))
 
 
 def summarised(motions: Sequence[ClipMotions]) -> dict[str, Accuracy]:

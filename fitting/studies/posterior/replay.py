@@ -20,6 +20,7 @@ from fitting.inference.sampling.blocks import BlockLogLikelihood
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem.problem import Problem
 from fitting.problem.scene import MEASURED, Scene
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 
 from . import likelihoods, predictive
@@ -55,12 +56,14 @@ def replay(problem: Problem[jaxik.FootIK], posterior: Posterior, seed: int) -> R
     u = marginal.thinned(posterior.kept_u)[::every]
     sigmas = {kind: draws[::every] for kind, draws in posterior.sigmas.items()}
     clips = [_Clip(problem, index, seed) for index in range(len(problem.data))]
-    for draw, row in enumerate(u):
-        ik = problem.space.unpack(jnp.asarray(row))
-        drawn = {kind: float(values[draw]) for kind, values in sigmas.items()}
-        replicated = draw % math.ceil(len(u) / REPLICATES) == 0
-        for clip in clips:
-            clip.add(ik, drawn, replicated)
+    with activity.announced(f"Playing {len(u)} draws of the posterior", len(u)) as playing:
+        for draw, row in enumerate(u):
+            ik = problem.space.unpack(jnp.asarray(row))
+            drawn = {kind: float(values[draw]) for kind, values in sigmas.items()}
+            replicated = draw % math.ceil(len(u) / REPLICATES) == 0
+            for clip in clips:
+                clip.add(ik, drawn, replicated)
+            playing.advance()
     ess = min(row["ess"] for row in posterior.summary)
     values = np.concatenate([clip.log_likelihood for clip in clips], axis=1)
     numbers = np.concatenate([np.full(len(clip.starts), clip.index + 1) for clip in clips])

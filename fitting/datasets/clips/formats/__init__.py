@@ -21,6 +21,7 @@ from fitting.datasets.clips.recording import Recording
 
 from .asfamc import read_asfamc
 from .bvh import read_bvh
+from .c3d import read_c3d
 from .gltf.reader import read_gltf
 
 READERS: Mapping[str, Callable[[Path], Recording]] = {
@@ -28,4 +29,5 @@ READERS: Mapping[str, Callable[[Path], Recording]] = {
     ".amc": read_asfamc,
     ".glb": read_gltf,
     ".gltf": read_gltf,
+    ".c3d": read_c3d,
 }

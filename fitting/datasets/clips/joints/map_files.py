@@ -34,6 +34,13 @@ TAIL = """
 #
 # All joints, each below its parent:
 """
+MARKER_TAIL = """
+# All lines are needed. A joint that is the mean of several markers has their names with a plus
+# between them, as in "LKNE + LKNM". Legs may have any names and number, on both sides: hip_left,
+# ...; names that end in l or left are of left legs.
+#
+# All markers:
+"""
 KNOWN = "These names were recognised, so no map is needed."
 GUESSED = "Guessed: check every line, and fill in what is empty."
 # What the names of joints contain, in the order in which it is looked for.
@@ -94,6 +101,19 @@ def template(names: tuple[str, ...], parents: tuple[int, ...], source: str) -> s
     tree = [f"#{'  ' * depth[joint]}{_shown(name)}" for joint, name in enumerate(names)]
     head = HEAD.format(source=_shown(source), state=GUESSED if match is None else KNOWN)
     return f"{head}\n{tomli_w.dumps(roles)}{TAIL}" + "\n".join(tree)
+
+
+def marker_template(names: tuple[str, ...], roles: dict[str, str], source: str) -> str:
+    """A joint map of markers to be edited: a guess of each role, and all markers.
+
+    Args:
+        names: the markers.
+        roles: "" where nothing is guessed.
+        source: name of the clip.
+    """
+    head = HEAD.format(source=_shown(source), state=GUESSED)
+    markers = "\n".join(f"#{_shown(name)}" for name in names)
+    return f"{head}\n{tomli_w.dumps(roles)}{MARKER_TAIL}{markers}"
 
 
 def _guess(names: tuple[str, ...], parents: tuple[int, ...]) -> dict[str, str]:

@@ -1,7 +1,5 @@
 // Ties data, view and controls together. What tests read stands in the canvas's data attributes.
 
-const element = (id) => document.getElementById(id);
-
 function showFailure() {
   element("failure").hidden = false;
   for (const part of document.querySelectorAll(".controls, .options, .to-worst")) part.hidden = true;
@@ -23,7 +21,8 @@ class Player {
   constructor(clips) {
     this.clips = clips;
     this.canvas = element("view");
-    this.shown = new Set(["captured", "fitted"]);
+    const visible = clips.flatMap((clip) => clip.skeletons).filter((skeleton) => skeleton.visible);
+    this.shown = new Set(visible.map((skeleton) => skeleton.key));
     this.playing = false;
     this.time = 0; // frames
     this.stage = makeStage(this.canvas);
@@ -32,7 +31,6 @@ class Player {
     this.camera = new Camera(this.canvas, () => this.request());
     this.timeline = new Timeline(element("timeline"));
     this.readPalette();
-    this.makeLegend();
     this.connect();
     this.setClip(0);
   }
@@ -43,15 +41,32 @@ class Player {
     this.skeletons = this.clip.skeletons.map((packed) => new Skeleton(packed, this.clip.legs.length));
     this.stage.setGround(new Ground(this.clip.ground, this.clip.size));
     element("time").max = this.clip.frames - 1;
-    this.timeline.setClip(this.clip, this.skeletons.at(-1));
+    this.makeLegend();
+    this.watch(this.watched?.key ?? this.clip.watched);
     this.seek(0);
     this.play(false);
-    this.camera.setClip(this.clip, ...this.skeletons.at(-1).reach());
+    this.camera.setClip(this.clip, ...this.watched.reach());
     this.camera.follow(this.pelvis());
   }
 
+  // What the marks over the slider, the red feet's label, the shadow and the camera belong to.
+  watch(key) {
+    const candidates = this.skeletons.filter((skeleton) => skeleton.worst);
+    this.watched = candidates.find((skeleton) => skeleton.key === key) ?? candidates[0];
+    const choice = element("watched");
+    choice.replaceChildren(...candidates.map(({ key, label }) => new Option(label, key)));
+    choice.value = this.watched.key;
+    choice.parentElement.hidden = candidates.length < 2;
+    this.shown.add(this.watched.key);
+    for (const box of element("legend").querySelectorAll("input")) box.checked = this.shown.has(box.dataset.key);
+    this.timeline.setClip(this.clip, this.watched);
+    this.timeline.point(this.time);
+    this.request();
+  }
+
   makeLegend() {
-    for (const { key, label } of this.clips[0].skeletons) {
+    element("legend").replaceChildren();
+    for (const { key, label, colour } of this.skeletons) {
       const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: this.shown.has(key) });
       box.dataset.key = key;
       box.addEventListener("change", () => {
@@ -60,7 +75,7 @@ class Player {
       });
       const swatch = document.createElement("span");
       swatch.className = "swatch";
-      swatch.style.background = `var(--${key})`;
+      swatch.style.background = colour;
       const entry = document.createElement("label");
       entry.append(box, swatch, label);
       element("legend").append(entry);
@@ -74,6 +89,7 @@ class Player {
       this.seek(Number(event.target.value));
     });
     element("follow").addEventListener("change", () => this.request());
+    element("watched").addEventListener("change", (event) => this.watch(event.target.value));
     element("jump").addEventListener("click", () => this.showWorst());
     element("clip")?.addEventListener("change", (event) => this.setClip(Number(event.target.value)));
     for (const button of document.querySelectorAll("[data-view]")) {
@@ -83,6 +99,7 @@ class Player {
       button.addEventListener("click", () => {
         if (element("clip")) element("clip").value = button.dataset.clip;
         if (this.index !== Number(button.dataset.clip)) this.setClip(Number(button.dataset.clip));
+        if (button.dataset.key) this.watch(button.dataset.key);
         this.showWorst();
         const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
         element("motion").scrollIntoView({ behavior: still ? "auto" : "smooth" });
@@ -103,8 +120,8 @@ class Player {
 
   showWorst() {
     this.play(false);
-    this.seek(this.clip.worst.start);
-    this.play(true, this.clip.worst.end);
+    this.seek(this.watched.worst.start);
+    this.play(true, this.watched.worst.end);
   }
 
   // Plays to the last frame, or to another one.
@@ -132,8 +149,7 @@ class Player {
   }
 
   pelvis() {
-    const main = this.skeletons.at(-1);
-    return main.point(main.pelvis);
+    return this.watched.point(this.watched.pelvis);
   }
 
   request() {
@@ -155,22 +171,24 @@ class Player {
     }
     if (element("follow").checked) this.camera.follow(this.pelvis());
     const shown = this.skeletons.filter((skeleton) => this.shown.has(skeleton.key));
+    shown.sort((a, b) => (a === this.watched) - (b === this.watched)); // it throws the shadow
     this.stage.draw(shown, this.time, this.camera, this.palette);
     this.describe(shown);
   }
 
   // In words, and for tests.
   describe(shown) {
-    const fitted = this.skeletons.at(-1);
-    const sunk = this.shown.has("fitted") ? fitted.sunkLegs(this.time) : [];
+    const { watched } = this;
+    const sunk = shown.includes(watched) ? watched.sunkLegs(this.time) : [];
     const names = this.clip.legs.filter((_, leg) => sunk[leg]);
     element("alert").hidden = !names.length;
-    element("alert").textContent = `${fitted.label}: ${names.join(", ")} sole in the ground`;
-    const ankles = fitted.legs.map((joints) => fitted.point(joints[2]).map((value) => value.toFixed(4)));
+    element("alert").textContent = `${watched.label}: ${names.join(", ")} sole in the ground`;
+    const ankles = watched.legs.map((joints) => watched.point(joints[2]).map((value) => value.toFixed(4)));
     Object.assign(this.canvas.dataset, {
       frame: Math.round(this.time),
       clip: this.index,
       playing: this.playing,
+      watched: watched.key,
       shown: shown.map((skeleton) => skeleton.key).join(" "),
       ankles: ankles.map((point) => point.join(",")).join(" "),
     });
@@ -187,44 +205,23 @@ class Player {
   readPalette() {
     const style = getComputedStyle(document.documentElement);
     const dark = document.documentElement.dataset.theme === "dark";
-    const colour = (name) => {
-      const digits = style.getPropertyValue(name).trim().slice(1);
-      return [0, 2, 4].map((at) => parseInt(digits.slice(at, at + 2), 16) / 255);
-    };
-    const light = (parts) => (dark ? parts.map((part) => part + 0.22 * (1 - part)) : parts);
+    const parts = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
+    const colour = (name) => parts(style.getPropertyValue(name).trim());
+    const light = (rgb) => (dark ? rgb.map((part) => part + 0.22 * (1 - part)) : rgb);
     this.palette = {
       low: colour("--ground-low"), high: colour("--ground-high"), grid: colour("--grid"),
       sky: colour("--sky"), sunk: colour("--sunk"),
     };
-    for (const key of Object.keys(LOOKS)) this.palette[key] = light(colour(`--${key}`));
+    for (const { key, colour: hex } of this.clips.flatMap((clip) => clip.skeletons)) {
+      this.palette[key] = light(parts(hex));
+    }
   }
 }
 
-// Light or dark: as the system says, until the button is pressed; paper is always light.
-function connectTheme(changed) {
-  const system = matchMedia("(prefers-color-scheme: dark)");
-  let chosen = null;
-  const show = (theme) => {
-    document.documentElement.dataset.theme = theme;
-    element("theme").setAttribute("aria-label", theme === "dark" ? "Switch to light" : "Switch to dark");
-    changed();
-  };
-  const current = () => chosen ?? (system.matches ? "dark" : "light");
-  system.addEventListener("change", () => show(current()));
-  element("theme").addEventListener("click", () => {
-    chosen = current() === "dark" ? "light" : "dark";
-    show(chosen);
-  });
-  addEventListener("beforeprint", () => show("light"));
-  addEventListener("afterprint", () => show(current()));
-  show(current());
-}
-
-let player = null;
-connectTheme(() => {
-  if (!player?.palette) return;
+const player = new Player(JSON.parse(element("data").textContent).clips);
+onTheme(() => {
+  if (!player.palette) return;
   player.readPalette();
   player.frame(performance.now());
   player.drawStill();
 });
-player = new Player(JSON.parse(element("data").textContent).clips);

@@ -1,7 +1,6 @@
 // Ground with a grid of metres and soft shadows of the bones, and bones as capsules.
 
 const LIGHT = normalise([0.45, 1.0, 0.25]);
-const MAX_SHADOWS = 64; // bones that throw a shadow
 
 const GROUND_VERTICES = `#version 300 es
 in vec3 position;
@@ -26,9 +25,9 @@ in float inside;
 uniform vec3 low, high, grid, sky, light, target;
 uniform vec2 heights;
 uniform float reach, size;
-uniform int shadows;
-uniform vec4 starts[${MAX_SHADOWS}];
-uniform vec4 ends[${MAX_SHADOWS}];
+uniform int shadows; // bones that throw one: start and end in a row each
+uniform highp sampler2D bones;
+uniform vec3 middle; // x and z of the bones, and how far from there they and their shadows reach
 out vec4 colour;
 
 float lines(vec2 at, float spacing) {
@@ -46,11 +45,13 @@ void main() {
   base *= shade;
   base = mix(base, grid, 0.45 * lines(place.xz, 1.0) + 0.12 * lines(place.xz, 0.25));
   float shadow = 0.0;
-  for (int i = 0; i < shadows; i++) {
-    vec3 along = ends[i].xyz - starts[i].xyz;
-    vec2 offset = place.xz - starts[i].xz;
+  int count = distance(place.xz, middle.xy) < middle.z ? shadows : 0;
+  for (int i = 0; i < count; i++) {
+    vec3 start = texelFetch(bones, ivec2(0, i), 0).xyz;
+    vec3 along = texelFetch(bones, ivec2(1, i), 0).xyz - start;
+    vec2 offset = place.xz - start.xz;
     float part = clamp(dot(offset, along.xz) / max(dot(along.xz, along.xz), 1e-6), 0.0, 1.0);
-    float above = max(starts[i].y + part * along.y - place.y, 0.0) / size;
+    float above = max(start.y + part * along.y - place.y, 0.0) / size;
     float radius = size * (0.035 + 0.09 * above);
     float near = length(offset - part * along.xz) / radius;
     shadow = max(shadow, (1.0 - smoothstep(0.3, 1.0, near)) / (1.0 + 3.0 * above));

@@ -1,12 +1,5 @@
 // Draws ground and skeletons with WebGL 2.
 
-const LOOKS = {
-  // Radius of the bones, m for an adult, and opacity. Captured is a shell of glass around fitted.
-  animated: { radius: 0.012, opacity: 1.0 },
-  before: { radius: 0.015, opacity: 1.0 },
-  captured: { radius: 0.034, opacity: 0.1 },
-  fitted: { radius: 0.02, opacity: 1.0 },
-};
 const HIDDEN = 0.22; // strength of what is behind or in the ground
 const FIELDS_OF_BONE = 11; // start, end, colour with opacity, radius
 
@@ -19,6 +12,7 @@ class Stage {
     this.groundProgram = this.program(GROUND_VERTICES, GROUND_COLOURS);
     this.boneProgram = this.program(BONE_VERTICES, BONE_COLOURS);
     this.bones = this.boneBuffers();
+    this.shadowTexture = this.texture();
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
@@ -78,6 +72,16 @@ class Stage {
     return { vertices, instances, count: triangles.length };
   }
 
+  texture() {
+    const gl = this.gl;
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+    }
+    return texture;
+  }
+
   setGround(ground) {
     const gl = this.gl;
     this.ground = ground;
@@ -105,7 +109,7 @@ class Stage {
     return width / height;
   }
 
-  // Draws posed skeletons; `palette` has colours of 0 to 1 by name.
+  // Draws posed skeletons, the one that throws the shadow last; `palette` has colours of 0 to 1 by name.
   draw(skeletons, time, camera, palette) {
     const gl = this.gl;
     const view = camera.matrix(this.resize());
@@ -113,7 +117,7 @@ class Stage {
     gl.clearColor(...palette.sky, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     this.drawGround(skeletons, view, camera, palette);
-    const opaqueFirst = [...skeletons].sort((a, b) => LOOKS[b.key].opacity - LOOKS[a.key].opacity);
+    const opaqueFirst = [...skeletons].sort((a, b) => b.opacity - a.opacity);
     for (const skeleton of opaqueFirst) this.drawSkeleton(skeleton, time, view, camera, palette);
   }
 
@@ -127,20 +131,29 @@ class Stage {
     gl.uniform2f(uniform("heights"), ground.lowest, ground.highest);
     gl.uniform1f(uniform("reach"), Math.max(6 * ground.size, 2.2 * camera.distance));
     gl.uniform1f(uniform("size"), ground.size);
-    const starts = [], ends = [];
-    const thrower = skeletons.at(-1); // the most important one
-    for (const [a, b] of thrower ? thrower.bones.slice(0, MAX_SHADOWS) : []) {
-      starts.push(...thrower.point(a), 0);
-      ends.push(...thrower.point(b), 0);
-    }
-    gl.uniform1i(uniform("shadows"), starts.length / 4);
-    if (starts.length) {
-      gl.uniform4fv(uniform("starts"), starts);
-      gl.uniform4fv(uniform("ends"), ends);
-    }
+    this.setShadows(skeletons.at(-1), uniform);
     gl.enable(gl.BLEND);
     gl.bindVertexArray(this.groundVertices);
     gl.drawElements(gl.TRIANGLES, ground.triangles.length, gl.UNSIGNED_INT, 0);
+  }
+
+  // All bones of a skeleton, if there is one, for the shader of the ground.
+  setShadows(thrower, uniform) {
+    const gl = this.gl;
+    const bones = thrower?.bones ?? [];
+    const points = new Float32Array(bones.flatMap(([a, b]) => [...thrower.point(a), 0, ...thrower.point(b), 0]));
+    gl.bindTexture(gl.TEXTURE_2D, this.shadowTexture);
+    if (bones.length) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 2, bones.length, 0, gl.RGBA, gl.FLOAT, points);
+    gl.uniform1i(uniform("bones"), 0);
+    gl.uniform1i(uniform("shadows"), bones.length);
+    const [x, , z] = thrower ? thrower.point(thrower.pelvis) : [0, 0, 0];
+    let reach = 0, highest = -Infinity;
+    for (let i = 0; i < points.length; i += 4) {
+      reach = Math.max(reach, Math.hypot(points[i] - x, points[i + 2] - z));
+      highest = Math.max(highest, points[i + 1]);
+    }
+    const softness = 0.035 * this.ground.size + 0.09 * Math.max(highest - this.ground.lowest, 0);
+    gl.uniform3f(uniform("middle"), x, z, reach + softness);
   }
 
   drawSkeleton(skeleton, time, view, camera, palette) {
@@ -174,13 +187,12 @@ class Stage {
 
   // Bones, soles and lines from the foot's joints to its sole, red where the foot is in the ground.
   instances(skeleton, sunk, palette) {
-    const look = LOOKS[skeleton.key];
     const size = this.ground.size;
     const colour = palette[skeleton.key];
     const bones = [];
     const bone = (a, b, inGround, thickness = 1) => {
-      const radius = size * look.radius * thickness * (inGround ? 1.4 : 1);
-      const opacity = inGround ? 1 : look.opacity;
+      const radius = size * skeleton.radius * thickness * (inGround ? 1.4 : 1);
+      const opacity = inGround ? 1 : skeleton.opacity;
       bones.push(...skeleton.point(a), ...skeleton.point(b), ...(inGround ? palette.sunk : colour), opacity, radius);
     };
     for (const [a, b] of skeleton.bones) {

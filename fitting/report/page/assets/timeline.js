@@ -29,9 +29,9 @@ class Timeline {
     return element;
   }
 
-  setClip(clip, fitted) {
+  setClip(clip, watched) {
     this.clip = clip;
-    this.fitted = fitted;
+    this.watched = watched;
     this.stance = new Uint8Array(bytesOf(clip.stance));
     this.drawAll();
   }
@@ -55,9 +55,9 @@ class Timeline {
     };
     clip.legs.forEach((name, leg) => {
       for (const stretch of Timeline.stretches(this.stance, legs, leg, clip.frames)) bar(stretch, leg, "stance", 7);
-      for (const stretch of Timeline.stretches(this.fitted.inGround, legs, leg, clip.frames)) bar(stretch, leg, "sunk", 5);
+      for (const stretch of Timeline.stretches(this.watched.inGround, legs, leg, clip.frames)) bar(stretch, leg, "sunk", 5);
     });
-    const [start, end] = [this.x(clip.worst.start), this.x(clip.worst.end)];
+    const [start, end] = [this.x(this.watched.worst.start), this.x(this.watched.worst.end)];
     this.element("path", { class: "worst", d: `M${start} 9V4H${end}V9` });
     this.now = this.element("line", { class: "now", y1: 2, y2: height });
     this.point(0);

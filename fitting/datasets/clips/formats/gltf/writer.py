@@ -5,14 +5,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
 from fitting.datasets.terrain.meshes import Mesh
 
-FLOAT, UNSIGNED = 5126, 5125  # component types
+from .bones import bone_mesh
+
+COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123}
 MAGIC, VERSION = b"glTF", 2
+BODY = "body"
 STILL = 1e-6  # m; a joint that moves less against its parent needs no track of positions
 TERRAIN = "terrain"
 GREY = [0.6, 0.6, 0.6, 1.0]
@@ -27,14 +31,18 @@ class _Buffer:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, *, with_range: bool = False) -> int:
-        """Appends an array of 32-bit numbers, and returns the index of its accessor."""
-        component = UNSIGNED if array.dtype.kind in "iu" else FLOAT
-        array = array.astype("<u4" if component == UNSIGNED else "<f4")
+        """Appends numbers of 16 bits as they are, others in 32; returns the accessor's index."""
+        whole = "<u2" if array.dtype == np.uint16 else "<u4"
+        dtype = whole if array.dtype.kind in "iu" else "<f4"
+        array = array.astype(dtype)
         self.views.append(
             {"buffer": 0, "byteOffset": len(self.content), "byteLength": array.nbytes}
         )
         self.content += array.tobytes()
-        accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": component}
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views) - 1,
+            "componentType": COMPONENTS[dtype],
+        }
         accessor |= {"count": len(array), "type": kind}
         if with_range:
             columns = array.reshape(len(array), -1)
@@ -46,6 +54,8 @@ class _Buffer:
 def glb_bytes(clip: Clip, ground: Mesh | None = None) -> bytes:
     """A GLB file: metres, y up; each joint is a node under its own name, and all are one skin.
 
+    A mesh of bones hangs on the skin, as some programs take no skeleton without a mesh.
+
     Args:
         clip: any clip.
         ground: world space; a node of its own beside the skeleton.
@@ -53,6 +63,7 @@ def glb_bytes(clip: Clip, ground: Mesh | None = None) -> bytes:
     buffer, joints = _Buffer(), len(clip.parents)
     rest = np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1))
     rest = rest if clip.rest_rotations_ls is None else clip.rest_rotations_ls
+    at_rest = _rest_pose(clip, rest)
     nodes: list[dict[str, Any]] = [
         {"name": name, "translation": list(map(float, offset)), "rotation": _xyzw(rot).tolist()}
         for name, offset, rot in zip(clip.joint_names, clip.offsets_ls, rest, strict=True)
@@ -69,16 +80,20 @@ def glb_bytes(clip: Clip, ground: Mesh | None = None) -> bytes:
         "skins": [{
             "name": "skeleton",
             "joints": list(range(joints)),
-            "inverseBindMatrices": buffer.add(_inverse_bind_matrices(clip, rest), "MAT4"),
+            "inverseBindMatrices": buffer.add(_inverse_bind_matrices(*at_rest), "MAT4"),
         }],
+        "meshes": [_body(at_rest[0], clip.parents, buffer)],
         "animations": [_animation(clip, buffer)],
     }  # fmt: skip
     if len(roots) == 1:
         document["skins"][0]["skeleton"] = roots[0]
+    beside = [{"name": BODY, "mesh": 0, "skin": 0}]
     if ground is not None:
-        document |= _ground(ground, buffer)
-        nodes.append({"name": TERRAIN, "mesh": 0})
-        document["scenes"][0]["nodes"].append(len(nodes) - 1)
+        mesh, document["materials"] = _ground(ground, buffer)
+        document["meshes"].append(mesh)
+        beside.append({"name": TERRAIN, "mesh": 1})
+    document["scenes"][0]["nodes"] += range(joints, joints + len(beside))
+    nodes += beside
     document |= {
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
@@ -101,18 +116,37 @@ def _xyzw(wxyz: np.ndarray) -> np.ndarray:
     return np.roll(wxyz, -1, axis=-1)
 
 
-def _inverse_bind_matrices(clip: Clip, rest: np.ndarray) -> np.ndarray:
-    """From the space of the skeleton to that of each joint in the rest pose, columns first."""
-    pose = (
-        np.array(clip.offsets_ls[None]),
-        np.array(rest[None]),
-    )  # SciPy refuses read-only ones
+def _rest_pose(
+    clip: Clip, rest: np.ndarray
+) -> tuple[Float64[np.ndarray, "joints 3"], Float64[np.ndarray, "joints 4"]]:
+    """Places and rotations of all joints in the space of the skeleton."""
+    pose = np.array(clip.offsets_ls[None]), np.array(rest[None])  # SciPy refuses read-only ones
     positions, rotations = world_from_local(clip.parents, *pose)
+    return positions[0], rotations[0]
+
+
+def _body(places: np.ndarray, parents: tuple[int, ...], buffer: _Buffer) -> dict[str, Any]:
+    """The bones as a mesh that follows the joints."""
+    vertices, faces, owners = bone_mesh(places, parents)
+    followed = np.zeros((len(owners), 4), np.uint16)
+    followed[:, 0] = owners
+    weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(owners), 1))
+    attributes = {
+        "POSITION": buffer.add(vertices, "VEC3", with_range=True),
+        "JOINTS_0": buffer.add(followed, "VEC4"),
+        "WEIGHTS_0": buffer.add(weights, "VEC4"),
+    }
+    indices = buffer.add(faces.reshape(-1), "SCALAR")
+    return {"name": BODY, "primitives": [{"attributes": attributes, "indices": indices}]}
+
+
+def _inverse_bind_matrices(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """From the space of the skeleton to that of each joint in the rest pose, columns first."""
     # The rows of a rotation matrix are the columns of its inverse.
-    columns = Rotation.from_quat(rotations[0], scalar_first=True).as_matrix()
+    columns = Rotation.from_quat(rotations, scalar_first=True).as_matrix()
     inverse = np.zeros((len(columns), 4, 4))
     inverse[:, :3, :3] = columns
-    inverse[:, 3, :3] = -np.einsum("ji,jik->jk", positions[0], columns)
+    inverse[:, 3, :3] = -np.einsum("ji,jik->jk", positions, columns)
     inverse[:, 3, 3] = 1.0
     return inverse
 
@@ -138,8 +172,8 @@ def _animation(clip: Clip, buffer: _Buffer) -> dict[str, Any]:
     return {"name": Path(clip.source).stem or "motion", "samplers": samplers, "channels": channels}
 
 
-def _ground(ground: Mesh, buffer: _Buffer) -> dict[str, Any]:
-    """A mesh, and its grey material that is seen from both sides."""
+def _ground(ground: Mesh, buffer: _Buffer) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A mesh, and the materials: its own is grey, and is seen from both sides."""
     primitive = {
         "attributes": {"POSITION": buffer.add(ground.vertices, "VEC3", with_range=True)},
         "indices": buffer.add(ground.faces.reshape(-1), "SCALAR"),
@@ -147,4 +181,4 @@ def _ground(ground: Mesh, buffer: _Buffer) -> dict[str, Any]:
     }
     surface = {"baseColorFactor": GREY, "metallicFactor": 0.0}
     material = {"name": TERRAIN, "doubleSided": True, "pbrMetallicRoughness": surface}
-    return {"meshes": [{"name": TERRAIN, "primitives": [primitive]}], "materials": [material]}
+    return {"name": TERRAIN, "primitives": [primitive]}, [material]

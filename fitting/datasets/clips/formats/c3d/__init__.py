@@ -1,0 +1,12 @@
+"""C3D files: markers become joints.
+
+`structure` checks the bytes, `markers` reads points through ezc3d (the extra `c3d`), `marker_sets`
+makes joint centres of them, `plug_in_gait` those of Vicon's lower-body marker set, and `reader`
+puts a `Recording` together.
+
+Start with `reader.read_c3d`.
+"""
+
+from .marker_sets import joint_name as joint_name
+from .reader import draft_marker_map as draft_marker_map
+from .reader import read_c3d as read_c3d

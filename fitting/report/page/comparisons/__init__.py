@@ -1,0 +1,1 @@
+"""Pages of comparisons: of systems on a clip, of systems in the suite, and of sampled runs."""

@@ -1,0 +1,1 @@
+"""Pages of jobs that fit many times: ablations, populations and calibrations."""

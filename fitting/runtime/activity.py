@@ -1,0 +1,145 @@
+"""What a program is busy with: long work announces itself here, and whoever watches shows it.
+
+```python
+with activity.announced("Drawing pictures", total=len(plots)) as work:
+    for plot in plots:
+        draw(plot)
+        work.advance()
+```
+
+A title says what is done and to how much of it; it is announced before the work begins. Without a
+watcher nothing happens. The command line watches; so may any program, with `watched_by`. Work in
+other threads and processes is not seen.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Protocol, runtime_checkable
+
+
+class Work:
+    """Something that takes long, while it is going on."""
+
+    def __init__(
+        self,
+        title: str,
+        total: int | None = None,
+        watcher: "Watcher | None" = None,
+        done: int = 0,
+    ):
+        self.title = title
+        self.total = total
+        """How many parts it has, or has at most; None if that cannot be said."""
+        self.done = done
+        """Of these parts."""
+        self._done_before = done
+        self.note = ""
+        """What it last said of itself, in a line."""
+        self.failed = False
+        self.began = time.monotonic()
+        self._watcher = watcher
+
+    @property
+    def seconds(self) -> float:
+        """Since it began."""
+        return time.monotonic() - self.began
+
+    @property
+    def seconds_each(self) -> float | None:
+        """Of the parts that were done since it began; None before the first one."""
+        done = self.done - self._done_before
+        return self.seconds / done if done > 0 else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """If it goes on as before; None where that is not known, and at the end."""
+        each = self.seconds_each
+        if self.total is None or each is None or self.done >= self.total:
+            return None
+        return each * (self.total - self.done)
+
+    def advance(self) -> None:
+        """Says that one more part is done."""
+        self.reach(self.done + 1)
+
+    def reach(self, done: int) -> None:
+        """Says how many parts are done."""
+        self.done = done
+        self.changed()
+
+    def changed(self) -> None:
+        """Tells the watcher of a new count or note."""
+        if self._watcher is not None:
+            self._watcher.changed(self)
+
+    @contextmanager
+    def part(self, title: str) -> Iterator["Work"]:
+        """Announces one of the parts, which is done at the end."""
+        with announced(title) as work:
+            yield work
+        self.advance()
+
+
+@runtime_checkable
+class Watcher(Protocol):
+    """Is told of all work, in the thread that does it; work within other work ends before it."""
+
+    def began(self, work: Work) -> None:
+        """Called before the work begins."""
+        ...
+
+    def changed(self, work: Work) -> None:
+        """Called with a new count or note."""
+        ...
+
+    def ended(self, work: Work) -> None:
+        """Called when it is done, or has failed."""
+        ...
+
+
+_watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
+_innermost: ContextVar[Work | None] = ContextVar("innermost", default=None)
+
+
+@contextmanager
+def watched_by(watcher: Watcher | None) -> Iterator[None]:
+    """Tells a watcher of all work that is done in this context; None tells nobody."""
+    token = _watcher.set(watcher)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+@contextmanager
+def announced(title: str, total: int | None = None, *, done: int = 0) -> Iterator[Work]:
+    """Announces work before it is done.
+
+    Args:
+        title: says what is done, for the reader: "Reading 3 clips".
+        total: how many parts it has, or has at most.
+        done: how many of them were done before.
+    """
+    watcher = _watcher.get()
+    work = Work(title, total, watcher, done)
+    token = _innermost.set(work)
+    if watcher is not None:
+        watcher.began(work)
+    try:
+        yield work
+    except BaseException:
+        work.failed = True
+        raise
+    finally:
+        _innermost.reset(token)
+        if watcher is not None:
+            watcher.ended(work)
+
+
+def note(text: str) -> None:
+    """Says in a line how the innermost work that is going on gets on."""
+    if (work := _innermost.get()) is not None:
+        work.note = text
+        work.changed()

@@ -1,0 +1,1 @@
+"""Results for those who go on with them: what notebooks show, and tables for pandas."""

@@ -1,0 +1,194 @@
+"""C3D files: joints from markers that were put on bodies whose joints are known."""
+
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fitting.cli import main
+from fitting.datasets.clips import load_clip
+from fitting.datasets.clips.formats.c3d.plug_in_gait import chord, hip_centres
+from fitting.datasets.clips.summary import as_text, describe
+from support.c3d_files import WIDTHS, both_sides, plug_in_gait, write_c3d
+from support.sample_clips import stair_walk
+
+pytest.importorskip("ezc3d", reason="C3D files are read by ezc3d, the extra c3d")
+
+ARCHIVE = Path(__file__).parents[2] / "data" / "clips" / "uneven_walk.npz"
+TOLERANCE = 1e-5  # m: the file has 32 bits
+ROLES = ("hip", "knee", "ankle", "toe")
+
+
+@pytest.fixture(scope="module")
+def body():
+    return stair_walk(lambda points: np.zeros(len(points)), strides=2)
+
+
+@pytest.fixture(scope="module")
+def places(body):
+    return plug_in_gait(body)
+
+
+@pytest.fixture(scope="module")
+def walk(places, tmp_path_factory):
+    """A whole file."""
+    path = tmp_path_factory.mktemp("c3d") / "walk.c3d"
+    return write_c3d(path, places, measures=both_sides(WIDTHS))
+
+
+def errors(clip, body) -> np.ndarray:
+    """How far the joints of the legs are from the body's, m, (frames, joints)."""
+    names = [f"{side}_{role}" for side in ("left", "right") for role in ROLES]
+    mine, theirs = (
+        c.positions_ws[:, [c.joint_names.index(name) for name in names]] for c in (clip, body)
+    )
+    return np.linalg.norm(mine - theirs, axis=-1)
+
+
+def test_joint_centres_are_those_of_the_body(walk, body):
+    clip = load_clip(walk)
+    assert errors(clip, body).max() < TOLERANCE
+    assert (clip.fps, clip.up_axis, clip.scale, clip.mask) == (60.0, "z", 0.001, None)
+    assert clip.remarks == ()
+    np.testing.assert_allclose(clip.rig.thigh, 0.5, atol=TOLERANCE)
+    np.testing.assert_allclose(clip.rig.shin, 0.48, atol=TOLERANCE)
+    np.testing.assert_allclose(clip.rig.ball_height, body.rig.ball_height, atol=1e-4)
+
+
+def test_rotations_are_those_of_the_body(walk, body):
+    clip = load_clip(walk)
+    for name in body.joint_names:  # whose own axes differ by a constant rotation
+        mine, theirs = (
+            Rotation.from_quat(c.rotations_ws[:, c.joint_names.index(name)], scalar_first=True)
+            for c in (clip, body)
+        )
+        between = mine.inv() * theirs
+        assert (between[0].inv() * between).magnitude().max() < 1e-3, name
+
+
+def test_hips_lie_where_the_regression_says():
+    """A pelvis 240 mm wide and 150 mm deep: 0.24 · 150 + 9.9 = 45.9 mm back, 0.30 · 240 + 10.9 =
+    82.9 mm down, 0.33 · 240 + 7.3 = 86.5 mm to the side."""
+    left, right, back = (np.array([p]) for p in ([120, 0, 0], [-120, 0, 0], [0, 0, -150]))
+    centres = hip_centres(left / 1000, right / 1000, back / 1000)
+    np.testing.assert_allclose(centres[0], [[0.0865, -0.0829, -0.0459]], atol=1e-12)
+    np.testing.assert_allclose(centres[1], [[-0.0865, -0.0829, -0.0459]], atol=1e-12)
+
+
+def test_a_chord_makes_a_right_angle_at_the_joint():
+    """Legs of 3 and 4 on a diameter of 5: the centre is 3 from the marker and 4 from the hip."""
+    hip, knee, wand = (np.array([p]) for p in ([0.0, 5, 0], [0.0, 0, 0], [1.0, 2, 0]))
+    np.testing.assert_allclose(chord(hip, knee, wand, 3.0), [[-2.4, 1.8, 0.0]], atol=1e-12)
+
+
+def test_frames_with_gaps_are_masked_and_nothing_is_measured_on_them(places, body, tmp_path):
+    gaps = {name: place.copy() for name, place in places.items()}
+    gaps["LTHI"][40:50] = np.nan
+    gaps["LASI"][:5] = np.nan
+    gaps["RTOE"][-3:] = np.nan
+    clip = load_clip(write_c3d(tmp_path / "gaps.c3d", gaps, measures=both_sides(WIDTHS)))
+    assert clip.mask is not None
+    masked = np.flatnonzero(~clip.mask).tolist()
+    last = body.frame_count
+    assert masked == [*range(5), *range(40, 50), *range(last - 3, last)]
+    assert errors(clip, body)[clip.mask].max() < TOLERANCE
+    assert np.isfinite(clip.positions_ws).all() and np.isfinite(clip.rotations_ws).all()
+    np.testing.assert_allclose(clip.rig.shin, 0.48, atol=TOLERANCE)
+    text = as_text(describe(clip))
+    assert "18 of 108 frames are masked" in text and "LTHI in 10, LASI in 5, RTOE in 3" in text
+
+
+def test_units_axes_rate_and_names_are_the_files_own(places, body, tmp_path):
+    named = {f"Bob:{name}": place for name, place in places.items()}
+    stated = {"UNITS": "m", "X_SCREEN": "+X", "Y_SCREEN": "+Z"}
+    options = {"measures": both_sides(WIDTHS), "rate": 120.0}
+    path = write_c3d(tmp_path / "m.c3d", named, point=stated, unit=1.0, **options)
+    clip = load_clip(path)
+    assert errors(clip, body).max() < TOLERANCE
+    assert (clip.scale, clip.fps) == (1.0, 120.0)
+    downward = stated | {"Y_SCREEN": "-Z", "X_SCREEN": "-X"}
+    path = write_c3d(tmp_path / "down.c3d", named, point=downward, unit=1.0, **options)
+    assert any("the pelvis is not above" in remark for remark in load_clip(path).remarks)
+    assert load_clip(path, up="z").up_axis == "z"
+
+
+def test_what_is_not_stated_is_guessed_with_a_remark(places, body, tmp_path):
+    path = write_c3d(tmp_path / "bare.c3d", places, point={})
+    clip = load_clip(path)
+    assert (clip.scale, clip.up_axis) == (0.001, "z")
+    assert any("no unit is stated" in remark for remark in clip.remarks)
+    assert any("widths of the left knee and ankle" in remark for remark in clip.remarks)
+    assert 1e-4 < errors(clip, body).max() < 0.02
+    assert load_clip(path, scale=0.002).rig.thigh[0] == pytest.approx(1.0, rel=0.05)
+
+
+def test_joint_centres_in_the_file_are_taken(places, body, tmp_path):
+    at = {name: body.positions_ws[:, i] for i, name in enumerate(body.joint_names)}
+    modelled = dict(places)
+    for side, letter in (("left", "L"), ("right", "R")):
+        for joint, ending in (("hip", "HJC"), ("knee", "KJC"), ("ankle", "AJC")):
+            modelled[letter + ending] = at[f"{side}_{joint}"] + [0.0, 0.0, 0.01]
+        del modelled[f"{letter}THI"], modelled[f"{letter}TIB"]
+    clip = load_clip(write_c3d(tmp_path / "centres.c3d", modelled))
+    off = errors(clip, body).reshape(-1, 2, 4)
+    np.testing.assert_allclose(off[..., :3], 0.01, atol=TOLERANCE)
+
+
+def test_a_map_names_markers_and_means_of_markers(places, body, tmp_path):
+    at = {name: body.positions_ws[:, i] for i, name in enumerate(body.joint_names)}
+    lines = ['pelvis = "LASI + RASI + LPSI + RPSI"']
+    own = {name: places[name] for name in ("LASI", "RASI", "LPSI", "RPSI")}
+    for side in ("left", "right"):
+        for role in ROLES:
+            joint = at[f"{side}_{role}"]
+            own |= {
+                f"{side} {role} in": joint - [0.03, 0, 0],
+                f"{side}{role}out": joint + [0.03, 0, 0],
+            }
+            lines.append(f'{role}_{side} = "{side} {role} in + {side}{role}out"')
+    (tmp_path / "map.toml").write_text("\n".join(lines))
+    path = write_c3d(tmp_path / "own.c3d", own)
+    clip = load_clip(path, joints=tmp_path / "map.toml")
+    assert errors(clip, body).max() < TOLERANCE and clip.dialect == "by hand"
+    bare = load_clip(path)
+    assert set(own) <= set(bare.joint_names) and bare.measured_rig is None
+    assert any("no set of markers recognised" in remark for remark in bare.remarks)
+    lines[1] = 'hip_left = "LASI + nobody"'
+    (tmp_path / "map.toml").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match="own.c3d: hip_left .* no marker 'nobody'; there are"):
+        load_clip(path, joints=tmp_path / "map.toml")
+
+
+def test_a_map_of_markers_is_drafted_and_no_map_of_an_npz(walk, body, tmp_path, capsys):
+    assert main.main(["inspect", str(walk), "--joints"]) == 0
+    draft = capsys.readouterr().out
+    assert 'pelvis = "LASI + RASI + LPSI + RPSI"' in draft and 'toe_right = "RTOE"' in draft
+    assert "#LTHI" in draft
+    assert main.main(["inspect", str(ARCHIVE), "--joints"]) == main.MISTAKE
+    assert "takes no joint map" in capsys.readouterr().err
+
+
+def test_files_without_motion_are_refused_in_one_line(walk, places, tmp_path, monkeypatch):
+    path = tmp_path / "odd.c3d"
+    content = walk.read_bytes()
+    for damaged, message in (
+        (b"", "0 bytes that begin with nothing; wanted a C3D file"),
+        (content[:700], "wanted a C3D file"),
+        (content[:4000], "the file has 4000"),
+        (content.replace(struct.pack("<f", 60.0), bytes(4)), "POINT:RATE is 0 Hz; wanted"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=message):
+            load_clip(path)
+    never = {name: np.full_like(place, np.nan) for name, place in places.items()}
+    with pytest.raises(ValueError, match="no frame has all of the 16 markers"):
+        load_clip(write_c3d(tmp_path / "never.c3d", never))
+    two = {f"{who}:{name}": place for who in ("Ann", "Bob") for name, place in places.items()}
+    with pytest.raises(ValueError, match=r"2 subjects wear .*\['Ann', 'Bob'\]"):
+        load_clip(write_c3d(tmp_path / "two.c3d", two))
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(ValueError, match=r'walk.c3d: .* pip install "jaxik\[c3d\]"'):
+        load_clip(walk)

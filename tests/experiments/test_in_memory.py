@@ -1,0 +1,127 @@
+"""Experiments of objects in memory: the same problems as those of files, with rules of any kind."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import pytest
+
+import fitting
+import jaxik
+from fitting.experiments import experiment_files, problems, systems
+from fitting.experiments.experiment import Experiment
+from fitting.experiments.in_memory.making import clip_entry, make_experiment
+from fitting.experiments.in_memory.saving import with_files
+from fitting.experiments.in_memory.selectors import free_table
+from fitting.problem.digest import digest
+from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.stages.pelvis import LowestPelvis
+from jaxik.world import terrain as terrains
+from support.experiments import ROOT, write
+
+NAMES = ("pelvis.on_gain", "foot.max_pitch")
+
+
+class MemoryPelvis(LowestPelvis):
+    """A rule that no file knows."""
+
+    extra: Leaf = parameter(0.3, unit="1", low=0.0, high=1.0, doc="Of no effect.")
+
+
+@pytest.fixture(scope="module")
+def objects() -> dict:
+    """The captured walk, its flat animation and its ground, as a notebook has loaded them."""
+    with jax.enable_x64(True):
+        return {
+            "reference": fitting.load_clip(ROOT / "data/clips/uneven_walk.npz"),
+            "base": fitting.load_clip(ROOT / "data/clips/uneven_walk_base.npz"),
+            "terrain": fitting.load_terrain(ROOT / "data/terrains/uneven_walk.ply"),
+        }
+
+
+@pytest.fixture(scope="module")
+def second(objects):
+    return clip_entry(**objects, start=1.0, end=2.0)
+
+
+def of_own_rule(entry) -> Experiment:
+    ik = dataclasses.replace(jaxik.presets.record(), pelvis=MemoryPelvis(limit=0.2))
+    return make_experiment(entry, free=[lambda ik: ik.pelvis.extra], system=ik)
+
+
+def test_objects_make_the_problem_that_their_files_make(second, tmp_path):
+    path = write(tmp_path, free="pelvis.on_gain = {}\nfoot.max_pitch = {}")
+    of_files = problems.make_problem(experiment_files.load_experiment(path))
+    free = ["pelvis.on_gain", lambda ik: ik.foot.max_pitch]
+    assert digest(problems.make_problem(make_experiment(second, free=free))) == digest(of_files)
+
+
+def test_free_parameters_are_named_or_picked_by_their_leaf():
+    ik = jaxik.presets.record()
+    assert free_table("pelvis.limit", ik) == {"pelvis.limit": {}}
+    both = free_table(lambda ik: (ik.pelvis.limit, ik.foot.max_pitch[0]), ik)
+    assert both == {"pelvis.limit": {}, "foot.max_pitch[0]": {}}
+    ranged = free_table({lambda ik: ik.pelvis.limit: {"low": 0.1}, "foot.max_pitch": {}}, ik)
+    assert ranged == {"pelvis.limit": {"low": 0.1}, "foot.max_pitch": {}}
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ([], "names no parameter"),
+        ([lambda ik: ik.pelvis.hight], "no attribute 'hight'; wanted a function that picks leaves"),
+        ([lambda ik: 0.5], "a function picks .0.5.; wanted"),
+        (["pelvis.hight"], "no parameter named 'pelvis.hight'; nearest is 'pelvis.limit'"),
+        ([lambda ik: ik.lock.enabled], "no parameter named 'lock.enabled'"),
+    ],
+)
+def test_what_picks_no_parameter_costs_one_sentence(free, message, second):
+    with pytest.raises(ValueError, match=message):
+        make_experiment(second, free=free)
+
+
+def test_a_rule_that_no_file_knows_is_fitted_from_memory(second):
+    experiment = of_own_rule(second)
+    assert (experiment.preset, experiment.faithful) == ("record", False)
+    space = problems.make_problem(experiment).space
+    assert space.names == ("pelvis.extra",)
+    assert isinstance(space.system.pelvis, MemoryPelvis)
+    assert float(space.system.pelvis.limit) == pytest.approx(0.2)
+
+
+def test_what_is_in_memory_is_written_where_a_run_needs_it(second, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="a file can name only after fitting.register_rule"):
+        with_files(of_own_rule(second), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setitem(systems.STAGES["pelvis"], "MemoryPelvis", MemoryPelvis)
+    saved = with_files(of_own_rule(second), tmp_path)
+    text = experiment_files.experiment_to_toml(saved, tmp_path)
+    (tmp_path / "experiment.toml").write_text(text)
+    moved = tmp_path.rename(tmp_path.with_name("moved"))
+    again = experiment_files.load_experiment(moved / "experiment.toml")
+    (clip,) = again.clips
+    assert clip.reference == moved / "captured.npz" and clip.terrain == moved / "terrain.ply"
+    space = problems.make_problem(again).space
+    assert isinstance(space.system.pelvis, MemoryPelvis)
+    assert space.parameters == problems.make_problem(of_own_rule(second)).space.parameters
+    moved.rename(tmp_path)  # where pytest looks for it
+
+
+def test_a_terrain_that_is_no_mesh_is_fitted_from_memory_but_not_saved(objects, tmp_path):
+    entry = clip_entry(objects["reference"], terrains.plane(), objects["base"], root="animation")
+    experiment = make_experiment(entry, free="pelvis.limit")
+    assert with_files(experiment, None) is experiment
+    with pytest.raises(ValueError, match="its terrain cannot be saved; fit without an output: a"):
+        with_files(experiment, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_experiment_needs_a_clip():
+    with pytest.raises(ValueError, match="no clip; wanted one at least"):
+        make_experiment(free=NAMES)
+
+
+def test_messages_name_the_clip_in_memory(objects):
+    entry = clip_entry(**objects, start=900.0)
+    with pytest.raises(ValueError, match=Path(objects["reference"].source).name):
+        problems.make_problem(make_experiment(entry, free=NAMES))

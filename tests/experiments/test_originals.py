@@ -1,0 +1,178 @@
+"""Settings of ozz, Unreal and Mec: the same numbers there and back, in units written by hand."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from fitting import jobs
+from fitting.cli import main
+from fitting.experiments import parameter_files
+from fitting.experiments.originals import conversion, settings_files
+from fitting.experiments.originals.layout import ORIGINALS
+from fitting.experiments.systems import Preset
+from jaxik import FootIK, presets
+from jaxik.maths import parameter_tree
+
+# From the originals: Unreal counts in centimetres, Unity in metres and degrees with x to the right.
+HANDS = {
+    "ozz": (
+        {
+            "foot_heigh_": 0.12, "weight_": 1.0, "soften_": 0.97, "auto_character_height_": True,
+            "pelvis_correction_": False, "two_bone_ik_": True, "aim_ik_": False,
+            "kCharacterRayHeightOffset.y": 10.0, "kFootRayHeightOffset.y": 0.5,
+        },
+        {
+            "target.foot_height": 0.12, "leg.weight": 1.0, "foot.weight": 1.0, "leg.soften": 0.97,
+            "root.enabled": True, "pelvis.enabled": False, "leg.enabled": True,
+            "foot.enabled": False, "root.ray_up": 10.0, "probe.ray_up": 0.5,
+        },
+    ),
+    "unreal": (
+        {
+            "m_IKCapsuleHalfHeight": 88.0, "m_IKTraceDistance": 55.0, "m_IKAdjustFootOffset": 3.0,
+            "m_IKInterpSpeed": 13.0, "m_IKHipInterpSpeed": 7.0,
+        },
+        {
+            "pelvis.half_height": 0.88, "probe.ray_up": 0.88, "probe.ray_down": 0.55,
+            "target.adjust": 0.03, "effector.speed": 13.0, "pelvis.speed": 7.0,
+        },
+    ),
+    "mec": (
+        {
+            "Plant Foot": True, "IK Hint Offset": [0.1, 0.2, 0.3], "Foot Offset Dist": 0.4,
+            "Foot Length": 0.22, "Foot Half Width": 0.04, "Foot Height": 0.11,
+            "Foot Rotation Limit": 60.0, "Transition Time": 0.25, "Extra Ray Distance Check": 0.15,
+            "Set Extra Ray Distance Check Automatically": True,
+            "Foot Distance from Ground Threshold": 0.13, "Extra Ray Distance Check Min": 0.01,
+            "Extra Ray Distance Check Max": 0.35, "Adjust Pelvis Vertically": True,
+            "Damp Pelvis": False, "Max Leg Length": 0.9, "Min Leg Length": 0.45,
+            "Pelvis Adjustment Speed": 8.0, "SetActive": [True, False], "SetPlantBlendWeight": 0.5,
+        },
+        {
+            "lock.plant": True, "leg.hint_offset": [-0.1, 0.2, 0.3], "probe.ray_up": 0.4,
+            "probe.foot_length": 0.22, "probe.half_width": 0.04, "target.foot_height": 0.11,
+            "foot.max_tilt": math.pi / 3, "effector.transition_time": 0.25, "probe.extra": 0.15,
+            "probe.by_height": True, "probe.stable_height": 0.13, "probe.extra_min": 0.01,
+            "probe.extra_max": 0.35, "pelvis.enabled": True, "pelvis.damp": False,
+            "pelvis.max_length": 0.9, "pelvis.min_length": 0.45, "pelvis.speed": 8.0,
+            "probe.active": [True, False], "lock.plant_weight": 0.5,
+        },
+    ),
+}  # fmt: skip
+
+
+def system_of(name: str) -> FootIK:
+    """The original with the parameters that are written above."""
+    return parameter_tree.replace(Preset(name, faithful=True).system(), HANDS[name][1])
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_settings_written_by_hand_are_these_parameters_and_back(name):
+    settings, parameters = HANDS[name]
+    ik = conversion.to_ik(settings, name)
+    for leaf, value in parameters.items():
+        assert parameter_tree.get(ik, leaf).tolist() == pytest.approx(value, rel=1e-6), leaf
+    written = conversion.to_settings(system_of(name), name)
+    assert written.keys() == settings.keys() == {s.name for s in ORIGINALS[name].settings}
+    for key, value in settings.items():
+        assert written[key] == pytest.approx(value, rel=1e-6), key
+
+
+@pytest.mark.parametrize("suffix", settings_files.SUFFIXES)
+@pytest.mark.parametrize("name", HANDS)
+def test_a_file_of_settings_comes_back_as_the_same_parameters(name, suffix, tmp_path):
+    ours, theirs = tmp_path / "ours.toml", tmp_path / f"theirs{suffix}"
+    preset = Preset(name, faithful=True)
+    ours.write_text(parameter_files.system_to_toml(system_of(name), preset), encoding="utf-8")
+    jobs.export(ours, theirs, system=name)
+    back = tmp_path / "back.toml"
+    jobs.export(theirs, back)
+    (ik, _), (again, kept) = map(parameter_files.load_system, (ours, back))
+    assert kept == preset
+    for slot in parameter_tree.slots(ik):
+        value = parameter_tree.get(again, slot.name).tolist()
+        assert value == pytest.approx(slot.value.tolist(), rel=1e-6), slot.name
+
+
+def test_what_an_original_cannot_hold_is_named_and_left_out_only_if_wanted(tmp_path, capsys):
+    ours, theirs = tmp_path / "ours.toml", tmp_path / "theirs.json"
+    ours.write_text('preset = "unreal"\n[effector]\nlatch = false\n[target]\nadjust = 0.02\n')
+    words = ["export", str(ours), "--as", "unreal", "-o", str(theirs)]
+    assert main.main(words) == main.MISTAKE
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "rules.fade = SpeedFade (NoFade)" in line and "effector.latch = off (on)" in line
+    assert "--drop" in line and not theirs.exists()
+    with pytest.warns(UserWarning, match="unreal has no setting for rules.fade"):
+        jobs.export(ours, theirs, system="unreal", drop=True)
+    assert json.loads(theirs.read_text())["settings"]["m_IKAdjustFootOffset"] == pytest.approx(2.0)
+
+
+def test_what_changes_nothing_is_not_missed():
+    ik = parameter_tree.replace(
+        presets.unreal(faithful=True), {"root.half_life": 0.3, "probe.max_step_up": 0.5}
+    )
+    assert conversion.dropped(ik, ORIGINALS["unreal"]) == {}
+    ik = parameter_tree.replace(ik, {"root.enabled": True})
+    assert set(conversion.dropped(ik, ORIGINALS["unreal"])) == {"root.enabled", "root.half_life"}
+
+
+def test_parameters_that_are_one_setting_must_agree():
+    ik = parameter_tree.replace(presets.unreal(faithful=True), {"probe.ray_up": 0.8})
+    with pytest.raises(ValueError, match="m_IKCapsuleHalfHeight is one setting, but pelvis.half_h"):
+        conversion.to_settings(ik, "unreal")
+    legs = parameter_tree.replace(presets.ozz(faithful=True), {"leg.soften": [1.0, 0.9]})
+    with pytest.raises(ValueError, match="soften_ is one for all legs"):
+        conversion.to_settings(legs, "ozz")
+    deep = parameter_tree.replace(presets.unreal(faithful=True), {"probe.ray_down": math.inf})
+    with pytest.raises(ValueError, match="m_IKTraceDistance is finite"):
+        conversion.to_settings(deep, "unreal")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('system = "unity"\n[settings]\n', "no settings of 'unity'; there are those of"),
+        ('system = "unreal"\n[settings]\nm_IKTrace = 1.0\n', "nearest is 'm_IKTraceDistance'"),
+        ('system = "unreal"\n[settings]\nm_IKTraceDistance = "x"\n', "wanted a number"),
+        ('system = "unreal"\n[settings]\nm_IKTraceDistance = [1.0, 2.0]\n', "wanted ()"),
+        ('system = "mec"\n[settings]\n"Plant Foot" = 1\n', "wanted true or false"),
+        ('[settings]\n"Plant Foot" = true\n', "there is no system"),
+        ('system = "unreal"\n[settings]\n[units]\nm_IKTraceDistance = "m"\n', "has it in 'cm'"),
+    ],
+)
+def test_a_wrong_table_of_settings_costs_one_sentence(text, message, tmp_path):
+    path = tmp_path / "theirs.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match="theirs.toml") as refused:
+        jobs.export(path, tmp_path / "ours.toml")
+    assert message in str(refused.value) and not (tmp_path / "ours.toml").exists()
+
+
+@pytest.mark.filterwarnings("ignore:parameters do not tell the knee's axis")
+def test_parameters_go_through_json_and_records_and_come_back(tmp_path):
+    ours = tmp_path / "ours.toml"
+    ours.write_text('preset = "record"\nfaithful = true\n[pelvis]\nlimit = 0.25\n')
+    chain = [ours, *(tmp_path / name for name in ("a.json", "b.bin", "c.csv", "d.toml"))]
+    for source, output in zip(chain, chain[1:], strict=False):
+        jobs.export(source, output)
+    ik, preset = parameter_files.load_system(chain[-1])
+    assert preset == Preset("record", faithful=True)
+    assert float(parameter_tree.get(ik, "pelvis.limit")) == pytest.approx(0.25)
+
+
+def test_json_keeps_infinity_and_the_body(tmp_path):
+    ours, plain = tmp_path / "ours.toml", tmp_path / "plain.json"
+    ours.write_text('preset = "ozz"\nleg_length = 0.9\n')
+    jobs.export(ours, plain)
+    content = json.loads(plain.read_text(), parse_constant=pytest.fail)
+    assert content["pelvis"]["limit"] is None and content["leg_length"] == 0.9
+    ik, _ = parameter_files.load_system(plain)
+    assert math.isinf(parameter_tree.get(ik, "pelvis.limit"))
+
+
+def test_another_ending_is_refused_before_anything_is_read(tmp_path):
+    for system, name in ((None, "a.txt"), ("ozz", "a.bin")):
+        with pytest.raises(ValueError, match="wanted a name that ends in one of"):
+            jobs.export(Path("no.toml"), tmp_path / name, system=system)
