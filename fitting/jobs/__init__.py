@@ -8,14 +8,15 @@ them, so `log=print` shows the same.
 Jobs compute in 64 bits, whatever JAX is set to, and leave that setting alone. Their arrays keep 64
 bits; a system that was made in 32 bits is taken with the values it has there.
 
-`drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample`, `ablate` and
-`translate`. `calibrations` judges what they say: `calibrate`. `populations` fits several clips and
-subjects: `population`. `animations` runs finished systems: `solve`, `apply`, `compare` and
-`run_suite`. `views` shows runs, clips and fits in the browser: `view`, `view_run`. `comparisons`
-compares sampled runs: `compare_runs`. `exports` writes parameters for others: `export`. `examples`
-copies the experiments that come with the package.
+`drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample` and
+`translate`. `ablations` leaves rules out: `ablate`. `calibrations` judges what fits say:
+`calibrate`. `populations` fits several clips and subjects: `population`. `animations` runs finished
+systems: `solve`, `apply`, `compare` and `run_suite`. `views` shows runs, clips and fits in the
+browser: `view`, `view_run`. `comparisons` compares sampled runs: `compare_runs`. `exports` writes
+parameters for others: `export`. `examples` copies the experiments that come with the package.
 """
 
+from .ablations import ablate as ablate
 from .animations import apply as apply
 from .animations import compare as compare
 from .animations import run_suite as run_suite
@@ -24,7 +25,6 @@ from .calibrations import calibrate as calibrate
 from .comparisons import compare_runs as compare_runs
 from .drafts import init as init
 from .exports import export as export
-from .fits import ablate as ablate
 from .fits import fit as fit
 from .fits import sample as sample
 from .fits import translate as translate

@@ -1,4 +1,4 @@
-"""Jobs that search: a fit, its posterior, its ablations, and translations between systems."""
+"""Jobs that search: a fit, its posterior, and translations between systems."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -19,12 +19,11 @@ from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
 from fitting.problem.problem import Problem
-from fitting.report import ablation_report, fit_report, posterior_report, translation_report
+from fitting.report import fit_report, posterior_report, translation_report
 from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
-from fitting.report.page.studies import ablation_page
 from fitting.runtime.precision import in_float64
-from fitting.studies import ablation, record_price, run_folder, translation
+from fitting.studies import record_price, run_folder, translation
 from fitting.studies.assess import assess_solution
 from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.posterior.replay import replay
@@ -150,47 +149,6 @@ def sample(
         log(joined(["", posterior_report.posterior_text(sampled, run)]))
         log_output(log, run, run_folder.SUMMARY)
         return posterior
-
-
-@in_float64
-def ablate(
-    experiment: Experiment | str | Path,
-    output: str | Path | None = None,
-    *,
-    folds: int = 2,
-    progress: Callable[[Progress], None] | None = None,
-    log: Log = silent,
-) -> list[ablation.Row]:
-    """Fits an experiment as it is and without each of its rules, cross-validated.
-
-    What is left out stands in the experiment's [[without]] tables. Each finished fit is written at
-    once, and a call with the same folder continues where an interrupted one ended.
-
-    Args:
-        experiment: an experiment, or the path of its file.
-        output: folder for the fits and the report.
-        folds: number of parts into which each clip is cut.
-        progress: called as a fit goes on; its stage names the variant and the part.
-        log: called with what the command line prints.
-
-    Raises:
-        ValueError: as `studies.ablation.ablate`, or the folder cannot be made.
-    """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(experiment)
-    with output_folder(output) as folder:
-        experiment = with_files(experiment, folder)
-
-        def log_row(row: ablation.Row) -> None:
-            log(ablation_report.row_text(row))
-
-        rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)
-        if folder is not None:
-            ablation_report.write(folder, experiment, rows)
-            ablation_page.write(folder, experiment, rows)
-        log(ablation_report.tables_text(rows))
-        log_output(log, folder, ablation_report.TABLE)
-        return rows
 
 
 @in_float64
