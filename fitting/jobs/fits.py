@@ -18,7 +18,6 @@ from fitting.inference.noise.model import NoiseModel, with_noise
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
-from fitting.problem.digest import digest_with
 from fitting.problem.problem import Problem
 from fitting.report import fit_report, posterior_report, translation_report
 from fitting.report.formatting import joined
@@ -31,6 +30,7 @@ from fitting.studies.posterior.replay import replay
 from fitting.studies.sample import SampledFit, log_probability_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
+from .kept import kept_stages, remove
 from .output import Loaded, Log, log_output, output_folder, silent, unwatched
 
 
@@ -80,14 +80,14 @@ def fit(
         heading = f"fitting {free} parameters of {experiment.preset} to {count} clip(s)"
         log("\n".join([heading, *lines]))
         loaded(experiment, problem, clips)
-        kept = _kept_stages(run, experiment, problem, log)
+        kept = kept_stages(run, experiment, problem, log)
         problem, solution = search_with_noise(problem, experiment, progress, kept)
         shown = Shown(clips, known_values)
         fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
         texts, sections = _price_of_record(fitted, progress, log)
         if run is not None:
             fit_report.write_fit(run, fitted, sections)
-        _remove(kept, fitted)
+        remove(kept, fitted)
         log(joined(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
@@ -184,7 +184,7 @@ def translate(
             f"{request.source.name} on {len(prepared.clips)} clip(s)"
         )
         start = translation.starting_point(problem)
-        kept = _kept_stages(run, experiment, problem, log)
+        kept = kept_stages(run, experiment, problem, log)
         solution = search(problem, experiment, progress, start, kept)
         shown = Shown(prepared.clips)
         if run is not None:
@@ -195,27 +195,11 @@ def translate(
         differences = translation_report.differences(fitted)
         if run is not None:
             translation_report.write(run, prepared, fitted, differences)
-        _remove(kept, fitted)
+        remove(kept, fitted)
         log(f"\n{solution.message} {fitted.verdict.sentence}\n")
         log(translation_report.translation_text(prepared, differences))
         log_output(log, run, run_folder.SUMMARY)
         return fitted
-
-
-def _kept_stages(
-    run: Path | None, experiment: Experiment, problem: Problem[jaxik.FootIK], log: Log
-) -> KeptStages | None:
-    """The finished stages of a fit that was killed in this folder, and room for those of this."""
-    if run is None:
-        return None
-    identity = digest_with(problem, experiment.fit, experiment.seed, experiment.noise)
-    kept = KeptStages(run / run_folder.SEARCH, identity, log)
-    if kept.count:
-        stages = f"{kept.count} stages of its search"
-        if kept.profile_count:
-            stages += f" and {kept.profile_count} of its profiles"
-        log(f"a fit that was interrupted here goes on after {stages}")
-    return kept
 
 
 def _price_of_record(
@@ -233,12 +217,6 @@ def _price_of_record(
         price = None
     text = record_price_report.text(experiment, price)
     return ["", text], record_price_report.section(experiment, price)
-
-
-def _remove(kept: KeptStages | None, fitted: Fit) -> None:
-    """Removes the stages of a fit that is finished; an interrupted one goes on from them."""
-    if kept is not None and not fitted.solution.interrupted:
-        kept.remove()
 
 
 def _save_and_report(run: Path, sampled: SampledFit) -> None:
