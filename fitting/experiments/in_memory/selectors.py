@@ -1,14 +1,14 @@
 """Free parameters by the leaf that a function picks: `lambda ik: ik.pelvis.limit`."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 
 import jaxik
 from fitting.inference.sensitivity import FreeTable
 
-Selector: TypeAlias = Callable[[jaxik.FootIK], object]
+Selector: TypeAlias = Callable[[Any], object]  # of a system; its rules have leaves of their own
 Choice: TypeAlias = str | Selector
 Free: TypeAlias = Choice | Iterable[Choice] | Mapping[Choice, Mapping[str, float | str]]
 """A name or a selector, or several; a mapping has what overrides the declaration of each."""
