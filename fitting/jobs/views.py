@@ -15,6 +15,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.problems import ClipData
 from fitting.inference.optimisation.solution import Progress, Report
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 
 from .output import Log, silent
 
@@ -50,15 +51,18 @@ def opened(
     """
     check_folder(folder)
     page = _page()
-    server = page.open_server(address.host, address.port, "jaxik view")
-    shown = page.Viewer(server, subject, folder)
-    log(f"{subject.title}: open {page.address(server)} in a browser")
-    if address.host not in LOOPBACK:
-        log(f"note: whoever reaches {address.host} can move sliders, and save into {folder}")
-    try:
+    with ExitStack() as stack:
+        server = page.open_server(
+            address.host, address.port, "jaxik view", own_pages_only=address.host in LOOPBACK
+        )
+        stack.callback(page.stop, server)
+        with activity.announced("Preparing the page"):
+            shown = page.Viewer(server, subject, folder)
+        stack.callback(shown.close)
+        log(f"{subject.title}: open {page.address(server)} in a browser")
+        if address.host not in LOOPBACK:
+            log(f"note: whoever reaches {address.host} can move sliders, and save into {folder}")
         yield shown
-    finally:
-        shown.close()
 
 
 def view(
@@ -145,13 +149,13 @@ class FitWatch:
         self.viewer = self._page.enter_context(page)
 
     def __call__(self, progress: Progress) -> None:
-        """Shows a point that is better than the one shown, now and then."""
+        """Shows the best point where it is another than the one shown, now and then."""
         self.progress(progress)
         cost, when = self._shown
         now = time.monotonic()
         if not isinstance(progress, Report) or self._problem is None:
             return
-        if progress.best < cost and now - when >= EVERY:
+        if progress.best != cost and now - when >= EVERY:  # it rises where noise is estimated anew
             self._shown = (progress.best, now)
             note = f"The fit goes on: {progress.stage}, best cost {progress.best:.6g}."
             self.viewer.restart(BEST, self._problem.space.unpack(progress.best_u), note)

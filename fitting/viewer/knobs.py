@@ -80,9 +80,10 @@ class Knob:
             ValueError: it is outside the range.
         """
         if not self.is_switch:
-            if not self.low <= value <= self.high:
+            if not self.low - self.step <= value <= self.high + self.step:
                 limits = f"{self.low:g} to {self.high:g}"
                 raise ValueError(f"{self.name} is {value:g}; wanted from {limits}")
+            value = min(max(value, self.low), self.high)  # a page rounds what it sends
             value = self._in_order(ik, value)
         leaf = np.array(parameter_tree.get(ik, self.leaf))
         leaf[self.index] = value

@@ -1,6 +1,7 @@
 """Work that is only worth doing for the newest request, in a thread of its own."""
 
 import threading
+import traceback
 from collections.abc import Callable
 
 
@@ -45,6 +46,8 @@ class Latest:
                 self._asked, self._busy = False, True
             try:
                 self.work()
+            except Exception:  # the next request may do better
+                traceback.print_exc()
             finally:
                 with self._changed:
                     self._busy = False

@@ -78,5 +78,5 @@ class Tuning:
     def restart(self, name: str, ik: jaxik.FootIK) -> None:
         """Begins anew with a system to go back to, as a fit that goes on finds better ones."""
         with self._lock:
-            self.starts[name] = self._ik = ik
+            self.starts, self._ik = {**self.starts, name: ik}, ik
             self._done, self._undone, self._last = [], [], ("", -PAUSE)

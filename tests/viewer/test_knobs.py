@@ -51,6 +51,11 @@ def test_a_knob_changes_its_own_number_and_no_other(ik, by_name):
         assert [other.read(moved) for other in others] == [other.read(ik) for other in others]
 
 
+def test_the_end_of_a_slider_is_within_the_range_however_a_page_rounds_it(ik, by_name):
+    knob = by_name["leg.max_knee_angle"]
+    assert knob.read(knob.write(ik, 3.1415927)) == knob.high < 3.1415927
+
+
 def test_the_order_of_two_parameters_is_kept(ik, by_name):
     names = parameter_tree.declarations(ik)
     (upper, declared), *_ = [(n, d) for n, d in names.items() if d.above is not None]

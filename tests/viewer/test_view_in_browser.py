@@ -16,7 +16,7 @@ from support import runs
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WINDOW = {"width": 720, "height": 420}  # small, for software has to draw it
-LONG = 90.0  # s, on a busy machine
+LONG = 300.0  # s, on a busy machine
 
 pytest.importorskip("viser", reason='needs `pip install "jaxik[view]"`')
 playwright = pytest.importorskip(
@@ -104,11 +104,12 @@ def test_it_listens_to_this_machine_only(viewer):
     assert viewer.url.startswith("http://127.0.0.1:")
 
 
-def test_a_dragged_slider_moves_its_parameter_and_undo_brings_it_back(viewer, page):
+def test_a_dragged_slider_moves_the_feet_and_undo_brings_them_back(viewer, page):
     before, first = feet(viewer), viewer.tuning.ik
-    drag(page, "pelvis.on_gain", -150)
+    drag(page, "foot.max_pitch", -300)
     until(page, lambda: viewer.tuning.ik is not first)
-    assert viewer.tuning.ik.pelvis.on_gain < first.pelvis.on_gain
+    assert (viewer.tuning.ik.foot.max_pitch < first.foot.max_pitch).all()
+    until(page, lambda: np.abs(feet(viewer) - before).max() > 0.01)
     while viewer.tuning.can_undo:  # a slow hand makes several steps
         steps = viewer.tuning.ik
         page.get_by_role("button", name="Undo").click()

@@ -1,11 +1,15 @@
 """A fit is watched while it goes on, and what cannot be shown costs one line."""
 
 import builtins
+import dataclasses
+import importlib.metadata
+import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fitting import viewer
 from fitting.cli import main
 from fitting.inference.optimisation.solution import Progress, Report
 from fitting.jobs import views
@@ -14,6 +18,9 @@ from fitting.studies.fit import Fit
 from support import runs
 from support.experiments import ROOT
 
+needs_viser = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None, reason='needs `pip install "jaxik[view]"`'
+)
 CLIP = [
     str(ROOT / "data" / "clips" / "uneven_walk_base.npz"), "--terrain",
     str(ROOT / "data" / "terrains" / "uneven_walk.ply"),
@@ -29,6 +36,7 @@ def report(best: float, u: np.ndarray) -> Report:
     return Report("descent", 0, 1, best, best, 1.0, best_u=u)
 
 
+@needs_viser
 def test_a_fit_in_progress_shows_its_best_point(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(views, "EVERY", 0.0)
     heard: list[Progress] = []
@@ -42,9 +50,11 @@ def test_a_fit_in_progress_shows_its_best_point(fitted, tmp_path, monkeypatch):
         assert watch.viewer.wait(300)
         shown = watch.viewer.tuning.ik
         assert watch.viewer.solved.cost == pytest.approx(float(fitted.problem.cost(u)))
-        watch(report(6.0, -u))  # not better
+        watch(report(5.0, -u))  # no other best point
         assert watch.viewer.tuning.ik is shown
-    assert len(heard) == 3
+        watch(report(6.0, -u))  # with another noise
+        assert watch.viewer.tuning.ik is not shown
+    assert len(heard) == 4
 
 
 def test_without_viser_one_line_names_the_extra(monkeypatch, capsys):
@@ -65,7 +75,9 @@ def test_without_viser_one_line_names_the_extra(monkeypatch, capsys):
     [
         (["view", CLIP[0]], "a clip needs --terrain"),
         (["view", "runs/walk", "--speed", "2"], "--speed is 2.0; a run has its own clips"),
-        (["view", *CLIP, "-o", "nowhere"], "nowhere: no such folder"),
+        pytest.param(
+            ["view", *CLIP, "-o", "nowhere"], "nowhere: no such folder", marks=needs_viser
+        ),
     ],
 )
 def test_a_mistake_costs_one_line(words, sentence, capsys, tmp_path, monkeypatch):
@@ -75,6 +87,57 @@ def test_a_mistake_costs_one_line(words, sentence, capsys, tmp_path, monkeypatch
     assert sentence in error and error.count("\n") == 1
 
 
+def subject_of_two_clips(fitted: Fit) -> viewer.Subject:
+    subject = viewer.subject_of_fit(fitted.experiment, fitted.problem, fitted.clips)
+    (take,) = subject.takes
+    other = dataclasses.replace(take, name="again")
+    return dataclasses.replace(subject, title="<img src=x onerror=run()>", takes=(take, other))
+
+
+@needs_viser
+def test_another_clip_is_shown_while_the_first_one_plays(fitted, tmp_path):
+    subject = subject_of_two_clips(fitted)
+    with views.opened(subject, tmp_path, Address(port=0)) as shown:
+        assert shown.wait(300)
+        first = shown.solver
+        shown._player.play(True)
+        shown._choose(1)
+        assert shown.wait(300) and shown.solver is not first
+        shown.reset("default")
+        assert shown.wait(300) and shown._player._thread.is_alive()
+
+
+@needs_viser
+def test_pages_of_other_origins_cannot_connect(fitted):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    from fitting.viewer.page import open_server, stop
+
+    server = open_server("127.0.0.1", 0, "test")
+    try:
+        address = f"127.0.0.1:{server.get_port()}"
+        protocol = {"subprotocols": [f"viser-v{viser_version()}"]}
+        with connect(f"ws://{address}", origin=f"http://{address}", **protocol):
+            pass
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://{address}", origin="http://elsewhere.example", **protocol)
+    finally:
+        stop(server)
+
+
+def viser_version() -> str:
+    return importlib.metadata.version("viser")
+
+
+@needs_viser
+def test_a_title_is_no_script():
+    from fitting.viewer.page.words import literal
+
+    assert literal("<img src=x>") == r"\<img src=x\>" and literal("walk 2") == "walk 2"
+
+
+@needs_viser
 def test_an_address_of_another_machine_is_refused(fitted):
     from fitting.viewer.page import open_server
 

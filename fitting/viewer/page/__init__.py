@@ -6,4 +6,5 @@ connects them with the system that is moved.
 
 from .server import address as address
 from .server import open_server as open_server
+from .server import stop as stop
 from .viewer import Viewer as Viewer

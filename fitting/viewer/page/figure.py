@@ -9,6 +9,7 @@ from scipy.ndimage import uniform_filter1d
 from fitting.datasets import ground_patch
 from fitting.datasets.ground_patch import GroundPatch
 from fitting.datasets.terrain.meshes import grid_faces
+from fitting.runtime.precision import in_float64
 from fitting.viewer.lines import Lines
 from fitting.viewer.solving import Drawn, Solved, Solver
 from jaxik.world import body
@@ -30,6 +31,7 @@ class Figure:
         solver: of the clip.
     """
 
+    @in_float64
     def __init__(self, server: viser.ViserServer, solver: Solver):
         self.server, self.solver = server, solver
         clip = solver.take.animated
@@ -39,7 +41,7 @@ class Figure:
         self._path = uniform_filter1d(solver.path_ws, frames, axis=0, mode="nearest") - self.origin
         self._lines: dict[str, Lines] = {}
         self._nodes: dict[str, viser.LineSegmentsHandle] = {}
-        self._lock = threading.RLock()
+        self._lock, self._removed = threading.RLock(), False
         self._world = server.scene.add_frame(ROOT, show_axes=False)
         self.follows, self.frame = True, 0
         server.initial_camera.look_at = np.zeros(3)
@@ -70,6 +72,8 @@ class Figure:
     def show(self, solved: Solved) -> None:
         """Draws another solution, in the same frame."""
         with self._lock:
+            if self._removed:
+                return
             self._put_motion("after", solved.motion)
             for name, lines in solved.overlays.items():
                 self._put(name, lines, OVERLAY, visible=False)
@@ -98,6 +102,8 @@ class Figure:
     def draw(self, frame: int) -> None:
         """Draws a frame, by its index."""
         with self._lock, self.server.atomic():
+            if self._removed:
+                return
             self.frame = frame
             for name, node in self._nodes.items():
                 points, colours = self._lines[name]
@@ -108,7 +114,8 @@ class Figure:
                 self._world.position = -self._path[frame]
 
     def remove(self) -> None:
-        """Takes everything off the page."""
+        """Takes everything off the page; whoever still draws then draws nothing."""
         with self._lock:
+            self._removed = True
             self._world.remove()
             self._nodes.clear()

@@ -17,8 +17,7 @@ from fitting.viewer.tuning import Tuning
 from .figure import Figure
 from .panel import KnobPanel, ShownPanel, TimePanel, WayBackPanel
 from .player import Player
-from .server import stop
-from .words import cost_text
+from .words import cost_text, literal
 
 
 class Viewer:
@@ -49,7 +48,7 @@ class Viewer:
 
     def _build_panel(self) -> None:
         gui, clip = self.server.gui, self.solver.take.animated
-        gui.add_markdown(f"**{self.subject.title}**")
+        gui.add_markdown(f"**{literal(self.subject.title)}**")
         if len(self.subject.takes) > 1:
             names = tuple(take.name for take in self.subject.takes)
             choice = gui.add_dropdown("Clip", names)
@@ -78,40 +77,47 @@ class Viewer:
 
     def reset(self, name: str) -> None:
         """Goes back to one of the subject's systems."""
-        self.tuning.reset(name)
+        with self._lock:
+            self.tuning.reset(name)
         self._moved()
 
     def restart(self, name: str, ik: jaxik.FootIK, note: str) -> None:
         """Begins anew with another system, as a fit that goes on finds better ones."""
-        self.tuning.restart(name, ik)
-        self._way_back.said.content = note
+        with self._lock:
+            self.tuning.restart(name, ik)
+        self._way_back.reset.options = tuple(self.tuning.starts)
+        self._way_back.said.content = literal(note)
         self._moved()
 
     def save(self) -> None:
         """Writes the system as it is, and says what was written."""
         subject = self.subject
         try:
-            said = saving.save(
-                self.folder, self.tuning.ik, subject.preset, subject.leg_length,
-                drop=self._way_back.drop.value,
-            )  # fmt: skip
+            with self._lock:
+                said = saving.save(
+                    self.folder, self.tuning.ik, subject.preset, subject.leg_length,
+                    drop=self._way_back.drop.value,
+                )  # fmt: skip
         except ValueError as error:
             said = [str(error)]
-        self._way_back.said.content = "\n\n".join(said)
+        self._way_back.said.content = "\n\n".join(map(literal, said))
 
     def close(self) -> None:
-        """Ends its threads and the server."""
+        """Ends its threads."""
         self._player.close()
         self._latest.close()
-        stop(self.server)
 
     def _move(self, knob: Knob, value: float | bool) -> None:
-        with self._lock:
-            self.tuning.change(knob.write(self.tuning.ik, value), knob.name, time.monotonic())
+        try:
+            with self._lock:
+                self.tuning.change(knob.write(self.tuning.ik, value), knob.name, time.monotonic())
+        except ValueError as error:
+            self._way_back.said.content = literal(str(error))
         self._latest.ask()
 
     def _step(self, way: str) -> None:
-        (self.tuning.undo if way == "Undo" else self.tuning.redo)()
+        with self._lock:
+            (self.tuning.undo if way == "Undo" else self.tuning.redo)()
         self._moved()
 
     def _moved(self) -> None:
@@ -119,27 +125,31 @@ class Viewer:
         self._latest.ask()
 
     def _solve(self) -> None:
-        ik = self.tuning.ik
+        with self._lock:
+            ik, solver, figure = self.tuning.ik, self.solver, self._figure
         try:
-            if self.solver is not self._compiled:
+            if solver is not self._compiled:
                 self._way_back.cost.content = "Compiling, which takes a while the first time …"
-                self.solver.solve(ik)
-                self._compiled = self.solver
-            solved = self.solver.solve(ik)
-        except ValueError as error:
-            self._way_back.cost.content = f"**{error}**"
+                solver.solve(ik)
+                self._compiled = solver
+            solved = solver.solve(ik)
+        except (ValueError, RuntimeError) as error:  # JAX raises the latter without memory
+            self._way_back.cost.content = f"**{literal(str(error))}**"
             return
+        if solver is not self.solver:
+            return  # another clip was chosen meanwhile, and has asked, too
         self.solved = solved
-        self._figure.show(solved)
+        figure.show(solved)
         self._show_chosen()
         for name, start in self.tuning.starts.items():
             if start is ik and solved.cost is not None:
                 self.costs[name] = solved.cost
-        self._way_back.cost.content = cost_text(self.solver, solved, self.costs)
+        self._way_back.cost.content = cost_text(solver, solved, self.costs)
 
     def _draw_time(self, seconds: float) -> None:
-        frame = min(round(seconds * self._figure.fps), self._figure.frame_count - 1)
-        self._figure.draw(frame)
+        figure = self._figure
+        frame = min(round(seconds * figure.fps), figure.frame_count - 1)
+        figure.draw(frame)
         self._time.frame.value = frame
 
     def _seek(self, frame: int) -> None:
@@ -152,10 +162,12 @@ class Viewer:
     def _choose(self, number: int) -> None:
         """Shows another clip of the subject."""
         with self._lock:
+            solver = Solver(self.subject, number)
             self._figure.remove()
-            self.solver = Solver(self.subject, number)
-            self._figure = Figure(self.server, self.solver)
-            clip = self.solver.take.animated
+            self.solver, self._figure = solver, Figure(self.server, solver)
+            self._figure.follows = self._time.follow.value
+            self._show_chosen()
+            clip = solver.take.animated
             self._player.seconds = clip.seconds
             self._time.frame.max = max(clip.frame_count - 1, 1)
             self._seek(0)

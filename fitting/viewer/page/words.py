@@ -1,13 +1,20 @@
 """What the panel says of a solution: its cost, and how its feet stand."""
 
 import math
+import re
 from collections.abc import Mapping
 
 from fitting.analysis.placement import Placement
 from fitting.report.formatting import markdown, percent
 from fitting.viewer.solving import Solved, Solver
 
+MARKS = re.compile(r"([\\`*_{}\[\]<>()#+.!|~&-])")
 HEADING = ["", "in the ground", "deepest", "slide", "largest"]
+
+
+def literal(text: str) -> str:
+    """Somebody's text in Markdown, where it stays text: viser would run a script in it."""
+    return MARKS.sub(r"\\\1", text)
 
 
 def cost_text(solver: Solver, solved: Solved, costs: Mapping[str, float]) -> str:
