@@ -32,7 +32,8 @@ jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
 jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
 
-plain_lines.PATIENCE = float("inf")  # what commands print must not depend on how fast they are
+# What commands print must not depend on how fast they are.
+plain_lines.PATIENCE = plain_lines.INTERVAL = plain_lines.SILENCE = float("inf")
 
 # Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
 gc.set_threshold(200_000, 50, 100)

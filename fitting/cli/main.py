@@ -30,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             with watched():
                 status = _function(options.command)(options)
-            sys.stdout.flush()
+            if sys.stdout is not None:  # else it was closed
+                sys.stdout.flush()
             return status
     except BrokenPipeError:  # the reader, such as `head`, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -45,9 +45,10 @@ EXAMPLES = """examples:
 
 exit status: 0 when done, 1 when `doctor` finds a problem, 2 for a mistake in the input, 3 when the
 search of `fit`, `population` or `translate` has not converged, 4 when `fit` has converged but does
-not fit, 5 when `calibrate` finds something outside its bounds, 130 when interrupted with Ctrl-C:
-`fit` then has written the best point so far, `sample` its chain, `ablate`, `calibrate` and
-`population` each finished fit, and `compare --suite` each finished situation.
+not fit, 5 when `calibrate` finds something outside its bounds, 130 when interrupted with Ctrl-C,
+which is how `view` ends, with 0: `fit` then has written the best point so far, `sample` its chain,
+`ablate`, `calibrate` and `population` each finished fit, and `compare --suite` each finished
+situation.
 `jaxik COMMAND --help` has more examples.
 """
 

@@ -9,6 +9,7 @@ from fitting.experiments.in_memory.saving import with_files
 from fitting.inference.optimisation.solution import Progress
 from fitting.report import ablation_report
 from fitting.report.page.studies import ablation_page
+from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation
 
@@ -49,8 +50,9 @@ def ablate(
 
         rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)
         if folder is not None:
-            ablation_report.write(folder, experiment, rows)
-            ablation_page.write(folder, experiment, rows)
+            with activity.announced("Drawing the report"):
+                ablation_report.write(folder, experiment, rows)
+                ablation_page.write(folder, experiment, rows)
         log(ablation_report.tables_text(rows))
         log_output(log, folder, ablation_report.TABLE)
         return rows

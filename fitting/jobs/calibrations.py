@@ -10,7 +10,7 @@ from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
 from fitting.report.formatting import joined
 from fitting.report.page.studies import calibration_page
-from fitting.runtime import cluster
+from fitting.runtime import activity, cluster
 from fitting.runtime.precision import in_float64
 from fitting.studies.calibration import calibration
 from fitting.studies.calibration.assessment import Assessment, assess
@@ -74,8 +74,9 @@ def calibrate(
             )  # fmt: skip
         assessment = assess(made)
         if folder is not None:
-            calibration_report.write(folder, experiment, made, assessment)
-            calibration_page.write(folder, experiment, assessment)
+            with activity.announced("Drawing the report"):
+                calibration_report.write(folder, experiment, made, assessment)
+                calibration_page.write(folder, experiment, assessment)
         log(joined(["", calibration_report.calibration_text(assessment)]))
         log_output(log, folder, calibration_report.SUMMARY)
         return assessment

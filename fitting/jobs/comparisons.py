@@ -6,6 +6,7 @@ from pathlib import Path
 from fitting.report.formatting import aligned, joined
 from fitting.report.page.comparisons import runs_page
 from fitting.report.uncertainty import run_comparison as report
+from fitting.runtime import activity
 from fitting.studies.posterior import run_comparison
 from fitting.studies.posterior.run_comparison import ComparedRun
 
@@ -27,10 +28,11 @@ def compare_runs(
             made.
     """
     with output_folder(output) as folder:
-        compared = run_comparison.compare_runs([Path(run) for run in runs])
-        if folder is not None:
-            report.write(folder, compared)
-            runs_page.write(folder, compared)
+        with activity.announced(f"Comparing {len(runs)} runs"):
+            compared = run_comparison.compare_runs([Path(run) for run in runs])
+            if folder is not None:
+                report.write(folder, compared)
+                runs_page.write(folder, compared)
         log(joined([aligned(report.table(compared)), report.explanation()], apart=True))
         log_output(log, folder, report.TABLE)
         return compared

@@ -15,7 +15,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.report.formatting import joined
 from fitting.report.hierarchy import population_report
 from fitting.report.page.studies import population_page
-from fitting.runtime import files
+from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.studies import run_folder
 from fitting.studies.hierarchy.population import Population, fit_clips_and_population
@@ -65,8 +65,9 @@ def population(
         )
         if folder is not None:
             _write_systems(folder, fitted)
-            population_report.write(folder, fitted)
-            population_page.write(folder, fitted)
+            with activity.announced("Drawing the report"):
+                population_report.write(folder, fitted)
+                population_page.write(folder, fitted)
         log(joined(["", population_report.population_text(fitted)]))
         log_output(log, folder, population_report.SUMMARY)
         return fitted

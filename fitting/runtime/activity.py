@@ -129,9 +129,9 @@ def announced(title: str, total: int | None = None, *, done: int = 0) -> Iterato
     watcher = _watcher.get()
     work = Work(title, total, watcher, done)
     token = _innermost.set(work)
-    if watcher is not None:
-        watcher.began(work)
     try:
+        if watcher is not None:
+            watcher.began(work)
         yield work
     except BaseException:
         work.failed = True

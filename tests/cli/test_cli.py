@@ -36,7 +36,8 @@ from support.sample_clips import BVH
 
 DATA = ROOT / "data"
 COMMANDS = [
-    "fit", "ablate", "calibrate", "population", "sample", "apply", "run", "compare", "translate",
+    "init", "fit", "ablate", "calibrate", "population", "sample", "apply", "run", "view", "compare",
+    "translate",
     "inspect", "terrain", "bench", "cache", "record", "record show", "record to-toml",
     "record to-bytes", "export",
 ]  # fmt: skip

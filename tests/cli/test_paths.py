@@ -135,7 +135,7 @@ def test_a_path_without_a_file_of_its_kind_costs_one_line(
     assert main.main([path if word == "{}" else word for word in words]) == main.MISTAKE
     output = capsys.readouterr()
     assert output.out == "" and output.err.count("\n") == 1 and output.err[:-1].isprintable()
-    assert "ken" in output.err or "x" * 300 in output.err or "xx ... " in output.err
+    assert "ken" in output.err or "x" * 300 in output.err
     assert sorted(Path().rglob("*")) == before
 
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import pytest
 
 from fitting.cli import main
-from fitting.cli.terminal import plain_lines, show, watched
+from fitting.cli.terminal import plain_lines, printing, show, watched
 from fitting.cli.terminal.plain_lines import PlainLines
 from fitting.jobs import examples
 from fitting.report.formatting import aligned, joined
@@ -41,6 +41,8 @@ class Screen:
             try:
                 part = os.read(self._reader, 65536)
             except OSError:  # so ends a terminal of Linux
+                return
+            if not part:  # and so one of macOS
                 return
             self._parts.append(part)
 
@@ -202,12 +204,22 @@ def test_a_pipe_gets_plain_lines_without_codes(environment, monkeypatch, capsys)
         assert capsys.readouterr() == ("a result meanwhile\n", "")
 
 
+def test_a_terminal_of_other_letters_and_a_closed_one_get_plain_lines(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm-256color")
+    for encoding, wanted in (("utf-8", True), ("latin-1", False)):
+        stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+        assert printing.can_draw(stream) is wanted
+    assert not printing.can_draw(None)
+
+
 class Clock:
     """A clock that is set by hand, and the lines that it makes a pipe get."""
 
     def __init__(self, monkeypatch):
         self.now = 0.0
-        monkeypatch.setattr(plain_lines, "PATIENCE", 1.5)
+        for name, seconds in {"PATIENCE": 1.5, "INTERVAL": 10.0, "SILENCE": 60.0}.items():
+            monkeypatch.setattr(plain_lines, name, seconds)
         monkeypatch.setattr(plain_lines.time, "monotonic", lambda: self.now)
         self._stream = io.StringIO()
         self.lines = PlainLines(self._stream)

@@ -213,17 +213,14 @@ def size_of_png(path: Path) -> tuple[int, int]:
     return struct.unpack(">II", path.read_bytes()[16:24])
 
 
-def test_the_terminal_shows_the_table_and_how_long_each_system_took(folder, compared, capsys):
+def test_the_terminal_shows_the_table_and_warnings(folder, compared, capsys):
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
     assert main.main([*map(str, words), "-o", str(folder / "again")]) == 0
     output = capsys.readouterr()
     assert output.out.splitlines()[0].split() == ["system", "as", "animated", "record"]
     assert f"read {folder / 'again' / comparison_report.TABLE}" in output.out
     assert "\nroot: as animated: the ground is " in output.out
-    timing, *warned = output.err.splitlines()
-    name, dots, seconds, unit = timing.split()
-    assert (name, dots, unit) == ("record", "...", "s") and float(seconds) >= 0.0
-    assert all(line.startswith("jaxik: record: ") for line in warned)
+    assert all(line.startswith("jaxik: record: ") for line in output.err.splitlines())
     assert numbers(folder / "again")["record"] == numbers(compared)["record"]
 
 
@@ -234,7 +231,7 @@ def test_an_interrupt_writes_nothing(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(program_cache, "run", interrupt)
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
     assert main.main([*map(str, words), "-o", str(tmp_path / "out")]) == main.INTERRUPTED
-    assert capsys.readouterr().err == "record ... stopped\n\njaxik compare: interrupted\n"
+    assert capsys.readouterr().err == "\njaxik compare: interrupted\n"
     assert not list(tmp_path.iterdir())
 
 

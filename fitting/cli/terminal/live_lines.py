@@ -35,6 +35,14 @@ class LiveLines:
         self._going_on: list[tuple[Work, TaskID]] = []
         self._lines: _Lines | None = None
 
+    def __enter__(self) -> "LiveLines":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._lines is not None:  # an interrupt came between the beginning and the end
+            self._lines.stop()
+            self._lines = None
+
     def began(self, work: Work) -> None:
         """Called before the work begins."""
         if self._lines is None:
@@ -54,9 +62,11 @@ class LiveLines:
 
     def ended(self, work: Work) -> None:
         """Called when it is done, or has failed."""
-        assert self._lines is not None  # it has begun
-        _, task = self._going_on.pop()
-        self._lines.remove_task(task)
+        ended = [pair for pair in self._going_on if pair[0] is work]
+        if self._lines is None or not ended:  # an interrupt came before it had begun
+            return
+        self._going_on.remove(ended[0])
+        self._lines.remove_task(ended[0][1])
         if not self._going_on:
             self._lines.stop()
             self._lines = None

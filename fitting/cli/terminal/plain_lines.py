@@ -60,6 +60,8 @@ class PlainLines:
         """Called when it is done, or has failed."""
         with self._lock:
             depth = len(self._going_on) - 1
+            if depth < 0 or self._going_on[depth] is not work:
+                return  # an interrupt came before it had begun
             self._going_on.pop()
             if depth in self._announced:
                 self._announced.discard(depth)

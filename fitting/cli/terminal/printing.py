@@ -31,12 +31,16 @@ class Stream(Protocol):
         ...
 
 
-def can_draw(stream: Stream) -> bool:
-    """Whether a stream is a terminal that knows escape codes."""
-    return stream.isatty() and os.environ.get("TERM", "").lower() not in INCAPABLE
+def can_draw(stream: Stream | None) -> bool:
+    """Whether a stream is a terminal that knows escape codes and lines; None is a closed one."""
+    if stream is None or not stream.isatty():
+        return False
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    knows_lines = encoding.lower().startswith("utf")
+    return knows_lines and os.environ.get("TERM", "").lower() not in INCAPABLE
 
 
-def make_console(stream: Stream) -> "Console | None":
+def make_console(stream: Stream | None) -> "Console | None":
     """What draws on a stream; None where nothing can, or where rich cannot be imported."""
     if not can_draw(stream):
         return None

@@ -15,6 +15,9 @@ def watched() -> Iterator[None]:
     """Shows the work of this context: with bars on a terminal, elsewhere in plain lines."""
     # Where results go to a terminal, too, it is the same one, and one console keeps them apart.
     console = None
+    if sys.stderr is None:  # it was closed
+        yield
+        return
     if make_console(sys.stderr) is not None:
         console = make_console(sys.stdout) or make_console(sys.stderr)
     if console is None:
@@ -25,7 +28,7 @@ def watched() -> Iterator[None]:
 
     token = console_in_use.set(console)
     try:
-        with activity.watched_by(LiveLines(console)):
+        with LiveLines(console) as lines, activity.watched_by(lines):
             yield
     finally:
         console_in_use.reset(token)
