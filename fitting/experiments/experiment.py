@@ -27,7 +27,7 @@ from jaxik.world.terrain import Terrain
 
 from .ablations import Ablation
 from .hierarchies import Hierarchy
-from .systems import DEFAULT_PRESET, Preset, with_parameters, with_rules
+from .systems import DEFAULT_PRESET, OWN_ROOT, Preset, with_parameters, with_rules
 
 DEFAULT_SIGMAS = {  # what a good fit of captured motion leaves
     "ankle": 0.02,  # m
@@ -198,7 +198,8 @@ class Experiment(Shown):
     def preset_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
         """The preset with the experiment's rules, for a rig unless it is meant for the adult."""
         if self.system is not None:
-            return with_floats(self.system, jnp.result_type(float))
+            ik = with_floats(self.system, jnp.result_type(float))
+            return with_rules(ik, self.rules, f"{self.path} [rules]")
         rig = rig if self.body == "clip" else None
         ik = Preset(self.preset, self.faithful).system(rig)
         return with_rules(ik, self.rules, f"{self.path} [rules]", rig)
@@ -230,7 +231,7 @@ class Experiment(Shown):
 
     def placed_clips(self) -> tuple[ClipEntry, ...]:
         """The clips, with the root as animated where the system is told to place it itself."""
-        if not self.parameters.get("root.enabled", False):
+        if not self.parameters.get(OWN_ROOT, False):
             return self.clips
         return tuple(
             replace(entry, root="animation") if entry.root == "auto" else entry

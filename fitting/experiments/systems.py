@@ -29,6 +29,8 @@ STAGES: dict[str, dict[str, type[eqx.Module]]] = {  # the rules to choose from, 
     for stage in fields(jaxik.FootIK)
 }
 
+OWN_ROOT = "root.enabled"  # which an experiment sets only to overrule where clips put the root
+
 Rule = TypeVar("Rule", bound=eqx.Module)
 
 
@@ -183,6 +185,16 @@ def changed_rules(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, str]:
     return {stage: name for stage, name in rule_names(ik).items() if name != originals[stage]}
 
 
+def own_root(ik: jaxik.FootIK, preset: jaxik.FootIK) -> dict[str, bool]:
+    """`root.enabled`, if the preset's rule, or else a new one of its kind, has it otherwise."""
+    kind = type(ik.root)
+    if kind not in STAGES["root"].values() or OWN_ROOT not in leaf_names(ik):
+        return {}
+    usual = preset if isinstance(preset.root, kind) else replace(preset, root=kind())
+    enabled = bool(parameter_tree.get(ik, OWN_ROOT))
+    return {OWN_ROOT: enabled} if enabled != bool(parameter_tree.get(usual, OWN_ROOT)) else {}
+
+
 def changed_values(ik: jaxik.FootIK, other: jaxik.FootIK) -> dict[str, object]:
     """Values in which a system differs from another one with the same rules, by dotted name."""
     values = {name: np.asarray(parameter_tree.get(ik, name)) for name in leaf_names(ik)}
@@ -231,8 +243,8 @@ def with_parameters(ik: jaxik.FootIK, values: Table, where: str) -> jaxik.FootIK
 
 def without_own_root(ik: jaxik.FootIK) -> jaxik.FootIK:
     """The system without a root rule of its own, for characters whose root is placed already."""
-    own = "root.enabled" in leaf_names(ik)
-    return parameter_tree.replace(ik, {"root.enabled": False}) if own else ik
+    own = OWN_ROOT in leaf_names(ik)
+    return parameter_tree.replace(ik, {OWN_ROOT: False}) if own else ik
 
 
 def leaf_names(ik: jaxik.FootIK) -> list[str]:

@@ -3,19 +3,25 @@
 import dataclasses
 from pathlib import Path
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import fitting
 import jaxik
+from fitting.datasets.terrain.meshes import mesh_of
 from fitting.experiments import experiment_files, problems, systems
+from fitting.experiments.ablations import Ablation
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.in_memory.making import clip_entry, make_experiment
 from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.in_memory.selectors import free_table
 from fitting.problem.digest import digest
+from fitting.studies.ablation import without
 from jaxik.maths.parameter_tree import Leaf, parameter
-from jaxik.stages.pelvis import LowestPelvis
+from jaxik.stages.pelvis import LowestPelvis, ReachPelvis
 from jaxik.world import terrain as terrains
 from support.experiments import ROOT, write
 
@@ -105,6 +111,47 @@ def test_what_is_in_memory_is_written_where_a_run_needs_it(second, tmp_path, mon
     assert isinstance(space.system.pelvis, MemoryPelvis)
     assert space.parameters == problems.make_problem(of_own_rule(second)).space.parameters
     moved.rename(tmp_path)  # where pytest looks for it
+
+
+def test_clips_of_one_source_keep_their_own_ground(objects, tmp_path):
+    low, high = terrain_at(0.0), terrain_at(0.5)
+    entries = [clip_entry(**objects | {"terrain": ground}) for ground in (low, high)]
+    saved = with_files(make_experiment(*entries, free=NAMES), tmp_path)
+    meshes = [mesh_of(fitting.load_terrain(entry.terrain)) for entry in saved.clips]
+    heights = [mesh.vertices[:, 1].max() for mesh in meshes]
+    assert heights == pytest.approx([0.0, 0.5])
+
+
+def terrain_at(height: float) -> terrains.Terrain:
+    corners = np.array([[-9.0, height, -9.0], [9.0, height, -9.0], [0.0, height, 9.0]])
+    return terrains.mesh(corners, np.array([[0, 2, 1]]))
+
+
+def test_a_rule_is_left_out_of_a_system_in_memory(second):
+    ablation = Ablation("another pelvis", rules={"pelvis": "ReachPelvis"})
+    experiment = make_experiment(
+        second, free="leg.soften", system=jaxik.presets.record(), without=(ablation,)
+    )
+    left = without(experiment, ablation).starting_system()
+    assert isinstance(left.pelvis, ReachPelvis)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_files_of_what_is_in_memory_mean_the_same(second, own, tmp_path):
+    ik = jaxik.presets.ozz()
+    ik = dataclasses.replace(ik, root=dataclasses.replace(ik.root, enabled=jnp.asarray(own)))
+    experiment = make_experiment(second, free="pelvis.limit", system=ik)
+    saved = with_files(experiment, tmp_path)
+    assert [clip.root for clip in saved.placed_clips()] == [
+        clip.root for clip in experiment.placed_clips()
+    ]
+    systems_of = [each.starting_system() for each in (experiment, saved)]
+    assert eqx.tree_equal(*systems_of)
+
+
+def test_keys_of_files_are_refused_for_a_clip_in_memory(objects):
+    with pytest.raises(ValueError, match="'scale'.*say how files are read"):
+        clip_entry(**objects, scale=0.01)
 
 
 def test_a_terrain_that_is_no_mesh_is_fitted_from_memory_but_not_saved(objects, tmp_path):

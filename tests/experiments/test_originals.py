@@ -172,6 +172,14 @@ def test_json_keeps_infinity_and_the_body(tmp_path):
     assert math.isinf(parameter_tree.get(ik, "pelvis.limit"))
 
 
+@pytest.mark.parametrize("value", ["[" * 100_000, '"' + "x" * 200_000])
+def test_a_damaged_table_of_settings_costs_one_sentence(value, tmp_path):
+    path = tmp_path / "settings.csv"
+    path.write_text(f"system,setting,value,unit\nozz,foot_heigh_,{value},m\n")
+    with pytest.raises(ValueError, match="no table of settings"):
+        settings_files.load_settings(path)
+
+
 def test_another_ending_is_refused_before_anything_is_read(tmp_path):
     for system, name in ((None, "a.txt"), ("ozz", "a.bin")):
         with pytest.raises(ValueError, match="wanted a name that ends in one of"):

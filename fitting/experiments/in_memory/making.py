@@ -7,13 +7,24 @@ import jaxik
 from fitting.datasets.clips import Clip
 from fitting.experiments.experiment import ClipEntry, Experiment, LoadedFiles
 from fitting.experiments.record_only import restrict
-from fitting.experiments.systems import DEFAULT_PRESET, Preset, all_presets, changed_rules
+from fitting.experiments.systems import (
+    DEFAULT_PRESET,
+    Preset,
+    all_presets,
+    changed_rules,
+    own_root,
+)
 from fitting.runtime.precision import in_float64
 from jaxik.world.terrain import Terrain
 
 from .selectors import Free, free_table
 
 PATH = Path("experiment")  # that messages name
+OF_FILES = (
+    "file_up", "joints", "scale", "up", "asf", "animation", "terrain_scale", "terrain_offset",
+    "terrain_cell",
+)  # fmt: skip
+"""Keys of a clip that say how its files are read."""
 
 
 def clip_entry(
@@ -27,7 +38,12 @@ def clip_entry(
         base: the flat animation, its legs as in `load_flat_animation` or not; None makes one from
             the reference.
         keys: others of `ClipEntry`, such as `start`, `end`, `root` or `subject`.
+
+    Raises:
+        ValueError: a key says how files are read.
     """
+    if unused := [key for key in OF_FILES if key in keys]:
+        raise ValueError(f"{unused} say how files are read; a clip in memory has been read")
     loaded = LoadedFiles(reference, terrain, base)
     names = {"reference": Path(reference.source), "terrain": Path("terrain")}
     flat = None if base is None else Path(base.source)
@@ -62,7 +78,9 @@ def make_experiment(
         ik = named.system()
     else:
         ik = system
-        keys |= {"system": ik, **_nearest_preset(ik)}
+        nearest = _nearest_preset(ik)
+        keys |= {"system": ik, "preset": nearest.name, "faithful": nearest.faithful}
+        keys["parameters"] = own_root(ik, nearest.system()) | keys.get("parameters", {})
     table = free_table(free, ik)
     keys = {"path": PATH, "name": PATH.name} | keys
     experiment = Experiment(clips=clips, free=table, **keys)
@@ -70,7 +88,6 @@ def make_experiment(
     return restrict(experiment) if record_only else experiment
 
 
-def _nearest_preset(ik: jaxik.FootIK) -> dict[str, Any]:
+def _nearest_preset(ik: jaxik.FootIK) -> Preset:
     """The preset from which a system's rules differ least, which files name."""
-    nearest = min(all_presets(), key=lambda preset: len(changed_rules(ik, preset.system())))
-    return {"preset": nearest.name, "faithful": nearest.faithful}
+    return min(all_presets(), key=lambda preset: len(changed_rules(ik, preset.system())))

@@ -1,6 +1,5 @@
 """Writes what an experiment has in memory as files, for a folder that has to stand alone."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.datasets.terrain.meshes import Mesh, mesh_of
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.systems import (
+    OWN_ROOT,
     STAGES,
     Preset,
     changed_rules,
@@ -21,8 +21,6 @@ from fitting.experiments.systems import (
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
-
-OWN_ROOT = "root.enabled"  # which a file sets only to overrule where clips put the root
 
 
 @in_float64
@@ -38,17 +36,16 @@ def with_files(experiment: Experiment, folder: Path | None) -> Experiment:
     """
     if folder is None:
         return experiment
-    in_memory = [entry for entry in experiment.clips if entry.loaded is not None]
-    meshes = {entry.reference: _mesh(entry) for entry in in_memory}
+    meshes = [None if entry.loaded is None else _mesh(entry) for entry in experiment.clips]
     if experiment.system is not None:
         experiment = _with_named_rules(experiment)
-    if not in_memory:
+    if not any(meshes):
         return experiment
     folder.mkdir(parents=True, exist_ok=True)
     several = len(experiment.clips) > 1
     clips = tuple(
-        _saved(entry, folder, f"_{number}" if several else "", meshes)
-        for number, entry in enumerate(experiment.clips, 1)
+        entry if mesh is None else _saved(entry, folder, f"_{number}" if several else "", mesh)
+        for number, (entry, mesh) in enumerate(zip(experiment.clips, meshes, strict=True), 1)
     )
     return replace(experiment, clips=clips)
 
@@ -59,14 +56,13 @@ def _mesh(entry: ClipEntry) -> Mesh:
         return mesh_of(entry.loaded.terrain)
 
 
-def _saved(entry: ClipEntry, folder: Path, ending: str, meshes: Mapping[Path, Mesh]) -> ClipEntry:
+def _saved(entry: ClipEntry, folder: Path, ending: str, mesh: Mesh) -> ClipEntry:
     """The entry with its clips and its terrain as files."""
-    if entry.loaded is None:
-        return entry
+    assert entry.loaded is not None
     folder = folder.resolve()
     reference, terrain = folder / f"captured{ending}.npz", folder / f"terrain{ending}.ply"
     save_clip(reference, entry.loaded.reference)
-    save_mesh(terrain, *meshes[entry.reference])
+    save_mesh(terrain, *mesh)
     base = None if entry.loaded.base is None else folder / f"animation{ending}.npz"
     if base is not None and entry.loaded.base is not None:
         save_clip(base, entry.loaded.base)
@@ -85,7 +81,7 @@ def _with_named_rules(experiment: Experiment) -> Experiment:
             )
     values = {name: np.asarray(parameter_tree.get(ik, name)).tolist() for name in leaf_names(ik)}
     usual = with_rules(preset.system(), rules, "rules")
-    if OWN_ROOT not in changed_values(ik, usual):
+    if OWN_ROOT not in changed_values(ik, usual) and OWN_ROOT not in experiment.parameters:
         values.pop(OWN_ROOT, None)
     parameters = values | parameter_tree.options(ik)
     return replace(experiment, system=None, rules=rules, parameters=parameters)

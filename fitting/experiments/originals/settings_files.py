@@ -88,13 +88,17 @@ def _read(path: Path) -> Content:
     if path.suffix.lower() == ".json":
         content = validation.read_json(path)
         return content if isinstance(content, dict) else {}
-    rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+    try:
+        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+    except csv.Error as error:
+        raise ValueError(f"no table of settings: {error}") from None
     if not rows or rows[0] != COLUMNS or any(len(row) != len(COLUMNS) for row in rows):
         raise ValueError(f"no table of settings; wanted the columns {COLUMNS}")
     if len(systems := {row[0] for row in rows[1:]}) != 1:
         raise ValueError(f"settings of {sorted(systems)}; wanted those of one system")
-    return {
-        "system": systems.pop(),
-        "settings": {name: json.loads(value) for _, name, value, _ in rows[1:]},
-        "units": {name: unit for _, name, _, unit in rows[1:]},
-    }
+    try:
+        settings = {name: json.loads(value) for _, name, value, _ in rows[1:]}
+    except RecursionError:
+        raise ValueError("no table of settings: a value is nested too deeply") from None
+    units = {name: unit for _, name, _, unit in rows[1:]}
+    return {"system": systems.pop(), "settings": settings, "units": units}
