@@ -1,6 +1,7 @@
 """Run folders that need no search: fits with invented numbers."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -79,3 +80,9 @@ def save(run: Path, fitted: Fit) -> None:
     """Writes a fit as a job does."""
     run_folder.save_solution(run, fitted.experiment, fitted.problem, fitted.solution)
     run_folder.save_fit(run, fitted)
+
+
+def placeless(run: Path) -> str:
+    """The experiment of a run, without where it was written."""
+    text = (run / run_folder.EXPERIMENT).read_text()
+    return re.sub(r"^written_in = .*\n", "", text, flags=re.MULTILINE)
