@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.cli import main
 from fitting.datasets.clips import load_clip
+from fitting.datasets.clips.formats.c3d.marker_sets import guess_map
 from fitting.datasets.clips.formats.c3d.plug_in_gait import chord, hip_centres
 from fitting.datasets.clips.summary import as_text, describe
 from support.c3d_files import WIDTHS, both_sides, plug_in_gait, write_c3d
@@ -169,6 +170,17 @@ def test_a_map_of_markers_is_drafted_and_no_map_of_an_npz(walk, body, tmp_path, 
     assert "#LTHI" in draft
     assert main.main(["inspect", str(ARCHIVE), "--joints"]) == main.MISTAKE
     assert "takes no joint map" in capsys.readouterr().err
+
+
+def test_markers_are_guessed_by_how_their_names_begin():
+    draft = guess_map(("lateral_ankle", "LKNE", "left_toe", "R.KNE", "Bob:RANK"))
+    assert (draft["ankle_left"], draft["knee_left"], draft["toe_left"]) == ("", "LKNE", "left_toe")
+    assert (draft["knee_right"], draft["ankle_right"]) == ("R.KNE", "Bob:RANK")
+
+
+def test_a_joint_map_in_memory_is_checked_as_a_file_is(walk):
+    with pytest.raises(ValueError, match="there is no pelvis; a joint map names it"):
+        load_clip(walk, joints={"hip_left": "LASI"})
 
 
 def test_files_without_motion_are_refused_in_one_line(walk, places, tmp_path, monkeypatch):

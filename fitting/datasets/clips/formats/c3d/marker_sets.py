@@ -250,6 +250,12 @@ def _axes(left: Vectors, up: Vectors) -> Rotations:
     return Rotation.from_matrix(axes).as_quat(scalar_first=True)
 
 
+def _follows(text: str, side: str, words: tuple[str, ...]) -> bool:
+    """Whether a name is that of a side, or its first letter, and then one of the words."""
+    rests = [text.removeprefix(start) for start in (side, side[0]) if text.startswith(start)]
+    return any(rest.lstrip("_ .-").startswith(words) for rest in rests)
+
+
 def guess_map(names: tuple[str, ...]) -> dict[str, str]:
     """The best guess of a joint map by what names contain; "" for what is unknown."""
     plain_names = {name: name.rpartition(":")[2].lower() for name in names}
@@ -258,11 +264,6 @@ def guess_map(names: tuple[str, ...]) -> dict[str, str]:
     for side in LEG_NAMES.values():
         for role in LEG_ROLES:
             words = GUESSES.get(role, ())
-            starts = (side, side[0])
-            own = [
-                name
-                for name, text in plain_names.items()
-                if text.startswith(starts) and any(word in text for word in words)
-            ]
+            own = [name for name, text in plain_names.items() if _follows(text, side, words)]
             roles[f"{role}_{side}"] = AND.join(own)
     return roles

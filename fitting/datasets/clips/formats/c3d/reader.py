@@ -45,7 +45,8 @@ def read_c3d(
     with error_context(path):
         markers = _turned(read_markers(path))
         if joints is not None:
-            return _recording(markers, from_map(markers, joints))
+            checked = map_files.check_joint_map(dict(joints), "the joint map")
+            return _recording(markers, from_map(markers, checked))
         if (subject := plug_in_gait.find_subject(markers.names)) is not None:
             return _recording(markers, from_plug_in_gait(markers, subject, scale))
         if (known := _as_joints(markers.names)) is not None:
