@@ -6,7 +6,7 @@ posterior, and writes reports; the command `jaxik` does the same from a shell. I
 
 Start with `fit`: it takes an experiment, which `load_experiment` reads from a file. The wings, each
 importing only those before it: `runtime`, `datasets`, `problem`, `inference`, `analysis`,
-`experiments`, `studies`, `report`, `jobs`, `bench`, `cli`.
+`experiments`, `studies`, `report`, `viewer`, `jobs`, `bench`, `cli`.
 """
 
 import lazy_loader

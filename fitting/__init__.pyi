@@ -9,6 +9,7 @@ from . import problem as problem
 from . import report as report
 from . import runtime as runtime
 from . import studies as studies
+from . import viewer as viewer
 from .datasets.clip_frames import frames_from_clip as frames_from_clip
 from .datasets.clips import Clip as Clip
 from .datasets.clips import load_clip as load_clip

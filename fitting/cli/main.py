@@ -30,8 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             with watched():
                 status = _function(options.command)(options)
-            if sys.stdout is not None:  # else it was closed
-                sys.stdout.flush()
+            _flush()
             return status
     except BrokenPipeError:  # the reader, such as `head`, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -42,6 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _flush() -> None:
+    """Passes on what was printed, unless stdout was closed."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
 
 
 def _function(command: str) -> Callable[[argparse.Namespace], int]:

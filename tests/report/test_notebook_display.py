@@ -42,7 +42,7 @@ def test_a_notebook_shows_the_clips_and_the_free_parameters_of_an_experiment(tmp
     experiment = experiment_files.load_experiment(write(tmp_path, top='name = "a <b> & c"'))
     text = experiment._repr_html_()
     clips, free = tables(text)
-    assert "a &lt;b&gt; &amp; c" in text
+    assert "a &lt;b&gt; &amp; c" in text and "Numbers are for an adult" in text
     assert clips[1] == [
         "uneven_walk.npz", "uneven_walk_base.npz", "uneven_walk.ply", "1 s", "2 s"
     ]  # fmt: skip

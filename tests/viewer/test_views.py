@@ -111,23 +111,21 @@ def test_another_clip_is_shown_while_the_first_one_plays(fitted, tmp_path):
 def test_pages_of_other_origins_cannot_connect(fitted):
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
+    from websockets.typing import Origin, Subprotocol
 
     from fitting.viewer.page import open_server, stop
 
     server = open_server("127.0.0.1", 0, "test")
     try:
         address = f"127.0.0.1:{server.get_port()}"
-        protocol = {"subprotocols": [f"viser-v{viser_version()}"]}
-        with connect(f"ws://{address}", origin=f"http://{address}", **protocol):
+        protocol = Subprotocol(f"viser-v{importlib.metadata.version('viser')}")
+        own, other = Origin(f"http://{address}"), Origin("http://elsewhere.example")
+        with connect(f"ws://{address}", origin=own, subprotocols=[protocol]):
             pass
         with pytest.raises(InvalidStatus, match="403"):
-            connect(f"ws://{address}", origin="http://elsewhere.example", **protocol)
+            connect(f"ws://{address}", origin=other, subprotocols=[protocol])
     finally:
         stop(server)
-
-
-def viser_version() -> str:
-    return importlib.metadata.version("viser")
 
 
 @needs_viser

@@ -1,5 +1,6 @@
 """What notebooks show of an experiment: its clips and what is free."""
 
+import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.report.formatting import Table, interval, number
 from fitting.runtime.display import notebook
@@ -14,9 +15,12 @@ def experiment_html(experiment: Experiment) -> str:
     preset = f"{experiment.preset}{' (faithful)' if experiment.faithful else ''}"
     system = f"preset {preset}" if experiment.system is None else "a system in memory"
     rules = [f"{stage} by {rule}" for stage, rule in experiment.rules.items()]
+    lines = [", ".join([system, *rules]) + "."]
+    if _rig(experiment) is None and experiment.system is None and experiment.body == "clip":
+        lines.append("Numbers are for an adult; a fit scales them to the body of its first clip.")
     return parts.page(
         f"Experiment: {experiment.name}",
-        parts.sentences([", ".join([system, *rules]) + "."]),
+        parts.sentences(lines),
         parts.table(_clips(experiment)),
         parts.table(_free(experiment)),
     )
@@ -33,11 +37,18 @@ def _clips(experiment: Experiment) -> Table:
     return rows
 
 
+def _rig(experiment: Experiment) -> jaxik.Rig | None:
+    """Of the first clip, if that is in memory."""
+    loaded = experiment.clips[0].loaded
+    return None if loaded is None else loaded.reference.rig
+
+
 def _free(experiment: Experiment) -> Table:
-    ik = experiment.starting_system()
+    rig = _rig(experiment)
+    ik = experiment.starting_system(rig)
     declared = parameter_tree.declarations(ik)
     rows = [["free parameter", "value", "unit", "range", "meaning"]]
-    for free in experiment.free_parameters(ik):
+    for free in experiment.free_parameters(ik, rig):
         meaning = declared[free.leaf]
         value = parameter_tree.shown(ik, free.leaf)
         rows.append([free.name, value, meaning.unit, interval(free.low, free.high), meaning.doc])

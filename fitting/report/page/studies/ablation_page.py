@@ -70,13 +70,13 @@ def rises(rows: Sequence[Row]) -> list[Rise]:
     """Of each variant, the largest first; without those of which nothing is known."""
     held_out = {(row.variant, row.part): row.agreement.ankle for row in rows if row.part}
     parts = sorted({part for _, part in held_out})
-    found = []
+    findings = []
     for variant in dict.fromkeys(row.variant for row in rows if row.variant != COMPLETE):
         each = [held_out[variant, part] - held_out[COMPLETE, part] for part in parts]
         mean = sum(each) / len(each)
         if not math.isnan(mean):
-            found.append(Rise(variant, mean, all(rise > 0.0 for rise in each)))
-    return sorted(found, key=lambda rise: -rise.mean)
+            findings.append(Rise(variant, mean, all(rise > 0.0 for rise in each)))
+    return sorted(findings, key=lambda rise: -rise.mean)
 
 
 def findings(rows: Sequence[Row]) -> list[Finding]:

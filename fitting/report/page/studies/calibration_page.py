@@ -64,21 +64,22 @@ def findings(assessment: Assessment) -> list[Finding]:
 def _intervals(assessment: Assessment) -> Finding:
     cover = assessment.fit_coverage
     count = assessment.replicates
-    made = f"{count} simulated motion{'s' * (count != 1)}"
+    motions = f"{count} simulated motion{'s' * (count != 1)}"
     bounds = f"{percent(cover.low, 0)} to {percent(cover.high, 0)}"
     share = percent(cover.fraction, 0)
     coverage = f"the fit's 95 % intervals contain {share} of the true values ({bounds})"
     if not assessment.inside:
         return Finding(
-            f"Of {made}, outside their bounds: {listed(assessment.outside)}; {coverage}.", bad=True
+            f"Of {motions}, outside their bounds: {listed(assessment.outside)}; {coverage}.",
+            bad=True,
         )
     if cover.high - cover.low > WIDE:
         return Finding(
-            f"Everything is inside its bounds, but {made} prove little, as these bounds are wide: "
-            f"{coverage}.",
+            f"Everything is inside its bounds, but {motions} prove little, as these bounds are "
+            f"wide: {coverage}.",
             bad=True,
         )
-    return Finding(f"On {made} everything is inside its bounds: {coverage}.")
+    return Finding(f"On {motions} everything is inside its bounds: {coverage}.")
 
 
 def _valleys(assessment: Assessment) -> Finding:
