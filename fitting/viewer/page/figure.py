@@ -4,6 +4,7 @@ import threading
 
 import numpy as np
 import viser
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import uniform_filter1d
 
 from fitting.datasets import ground_patch
@@ -15,7 +16,9 @@ from fitting.viewer.solving import Drawn, Solved, Solver
 from jaxik.world import body
 
 GROUND = (150, 138, 116)
-BONE, FOOT, OVERLAY = 0.016, 0.03, 0.012  # m, thickness of lines
+BONE, FOOT, OVERLAY, FINE = 0.016, 0.03, 0.012, 0.006  # m, thickness of lines
+SQUARE = 0.5  # m, between lines on the ground
+LIFT = np.array([0.0, 0.002, 0.0])  # m, of these lines, so that the ground does not hide them
 STEADY = 1.0  # s, over which the camera averages the path that it follows
 VIEW_FROM = np.array([1.9, 0.6, 1.5])  # m, from the pelvis, for an adult
 ROOT = "/world"
@@ -57,7 +60,8 @@ class Figure:
         x, z = np.meshgrid(np.arange(columns), np.arange(rows))
         heights = np.nan_to_num(patch.heights)
         across = (patch.corner[0] + patch.spacing * x, heights, patch.corner[1] + patch.spacing * z)
-        vertices = np.stack(across, axis=-1).reshape(-1, 3) - self.origin
+        points = np.stack(across, axis=-1) - self.origin
+        vertices = points.reshape(-1, 3)
         faces = grid_faces(rows, columns)
         known = np.isfinite(patch.heights).reshape(-1)
         faces = faces[known[faces].all(axis=-1)]
@@ -68,6 +72,11 @@ class Figure:
             color=GROUND,
             side="double",
         )
+        grid = _grid(points + LIFT, np.isfinite(patch.heights), patch.spacing).astype(np.float32)
+        if len(grid):
+            self.server.scene.add_line_segments(
+                f"{ROOT}/grid", grid, _linear(np.full(grid.shape, GROUND, np.uint8)), thickness=FINE
+            )
 
     def show(self, solved: Solved) -> None:
         """Draws another solution, in the same frame."""
@@ -86,10 +95,11 @@ class Figure:
     def _put(self, name: str, lines: Lines, thickness: float, *, visible: bool = True) -> None:
         """Keeps lines to be drawn, and makes a node for them, if there is none yet."""
         points = (lines.points - self.origin).astype(np.float32)
-        self._lines[name] = Lines(points, lines.colours)
+        colours = _linear(lines.colours)
+        self._lines[name] = Lines(points, colours)
         if name not in self._nodes:
             self._nodes[name] = self.server.scene.add_line_segments(
-                f"{ROOT}/{name}", points[0], lines.colours[0], thickness=thickness, visible=visible
+                f"{ROOT}/{name}", points[0], colours[0], thickness=thickness, visible=visible
             )
 
     def set_visible(self, name: str, visible: bool) -> None:
@@ -119,3 +129,25 @@ class Figure:
             self._removed = True
             self._world.remove()
             self._nodes.clear()
+
+
+def _grid(
+    points: Float[np.ndarray, "rows columns 3"],
+    known: Bool[np.ndarray, "rows columns"],
+    spacing: float,
+) -> Float[np.ndarray, "lines 2 3"]:
+    """Lines on the ground in both directions, which show how it rises and falls."""
+    every = max(1, round(SQUARE / spacing))
+    segments = []
+    for way, there in ((points, known), (points.swapaxes(0, 1), known.T)):
+        whole = there[::every, :-1] & there[::every, 1:]
+        ends = np.stack([way[::every, :-1], way[::every, 1:]], axis=2)
+        segments.append(ends[whole])
+    return np.concatenate(segments)
+
+
+def _linear(colours: UInt8[np.ndarray, "*any 3"]) -> UInt8[np.ndarray, "*any 3"]:
+    """Colours of lines as viser wants them: it takes them for linear light, and brightens them."""
+    parts = colours / 255.0
+    light = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return np.round(255.0 * light).astype(np.uint8)
