@@ -1,6 +1,5 @@
 """Pages in a browser: they open from disk, draw, play, and fit a phone."""
 
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,9 @@ from fitting.report.page.comparisons import compare_page, runs_page
 from fitting.studies import run_folder
 from fitting.studies.posterior.run_comparison import ComparedRun
 from support import comparisons, runs
+from support.browsers import launch, needs_chromium
 from support.pages import Page
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 STILL = """(() => {
   const still = document.getElementById("still");
   const pixels = still.getContext("2d").getImageData(0, 0, still.width, still.height).data;
@@ -33,7 +31,7 @@ DESKTOP = {"width": 1280, "height": 900}
 playwright = pytest.importorskip(
     "playwright.sync_api", reason='needs `pip install "jaxik[browser]"`'
 )
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium, which is not installed")
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +62,7 @@ def plain_path(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL]
-        )
+        browser = launch(driver)
         yield browser
         browser.close()
 
@@ -159,7 +155,9 @@ def test_it_plays_by_keyboard_and_stops_at_the_end(open_page):
     assert page.locator("#play").get_attribute("aria-label") == "Pause"
     page.wait_for_function("document.getElementById('view').dataset.playing === 'false'")
     last = page.locator("#time").get_attribute("max")
-    assert shown(page)["frame"] == last and int(last) > 0
+    # The picture of the last frame may come a moment after the end.
+    page.wait_for_function(f"document.getElementById('view').dataset.frame === '{last}'")
+    assert int(last) > 0
     page.locator("#time").focus()
     page.keyboard.press("ArrowLeft")
     assert shown(page)["frame"] == str(int(last) - 1)

@@ -1,7 +1,6 @@
 """The live viewer in a browser: it loads, sliders move parameters, and there is a way back."""
 
 import dataclasses
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,8 @@ from fitting.jobs.views import Address
 from fitting.problem.free_parameters import free_parameter
 from fitting.viewer import subject_of_run
 from support import runs
+from support.browsers import launch, needs_chromium
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WINDOW = {"width": 720, "height": 420}  # small, for software has to draw it
 LONG = 300.0  # s, on a busy machine
 
@@ -24,7 +22,7 @@ pytest.importorskip("viser", reason='needs `pip install "jaxik[view]"`')
 playwright = pytest.importorskip(
     "playwright.sync_api", reason='needs `pip install "jaxik[browser]"`'
 )
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium, which is not installed")
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +50,7 @@ def page(viewer) -> Iterator[Any]:
     """The page, loaded; at the end nothing has gone wrong, and nothing came from elsewhere."""
     problems: list[str] = []
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL]
-        )
+        browser = launch(driver)
         page = browser.new_page(viewport=WINDOW)
         page.set_default_timeout(1000 * LONG)
         page.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
