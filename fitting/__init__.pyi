@@ -26,6 +26,7 @@ from .jobs import calibrate as calibrate
 from .jobs import compare as compare
 from .jobs import export as export
 from .jobs import fit as fit
+from .jobs import fit_many as fit_many
 from .jobs import population as population
 from .jobs import sample as sample
 from .jobs import translate as translate
