@@ -1,0 +1,136 @@
+"""A problem of many clips whose residuals are computed on all devices, each with its clips.
+
+The clips lie on the devices and stay there; the parameters go to all of them, and one number comes
+back for each point, the sum of what all devices found. It is that of one device up to rounding.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+import jaxik
+from fitting.inference.noise.marginal import with_unknown_sigmas
+from fitting.problem import stacking
+from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scene, residuals_of_scenes
+from fitting.problem.scene import Scene
+
+CLIPS = "clips"  # the axis of the devices
+EVERYWHERE, SPLIT = PartitionSpec(), PartitionSpec(CLIPS)
+
+
+class ShardedScenes(eqx.Module):
+    """The clips of a problem, on several devices."""
+
+    stacks: tuple[Scene, ...]
+    """Each with clips on the first axis of its arrays, as many for each device."""
+    shared: tuple[bool, ...] = eqx.field(static=True)
+    """Of each stack, whether its clips have one terrain."""
+    mesh: Mesh = eqx.field(static=True)
+    """The devices."""
+
+
+def over_devices(
+    problem: Problem[jaxik.FootIK], devices: Sequence[jax.Device] | None = None
+) -> Problem[jaxik.FootIK]:
+    """The problem with its clips shared out among devices; the same up to rounding.
+
+    Its residuals come in another order, with zeros where clips were made longer or devices have
+    less to do. With one device or one clip, or residuals of another kind, it stays as it is.
+
+    Args:
+        problem: of clips, as `problem_from_clips` makes it.
+        devices: which; None takes all of this process.
+    """
+    devices = jax.local_devices() if devices is None else list(devices)
+    if (
+        len(devices) < 2
+        or problem.residual_function is not residuals_of_scenes
+        or len(problem.data) < 2
+    ):
+        return problem
+    mesh = Mesh(np.array(devices), (CLIPS,))
+    stacks = [_filled(stack, len(devices)) for stack in stacking.stack(problem.data)]
+    each = [scene for stack in stacks for scene in _unstacked(stack)]
+    sharded = dataclasses.replace(
+        problem,
+        data=ShardedScenes(
+            tuple(_placed(stack, mesh) for stack in stacks),
+            tuple(stack.shares_terrain for stack in stacks),
+            mesh,
+        ),
+        residual_function=residuals_of_sharded,
+    )
+    if problem.unknown_sigmas is None:
+        return sharded
+    # Which residual has which sigma, in their new order.
+    unsharded = dataclasses.replace(problem, data=tuple(each), unknown_sigmas=None)
+    unknown = with_unknown_sigmas(unsharded).unknown_sigmas
+    return dataclasses.replace(sharded, unknown_sigmas=unknown)
+
+
+def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, " residuals"]:
+    """Residuals of clips on several devices, one clip after another."""
+    parts = []
+    for scenes, shared in zip(data.stacks, data.shared, strict=True):
+        axes = _axes(scenes, shared)
+        spread = jax.tree.map(
+            lambda axis: SPLIT if axis == 0 else EVERYWHERE, axes, is_leaf=lambda a: a is None
+        )
+        of_clips = jax.vmap(residuals_of_scene, in_axes=(None, axes))
+        # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
+        of_devices = jax.shard_map(
+            of_clips,
+            mesh=data.mesh,
+            in_specs=(EVERYWHERE, spread),
+            out_specs=SPLIT,
+            check_vma=False,
+        )
+        parts.append(of_devices(ik, scenes).ravel())
+    return jnp.concatenate(parts)
+
+
+def _filled(stack: stacking.Stack, devices: int) -> stacking.Stack:
+    """The stack with clips that nobody observed, until each device has as many."""
+    count = len(stack.members)
+    whole = -(-count // devices) * devices
+    scenes = stack.part(0, whole)
+    observed = np.array(scenes.reference.observed)
+    observed[count:] = False
+    scenes = dataclasses.replace(
+        scenes, reference=dataclasses.replace(scenes.reference, observed=observed)
+    )
+    return stack._replace(scenes=scenes, members=(*stack.members, *[-1] * (whole - count)))
+
+
+def _unstacked(stack: stacking.Stack) -> list[Scene]:
+    axes = stack.axes
+    return [
+        jax.tree.map(
+            lambda leaf, axis: leaf if axis is None else leaf[i],  # noqa: B023
+            stack.scenes,
+            axes,
+        )
+        for i in range(len(stack.members))
+    ]
+
+
+def _axes(scenes: Scene, shared: bool) -> Scene:
+    return stacking.Stack(scenes, (), shared).axes
+
+
+def _placed(stack: stacking.Stack, mesh: Mesh) -> Scene:
+    """The stack's arrays on their devices."""
+    leaves, structure = jax.tree.flatten(stack.scenes)
+    axes = structure.flatten_up_to(stack.axes)
+    placed = [
+        jax.device_put(leaf, NamedSharding(mesh, EVERYWHERE if axis is None else SPLIT))
+        for leaf, axis in zip(leaves, axes, strict=True)
+    ]
+    return jax.tree.unflatten(structure, placed)
