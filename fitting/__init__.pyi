@@ -33,5 +33,7 @@ from .jobs import translate as translate
 from .runtime.xla import configure_xla as configure_xla
 from .studies.animations import AnimationFiles as AnimationFiles
 from .studies.fit import Fit as Fit
+from .studies.many.evaluation import evaluate_many as evaluate_many
+from .studies.many.evaluation import vary as vary
 from .studies.translation import TranslationRequest as TranslationRequest
 from .studies.translation import load_named_system as load_named_system

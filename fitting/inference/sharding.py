@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 import jaxik
 from fitting.inference.noise.marginal import with_unknown_sigmas
@@ -30,8 +30,8 @@ class ShardedScenes(eqx.Module):
 
     stacks: tuple[Scene, ...]
     """Each with clips on the first axis of its arrays, as many for each device."""
-    shared: tuple[bool, ...] = eqx.field(static=True)
-    """Of each stack, whether its clips have one terrain."""
+    stacked: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    """Of each stack, which of its arrays have that axis."""
     mesh: Mesh = eqx.field(static=True)
     """The devices."""
 
@@ -57,12 +57,12 @@ def over_devices(
         return problem
     mesh = Mesh(np.array(devices), (CLIPS,))
     stacks = [_filled(stack, len(devices)) for stack in stacking.stack(problem.data)]
-    each = [scene for stack in stacks for scene in _unstacked(stack)]
+    each = [stack.one(i) for stack in stacks for i in range(len(stack.members))]
     sharded = dataclasses.replace(
         problem,
         data=ShardedScenes(
             tuple(_placed(stack, mesh) for stack in stacks),
-            tuple(stack.shares_terrain for stack in stacks),
+            tuple(stack.stacked for stack in stacks),
             mesh,
         ),
         residual_function=residuals_of_sharded,
@@ -78,12 +78,11 @@ def over_devices(
 def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, " residuals"]:
     """Residuals of clips on several devices, one clip after another."""
     parts = []
-    for scenes, shared in zip(data.stacks, data.shared, strict=True):
-        axes = _axes(scenes, shared)
-        spread = jax.tree.map(
-            lambda axis: SPLIT if axis == 0 else EVERYWHERE, axes, is_leaf=lambda a: a is None
+    for scenes, stacked in zip(data.stacks, data.stacked, strict=True):
+        of_clips = jax.vmap(
+            residuals_of_scene, in_axes=(None, stacking.labelled(scenes, stacked, 0))
         )
-        of_clips = jax.vmap(residuals_of_scene, in_axes=(None, axes))
+        spread = specifications(scenes, stacked, SPLIT)
         # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
         of_devices = jax.shard_map(
             of_clips,
@@ -109,28 +108,17 @@ def _filled(stack: stacking.Stack, devices: int) -> stacking.Stack:
     return stack._replace(scenes=scenes, members=(*stack.members, *[-1] * (whole - count)))
 
 
-def _unstacked(stack: stacking.Stack) -> list[Scene]:
-    axes = stack.axes
-    return [
-        jax.tree.map(
-            lambda leaf, axis: leaf if axis is None else leaf[i],  # noqa: B023
-            stack.scenes,
-            axes,
-        )
-        for i in range(len(stack.members))
-    ]
-
-
-def _axes(scenes: Scene, shared: bool) -> Scene:
-    return stacking.Stack(scenes, (), shared).axes
+def specifications(tree: PyTree, stacked: Sequence[bool], split: PartitionSpec) -> PyTree:
+    """How the arrays of a tree are split among devices: those that are not stacked are copied."""
+    leaves = [split if flag else EVERYWHERE for flag in stacked]
+    return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
 
 def _placed(stack: stacking.Stack, mesh: Mesh) -> Scene:
     """The stack's arrays on their devices."""
     leaves, structure = jax.tree.flatten(stack.scenes)
-    axes = structure.flatten_up_to(stack.axes)
     placed = [
-        jax.device_put(leaf, NamedSharding(mesh, EVERYWHERE if axis is None else SPLIT))
-        for leaf, axis in zip(leaves, axes, strict=True)
+        jax.device_put(leaf, NamedSharding(mesh, SPLIT if flag else EVERYWHERE))
+        for leaf, flag in zip(leaves, stack.stacked, strict=True)
     ]
     return jax.tree.unflatten(structure, placed)

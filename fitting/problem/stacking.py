@@ -8,7 +8,7 @@ few, so that a thousand clips of a thousand lengths need a few programs.
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .scene import Scene
+
+Tree = TypeVar("Tree", bound=PyTree)
 
 GROWTH = 1.25  # of the lengths that clips are rounded up to: at most a fifth is padding
 SHORTEST = 32  # frames
@@ -31,21 +33,35 @@ class Stack(NamedTuple):
     shares_terrain: bool
 
     @property
-    def axes(self) -> PyTree:
-        """0 for each array that has an axis of clips, None for others: as `jax.vmap` takes it."""
-        axes = jax.tree.map(lambda leaf: 0, self.scenes)
+    def stacked(self) -> tuple[bool, ...]:
+        """For each array, whether it has an axis of clips."""
+        flags = jax.tree.map(lambda leaf: True, self.scenes)
         if self.shares_terrain:
-            axes = _with_terrain(axes, jax.tree.map(lambda leaf: None, self.scenes.terrain))
-        return axes
+            terrain = jax.tree.map(lambda leaf: False, self.scenes.terrain)
+            flags = _with_terrain(flags, terrain)
+        return tuple(jax.tree.leaves(flags))
+
+    def one(self, number: int) -> Scene:
+        """A clip of the stack, without an axis of clips."""
+        return chosen(self.scenes, self.stacked, number)
 
     def part(self, first: int, count: int) -> Scene:
         """So many clips from one of them on; the last clip is repeated where there are fewer."""
-        chosen = np.minimum(np.arange(first, first + count), len(self.members) - 1)
-        part = jax.tree.map(lambda leaf: leaf[chosen], _with_terrain(self.scenes, None))
-        terrain = self.scenes.terrain
-        if not self.shares_terrain:
-            terrain = jax.tree.map(lambda leaf: leaf[chosen], terrain)
-        return _with_terrain(part, terrain)
+        numbers = np.minimum(np.arange(first, first + count), len(self.members) - 1)
+        return chosen(self.scenes, self.stacked, numbers)
+
+
+def chosen(tree: Tree, stacked: Sequence[bool], numbers: int | np.ndarray) -> Tree:
+    """A tree whose stacked arrays have only these members, or a member and no axis of them."""
+    leaves, structure = jax.tree.flatten(tree)
+    pairs = zip(leaves, stacked, strict=True)
+    return jax.tree.unflatten(structure, [x[numbers] if flag else x for x, flag in pairs])
+
+
+def labelled(tree: PyTree, stacked: Sequence[bool], label: object) -> PyTree:
+    """The tree with a label for each stacked array and None for others, as axes are given."""
+    leaves = [label if flag else None for flag in stacked]
+    return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
 
 def frame_count(scene: Scene) -> int:
