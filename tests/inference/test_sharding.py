@@ -53,9 +53,7 @@ def test_two_processes_find_what_one_finds(on_one_device, tmp_path):
         listener.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{listener.getsockname()[1]}"
     paths = [tmp_path / f"{number}.npz" for number in range(2)]
-    processes = [
-        start(path, 2, address, "2", str(number)) for number, path in enumerate(paths)
-    ]
+    processes = [start(path, 2, address, "2", str(number)) for number, path in enumerate(paths)]
     for process in processes:
         _, errors = process.communicate(timeout=500)
         assert process.returncode == 0, errors[-2000:]
