@@ -6,6 +6,7 @@ back for each point, the sum of what all devices found. It is that of one device
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,7 +38,7 @@ class ShardedScenes(eqx.Module):
 
 
 def over_devices(
-    problem: Problem[jaxik.FootIK], devices: Sequence[jax.Device] | None = None
+    problem: Problem[jaxik.FootIK], devices: Sequence[Any] | None = None
 ) -> Problem[jaxik.FootIK]:
     """The problem with its clips shared out among devices; the same up to rounding.
 
@@ -46,7 +47,7 @@ def over_devices(
 
     Args:
         problem: of clips, as `problem_from_clips` makes it.
-        devices: which; None takes all of this process.
+        devices: those of JAX; None takes all of this process.
     """
     devices = jax.local_devices() if devices is None else list(devices)
     if (

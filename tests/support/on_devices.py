@@ -23,7 +23,7 @@ def main() -> None:
     if processes:
         address, count, number = processes
         jax.distributed.initialize(address, int(count), int(number))
-    np.savez(path, **numbers())
+    np.savez(path, allow_pickle=False, **numbers())
 
 
 def numbers() -> dict[str, np.ndarray]:

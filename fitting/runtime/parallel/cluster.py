@@ -30,6 +30,8 @@ MAX_MAPPINGS = 20_000
 MAPPINGS = Path("/proc/self/maps")
 # Dask would look at every stack a hundred times a second: 7 % of a fit's CPU time.
 UNPROFILED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
+# Dask has workers give memory back at once (64 kB), which a fit asks for again at once.
+MEMORY = {"MALLOC_TRIM_THRESHOLD_": f"{1 << 28}", "MALLOC_MMAP_THRESHOLD_": f"{1 << 25}"}
 Argument = TypeVar("Argument")
 
 
@@ -131,11 +133,16 @@ def _environment() -> dict[str, str]:
     """What makes workers of this machine compute, and keep programs, as this process does."""
     names = (cache_folder.FOLDER, cache_folder.ENABLED, cache_folder.MIN_SECONDS)
     settings = {name.upper(): cache_folder.setting(name) for name in names}
-    return {
-        name: str(int(value) if isinstance(value, bool) else value)
-        for name, value in settings.items()
-        if value is not None
-    } | {name: os.environ[name] for name in (xla.VARIABLE,) if name in os.environ} | UNPROFILED
+    return (
+        {
+            name: str(int(value) if isinstance(value, bool) else value)
+            for name, value in settings.items()
+            if value is not None
+        }
+        | {name: os.environ[name] for name in (xla.VARIABLE,) if name in os.environ}
+        | UNPROFILED
+        | MEMORY
+    )
 
 
 @in_float64

@@ -88,7 +88,7 @@ def evaluate_many(
     *,
     chunk: int | None = None,
     memory: float = MEMORY,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> dict[str, Float[np.ndarray, "systems clips *numbers"]]:
     """What every system of a batch makes of every clip, in numbers.
 
