@@ -30,8 +30,6 @@ MAX_MAPPINGS = 20_000
 MAPPINGS = Path("/proc/self/maps")
 # Dask would look at every stack a hundred times a second: 7 % of a fit's CPU time.
 UNPROFILED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
-# Dask has workers give memory back at once (64 kB), which a fit asks for again at once.
-MEMORY = {"MALLOC_TRIM_THRESHOLD_": f"{1 << 28}", "MALLOC_MMAP_THRESHOLD_": f"{1 << 25}"}
 Argument = TypeVar("Argument")
 
 
@@ -141,7 +139,6 @@ def _environment() -> dict[str, str]:
         }
         | {name: os.environ[name] for name in (xla.VARIABLE,) if name in os.environ}
         | UNPROFILED
-        | MEMORY
     )
 
 
