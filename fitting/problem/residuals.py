@@ -7,13 +7,18 @@ import jaxik
 from jaxik.maths import quat, vec
 
 from .scene import Scene, legs_ws, pelvis_ws
-from .shared_world import run_scenes
+from .shared_world import run_scene, run_scenes
 
 
 def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " residuals"]:
     """Residuals of several clips in standard deviations, one clip after another."""
     pairs = zip(scenes, run_scenes(ik, scenes), strict=True)
     return jnp.concatenate([residuals_of_result(scene, result) for scene, result in pairs])
+
+
+def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " residuals"]:
+    """Residuals of one clip, which runs alone."""
+    return residuals_of_result(scene, run_scene(ik, scene))
 
 
 def residuals_of_result(scene: Scene, result: jaxik.Result) -> Float[Array, " residuals"]:

@@ -83,6 +83,11 @@ def row_of(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> Row:
     return Row(ik, first.rig, first.place.terrain, frames, _tracks_in_a_row(ik, scenes))
 
 
+def run_scene(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
+    """What a system makes of the clip of one scene, in its own world."""
+    return _run_row(ik, [scene])[0]
+
+
 def run_scenes(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[jaxik.Result, ...]:
     """What a system makes of the clip of each scene: one loop for those that share a world."""
     results: dict[int, Result] = {}

@@ -109,7 +109,7 @@ def stack(scenes: Sequence[Scene], *, rounded: bool = True) -> list[Stack]:
     groups: dict[object, list[tuple[int, Scene]]] = {}
     for number, scene in enumerate(scenes):
         length = rounded_up(frame_count(scene)) if rounded else longest
-        plain = _without_names(padded(scene, length))
+        plain = _without_names(dataclasses.replace(padded(scene, length), place=None))
         groups.setdefault(_shapes(plain), []).append((number, plain))
     return [_stacked(members) for members in groups.values()]
 

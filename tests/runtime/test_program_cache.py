@@ -296,9 +296,9 @@ def test_arrays_are_compiled_for_once_wherever_they_come_from(folder):
     """Those that come out of a kept program are committed to a device, unlike fresh ones."""
     compiled = []
 
-    def count(event: str, duration: float, **named: object) -> None:
+    def count(event: str, duration_secs: float, **named: object) -> None:
         if event.endswith("backend_compile_duration") and named.get("fun_name") == "jit(stretch)":
-            compiled.append(duration)
+            compiled.append(duration_secs)
 
     call, points = program_cache.cached(stretch), jnp.ones((4, 3))
     jax.monitoring.register_event_duration_secs_listener(count)

@@ -6,7 +6,7 @@ import pytest
 
 import fitting
 from fitting.experiments.problems import make_problem
-from fitting.problem.scene import run_system
+from fitting.problem.shared_world import run_scene
 from fitting.studies.many import evaluation
 from jaxik.maths import parameter_tree
 from support import scenes
@@ -33,7 +33,7 @@ def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
     residuals = problem.residual_function(one, problem.data)
     assert found[COST][3].sum() == pytest.approx(0.5 * float(np.sum(residuals**2)), rel=1e-10)
     scene = problem.data[1]
-    alone = run_system(one, scene)
+    alone = run_scene(one, scene)
     errors = np.asarray(evaluation.errors_by_kind(scene, alone)["pelvis"])
     seen = np.asarray(scene.reference.observed)
     expected = np.sqrt(np.mean(errors[seen] ** 2, axis=0).sum())

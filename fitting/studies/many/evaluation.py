@@ -26,7 +26,8 @@ from fitting.experiments.problems import make_problem
 from fitting.inference.sharding import EVERYWHERE, specifications
 from fitting.problem import stacking
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
-from fitting.problem.scene import Scene, run_system
+from fitting.problem.scene import Scene
+from fitting.problem.shared_world import run_scene
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.threads import on_all_cores, usable_cores
@@ -209,7 +210,7 @@ class _Calls:
     def _bytes_each(self) -> float:
         """What a system on a clip takes while it is computed."""
         system, scene = jax.tree.map(lambda leaf: leaf[0], self.ik_batch), self.stack.one(0)
-        shapes = jax.tree.leaves(jax.eval_shape(run_system, system, scene))
+        shapes = jax.tree.leaves(jax.eval_shape(run_scene, system, scene))
         return WORKSPACE * sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
 
 
@@ -238,7 +239,7 @@ def _along(
     )
 
     def of_one(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
-        return dict(measure(scene, run_system(ik, scene)))
+        return dict(measure(scene, run_scene(ik, scene)))
 
     # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
     return jax.shard_map(
