@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import fitting
+import jaxik
 from fitting.experiments.problems import make_problem
+from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
 from fitting.studies.many import evaluation
 from jaxik.maths import parameter_tree
@@ -40,14 +42,24 @@ def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
     assert found["pelvis"][3, 1] == pytest.approx(expected, rel=1e-10)
 
 
+traced: list[int] = []  # frames of the clips for which `cost` was traced
+
+
+def cost(scene: Scene, result: jaxik.Result) -> dict[str, jax.Array]:
+    """The cost; says that a program is compiled for it."""
+    traced.append(scene.frames.dt.shape[-1])
+    return {COST: evaluation.errors_and_cost(scene, result)[COST]}
+
+
 def test_no_chunk_and_no_second_call_compiles_anew(problem, ik):
     batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
-    fitting.evaluate_many(batch, problem.data, chunk=2)
-    before = evaluation._along._cache_size()
-    fitting.evaluate_many(batch, problem.data, chunk=2)
+    fitting.evaluate_many(batch, problem.data, cost, chunk=2)
+    before = len(traced)
+    assert before >= 1
+    fitting.evaluate_many(batch, problem.data, cost, chunk=2)
     more = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, 7)})
-    found = fitting.evaluate_many(more, problem.data, chunk=2)
-    assert evaluation._along._cache_size() == before
+    found = fitting.evaluate_many(more, problem.data, cost, chunk=2)
+    assert len(traced) == before
     assert found[COST].shape == (7, 3)
 
 
