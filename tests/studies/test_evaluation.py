@@ -75,10 +75,32 @@ def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik):
         )  # fmt: skip
         return calls._size()
 
-    each = evaluation.WORKSPACE
-    assert each > 1 and size(None, 0.0) == 1 and size(None, 1e15) == evaluation.CACHED
+    assert size(None, 0.0) == 1 and size(None, 1e15) == evaluation.CACHED
     assert 1 < size(None, 1e7) < size(None, 5e7) <= evaluation.CACHED
     assert size(10, 0.0) == 10 and size(5000, 0.0) == 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("along_clips", [False, True])
+def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, along_clips):
+    count = 16
+    systems = 1 if along_clips else count
+    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
+    mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
+    (stack,) = evaluation.stacking.stack(problem.data * (count if along_clips else 1))
+    calls = evaluation._Calls(
+        jax.tree.map(np.asarray, batch),
+        systems,
+        stack,
+        evaluation.errors_and_cost,
+        mesh,
+        count,
+        1.0,
+    )
+    memory = evaluation._along.lower(*calls.arguments(0, 0, count)).compile().memory_analysis()
+    assert memory is not None
+    taken = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+    assert 0.1 * count * calls._bytes_each() < taken < count * calls._bytes_each()
 
 
 def test_mistakes_are_told(problem, ik):

@@ -206,7 +206,7 @@ def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch
 def workers_of(client: subprocess.Popen) -> list[int]:
     """The processes of a command that compute."""
     lines = subprocess.run(
-        ["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
+        ["ps", "-wweo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     every = [(int(pid), int(ppid), words) for pid, ppid, words in (x.split(None, 2) for x in lines)]
     return [pid for pid, ppid, words in every if ppid == client.pid and "spawn_main" in words]
