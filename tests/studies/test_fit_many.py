@@ -90,6 +90,14 @@ def test_numbers_that_make_no_sense_are_refused(experiment_file, tmp_path, optio
         fit_many([], tmp_path / "out")
 
 
+def test_a_folder_with_something_else_is_refused(experiment_file, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.md").write_text("of another command")
+    with pytest.raises(ValueError, match=r"there is something in it already: \['summary.md'\]"):
+        fit_many(experiment_file, tmp_path / "out")
+    assert (tmp_path / "out" / "summary.md").read_text() == "of another command"
+
+
 # What is kept
 
 

@@ -23,12 +23,12 @@ def main() -> None:
     if processes:
         address, count, number = processes
         jax.distributed.initialize(address, int(count), int(number))
-    found = evaluations() if processes else evaluations() | log_probabilities()
+    found = evaluations("systems") if processes else evaluations() | log_probabilities()
     np.savez(path, allow_pickle=False, **found)
 
 
-def evaluations() -> dict[str, np.ndarray]:
-    """Errors of many systems on clips, and of one system on them."""
+def evaluations(*kinds: str) -> dict[str, np.ndarray]:
+    """Errors of many `systems` on clips, and of one system on all `clips` at once."""
     import fitting
     from fitting.experiments.problems import make_problem
     from support.scenes import experiment
@@ -36,13 +36,12 @@ def evaluations() -> dict[str, np.ndarray]:
     problem = make_problem(experiment())
     ik = problem.space.unpack(problem.space.start)
     found = {}
-    for name, gains, chunk in (
-        ("systems", np.linspace(0.05, 0.9, SYSTEMS), CHUNK),
-        ("clips", [0.2], 2),
-    ):
+    for kind in kinds or ("systems", "clips"):
+        gains = np.linspace(0.05, 0.9, SYSTEMS) if kind == "systems" else [0.2]
         batch = fitting.vary(ik, {"pelvis.on_gain": gains})
+        chunk = CHUNK if kind == "systems" else 2
         values = fitting.evaluate_many(batch, problem.data, chunk=chunk)
-        found |= {f"{name} {key}": value for key, value in values.items()}
+        found |= {f"{kind} {name}": value for name, value in values.items()}
     return found
 
 

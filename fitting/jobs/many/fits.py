@@ -18,10 +18,11 @@ from fitting.runtime.parallel import cluster
 from fitting.runtime.precision import in_float64
 from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
+from fitting.studies import run_folder
 from fitting.studies.many import table
 from fitting.studies.many.progress import ManyFits, ManyProgress, Tally
 from fitting.studies.many.rows import Row, failed_row
-from fitting.studies.many.tasks import FitTask, plan
+from fitting.studies.many.tasks import RUNS, FitTask, plan
 
 from .task import fit_task
 
@@ -67,9 +68,11 @@ def fit_many(
 
     Raises:
         ValueError: an experiment cannot be read; there is none, or not one seed; the folder cannot
-            be made or holds the fit of another experiment; there is no such cluster.
+            be made, holds something that is no such fit, or the fit of another experiment; there is
+            no such cluster.
     """
     loaded = _loaded(experiments)
+    _check_folder(Path(output))
     with output_folder(output) as folder:
         assert folder is not None
         folder = folder.absolute()
@@ -102,6 +105,12 @@ def _loaded(
     return [
         entry if isinstance(entry, Experiment) else load_experiment(entry) for entry in experiments
     ]
+
+
+def _check_folder(folder: Path) -> None:
+    """Raises ValueError where a folder is not of an earlier call, and not a new one either."""
+    if not any((folder / name).is_dir() for name in (RUNS, INPUTS)):
+        run_folder.check_new_folder(folder)
 
 
 @contextmanager
