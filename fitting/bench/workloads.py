@@ -20,6 +20,7 @@ from fitting.experiments.problems import ClipData, make_scene
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.scene import Scene
 from fitting.problem.shared_world import share_world
 from fitting.problem.space import make_space
 from fitting.runtime.precision import with_floats
@@ -294,6 +295,15 @@ def problem(frame_count: int, names: tuple[str, ...] = tuple(TRUTH), clips: int 
         reference, base, mesh = recording(frame_count + 10 * number, make_ground)
         data.append(ClipData(reference, base, terrain.mesh(mesh.vertices, mesh.faces)))
     return problem_from_clips(data, names)
+
+
+def first_frames(scene: Scene, count: int) -> Scene:
+    """The beginning of a clip."""
+    parts = (scene.frames, scene.pelvis, scene.reference, scene.tracks)
+    motion, pelvis, reference, tracks = jax.tree.map(lambda leaf: leaf[:count], parts)
+    return dataclasses.replace(
+        scene, frames=motion, pelvis=pelvis, reference=reference, tracks=tracks
+    )
 
 
 def _with_noise(wxyz: np.ndarray, random: np.random.Generator) -> np.ndarray:
