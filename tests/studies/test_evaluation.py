@@ -81,6 +81,7 @@ def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("along_clips", [False, True])
 def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, along_clips):
     count = 16

@@ -38,8 +38,9 @@ BATCH = "batch"  # the axis of the devices
 MEMORY = 1e9  # bytes that chunks take at once, together
 # Bytes of a system on a clip, while it is computed, over those of all that `run` returns for it.
 # Measured of compiled programs, float64, CPU, 8 to 64 at a time: 0.40 of systems on a clip; 0.53 of
-# clips with a system, and 0.27 for the clips themselves.
-WORKSPACE = 1.0
+# clips with a system, and 0.27 for the clips themselves. Of clips of one second, 16 at a time, with
+# the ground that they share, 1.21.
+WORKSPACE = 1.5
 CACHED = 64  # systems, or clips, at a time on a core of a CPU
 Measure: TypeAlias = Callable[[Scene, jaxik.Result], Mapping[str, Float[Array, "*numbers"]]]
 """What is kept of a system on a clip. It must be a function of a module: a new lambda for each call
