@@ -96,13 +96,14 @@ def residuals(
     problem: Problem, candidates: Float[np.ndarray, "candidates free"]
 ) -> Float[np.ndarray, "candidates residuals"]:
     """Residuals of any number of `u`, of the hard program, with 32-bit floats."""
-    return np.concatenate(_of_batches(lambda filled: _evaluate(problem, filled)[1:], candidates)[0])
+    (rows,) = _of_batches(lambda filled: _evaluate(problem, filled)[1:], candidates)
+    return rows
 
 
 def _of_batches(
     call: Callable[[Array], Sequence[Array]], candidates: np.ndarray
-) -> list[list[np.ndarray]]:
-    """What a call gives of all candidates, BATCH at a time: each output a list of 64-bit parts.
+) -> list[np.ndarray]:
+    """What a call gives of all candidates, computed BATCH at a time; 64-bit floats.
 
     The last batch is filled up, so that there is one program. It runs on one core, so batches share
     the cores out among themselves.
@@ -114,7 +115,7 @@ def _of_batches(
         return [np.asarray(output, float)[: len(batch)] for output in call(filled)]
 
     outputs = on_all_cores([partial(parts, batch) for batch in batches])
-    return list(map(list, zip(*outputs, strict=True)))
+    return [np.concatenate(output) for output in zip(*outputs, strict=True)]
 
 
 def evaluate(
@@ -135,13 +136,12 @@ def evaluate(
         cost, residuals = _evaluate(problem, filled)
         return (cost,) if matrix is None else (cost, residuals @ matrix)
 
-    costs, *gradients = _of_batches(call, candidates)
-    cost = np.concatenate(costs)
+    cost, *gradients = _of_batches(call, candidates)
     finite = np.isfinite(cost)
     cost = np.where(finite, cost, np.inf)
     if full is None:
         return Evaluation(cost, candidates, cost)
-    gradient = np.concatenate(*gradients)
+    (gradient,) = gradients
     gram = np.asarray(full.T @ full)
     zero = np.diag(gram) == 0
     steps = -np.linalg.solve(gram + np.diag(zero), gradient.T).T
