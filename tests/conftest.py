@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from fitting.cli.terminal import plain_lines
 from fitting.runtime import xla
+from fitting.runtime.parallel import beside
 
 xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
@@ -34,6 +35,9 @@ jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
 
 # What commands print must not depend on how fast they are.
 plain_lines.PATIENCE = plain_lines.INTERVAL = plain_lines.SILENCE = float("inf")
+
+# Each test process would start others to draw in, only to draw small pictures.
+beside.usable_cores = lambda: 1
 
 # Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
 gc.set_threshold(200_000, 50, 100)

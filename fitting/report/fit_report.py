@@ -1,6 +1,7 @@
 """The report of a fit: text for the terminal, the run's summary.md with its plots, its page."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeAlias
 
@@ -12,6 +13,7 @@ from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.playback import Playback
 from fitting.analysis.rehearsal import Rehearsal
 from fitting.runtime import activity, files
+from fitting.runtime.parallel.beside import calls_beside
 from fitting.runtime.precision import in_float64
 from fitting.studies.assess import MIN_IMPROVEMENT
 from fitting.studies.fit import Fit, FitSummary
@@ -64,32 +66,35 @@ def write_fit(
     worst = ["## The worst two seconds"]
     with activity.announced("Playing the clips with the system before the fit"):
         before = (rehearsal or Rehearsal(fitted.problem)).results()
-    for index, (scene, after) in enumerate(zip(fitted.problem.data, fitted.playbacks, strict=True)):
-        with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
-            first = playback.play(scene, before[index])
-            plots |= _draw_clip(run, fitted, index, first, after)
-            worst += _worst_window(run, fitted, index, after)
-    with activity.announced("Drawing the curves of the parameters"):
-        plots |= _draw_profiles(run, fitted)
-        title = f"{fitted.experiment.name}: cost of the fit over time"
-        figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
-        plots |= save_plot(run, "cost.png", title, figure)
-    with activity.announced("Measuring where limits are in effect"):
-        clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
-        limits = _limits(fitted, clips)
-    parts = [
-        *_result(fitted),
-        *opening,
-        *goodness_report.section(fitted),
-        *_parameters(fitted),
-        *priors.prior_section(fitted.summary["parameters"]),
-        *identifiability_sections(fitted, clips),
-        *limits,
-        *worst,
-        *details,
-        "## Pictures",
-        gallery(plots),
-    ]
+    with ExitStack() as drawing, calls_beside():
+        plays = zip(fitted.problem.data, fitted.playbacks, strict=True)
+        for index, (scene, after) in enumerate(plays):
+            with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
+                first = playback.play(scene, before[index])
+                plots |= _draw_clip(run, fitted, index, first, after)
+                worst += _worst_window(run, fitted, index, after)
+        with activity.announced("Drawing the curves of the parameters"):
+            plots |= _draw_profiles(run, fitted)
+            title = f"{fitted.experiment.name}: cost of the fit over time"
+            figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
+            plots |= save_plot(run, "cost.png", title, figure)
+        with activity.announced("Measuring where limits are in effect"):
+            clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
+            limits = _limits(fitted, clips)
+        parts = [
+            *_result(fitted),
+            *opening,
+            *goodness_report.section(fitted),
+            *_parameters(fitted),
+            *priors.prior_section(fitted.summary["parameters"]),
+            *identifiability_sections(fitted, clips),
+            *limits,
+            *worst,
+            *details,
+            "## Pictures",
+            gallery(plots),
+        ]
+        drawing.enter_context(activity.announced("Finishing the pictures"))
     files.write_text(run / SUMMARY, "\n\n".join(parts) + "\n")
     if fitted.clips:
         with activity.announced("Writing the page"):

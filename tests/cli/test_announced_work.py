@@ -38,6 +38,7 @@ FIT = [
     "Drawing the curves of the parameters",
     "Measuring where limits are in effect",
     "Finding what determines 2 parameters",
+    "Finishing the pictures",
     "Writing the page",
 ]
 SAMPLE = [

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.text import Text
 
 from fitting.runtime import files
+from fitting.runtime.parallel import beside
 
 # The palette of Okabe and Ito, which colour-blind readers can distinguish.
 BEFORE, AFTER, CAPTURED = "#8c8c8c", "#0072B2", "#D55E00"
@@ -98,7 +99,14 @@ def legend(figure: Figure, *entries: Artist, columns: int = 4) -> None:
 
 
 def save(path: Path, figure: Figure) -> None:
-    """Writes a figure; never leaves half a file."""
+    """Writes a figure, which is not changed any more; never leaves half a file.
+
+    Within `calls_beside`, another process does.
+    """
+    beside.call(_write, path, figure)
+
+
+def _write(path: Path, figure: Figure) -> None:
     look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
 
     def fill(temporary: Path) -> None:

@@ -1,0 +1,70 @@
+"""Calls that run in other processes beside what goes on here, such as the drawing of pictures.
+
+Threads would wait for each other, as Python runs one at a time. The processes import what the
+functions need and nothing of the program that runs, so scripts need no guard; they end by
+themselves when they have been idle for a while.
+"""
+
+import multiprocessing
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeAlias
+
+import loky
+
+from fitting.runtime.threads import usable_cores
+
+IDLE = 20  # s after which the processes end
+Notes: TypeAlias = list[warnings.WarningMessage]
+
+_running: ContextVar[list[Future[Notes]] | None] = ContextVar("running", default=None)
+
+
+@contextmanager
+def calls_beside() -> Iterator[None]:
+    """Inside, calls of `call` run in other processes; at the end all of them have finished.
+
+    An error in one of them is raised at the end, and warnings are given there. On one core, and in
+    processes that may have no children, they run at once instead.
+    """
+    if usable_cores() < 2 or multiprocessing.current_process().daemon:
+        yield
+        return
+    running: list[Future[Notes]] = []
+    token = _running.set(running)
+    try:
+        yield
+    except BaseException:
+        for future in running:
+            future.cancel()
+        raise
+    finally:
+        _running.reset(token)
+    for future in running:
+        for note in future.result():
+            warnings.warn_explicit(note.message, note.category, note.filename, note.lineno)
+
+
+def call(function: Callable[..., None], *arguments: Any) -> None:
+    """Calls a function: in another process where `calls_beside`, here otherwise.
+
+    Args:
+        function: of a module.
+        arguments: which can be pickled; they are pickled before this returns or soon after, and
+            must not change any more.
+    """
+    if (running := _running.get()) is None:
+        function(*arguments)
+        return
+    executor = loky.get_reusable_executor(usable_cores(), timeout=IDLE)
+    running.append(executor.submit(_with_notes, function, *arguments))
+
+
+def _with_notes(function: Callable[..., None], *arguments: Any) -> Notes:
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("default")
+        function(*arguments)
+    return notes
