@@ -37,6 +37,7 @@ class Work:
         self._first: tuple[int, float] | None = None
         self.note = ""
         """What it last said of itself, in a line."""
+        self._compiling: dict[str, float] = {}
         self.failed = False
         self.began = time.monotonic()
         self._watcher = watcher
@@ -61,6 +62,23 @@ class Work:
         if self.total is None or each is None or self.done >= self.total:
             return None
         return each * (self.total - self.done)
+
+    @property
+    def compiling(self) -> str:
+        """Which programs are traced and compiled for it at this moment, and since when."""
+        begun = list(self._compiling.items())
+        programs = [f"{name} ({time.monotonic() - since:.0f} s)" for name, since in begun]
+        return f"compiling {', '.join(programs)}" if programs else ""
+
+    def began_compiling(self, program: str) -> None:
+        """Says that it waits for a program from now on."""
+        self._compiling[program] = time.monotonic()
+        self.changed()
+
+    def ended_compiling(self, program: str) -> None:
+        """Says that it has the program."""
+        if self._compiling.pop(program, None) is not None:
+            self.changed()
 
     def advance(self) -> None:
         """Says that one more part is done."""
@@ -140,6 +158,11 @@ def announced(title: str, total: int | None = None, *, done: int = 0) -> Iterato
         _innermost.reset(token)
         if watcher is not None:
             watcher.ended(work)
+
+
+def innermost() -> Work | None:
+    """The work that is going on in this context, if it was announced."""
+    return _innermost.get()
 
 
 def note(text: str) -> None:

@@ -21,7 +21,7 @@ from jaxtyping import PyTree
 
 import jaxik
 
-from . import cache_folder, program_file
+from . import activity, cache_folder, program_file
 from .cache_folder import warn_once
 from .plain_tree import NotPlainError
 from .program_file import Program, Slot
@@ -57,8 +57,12 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     inside another traced program, this is plain `filter_jit`.
     """
 
+    name = function.__name__.strip("_").replace("_", " ")
+
     def from_cache(*args: Inputs.args, **named: Inputs.kwargs) -> Any:
         arguments = (args, named)
+        if (work := activity.innermost()) is not None:
+            work.began_compiling(name)
         if (place := _place(function, arguments)) is None:
             return function(*args, **named)
         program, failure = _read(place), ""
@@ -84,7 +88,11 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return inside(*args, **named)
         args, named = committed((args, named))
-        return outside(*args, **named)
+        try:
+            return outside(*args, **named)
+        finally:
+            if (work := activity.innermost()) is not None:
+                work.ended_compiling(name)
 
     return call
 

@@ -43,8 +43,9 @@ def on_all_cores(calls: Sequence[Callable[[], Output]]) -> list[Output]:
         finally:
             pending.clear()
 
-    helpers = usable_cores() - 1
-    futures = [_thread_pool(helpers).submit(for_other_thread(work)) for _ in range(helpers)]
+    helpers = min(usable_cores(), len(calls)) - 1
+    pool = _thread_pool(usable_cores())
+    futures = [pool.submit(for_other_thread(work)) for _ in range(helpers)]
     work()
     for future in futures:
         future.result()

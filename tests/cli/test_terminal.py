@@ -268,6 +268,20 @@ def test_progress_is_reported_every_ten_seconds_with_the_time_left(monkeypatch):
     ]
 
 
+def test_what_is_compiled_is_named_with_its_seconds(monkeypatch):
+    clock = Clock(monkeypatch)
+    with activity.watched_by(clock.lines), activity.announced("Preparing") as preparing:
+        preparing.began_compiling("step")
+        assert clock.wait(2.0) == ["Preparing: compiling step (2 s) ..."]
+        preparing.began_compiling("evaluate")
+        wanted = ["  11.6 s  Preparing: compiling step (12 s), evaluate (10 s)"]
+        assert clock.wait(11.0) == wanted
+        preparing.ended_compiling("step")
+        preparing.ended_compiling("evaluate")
+        assert clock.wait(40.0) == []
+    assert clock.wait(0.0) == ["Preparing: 53.0 s"]
+
+
 def test_what_is_repeated_within_other_work_is_announced_once(monkeypatch):
     clock = Clock(monkeypatch)
     with activity.watched_by(clock.lines), activity.announced("Fitting 100 replicates", 100):

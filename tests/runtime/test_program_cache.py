@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.runtime import cache_folder, files, program_cache, program_key
+from fitting.runtime import activity, cache_folder, files, program_cache, program_key
 from jaxik.maths import vec
 
 TRACED = []
@@ -318,3 +318,21 @@ def test_what_is_committed_already_or_lies_on_no_device_stays_as_it_is():
     assert bound["points"].committed and not tree["points"].committed
     assert (bound["name"], bound["count"], bound["host"]) == ("here", 3, tree["host"])
     assert program_cache.committed(bound) is bound
+
+
+def test_work_says_what_is_compiled_for_it_and_for_how_long():
+    said = []
+
+    @program_cache.cached
+    def _long_sum(x: jax.Array) -> jax.Array:
+        said.append(work.compiling)
+        return jnp.sum(x)
+
+    with activity.announced("Adding up") as work:
+        for size in (3, 3, 4):
+            _long_sum(jnp.ones(size))
+            assert work.compiling == ""
+    assert said == ["compiling long sum (0 s)"] * 2
+    with pytest.raises(TypeError), activity.announced("Failing") as work:
+        _long_sum("no numbers")
+    assert work.compiling == ""

@@ -75,7 +75,7 @@ class LiveLines:
 
 
 class _Lines(Progress):
-    """The lines, and below them what the innermost work last said of itself."""
+    """The lines, and below them what is compiled, or what the innermost work last said."""
 
     def __init__(self, console: Console):
         super().__init__(
@@ -91,7 +91,8 @@ class _Lines(Progress):
     def get_renderables(self) -> Iterable[RenderableType]:
         """The parts of what is shown."""
         yield self.make_tasks_table(self.tasks)
-        notes = [task.fields["work"].note for task in self.tasks]
+        works = [task.fields["work"] for task in self.tasks]
+        notes = [work.compiling or work.note for work in works]
         if note := next(filter(None, reversed(notes)), ""):
             yield Text(f"  {note}", DIM, no_wrap=True, overflow="ellipsis")
 

@@ -75,8 +75,10 @@ class PlainLines:
                 if is_new and depth not in self._announced and work.seconds >= PATIENCE:
                     self._announced.add(depth)
                     self._titles.add(work.title)
-                    self._print(f"{work.title} ...")
-            if self._going_on and time.monotonic() - self._last >= SILENCE:
+                    self._print(f"{': '.join(filter(None, [work.title, work.compiling]))} ...")
+            compiling = any(work.compiling for work in self._going_on)
+            patience = INTERVAL if compiling else SILENCE
+            if self._going_on and time.monotonic() - self._last >= patience:
                 self._report()
 
     def _watch(self) -> None:
@@ -96,13 +98,13 @@ class PlainLines:
 
 
 def describe(work: Work) -> str:
-    """How far some work is, and what it last said of itself."""
+    """How far some work is, what it last said of itself, and what is compiled for it."""
     parts = [work.title]
     if work.total is not None:
         parts[0] += f", {work.done} of {work.total}"
         if (seconds := work.seconds_left) is not None:
             parts[0] += f", {duration(seconds)} left"
-    return ": ".join([*parts, work.note] if work.note else parts)
+    return ": ".join(filter(None, [*parts, work.note, work.compiling]))
 
 
 def ending(work: Work) -> str:

@@ -20,6 +20,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from functools import partial
 
 import numpy as np
@@ -236,7 +237,7 @@ def _begin(
     """Cost of the system as it is, and the state with the first point evaluated."""
     problem = search.problem
     with ThreadPoolExecutor(1) as thread:  # the two programs compile side by side
-        before = thread.submit(cost_before, problem)
+        before = thread.submit(copy_context().run, cost_before, problem)
         evaluate(problem, np.asarray(problem.space.pack({}))[None])
     lm = levenberg_marquardt.evaluate(HardModel(problem, first), first)
     return before.result(), dataclasses.replace(state, evaluated=lm, best=point_of(lm))
