@@ -3,6 +3,8 @@
 import os
 from importlib import metadata
 
+from .allocator import keep_freed_memory
+
 VARIABLE = "XLA_FLAGS"
 ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
 
@@ -45,12 +47,13 @@ def configure_xla() -> None:
 
     Programs also run in the thread that calls them, unless `JAX_CPU_ENABLE_ASYNC_DISPATCH` says
     otherwise: waking another thread, as JAX does by default, takes as long as computing one frame
-    of one character.
+    of one character. And memory of arrays that were freed is kept for new ones (`allocator`).
     """
     import jax  # takes half a second, which `jaxik --help` should not spend
 
     if flags := combine_flags(FLAGS.get(jaxlib_version(), ()), os.environ.get(VARIABLE)):
         os.environ[VARIABLE] = flags
+    keep_freed_memory()
     if ASYNC_DISPATCH not in os.environ:
         jax.config.update(ASYNC_DISPATCH.lower(), False)
 
