@@ -85,11 +85,13 @@ def _half_angle(
     )
     length = jnp.sqrt(cos * cos + sin * sin)
     half_cos, half_sin = vec.stacked_barrier(*quat.half_direction(cos, sin, length))
-    # Never zero unless both are.
+    # At least the square of the length: zero only where that is.
     square = half_cos * half_cos + half_sin * half_sin
     bendable = (ab > jnp.finfo(ab.dtype).eps) & (square > 0)
     inverse = 1.0 / jnp.sqrt(jnp.where(bendable, square, 1.0))
-    return jnp.where(bendable, half_cos * inverse, 1.0), jnp.where(bendable, half_sin * inverse, 0.0)
+    return jnp.where(bendable, half_cos * inverse, 1.0), jnp.where(
+        bendable, half_sin * inverse, 0.0
+    )
 
 
 @_half_angle.defjvp
@@ -138,9 +140,9 @@ def _aligned_arc(start: Array, aim: Array, hinge: Array) -> Array:
     The shortest arc from s to a is (1 + s.a, s x a), scaled. After it, a rotation about a by half
     an angle of cosine c and sine d makes it (c (1 + s.a), c s x a + d (s + a)), scaled. The arc
     leaves the hinge h at an angle about a from where it was; its cosine and sine are
-    (1 + s.a) (h.h + h.s h.a) - (h.(s + a))² and h.(s x a) h.(s + a), scaled alike. No rotation about
-    a where the hinge lies along s or a. Where those are opposed, a rotation by pi about the part of
-    the hinge at right angles to s.
+    (1 + s.a) (h.h + h.s h.a) - (h.(s + a))² and h.(s x a) h.(s + a), scaled alike. No rotation
+    about a where the hinge lies along s or a. Where those are opposed, a rotation by pi about the
+    part of the hinge at right angles to s.
     """
     middle, normal = vec.add(start, aim), vec.barrier(vec.cross(start, aim))
     spread = 0.5 * vec.dot(middle, middle)
