@@ -25,6 +25,7 @@ from fitting.inference.optimisation.search import find_best_fit
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
+from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
