@@ -6,7 +6,8 @@ of one character is over a hundred arrays, and handing them over takes longer th
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,8 +23,8 @@ LARGE = 1024  # numbers; a larger array stays as it is, since packing it would c
 class Layout:
     """Where each array of a tree lies in the vectors; see `layout_of`."""
 
-    def __init__(self, structure: jax.tree_util.PyTreeDef, arrays: tuple) -> None:
-        self.structure = structure
+    def __init__(self, structure: Hashable, arrays: tuple) -> None:
+        self.structure: Any = structure
         self.shapes = [shape for shape, _ in arrays]
         groups: dict[object, list[int]] = {}
         for number, (shape, dtype) in enumerate(arrays):
@@ -39,7 +40,7 @@ class Layout:
                 end = begin + math.prod(self.shapes[number])
                 self.slices[number], begin = slice(begin, end), end
 
-    def fits(self, arrays: Sequence[np.ndarray], structure: jax.tree_util.PyTreeDef) -> bool:
+    def fits(self, arrays: Sequence[np.ndarray], structure: Hashable) -> bool:
         """Whether this is the layout of a tree of these arrays, whatever their types."""
         return structure == self.structure and [x.shape for x in arrays] == self.shapes
 

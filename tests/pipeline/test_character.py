@@ -68,11 +68,11 @@ def test_results_are_numpy_arrays_that_later_steps_leave_alone():
 
 def test_characters_with_other_numbers_share_a_program():
     jaxik.Character(IK, RIG, GROUND).step(frames()[0])
-    compiled = character._step._cache_size()
+    compiled = character._step._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     steep = to_terrain(planes((0.3, 0.0, 0.0)))
     one = jaxik.Character(IK, RIG, GROUND).step(frames()[0])
     other = jaxik.Character(IK, RIG, steep).step(frames()[0])
-    assert character._step._cache_size() == compiled
+    assert character._step._cache_size() == compiled  # pyright: ignore[reportAttributeAccessIssue]
     assert np.abs(one.pose.ankle.pos - other.pose.ankle.pos).max() > 0.01
 
 
