@@ -10,6 +10,7 @@ from .batching.lanes import lanes as lanes
 from .maths.gate import HARD as HARD
 from .maths.gate import Hard as Hard
 from .maths.gate import Smooth as Smooth
+from .pipeline import Character as Character
 from .pipeline import FootIK as FootIK
 from .pipeline import Result as Result
 from .pipeline import State as State

@@ -12,7 +12,7 @@ from fitting.report.plots import style
 from fitting.runtime import files, xla
 
 from . import scaling_plot
-from .host import hardware, load_average
+from .host import hardware, load_average, time_in_width
 from .measurement import Figure, Measurement, medians
 from .runner import Report
 
@@ -74,13 +74,17 @@ def text(report: Report) -> str:
     machine = hardware()
     loads = _loads(report)
     memory = f"{machine['memory_gb']:.0f} GB, " if machine["memory_gb"] else ""
+    vectors = f"vectors of {machine['vector_bits']} bits, " if machine["vector_bits"] else ""
     lines = [
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, {memory}"
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads used, "
+        f"{vectors}{memory}"
         f"{machine['device']}; JAX {machine['jax']}, Python {machine['python']}; "
         f"load average {min(loads):.1f} to {max(loads):.1f}",
         f"XLA flags: {xla.describe_flags()}",
         "Medians of several runs. CPU: by CPU time, divided by the number of threads that work. "
-        "Limit: what memory, arithmetic or dispatch alone would allow, and the fraction reached.",
+        "Limit: what memory, arithmetic or dispatch alone would allow, and the fraction reached. "
+        "Targets of legs, feet and crowds are those of vectors of 256 bits, times "
+        f"{time_in_width():.2g} for this core.",
     ]
     if report.quick:
         lines.append(

@@ -2,9 +2,15 @@
 
 import os
 from importlib import metadata
+from pathlib import Path
+
+from .allocator import keep_freed_memory
 
 VARIABLE = "XLA_FLAGS"
 ASYNC_DISPATCH = "JAX_CPU_ENABLE_ASYNC_DISPATCH"
+
+CPU = Path("/proc/cpuinfo")  # on Linux
+WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256, "sse2": 128, "asimd": 128}  # bits
 
 # What each flag gains was measured with JAX 0.10.2; in brackets, by CPU time with 0.12.0.1.
 
@@ -45,12 +51,13 @@ def configure_xla() -> None:
 
     Programs also run in the thread that calls them, unless `JAX_CPU_ENABLE_ASYNC_DISPATCH` says
     otherwise: waking another thread, as JAX does by default, takes as long as computing one frame
-    of one character.
+    of one character. And memory of arrays that were freed is kept for new ones (`allocator`).
     """
     import jax  # takes half a second, which `jaxik --help` should not spend
 
     if flags := combine_flags(FLAGS.get(jaxlib_version(), ()), os.environ.get(VARIABLE)):
         os.environ[VARIABLE] = flags
+    keep_freed_memory()
     if ASYNC_DISPATCH not in os.environ:
         jax.config.update(ASYNC_DISPATCH.lower(), False)
 
@@ -58,6 +65,14 @@ def configure_xla() -> None:
 def jaxlib_version() -> str:
     """The installed version of the library that holds XLA."""
     return metadata.version("jaxlib")
+
+
+def vector_bits() -> int | None:
+    """Width of this core's vectors; None where the system does not tell its features."""
+    text = CPU.read_text(encoding="utf-8") if CPU.is_file() else ""
+    rows = (line.partition(":") for line in text.splitlines())
+    known = next((row[2].split() for row in rows if row[0].strip() in ("flags", "Features")), [])
+    return next((bits for feature, bits in WIDTHS.items() if feature in known), None)
 
 
 def combine_flags(flags: tuple[str, ...], of_user: str | None) -> str:

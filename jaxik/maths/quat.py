@@ -82,25 +82,32 @@ def dot(a: Float[Array, "*a 4"], b: Float[Array, "*b 4"]) -> Array:
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     """`q` scaled to length 1; the identity, with zero gradient, where `q` is zero."""
-    square = dot(q, q)
-    known = square > jnp.finfo(q.dtype).eps ** 2
-    inverse = 1.0 / jnp.sqrt(jnp.where(known, square, 1.0))
-    w, x, y, z = (jnp.where(known, c * inverse, 0.0) for c in components(q))
-    return vec.barrier(stack(jnp.where(known, w, 1.0), x, y, z))
+    return vec.normalize(q, identity(q.dtype))
 
 
 def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array, Array]:
     """Cosine (0 or more) and sine of half of an angle, given the angle's cosine and sine.
 
-    The angle is taken in -pi..pi rad. Uses the half-angle formula that is better conditioned on
-    either side of a right angle: exact, with finite gradients everywhere. At an angle of pi, of
-    either sign, the half-angle is +pi/2.
+    The angle is taken in -pi..pi rad. Exact, with finite gradients everywhere. At an angle of pi,
+    of either sign, the half-angle is +pi/2.
+    """
+    larger = 1.0 + jnp.where(cos >= 0, cos, -cos)
+    inverse = 1.0 / jnp.sqrt(2.0 * larger)
+    half_cos, half_sin = half_direction(cos, sin, jnp.ones_like(cos))
+    return half_cos * inverse, half_sin * inverse
+
+
+def half_direction(
+    cos: Float[Array, "*b"], sin: Float[Array, "*b"], length: Float[Array, "*b"]
+) -> tuple[Array, Array]:
+    """`half_angle` of a cosine and a sine that are both times `length`, times a positive factor.
+
+    Uses the half-angle formula that is better conditioned on either side of a right angle.
     """
     acute = cos >= 0
-    larger = jnp.sqrt(jnp.where(acute, 1.0 + cos, 1.0 - cos) * 0.5)
-    smaller = sin / (2.0 * larger)
     sign = jnp.where(sin < 0, -1.0, 1.0)
-    return jnp.where(acute, larger, sign * smaller), jnp.where(acute, smaller, sign * larger)
+    half_cos = jnp.where(acute, length + cos, sign * sin)
+    return half_cos, jnp.where(acute, sin, sign * (length - cos))
 
 
 def half_cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
@@ -152,18 +159,9 @@ def shortest_arc(
     """
     w = 1.0 + vec.dot(a, b)
     known = w > 4.0 * jnp.finfo(w.dtype).eps
-    x, y, z = vec.components(vec.cross(a, b))
-    fx, fy, fz = vec.components(fallback)
-    safe = jnp.where(known, w, 1.0)
+    axis = jnp.where(known[..., None], vec.cross(a, b), fallback)
     # |(w, a x b)|² = 2 w for unit vectors, but a float32 "unit" vector is not quite one.
-    inverse = 1.0 / jnp.sqrt(safe * safe + jnp.where(known, x * x + y * y + z * z, 0.0))
-    rot = stack(
-        jnp.where(known, safe * inverse, 0.0),
-        jnp.where(known, x * inverse, fx),
-        jnp.where(known, y * inverse, fy),
-        jnp.where(known, z * inverse, fz),
-    )
-    return vec.barrier(rot)
+    return normalize(stack(jnp.where(known, w, 0.0), *vec.components(axis)))
 
 
 def nlerp(

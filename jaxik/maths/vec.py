@@ -221,13 +221,13 @@ def has_direction(v: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
 
 @jax.custom_jvp
 @jax.jit
-def normalize(v: Float[Array, "*b 3"], fallback: Float[Array, "*f 3"]) -> Float[Array, "*c 3"]:
+def normalize(v: Float[Array, "*b n"], fallback: Float[Array, "*f n"]) -> Float[Array, "*c n"]:
     """`v` scaled to length 1; `fallback`, with zero gradient in `v`, where `v` has no direction."""
-    known = has_direction(v)
-    inverse = 1.0 / jnp.sqrt(jnp.where(known, dot(v, v), 1.0))
-    # Without stack and barrier each consumer would compute the length again.
-    pairs = zip(components(v), components(fallback), strict=True)
-    return barrier(stack(*(jnp.where(known, x * inverse, other) for x, other in pairs)))
+    # XLA computes a root once if it is broadcast; in a scalar, each component would compute it.
+    inverse = unstack(barrier(jnp.broadcast_to(_inverse_length(v)[..., None], v.shape)))
+    # Without stack and barrier each consumer would compute the components again.
+    parts = zip(unstack(v), inverse, unstack(fallback), strict=True)
+    return barrier(stack(*(jnp.where(scale > 0, x * scale, other) for x, scale, other in parts)))
 
 
 @normalize.defjvp
@@ -235,12 +235,19 @@ def _normalize_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     # Written in terms of the result. JAX's own rule reads v four times and has a long reverse;
     # fused and recomputed in each consumer, it took a third of the time of a gradient.
     (v, fallback), (dv, d_fallback) = primals, tangents
-    direction, known = normalize(v, fallback), has_direction(v)
-    inverse = 1.0 / jnp.sqrt(jnp.where(known, dot(v, v), 1.0))
-    along = dot(direction, dv)
-    pairs = zip(components(dv), components(direction), strict=True)
+    direction, inverse = normalize(v, fallback), _inverse_length(v)
+    pairs = list(zip(unstack(dv), unstack(direction), strict=True))
+    along = functools.reduce(jnp.add, (dx * x for dx, x in pairs))
     d_direction = stack(*((dx - along * x) * inverse for dx, x in pairs))
-    return direction, jnp.where(known[..., None], d_direction, d_fallback)
+    return direction, jnp.where(inverse[..., None] > 0, d_direction, d_fallback)
+
+
+def _inverse_length(v: Float[Array, "*b n"]) -> Float[Array, "*b"]:
+    """1 / length; 0 where `v` is at most as long as the machine epsilon."""
+    # XLA computes a root once for all components if it is broadcast to them; what follows a root,
+    # such as a choice, it would compute again for each.
+    square = functools.reduce(jnp.add, (x * x for x in unstack(v)))
+    return jax.lax.rsqrt(jnp.where(square > jnp.finfo(v.dtype).eps ** 2, square, jnp.inf))
 
 
 def reject(v: Float[Array, "*a 3"], direction: Float[Array, "*b 3"]) -> Float[Array, "*c 3"]:

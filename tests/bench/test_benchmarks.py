@@ -25,6 +25,7 @@ from fitting.inference.optimisation.search import find_best_fit
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
+from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
@@ -80,12 +81,13 @@ def test_import_times_do_not_include_that_of_jax(monkeypatch):
     }  # fmt: skip
 
 
-def test_legs_and_feet_have_their_targets():
+def test_legs_and_feet_have_their_targets(monkeypatch):
+    monkeypatch.setattr(xla, "vector_bits", lambda: 256)
     timings = measure("legs")
-    assert figures(timings)["a leg and core"].at_most == 30.0
+    assert figures(timings)["a leg and core"].at_most == 45.0
     ratio = np.median(timings.samples["NumPy"]) / np.median(timings.samples["ours"])
     assert figures(timings)["NumPy's time in ours"].value == pytest.approx(ratio)
-    assert figures(measure("feet"))["a leg and core"].at_most == 80.0
+    assert figures(measure("feet"))["a leg and core"].at_most == 110.0
 
 
 def test_the_leg_in_numpy_is_the_same_as_ours():
@@ -136,7 +138,7 @@ def flat(monkeypatch):
 
 def test_the_crowd_is_measured_on_a_plane_and_on_a_mesh(flat):
     of_crowd = figures(measure("crowd"))
-    assert of_crowd["plane, leg-frames a second"].at_least == 12.0
+    assert of_crowd["plane, leg-frames a second"].at_least == 9.0
     assert of_crowd["mesh, leg-frames a second"].at_least == 5.0
     assert of_crowd["peak of memory"].value > 50.0
 
@@ -154,9 +156,9 @@ def test_the_gradient_is_measured_in_forward_runs(monkeypatch):
 
 def test_a_step_is_measured_with_its_dispatch(flat):
     timings = measure("step")
-    assert figures(timings)["on a plane"].at_most == 150.0
+    assert figures(timings)["Character on a plane"].at_most == 150.0
     assert set(timings.work) == set(timings.samples) == {
-        "plane", "mesh", "plane, program", "mesh, program",
+        "plane", "mesh", "plane, program", "mesh, program", "plane, Character", "mesh, Character",
     }  # fmt: skip
 
 

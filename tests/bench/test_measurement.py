@@ -212,7 +212,7 @@ def test_the_json_is_complete(trivial_suite, tmp_path, capsys):
     content = json.loads(numbers.read_text())
     assert not content["quick"] and not content["interrupted"]
     assert set(content["machine"]) == {
-        "cpu", "cores", "threads", "memory_gb", "device", "jax", "jaxlib", "python",
+        "cpu", "cores", "vector_bits", "threads", "memory_gb", "device", "jax", "jaxlib", "python",
         "xla_flags", "load",
     }  # fmt: skip
     assert len(content["machine"]["load"]) == 2  # at the start and at the end

@@ -5,18 +5,18 @@ import platform
 from collections.abc import Iterator
 from pathlib import Path
 
+from fitting.runtime import xla
+
 from .findings import Finding
 
 CPU, MEMORY = Path("/proc/cpuinfo"), Path("/proc/meminfo")  # on Linux
-VECTORS = {"avx512f": 512, "avx2": 256, "avx": 256, "sse2": 128, "asimd": 128}  # bits
 NEEDED_GB = 1.0  # the self-test, which fits one parameter to 12 s of motion, takes 0.6
 
 
 def examine() -> Iterator[Finding]:
     """Processor and memory."""
     name = _entry(CPU, "model name") or platform.processor() or platform.machine()
-    flags = (_entry(CPU, "flags") or _entry(CPU, "Features")).split()
-    width = next((bits for flag, bits in VECTORS.items() if flag in flags), None)
+    width = xla.vector_bits()
     vectors = f", vectors of {width} bits" if width else ""
     yield Finding("processor", f"{name}, {os.cpu_count()} cores{vectors}")
     total, free = (_gigabytes(key) for key in ("MemTotal", "MemAvailable"))

@@ -127,7 +127,9 @@ def ground_normal(now: SensedMoment, state: LeanState) -> Float[Array, "3"]:
 @vec.remat
 def _normal(slope: Slope, up_ws: Array, forward: Array, side: Array) -> Array:
     """Unit normal of ground that rises by these angles ahead and to the right, rad."""
-    (forward_cos, forward_sin), (side_cos, side_sin) = vec.cos_sin(forward), vec.cos_sin(side)
+    forward_cos, forward_sin, side_cos, side_sin = vec.stacked_barrier(
+        *vec.cos_sin(forward), *vec.cos_sin(side)
+    )
     ahead = vec.scale(slope.forward_ws, forward_sin * side_cos)
     aside = vec.scale(slope.right_ws, forward_cos * side_sin)
     return vec.normalize(vec.scale(up_ws, forward_cos * side_cos) - ahead - aside, up_ws)

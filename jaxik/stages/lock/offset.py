@@ -161,6 +161,8 @@ class OffsetLock(AbstractLock):
         stays = self._may_stay(now, foothold_ws + kept_ws, hip_ws)
         stays = stays * self._follows_animation(now, before - moved, state.turn - turned, moved)
         starts = stays * self._may_start(now, moved, state.factor)
+        # Without this, each number of the memory would compute all these conditions again.
+        stays, starts = vec.stacked_barrier(stays, starts)
 
         ones, zeros = jnp.ones_like(state.locked), jnp.zeros_like(state.locked)
         locked = gate.choose(starts, ones, state.locked)
@@ -171,6 +173,7 @@ class OffsetLock(AbstractLock):
         risen = smoothing.lerp(state.factor, ones, lock_fraction)
         factor = gate.choose(locked, risen, smoothing.lerp(state.factor, zeros, unlock_fraction))
         remaining = 1.0 - self._returned(now, before, state.turn, unlock_fraction)
+        locked, factor, remaining = vec.stacked_barrier(locked, factor, remaining)
         offset_ws = gate.choose(
             locked[..., None], before - vec.scale(moved, risen), vec.scale(before, remaining)
         )

@@ -1,0 +1,115 @@
+"""A live character gives what `step` gives, one call after another."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from jaxik.pipeline import character, packing
+from support.clips import make_rig, planes, to_frames, to_rig, to_terrain, wandering
+
+RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.06, 0.04, 0.1)))
+IK = jaxik.presets.record()
+COUNT = 6
+
+
+@functools.cache
+def frames() -> list[jaxik.Frame]:
+    clip = to_frames(wandering(make_rig(), np.random.default_rng(3), COUNT))
+    return [jax.tree.map(lambda x: np.asarray(x[n]), clip) for n in range(COUNT)]  # noqa: B023
+
+
+@functools.cache
+def stepped() -> tuple[jaxik.State, list[jaxik.Result]]:
+    state, results = jaxik.init(IK, RIG), []
+    for frame in frames():
+        state, result = jaxik.step(IK, RIG, GROUND, state, frame)
+        results.append(result)
+    return state, results
+
+
+def assert_same(ours, theirs) -> None:
+    assert jax.tree.structure(ours) == jax.tree.structure(theirs)
+    for x, y in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
+
+
+def test_a_character_moves_as_steps_do_and_keeps_their_memory():
+    walker = jaxik.Character(IK, RIG, GROUND)
+    state, results = stepped()
+    for frame, expected in zip(frames(), results, strict=True):
+        assert_same(walker.step(frame), expected)
+    assert_same(walker.state, state)
+
+
+def test_a_character_goes_on_from_a_memory_and_takes_arrays_of_jax():
+    state = jaxik.init(IK, RIG)
+    for frame in frames()[:3]:
+        state, _ = jaxik.step(IK, RIG, GROUND, state, frame)
+    walker = jaxik.Character(IK, RIG, GROUND, state=state)
+    for frame, expected in zip(frames()[3:], stepped()[1][3:], strict=True):
+        assert_same(walker.step(jax.tree.map(jnp.asarray, frame)), expected)
+
+
+def test_results_are_numpy_arrays_that_later_steps_leave_alone():
+    walker = jaxik.Character(IK, RIG, GROUND)
+    first = walker.step(frames()[0])
+    kept = jax.tree.map(np.copy, first)
+    walker.step(frames()[3])
+    assert_same(first, kept)
+    leaves = jax.tree.leaves(first)
+    assert all(isinstance(x, np.ndarray) and not x.flags.writeable for x in leaves)
+
+
+def test_characters_with_other_numbers_share_a_program():
+    jaxik.Character(IK, RIG, GROUND).step(frames()[0])
+    compiled = character._step._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    steep = to_terrain(planes((0.3, 0.0, 0.0)))
+    one = jaxik.Character(IK, RIG, GROUND).step(frames()[0])
+    other = jaxik.Character(IK, RIG, steep).step(frames()[0])
+    assert character._step._cache_size() == compiled  # pyright: ignore[reportAttributeAccessIssue]
+    assert np.abs(one.pose.ankle.pos - other.pose.ankle.pos).max() > 0.01
+
+
+def test_a_frame_of_other_floats_is_computed_with_those_of_the_rig():
+    rig = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, RIG)
+    ik, ground = (
+        jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, tree)
+        for tree in (IK, GROUND)
+    )
+    result = jaxik.Character(ik, rig, ground).step(frames()[0])
+    assert result.pose.ankle.pos.dtype == np.float32
+    np.testing.assert_allclose(
+        result.pose.ankle.pos, stepped()[1][0].pose.ankle.pos, rtol=0, atol=1e-4
+    )
+
+
+def test_a_frame_of_another_shape_is_refused_by_name():
+    walker = jaxik.Character(IK, RIG, GROUND)
+    walker.step(frames()[0])
+    with pytest.raises(ValueError, match=r"frame\.weight has shape \(3,\), wanted \(2,\)"):
+        walker.step(dataclasses.replace(frames()[0], weight=np.ones(3)))
+    assert_same(walker.step(frames()[1]), stepped()[1][1])
+
+
+def test_packing_keeps_types_and_leaves_large_arrays_as_they_are():
+    large = jnp.arange(packing.LARGE + 1, dtype=jnp.float32)
+    tree = {
+        "flag": jnp.asarray(True),
+        "large": large.reshape(-1, 1),
+        "number": jnp.asarray(3, jnp.uint32),
+        "none": None,
+        "empty": jnp.zeros((0, 3)),
+        "vectors": [jnp.arange(6.0).reshape(2, 3), jnp.asarray(2.0)],
+    }
+    packed = packing.pack(tree)
+    assert len(packed.vectors) == 4
+    assert any(vector is tree["large"] for vector in packed.vectors)
+    assert_same(packed.unpack(), tree)
+    assert_same(jax.jit(lambda x: packing.pack(x.unpack()))(packed).unpack(), tree)
+    assert packing.pack(tree).layout is packed.layout
