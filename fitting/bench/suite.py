@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from .benchmarks import ceilings, crowd, inference, kernels, live, many, scaling
+from .benchmarks import ceilings, crowd, first_run, inference, kernels, live, many, scaling
 from .runner import Benchmark
 
 CEILINGS = "machine"  # the benchmark of the machine's limits, with which the others are compared
@@ -24,6 +24,9 @@ BENCHMARKS = {
     "fit": Benchmark(
         "a fit of twenty parameters to a clip of 10 s", "float64", inference.fit,
         x64=True, long=True,
+    ),
+    "first": Benchmark(
+        "seconds that a newcomer waits", "float64", first_run.first_run, long=True
     ),
     "posterior": Benchmark("the posterior of that fit", "float64", inference.posterior, x64=True),
     "view": Benchmark("a slider of `jaxik view`", "float64", live.drag, x64=True),
