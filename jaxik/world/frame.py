@@ -140,6 +140,10 @@ class GroundHits:
     """0..1, how far swinging feet turn to the ground; standing feet do by their contact."""
     rays: Rays
     """For stages that cast further rays."""
+    lift: Float[Array, " legs"] | None = None
+    """m, how much higher than animated each ankle swings over its ground; None is 0."""
+    pitch: Float[Array, " legs"] | None = None
+    """rad, how much further than animated each foot's toes are up; None is 0."""
 
 
 @struct
