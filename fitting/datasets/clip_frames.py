@@ -140,14 +140,15 @@ def _stride(
 ) -> tuple[np.ndarray, ...]:
     """The fields of a `Stride`, in order; unknown where a foot will not stand any more."""
     known = np.cumsum(stance[::-1], axis=0)[::-1] > 0
-    last_ws, next_ws = np.zeros(balls.shape), np.zeros(balls.shape)
+    last_ws, next_ws, aside_ws = (np.zeros(balls.shape) for _ in range(3))
     fraction = np.zeros(stance.shape)
     for leg in np.flatnonzero(stance.any(axis=0)):
         falls = contacts.footfalls(balls[:, leg], stance[:, leg])
         last_ws[:, leg] = falls.positions_ws[falls.last]
         next_ws[:, leg] = falls.positions_ws[falls.next]
         fraction[:, leg] = falls.swing_fraction
-    return stance, last_ws, next_ws, fraction, known
+        aside_ws[:, leg] = falls.aside_ws[falls.last]
+    return stance, last_ws, next_ws, fraction, known, aside_ws
 
 
 def clip_from_result(

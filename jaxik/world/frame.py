@@ -34,6 +34,9 @@ class Stride:
     """0..1, time of the swing that has passed; 0 while standing."""
     known: Float[Array, "*b legs"]
     """1, or 0 where positions have to be predicted from velocity."""
+    aside_ws: Float[Array, "*b legs 3"] | None = None
+    """m, by how far the middle of a swing is beside the straight way to the next foothold: round a
+    corner of the ground, or round the other foot. None is 0."""
 
     @classmethod
     def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":

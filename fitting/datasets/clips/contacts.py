@@ -20,6 +20,7 @@ MAX_GAP = 0.05  # s: shorter interruptions of a stance are marker noise
 MIN_STANCE = 0.06  # s: shorter slow spells are no stance; runners stand for 0.075 s
 HANG_WINDOW = 0.2  # s before and after a slow spell, in which a hanging foot shows
 HANG_HEIGHT = 0.03  # m by which a hanging foot is higher than before and after
+SHORTEST_WAY = 0.05  # m between footholds, below which nothing is beside it
 
 
 def detect_stances(
@@ -81,6 +82,8 @@ class Footfalls:
     """Index of the following one; at both ends of a clip `last`."""
     swing_fraction: Float64[np.ndarray, " frames"]
     """0..1, of the swing's duration that has passed."""
+    aside_ws: Float64[np.ndarray, "stances 3"]
+    """m, by how far the middle of the swing after each stance is beside the straight way."""
 
 
 def footfalls(
@@ -101,7 +104,32 @@ def footfalls(
     swinging = (frames > leaving) & (next_ > last)
     fraction = np.where(swinging, (frames - leaving) / np.maximum(arriving - leaving, 1), 0.0)
     positions = np.array([np.median(ball_ws[a : b + 1], axis=0) for a, b in stances])
-    return Footfalls(positions, last, next_, fraction)
+    aside = np.zeros(positions.shape)
+    for index in range(len(stances) - 1):
+        swing = ball_ws[lasts[index] + 1 : firsts[index + 1]]
+        aside[index] = _aside(swing, positions[index], positions[index + 1])
+    return Footfalls(positions, last, next_, fraction, aside)
+
+
+def _aside(
+    swing_ws: Float64[np.ndarray, "frames 3"], last_ws: np.ndarray, next_ws: np.ndarray
+) -> Float64[np.ndarray, "3"]:
+    """By how far the middle of a swing is beside the straight way, m.
+
+    It is that of a parabola through both footholds and through the first frame in which the ball
+    has covered half of the way.
+    """
+    way = (next_ws - last_ws) * [1.0, 0.0, 1.0]
+    length2 = way @ way
+    if not len(swing_ws) or length2 < SHORTEST_WAY**2:
+        return np.zeros(3)
+    covered = (swing_ws - last_ws) @ way / length2
+    middle = int(np.argmax(covered >= 0.5))
+    part = covered[middle]
+    if not 0.5 <= part <= 0.75:
+        return np.zeros(3)
+    beside = (swing_ws[middle] - last_ws - part * way) * [1.0, 0.0, 1.0]
+    return beside / (4.0 * part * (1.0 - part))
 
 
 def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> bool:

@@ -21,7 +21,6 @@ from .swing import FAR, AbstractSwingProbe, Level, s_curve
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAIRS = 0.75  # rise over run of the steepest stairs
-ASIDE = 0.06  # m, to both sides of the way, where a foot may pass instead
 
 
 class StrideProbe(AbstractSwingProbe):
@@ -113,6 +112,8 @@ class StrideProbe(AbstractSwingProbe):
         way_ws = stride.next_ws - stride.last_ws
         fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
         path_ws = stride.last_ws + vec.scale(way_ws, fractions)
+        if stride.aside_ws is not None:
+            path_ws += vec.scale(stride.aside_ws, 4.0 * fractions * (1.0 - fractions))
         path = self._ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
         if self.check_support:
             ends = self._ground_at(inputs, level, path_ws[jnp.array([0, -1])], stood_on=True)
@@ -129,8 +130,9 @@ class StrideProbe(AbstractSwingProbe):
         climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
+        evened = heights - slope * fractions
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
-        trust *= self._trust_of_way(heights - slope * fractions, path.found)
+        trust *= self._trust_of_way(evened, path.found)
 
         since_start = stride.fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
@@ -143,17 +145,12 @@ class StrideProbe(AbstractSwingProbe):
         normal += vec.scale(next_.normal - normal, trust * fraction)
         normal = vec.normalize(normal, level.up_ws)
 
-        beside = self._beside(inputs, level, path, path_ws[1:-1], way)
-        over = self.over_footholds(
-            inputs,
-            level.height(beside.point) - slope * fractions[1:-1],
-            beside.found,
-            low + jnp.where(step > 0, step, 0.0),
-        )
+        edges = jax.tree.map(lambda x: x[1:-1], path)
+        higher = low + jnp.where(step > 0, step, 0.0)
+        over = self.over_footholds(inputs, evened[1:-1], edges.found, higher)
         swing = self.swing(inputs, stride, step, over, trust)
         soles = self.soles(inputs, foot_height)
         under_soles = height + self._climb(normal, soles - ball, level)
-        edges = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), beside)
         height += self.clearance_over_edges(inputs, stride, swing, soles, under_soles, top, edges)
         height += self._climb(normal, ankle - ball, level)
         height = jnp.where(found > 0, height, 0.0)
@@ -191,7 +188,10 @@ class StrideProbe(AbstractSwingProbe):
             for label, time in ((labelled.last_ws, -since_last), (labelled.next_ws, until_next))
         )
         fraction = jnp.where(known, labelled.fraction, fraction)
-        return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known)
+        aside_ws = labelled.aside_ws
+        if aside_ws is not None:
+            aside_ws = jnp.where(known[..., None], vec.reject(aside_ws, level.up_ws), 0.0)
+        return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known, aside_ws)
 
     def _ground_at(
         self, inputs: Inputs, level: Level, points_ws: Array, stood_on: bool = False
@@ -203,15 +203,6 @@ class StrideProbe(AbstractSwingProbe):
         above += vec.scale(level.up_ws, self.ray_up)
         reach = self.ray_up + self.ray_down
         return self.cast(inputs, above, reach, self.layers, margin, stood_on)
-
-    def _beside(
-        self, inputs: Inputs, level: Level, path: Hit, path_ws: Array, way: Array
-    ) -> Hit:
-        """The ground on the way and on both sides of it (ways points legs)."""
-        side = vec.normalize(vec.cross(way, level.up_ws), jnp.zeros(3, way.dtype))
-        sides_ws = jnp.stack([path_ws + vec.scale(side, aside) for aside in (-ASIDE, ASIDE)])
-        sides = self._ground_at(inputs, level, sides_ws)
-        return jax.tree.map(lambda x, y: jnp.concatenate([x[None, 1:-1], y]), path, sides)
 
     def _trust_of_way(self, heights: Array, found: Array) -> Float[Array, " legs"]:
         """0..1, how far the highest step that cannot be avoided on the way is accepted.

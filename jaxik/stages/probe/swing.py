@@ -184,23 +184,20 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     def over_footholds(
         self, inputs: Inputs, heights: Array, found: Array, top: Array
     ) -> Float[Array, " legs"]:
-        """How far the ground on the way is over both footholds, m.
-
-        Of several ways beside each other the lowest counts: a foot goes round a corner.
+        """How far the highest ground on the way is over both footholds, m.
 
         Args:
             inputs: the frame.
-            heights: of the ground along each way (ways points legs), m.
+            heights: of the ground along the way (points legs), m.
             found: of that ground.
             top: height of the higher foothold, m.
         """
         gate = inputs.gate
         over = jnp.where(found > 0, heights - top, -FAR)
-        highest = gate.maximum(jnp.moveaxis(over, 1, -1), band=HEIGHT_BAND)
-        least = gate.minimum(jnp.moveaxis(highest, 0, -1), band=HEIGHT_BAND)
-        zero = jnp.zeros_like(least)
-        least = gate.clip(least, zero, zero + jnp.inf, band=HEIGHT_BAND)
-        return least * (1.0 - smoothstep((least - self.max_step_up) / self.step_fade))
+        highest = gate.maximum(jnp.moveaxis(over, 0, -1), band=HEIGHT_BAND)
+        zero = jnp.zeros_like(highest)
+        highest = gate.clip(highest, zero, zero + jnp.inf, band=HEIGHT_BAND)
+        return highest * (1.0 - smoothstep((highest - self.max_step_up) / self.step_fade))
 
     def soles(self, inputs: Inputs, foot_height: Array) -> Array:
         """Animated heels, balls and toes' tips at sole height, (3 legs 3), m, world space."""
