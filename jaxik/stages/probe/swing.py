@@ -79,7 +79,11 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
     )
     toe_length: Leaf = parameter(
-        0.06, unit="m", low=0.0, high=0.2, doc="Distance forward from the ball to the toes' tip."
+        0.04,
+        unit="m",
+        low=0.0,
+        high=0.2,
+        doc="Distance forward from the ball to the tip of the toes, which bend as they pass.",
     )
     ball_height: Leaf = parameter(
         0.055,
