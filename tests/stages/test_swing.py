@@ -1,0 +1,80 @@
+"""How feet swing over uneven ground: later, higher, and with the toes pointed down."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxik
+from jaxik.stages.probe.swing import bump
+from reference import maths
+from reference.stages import swing as reference
+from reference.terrain import Terrain as PlainTerrain
+from support.cases import RIG
+from support.clips import to_frames, to_ik, to_rig, to_terrain
+from support.strides import walk
+
+COUNT = 90
+
+
+def ground(*tops: tuple[float, float, float, float, float]) -> PlainTerrain:
+    """Level rectangles: from and to along x, from and to along z, height, m."""
+    triangles = []
+    for left, right, near, far, height in tops:
+        a, b, c, d = ([x, height, z] for x in (left, right) for z in (near, far))
+        triangles += [[a, b, c], [b, d, c]]
+    return PlainTerrain(maths.Y, triangles=np.array(triangles))
+
+
+FLAT = ground((-2.0, 2.0, -3.0, 3.0, 0.0))
+STEP_UP = ground((-2.0, 2.0, -3.0, 0.3, 0.0), (-2.0, 2.0, 0.3, 3.0, 0.25))
+HURDLE = ground((-2.0, 2.0, -3.0, 3.0, 0.0), (-0.5, 0.5, 0.24, 0.3, 0.2))
+
+
+def frames_over_a_step() -> jaxik.Frame:
+    return to_frames(walk(RIG, COUNT, start=(0.0, 0.0, -0.5)))
+
+
+def hits(
+    terrain: PlainTerrain, frames: jaxik.Frame, **values: float
+) -> jaxik.world.frame.GroundHits:
+    ik = to_ik({f"probe.{name}": value for name, value in values.items()}, "stride")
+    return jaxik.run(ik, to_rig(RIG), to_terrain(terrain), frames).trace.sensed.ground
+
+
+@pytest.mark.parametrize("peak", [0.23, 0.5, 0.75])
+def test_a_bump_is_one_at_its_peak_and_nothing_at_both_ends(peak: float):
+    x = np.linspace(0.0, 1.0, 41)
+    expected = [reference.bump(value, peak) for value in x]
+    np.testing.assert_allclose(bump(jnp.asarray(x), peak), expected, rtol=0, atol=1e-6)
+    assert float(bump(jnp.asarray(peak), peak)) == pytest.approx(1.0, abs=1e-6)
+    slopes = jax.vmap(jax.grad(lambda fraction: bump(fraction, peak)))(jnp.asarray(x))
+    assert np.isfinite(slopes).all()
+    assert float(slopes[0]) == float(slopes[-1]) == 0.0
+
+
+def test_on_a_flat_floor_no_foot_is_lifted_or_pitched():
+    found = hits(FLAT, frames_over_a_step())
+    assert np.abs(found.lift).max() == 0.0
+    assert np.abs(found.pitch).max() == 0.0
+
+
+def test_only_swinging_feet_are_lifted_onto_a_step():
+    frames = frames_over_a_step()
+    found = hits(STEP_UP, frames, held_lift=0.0)
+    standing = np.asarray(frames.stride.fraction) == 0.0
+    assert np.abs(np.asarray(found.lift)[standing]).max() == 0.0
+    assert np.asarray(found.lift).max() > 0.1
+    assert np.asarray(found.pitch).min() < -0.2
+
+
+def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():
+    frames = frames_over_a_step()
+    aside = jnp.broadcast_to(jnp.asarray([1.5, 0.0, 0.0]), frames.stride.last_ws.shape)
+    stride = dataclasses.replace(frames.stride, aside_ws=aside)
+    straight = hits(HURDLE, frames, held_lift=0.0).lift
+    round_it = hits(HURDLE, dataclasses.replace(frames, stride=stride), held_lift=0.0).lift
+    assert np.asarray(straight).max() > 0.2
+    assert np.abs(round_it).max() < 0.01
