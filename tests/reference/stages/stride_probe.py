@@ -96,6 +96,7 @@ def ground_of_stride(
     last, following = (look(parameters, terrain, leg, pos) for pos in (stride.last, stride.next))
     if not last.found and not following.found:
         return Hit(False, here, up), stride
+    arrives = float(following.found)  # a swing to nowhere stays as animated
     last = last if last.found else following
     following = following if following.found else last
 
@@ -113,7 +114,7 @@ def ground_of_stride(
     over = max(0.0, max(evened, default=0.0) - low - max(step, 0.0)) if evened else 0.0
     over *= 1.0 - smooth01((over - parameters.of_leg("probe.max_step_up", leg)) / FADE)
     stride.lift, stride.pitch = beyond_animation(
-        parameters, rig, frame, leg, up, stride.fraction, step, over, sure
+        parameters, rig, frame, leg, up, stride.fraction, step, over, sure * arrives
     )
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
