@@ -26,11 +26,15 @@ from .jobs import calibrate as calibrate
 from .jobs import compare as compare
 from .jobs import export as export
 from .jobs import fit as fit
+from .jobs import fit_many as fit_many
 from .jobs import population as population
 from .jobs import sample as sample
 from .jobs import translate as translate
 from .runtime.xla import configure_xla as configure_xla
 from .studies.animations import AnimationFiles as AnimationFiles
 from .studies.fit import Fit as Fit
+from .studies.many.evaluation import evaluate_many as evaluate_many
+from .studies.many.evaluation import vary as vary
+from .studies.many.progress import ManyFits as ManyFits
 from .studies.translation import TranslationRequest as TranslationRequest
 from .studies.translation import load_named_system as load_named_system

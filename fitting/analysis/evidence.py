@@ -12,7 +12,8 @@ from fitting.inference.profiles.profile import Profile
 from fitting.problem.loss import Loss, apply_loss
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
-from fitting.problem.scene import Scene, run_system
+from fitting.problem.scene import Scene
+from fitting.problem.shared_world import run_scenes
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 
@@ -70,18 +71,22 @@ def _costs(problem: Problem[jaxik.FootIK], u: Array | np.ndarray) -> list[dict[s
     ik, fraction = problem.space.unpack(jnp.asarray(u)), float(problem.independent_fraction)
     return [
         {kind: fraction * np.asarray(cost) for kind, cost in costs.items()}
-        for costs in (
-            _frame_costs(ik, scene, problem.loss, problem.tails) for scene in problem.data
-        )
+        for costs in _frame_costs(ik, problem.data, problem.loss, problem.tails)
     ]
 
 
 @cached
 def _frame_costs(
-    ik: jaxik.FootIK, scene: Scene, loss: Loss, tails: Float[Array, ""]
+    ik: jaxik.FootIK, scenes: tuple[Scene, ...], loss: Loss, tails: Float[Array, ""]
+) -> list[dict[str, Array]]:
+    """The cost of every frame, (frames), by kind of residual, clip by clip."""
+    pairs = zip(scenes, run_scenes(ik, scenes), strict=True)
+    return [_costs_of_result(scene, result, loss, tails) for scene, result in pairs]
+
+
+def _costs_of_result(
+    scene: Scene, result: jaxik.Result, loss: Loss, tails: Float[Array, ""]
 ) -> dict[str, Array]:
-    """The cost of every frame of a clip, (frames), by kind of residual."""
-    result = run_system(ik, scene)
     frames, costs = len(scene.frames.dt), {}
     for kind, residuals in residuals_by_kind(scene, errors_by_kind(scene, result)).items():
         squares = apply_loss(residuals.ravel(), loss, tails).reshape(len(residuals), -1) ** 2

@@ -1,6 +1,6 @@
 """A clip before and after foot IK, and as captured: the numbers that reports and pictures show."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TypeAlias
 
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 import jaxik
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene, legs_ws, own_system, pelvis_ws
+from fitting.problem.shared_world import groups, run_scenes
 from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64, with_floats
 from jaxik.maths import vec
@@ -127,6 +128,23 @@ def run(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
     ik = own_system(with_floats(ik, scene.frames.dt.dtype), scene)
     tracks = scene.tracks or None
     return program_cache.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks)
+
+
+@in_float64
+def run_all(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[jaxik.Result, ...]:
+    """The result of a system on each scene's clip; those that share a world share a program."""
+    results: dict[int, jaxik.Result] = {}
+    for numbers in groups(scenes):
+        members = tuple(scenes[number] for number in numbers)
+        alone = len(members) == 1  # then by the program that all other clips use, too
+        of_group = (run(ik, *members),) if alone else _run_group(ik, members)
+        results |= zip(numbers, of_group, strict=True)
+    return tuple(results[number] for number in range(len(scenes)))
+
+
+@program_cache.cached
+def _run_group(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> tuple[jaxik.Result, ...]:
+    return run_scenes(with_floats(ik, scenes[0].frames.dt.dtype), scenes)
 
 
 def stage_outputs(result: jaxik.Result) -> Trace:

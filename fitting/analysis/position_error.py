@@ -6,7 +6,8 @@ from jaxtyping import Array
 
 import jaxik
 from fitting.problem.residuals import errors_by_kind
-from fitting.problem.scene import Scene, run_system
+from fitting.problem.scene import Scene
+from fitting.problem.shared_world import run_scene
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 
@@ -27,7 +28,7 @@ def position_error(ik: jaxik.FootIK, scene: Scene) -> float:
 @cached
 def _squares(ik: jaxik.FootIK, scene: Scene) -> tuple[Array, Array]:
     """Sum of the squared distances, m², and their number."""
-    errors = errors_by_kind(scene, run_system(ik, scene))
+    errors = errors_by_kind(scene, run_scene(ik, scene))
     observed, legs = scene.reference.observed, jnp.sum(scene.rig.present)
     each = [jnp.sum(errors[joint].reshape(len(observed), -1) ** 2, axis=1) for joint in JOINTS]
     total = jnp.sum(jnp.where(observed, sum(each), 0.0))

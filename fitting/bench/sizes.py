@@ -47,6 +47,9 @@ class Sizes:
     """Cells a side: 10² to 10⁷ triangles."""
     parameters: tuple[int, ...] = (5, 10, 20, 40)
     legs_each: tuple[int, ...] = (2, 4, 6, 8)
+    devices: tuple[int, ...] = (1, 2, 4, 8)
+    clips: tuple[int, ...] = (10, 100, 1000)
+    workers: tuple[int, ...] = (1, 2, 4)
 
 
 FULL = Sizes()
@@ -54,5 +57,5 @@ QUICK = Sizes(
     repeats=3, characters=64, derived=64, cells=200, rays=200_000, read=1 << 24, crowd_repeats=2,
     fits=1, cold=False, floats=("float64",), steps=20,
     batches=(100, 1000, 10_000), lengths=(100, 1000), grids=(22, 71), parameters=(5, 20),
-    legs_each=(2, 4),
+    legs_each=(2, 4), devices=(1, 2), clips=(10, 100), workers=(1, 2),
 )  # fmt: skip

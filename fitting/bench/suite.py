@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from .benchmarks import ceilings, crowd, inference, kernels, live, scaling
+from .benchmarks import ceilings, crowd, inference, kernels, live, many, scaling
 from .runner import Benchmark
 
 CEILINGS = "machine"  # the benchmark of the machine's limits, with which the others are compared
@@ -24,6 +24,9 @@ BENCHMARKS = {
     ),
     "posterior": Benchmark("the posterior of that fit", "float64", inference.posterior, x64=True),
     "view": Benchmark("a slider of `jaxik view`", "float64", live.drag, x64=True),
+    "many": Benchmark(
+        "time and memory against devices, clips and workers", "float64", many.many, long=True
+    ),
     "scaling": Benchmark("time against sizes", "float32", scaling.scaling, long=True),
 }  # fmt: skip
 

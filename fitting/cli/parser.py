@@ -15,6 +15,7 @@ from .parsers.fits import (
 )
 from .parsers.guides import add_completion, add_doctor, add_example, add_parameters, add_schema
 from .parsers.machine import add_bench, add_cache
+from .parsers.many import add_fit_many
 from .parsers.options import Parser
 from .terminal.help_texts import help_formatter
 
@@ -24,6 +25,7 @@ EXAMPLES = """examples:
   jaxik ablate data/experiments/blocks.toml -o runs/ablation   the fit without each of its rules
   jaxik calibrate data/experiments/ozz.toml -o runs/known      fits of known truths, judged
   jaxik population walks.toml -o runs/walks                    several subjects, and their spread
+  jaxik fit-many walks.toml --seeds 3 -o runs/all              each clip alone, on all cores
   jaxik sample runs/walk                                       its posterior; again to continue
   jaxik apply runs/walk walk.bvh --terrain steps.obj -o walk_on_steps.npz
   jaxik run walk.bvh --terrain steps.obj -o walk_on_steps.npz --preset record
@@ -44,11 +46,11 @@ EXAMPLES = """examples:
   jaxik completion bash                                        for the shell's Tab key
 
 exit status: 0 when done, 1 when `doctor` finds a problem, 2 for a mistake in the input, 3 when the
-search of `fit`, `population` or `translate` has not converged, 4 when `fit` has converged but does
-not fit, 5 when `calibrate` finds something outside its bounds, 130 when interrupted with Ctrl-C,
-which is how `view` ends, with 0: `fit` then has written the best point so far, `sample` its chain,
-`ablate`, `calibrate` and `population` each finished fit, and `compare --suite` each finished
-situation.
+search of `fit`, `fit-many`, `population` or `translate` has not converged, 4 when `fit` has
+converged but does not fit, 5 when `calibrate` finds something outside its bounds, 6 when a fit of
+`fit-many` has failed, 130 when interrupted with Ctrl-C, which is how `view` ends, with 0: `fit`
+then has written the best point so far, `sample` its chain, `ablate`, `calibrate`, `fit-many` and
+`population` each finished fit, and `compare --suite` each finished situation.
 `jaxik COMMAND --help` has more examples.
 """
 
@@ -63,10 +65,10 @@ def make_parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
-        add_init, add_fit, add_ablate, add_calibrate, add_population, add_sample, add_apply,
-        add_run, add_view, add_compare, add_translate, add_inspect, add_terrain, add_bench,
-        add_record, add_export, add_cache, add_parameters, add_schema, add_example, add_doctor,
-        add_completion,
+        add_init, add_fit, add_ablate, add_calibrate, add_population, add_fit_many, add_sample,
+        add_apply, add_run, add_view, add_compare, add_translate, add_inspect, add_terrain,
+        add_bench, add_record, add_export, add_cache, add_parameters, add_schema, add_example,
+        add_doctor, add_completion,
     ):  # fmt: skip
         add(commands)
     return top

@@ -29,7 +29,8 @@ from fitting.datasets.terrain.mesh_files import TerrainOptions
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import WHITENED, Reference, Scene, Sigmas
-from fitting.runtime import activity
+from fitting.problem.shared_world import share_world
+from fitting.runtime import activity, program_cache
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.validation import error_context
 from jaxik.maths import parameter_tree
@@ -135,9 +136,11 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
             with error_context(f"{experiment.path} [parameters]"):
                 parameter_tree.check_shapes(ik, len(scene.rig.side))
             scenes.append(scene)
+        scenes = share_world(scenes, ik.probe)
     dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
     independent = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
-    return Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, independent)
+    problem = Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, independent)
+    return program_cache.committed(problem)
 
 
 def _load_rig(entry: ClipEntry) -> jaxik.Rig:

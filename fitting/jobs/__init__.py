@@ -10,7 +10,8 @@ bits; a system that was made in 32 bits is taken with the values it has there.
 
 `drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample` and
 `translate`. `ablations` leaves rules out: `ablate`. `calibrations` judges what fits say:
-`calibrate`. `populations` fits several clips and subjects: `population`. `animations` runs finished
+`calibrate`. `populations` fits several clips and subjects: `population`. `many`
+fits clips × experiments × seeds in other processes: `fit_many`. `animations` runs finished
 systems: `solve`, `apply`, `compare` and `run_suite`. `views` shows runs, clips and fits in the
 browser: `view`, `view_run`. `comparisons` compares sampled runs: `compare_runs`. `exports` writes
 parameters for others: `export`. `examples` copies the experiments that come with the package.
@@ -28,6 +29,7 @@ from .exports import export as export
 from .fits import fit as fit
 from .fits import sample as sample
 from .fits import translate as translate
+from .many.fits import fit_many as fit_many
 from .output import Log as Log
 from .populations import population as population
 from .views import view as view

@@ -10,7 +10,8 @@ from fitting.experiments.problems import make_problem
 from fitting.report.calibration import calibration_report
 from fitting.report.formatting import joined
 from fitting.report.page.studies import calibration_page
-from fitting.runtime import activity, cluster
+from fitting.runtime import activity
+from fitting.runtime.parallel import cluster
 from fitting.runtime.precision import in_float64
 from fitting.studies.calibration import calibration
 from fitting.studies.calibration.assessment import Assessment, assess

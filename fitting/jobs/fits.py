@@ -50,6 +50,7 @@ def fit(
     progress: Callable[[Progress], None] | None = None,
     log: Log = silent,
     loaded: Loaded = unwatched,
+    report: bool = True,
 ) -> Fit:
     """Fits the free parameters of an experiment to its clips.
 
@@ -63,6 +64,7 @@ def fit(
         progress: called as the search goes on.
         log: called with what the command line prints.
         loaded: called with the experiment, its problem and clips, before the search.
+        report: whether the folder gets tables, pictures and a page beside the numbers.
 
     Raises:
         ValueError: the experiment is wrong or does not fit its clips or its preset, or the folder
@@ -85,7 +87,7 @@ def fit(
         shown = Shown(clips, known_values)
         fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
         texts, sections = _price_of_record(fitted, progress, log)
-        if run is not None:
+        if run is not None and report:
             fit_report.write_fit(run, fitted, sections)
         remove(kept, fitted)
         log(joined(["", fit_report.fit_text(fitted), *texts]))

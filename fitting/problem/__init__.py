@@ -6,6 +6,6 @@ posterior is sampled (`fitting.inference`), nor of files (`fitting.experiments`)
 
 Start with `problem.py`. `free_parameters.py` and `space.py` describe the parameters, `prior.py`
 says what is known of them before any data. `scene.py` and `residuals.py` are the data of foot IK,
-`loss.py` the robust losses. `simulation.py` makes data whose truth is known, `digest.py` tells
-problems apart.
+`shared_world.py` runs several clips in a row, `stacking.py` side by side. `loss.py` has the robust
+losses, `simulation.py` makes data whose truth is known, `digest.py` tells problems apart.
 """

@@ -6,17 +6,23 @@ from jaxtyping import Array, Bool, Float
 import jaxik
 from jaxik.maths import quat, vec
 
-from .scene import Scene, legs_ws, pelvis_ws, run_system
+from .scene import Scene, legs_ws, pelvis_ws
+from .shared_world import run_scene, run_scenes
 
 
 def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " residuals"]:
-    """Residuals of several clips, one clip after another."""
-    return jnp.concatenate([residuals_of_scene(ik, scene) for scene in scenes])
+    """Residuals of several clips in standard deviations, one clip after another."""
+    pairs = zip(scenes, run_scenes(ik, scenes), strict=True)
+    return jnp.concatenate([residuals_of_result(scene, result) for scene, result in pairs])
 
 
 def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " residuals"]:
+    """Residuals of one clip, which runs alone."""
+    return residuals_of_result(scene, run_scene(ik, scene))
+
+
+def residuals_of_result(scene: Scene, result: jaxik.Result) -> Float[Array, " residuals"]:
     """Residuals of one clip in standard deviations, one kind after another."""
-    result = run_system(ik, scene)
     residuals = residuals_by_kind(scene, errors_by_kind(scene, result))
     return jnp.concatenate([of_kind.ravel() for of_kind in residuals.values()])
 

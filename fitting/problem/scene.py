@@ -56,6 +56,17 @@ class Reference(eqx.Module):
     """What plots call it."""
 
 
+class Place(eqx.Module):
+    """Where the clip of a scene is in a world that it shares with others; see `shared_world`."""
+
+    terrain: Terrain
+    """The grounds of all clips of the world."""
+    offset_ws: Float[Array, "3"]
+    """m, by which this clip is moved there."""
+    world: int = eqx.field(static=True)
+    """Its number."""
+
+
 class Scene(eqx.Module):
     """One clip: rig, terrain and animation as inputs, and the reference with its sigmas."""
 
@@ -71,18 +82,13 @@ class Scene(eqx.Module):
     size: Float[Array, ""] | None = None
     """Leg length over that of the body for which systems are meant; they become `similar`. None
     takes them as they are."""
+    place: Place | None = None
+    """In a world shared with other scenes, with which it then runs in one loop; None runs alone."""
 
 
 def own_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.FootIK:
     """The system as it is for the body of a scene."""
     return ik if scene.size is None else similar(ik, scene.size)
-
-
-def run_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
-    """What a system makes of the clip of a scene."""
-    ik, tracks = own_system(ik, scene), scene.tracks or None
-    # Clips are checked when they are loaded.
-    return jaxik.run(ik, scene.rig, scene.terrain, scene.frames, tracks=tracks, checked=True)
 
 
 def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:

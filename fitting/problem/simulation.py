@@ -1,5 +1,7 @@
 """Problems whose truth is known: references made by a system itself, plus noise."""
 
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,10 +16,13 @@ from jaxik.maths import quat
 from jaxik.world.skeleton import Transform
 
 from .problem import Problem
-from .scene import Reference, Scene, legs_ws, pelvis_ws, run_system
+from .scene import Reference, Scene, legs_ws, pelvis_ws
+from .shared_world import run_scenes
 from .space import Vector
 
 Noise = Float[np.ndarray, "frames *shape"]
+# Pelvis, knees, ankles and contact weights along a clip, world space.
+Motion: TypeAlias = tuple[Transform, Array, Transform, Array]
 
 
 @in_float64
@@ -41,14 +46,15 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
     random = np.random.default_rng(seed)
     fraction = float(problem.independent_fraction)
     ik = problem.space.unpack(u)
-    scenes = tuple(_simulated(ik, scene, fraction, random) for scene in problem.data)
+    motions = zip(problem.data, _motions(ik, problem.data), strict=True)
+    scenes = tuple(_simulated(scene, motion, fraction, random) for scene, motion in motions)
     return eqx.tree_at(lambda problem: problem.data, problem, scenes)
 
 
 def _simulated(
-    ik: jaxik.FootIK, scene: Scene, independent_fraction: float, random: np.random.Generator
+    scene: Scene, motion: Motion, independent_fraction: float, random: np.random.Generator
 ) -> Scene:
-    """A scene whose reference is the system's motion plus noise."""
+    """A scene whose reference is the motion of a system plus noise."""
     sigmas, reference = scene.sigmas, scene.reference
     if np.isfinite(sigmas.smooth):
         raise ValueError(
@@ -62,7 +68,7 @@ def _simulated(
         errors = correlated(random.normal(size=shape), correlation, independent_fraction)
         return sigma * errors if np.isfinite(sigma) else np.zeros(shape)
 
-    pelvis, knee_ws, ankle, contact = _motion(ik, scene)
+    pelvis, knee_ws, ankle, contact = motion
     replaced = Reference(
         pelvis=_displaced(
             pelvis, noise("pelvis", pelvis.pos.shape), noise("body", pelvis.pos.shape)
@@ -77,12 +83,14 @@ def _simulated(
 
 
 @cached
-def _motion(ik: jaxik.FootIK, scene: Scene) -> tuple[Transform, Array, Transform, Array]:
-    """Pelvis, knees, ankles and contact weights of a system along a scene, world space."""
-    result = run_system(ik, scene)
-    assert result.trace is not None  # `jaxik.run` always has one
-    legs = legs_ws(scene, result)
-    return pelvis_ws(scene, result), legs.knee.pos, legs.ankle, result.trace.sensed.contact.weight
+def _motions(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[Motion]:
+    """What a system makes of each clip."""
+    motions = []
+    for scene, result in zip(scenes, run_scenes(ik, scenes), strict=True):
+        assert result.trace is not None  # `jaxik.run` always has one
+        legs, contact = legs_ws(scene, result), result.trace.sensed.contact.weight
+        motions.append((pelvis_ws(scene, result), legs.knee.pos, legs.ankle, contact))
+    return motions
 
 
 def correlated(draws: Noise, correlation: float, independent_fraction: float) -> Noise:

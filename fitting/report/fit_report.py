@@ -58,7 +58,7 @@ def write_fit(
     worst = ["## The worst two seconds"]
     system = fitted.problem.space.unpack(fitted.problem.space.pack({}))
     with activity.announced("Playing the clips with the system before the fit"):
-        before = [playback.run(system, scene) for scene in fitted.problem.data]
+        before = playback.run_all(system, fitted.problem.data)
     for index, (scene, after) in enumerate(zip(fitted.problem.data, fitted.playbacks, strict=True)):
         with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
             first = playback.play(scene, before[index])
@@ -70,10 +70,7 @@ def write_fit(
         figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
         plots |= save_plot(run, "cost.png", title, figure)
     with activity.announced("Measuring where limits are in effect"):
-        clips = [
-            limit_activity.measure(fitted.ik, scene, result)
-            for scene, result in zip(fitted.problem.data, fitted.results, strict=True)
-        ]
+        clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
     parts = [
         *_result(fitted),
         *opening,

@@ -38,6 +38,7 @@ TRACING = threading.RLock()  # parallel tracing gains nothing, and shared parts 
 
 Inputs = ParamSpec("Inputs")
 Output = TypeVar("Output")
+Tree = TypeVar("Tree")
 
 
 class _Place(NamedTuple):
@@ -80,10 +81,30 @@ def cached(function: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     @functools.wraps(function)
     def call(*args: Inputs.args, **named: Inputs.kwargs) -> Output:
         leaves = jax.tree.leaves((args, named))
-        traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-        return (inside if traced else outside)(*args, **named)
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return inside(*args, **named)
+        args, named = committed((args, named))
+        return outside(*args, **named)
 
     return call
+
+
+def committed(tree: Tree) -> Tree:
+    """The tree with its arrays committed to the one device they are on.
+
+    JAX compiles a program anew for arrays that are committed to a device, which those that come out
+    of a kept program are and most others are not. A program that is cached commits its arguments
+    itself, but for several hundred arrays that takes longer than many a call; what goes into many
+    calls is committed before. Arrays on several devices stay as they are.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    loose = [i for i, leaf in enumerate(leaves) if not getattr(leaf, "committed", True)]
+    if not loose or len({d for leaf in leaves if eqx.is_array(leaf) for d in leaf.devices()}) > 1:
+        return tree
+    device = leaves[loose[0]].sharding
+    for i, leaf in zip(loose, jax.device_put([leaves[i] for i in loose], device), strict=True):
+        leaves[i] = leaf
+    return jax.tree.unflatten(structure, leaves)
 
 
 def _place(function: Callable, arguments: Arguments) -> _Place | None:

@@ -152,7 +152,7 @@ class Fit(Shown):
     def results(self) -> tuple[jaxik.Result, ...]:
         """What the fitted system makes of each clip."""
         with activity.announced("Playing the clips with the fitted system"):
-            return tuple(playback.run(self.ik, scene) for scene in self.problem.data)
+            return playback.run_all(self.ik, self.problem.data)
 
     @cached_property
     def playbacks(self) -> tuple[Playback, ...]:

@@ -63,8 +63,8 @@ def measure(fitted: Fit, progress: Callable[[Progress], None] | None = None) -> 
 def _errors(problem: Problem[jaxik.FootIK], ik: jaxik.FootIK) -> dict[str, float]:
     """Root mean square of the errors by kind, over all clips."""
     squares: dict[str, list[np.ndarray]] = {}
-    for scene in problem.data:
-        play = playback.play(scene, playback.run(ik, scene))
+    for scene, result in zip(problem.data, playback.run_all(ik, problem.data), strict=True):
+        play = playback.play(scene, result)
         for kind in play.fitted_kinds:
             in_sigmas, _, counts = groups.series(play, kind)
             sizes = in_sigmas[counts] * float(play.sigmas[kind])

@@ -34,7 +34,7 @@ class Faults:
     """Where a number of the whole frame is not finite, or one of each leg that is there."""
 
 
-def clean(frame: Frame, present: Bool[Array, " legs"]) -> tuple[Frame, Faults]:
+def clean(frame: Frame, present: Bool[Array, "*#b legs"]) -> tuple[Frame, Faults]:
     """The frame with finite numbers only, and where it had others.
 
     A joint that is not finite goes to the model's origin, unturned; the rest of its leg stays as
@@ -42,8 +42,9 @@ def clean(frame: Frame, present: Bool[Array, " legs"]) -> tuple[Frame, Faults]:
 
     Args:
         frame: the leaves may have a leading axis of frames.
-        present: the legs that are there; what others hold is no fault.
+        present: the legs that are there, of the rig; what others hold is no fault.
     """
+    present = present if frame.rig is None else frame.rig.present
     rank, pose = frame.dt.ndim, frame.pose
     joints = (pose.hip, pose.knee, pose.ankle, pose.toe)
     of_legs = (frame.weight, frame.foot_speed, frame.toe_speed, frame.stride)
@@ -85,6 +86,7 @@ def clean(frame: Frame, present: Bool[Array, " legs"]) -> tuple[Frame, Faults]:
         platforms_before=platforms_before,
         stride_scale=stride_scale,
         restart=frame.restart,
+        rig=frame.rig,
     )
     return cleaned, Faults(faulty, ~frame_sound)
 

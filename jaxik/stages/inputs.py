@@ -33,7 +33,7 @@ class Inputs:
             frame: the animation, where numbers that are not finite have been replaced.
             faulty: legs that had some, and so count as legs that are not there.
         """
-        rig = self.rig
+        rig = self.rig if frame.rig is None else frame.rig
         if faulty is not None:
             rig = dataclasses.replace(rig, present=rig.present & ~faulty)
         centre_ws = places.centre_about(frame.world_from_model.pos)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, UInt
 from jaxik.maths import quat, vec
 from jaxik.maths.struct import place, struct
 
-from .skeleton import LegPose, Still, Transform
+from .skeleton import LegPose, Rig, Still, Transform
 from .terrain import Hit
 
 FORWARD = (0.0, 0.0, 1.0)  # model space
@@ -77,6 +77,9 @@ class Frame:
     restart: Bool[Array, "*b"] | None = None
     """True where nothing leads here from the previous frame, as after a teleport: memory starts
     anew. Speeds and strides are then those after it. None never restarts and costs nothing."""
+    rig: Rig | None = None
+    """The legs of the body that this frame is of, as many as the call's rig has: for clips of
+    several bodies in a row, with a `restart` where another begins. None takes the call's rig."""
 
     @property
     def speed(self) -> Float[Array, "*b"]:

@@ -28,7 +28,7 @@ from fitting.problem.loss import rho
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
-from fitting.problem.simulation import _motion
+from fitting.problem.simulation import _motions
 from fitting.problem.space import from_fractions, make_space
 from fitting.runtime.precision import in_float64, with_floats
 from jaxik import presets
@@ -123,7 +123,7 @@ def scene_of(clip: str, ground: str) -> Scene:
 @in_float64
 def motion(ik: jaxik.FootIK, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Positions (frames, n, 3) and rotations (frames, n, 4) of pelvis, knees and ankles, sigmas."""
-    pelvis, knee_ws, ankle, _ = _motion(ik, scene)
+    ((pelvis, knee_ws, ankle, _),) = _motions(ik, (scene,))
     positions = [pelvis.pos[:, None], knee_ws, ankle.pos]
     rotations = np.concatenate([pelvis.rot[:, None], ankle.rot], axis=1)
     return np.concatenate(positions, axis=1) / POSITION, rotations / (0.5 * ROTATION)
@@ -215,7 +215,7 @@ def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
     profile = profile_of("record", "pelvis.limit", clip, ground, student)
     ik, scene = system_of("record"), scene_of(clip, ground)
     with jax.enable_x64(True):
-        pelvis, knee_ws, ankle, _ = _motion(ik, scene)
+        ((pelvis, knee_ws, ankle, _),) = _motions(ik, (scene,))
         exact = dataclasses.replace(scene.reference, pelvis=pelvis, knee_ws=knee_ws, ankle=ankle)
         none = jnp.asarray(jnp.inf)
         sigmas = dataclasses.replace(scene.sigmas, foot=none, body=none)

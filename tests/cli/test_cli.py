@@ -36,8 +36,8 @@ from support.sample_clips import BVH
 
 DATA = ROOT / "data"
 COMMANDS = [
-    "init", "fit", "ablate", "calibrate", "population", "sample", "apply", "run", "view", "compare",
-    "translate",
+    "init", "fit", "ablate", "calibrate", "population", "fit-many", "sample", "apply", "run",
+    "view", "compare", "translate",
     "inspect", "terrain", "bench", "cache", "record", "record show", "record to-toml",
     "record to-bytes", "export",
 ]  # fmt: skip
@@ -118,6 +118,7 @@ def test_the_help_lists_all_commands_and_exit_statuses(capsys):
     assert "exit status: 0 when done, 1 when `doctor` finds a problem, 2 for a mistake" in text
     assert "3 when the search" in text and "4 when `fit` has converged but does not fit" in text
     assert "5 when `calibrate` finds something outside its bounds" in text and "130 when" in text
+    assert "6 when a fit of `fit-many` has failed" in text
 
 
 @pytest.mark.parametrize(

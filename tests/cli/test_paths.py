@@ -24,6 +24,7 @@ PLACES: dict[str, tuple[list[str], str]] = {  # words with a place for a path, a
     "ablate": (["ablate", "{}", "-o", "out"], ".toml"),
     "calibrate": (["calibrate", "{}", "-o", "out"], ".toml"),
     "population": (["population", "{}", "-o", "out"], ".toml"),
+    "fit-many": (["fit-many", "{}", "-o", "out"], ".toml"),
     "sample": (["sample", "{}"], ""),
     "apply": (["apply", "{}", *ANIMATION, "-o", "a.npz"], ""),
     "run clip": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".bvh"),
@@ -128,7 +129,17 @@ def test_a_path_without_a_file_of_its_kind_costs_one_line(
     Path("whole.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\n")
     Path("walk.bvh").write_text(BVH)
     words, suffix = PLACES[place]
-    if way == "empty" and suffix == ".toml" and place not in ("fit", "ablate", "calibrate"):
+    if (
+        way == "empty"
+        and suffix == ".toml"
+        and place
+        not in (
+            "fit",
+            "ablate",
+            "calibrate",
+            "fit-many",
+        )
+    ):
         pytest.skip("an empty TOML file is a whole one")
     path = broken_path(way, suffix)
     before = sorted(Path().rglob("*"))
@@ -155,6 +166,7 @@ OUTPUTS: dict[str, tuple[list[str], str]] = {
     "ablate": (["ablate", "{experiment}", "-o", "{}"], ""),
     "calibrate": (["calibrate", "{experiment}", "-o", "{}"], ""),
     "population": (["population", "{experiment}", "-o", "{}"], ""),
+    "fit-many": (["fit-many", "{experiment}", "-o", "{}"], ""),
     "parameters": (["parameters", "-o", "{}"], ".md"),
     "schema": (["schema", "-o", "{}"], ".json"),
     "example": (["example", "uneven_walk", "-o", "{}"], ""),

@@ -134,7 +134,8 @@ def test_the_fit_with_noise_is_the_joint_optimum(short):
     def objective(x: np.ndarray) -> float:
         u, sigmas, rhos = x[:2], np.exp(x[2:7]), np.tanh(x[7:])
         ik = short.space.unpack(jnp.asarray(u))
-        errors = model._errors_of(ik, short.data[0])
+        (by_kind,) = model._errors_by_kind(ik, short.data)
+        errors = model._counted(short.data[0], by_kind)
         total = 0.5 * float(np.sum(np.asarray(short.space.prior_residuals(jnp.asarray(u))) ** 2))
         for kind, sigma, rho in zip(KINDS, sigmas, rhos, strict=True):
             values = errors[kind].values

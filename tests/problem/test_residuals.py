@@ -56,7 +56,7 @@ quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimizati
 
 @quick_jit
 def residuals_and_result(ik, scene):
-    return residuals.residuals_of_scene(ik, scene), jaxik.run(
+    return residuals.residuals_of_scenes(ik, (scene,)), jaxik.run(
         ik, scene.rig, scene.terrain, scene.frames
     )
 
@@ -184,7 +184,8 @@ def test_an_absent_leg_has_zero_residuals(scene):
 
 
 def test_several_clips_follow_one_another(scene, monkeypatch):
-    monkeypatch.setattr(residuals, "residuals_of_scene", lambda ik, scene: scene.rig.shin)
+    monkeypatch.setattr(residuals, "run_scenes", lambda ik, scenes: scenes)
+    monkeypatch.setattr(residuals, "residuals_of_result", lambda scene, result: scene.rig.shin)
     other = eqx.tree_at(lambda scene: scene.rig.shin, scene, jnp.array([3.0]))
     joined = residuals.residuals_of_scenes(jaxik.presets.record(), (other, scene))
     np.testing.assert_array_equal(joined, [3.0, *scene.rig.shin])

@@ -238,7 +238,8 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
     nudged = line_of(text.split("threshold moves")[1], "contact.planted_height")
     assert f"{down.rise:+.1f}" in nudged and f"{up.rise:+.1f}" in nudged
     scene = fitted.problem.data[0]
-    activity = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
+    result = playback.run(fitted.ik, scene)
+    (activity,) = limit_activity.measure(fitted.ik, (scene,), (result,))
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
 
@@ -298,7 +299,7 @@ def test_a_playback_has_the_residuals_of_the_fit(fitted):
     played = playback.play(scene, playback.run(fitted.ik, scene))
     assert played.fitted_kinds == list(playback.RESIDUAL_KINDS)
     shown = np.concatenate([np.ravel(played.residuals[kind]) for kind in playback.RESIDUAL_KINDS])
-    np.testing.assert_allclose(shown, residuals.residuals_of_scene(fitted.ik, scene), atol=1e-9)
+    np.testing.assert_allclose(shown, residuals.residuals_of_scenes(fitted.ik, (scene,)), atol=1e-9)
 
 
 def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
@@ -318,10 +319,10 @@ def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitte
     scene = fitted.problem.data[0]
     values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}
     ik = parameter_tree.replace(fitted.ik, values)
-    ends = limit_activity.active_limits(ik, scene, playback.run(ik, scene))
+    (ends,) = limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))
     assert [ends[name] for name in values] == [0.0, 0.0, 0.0]
     ik = parameter_tree.replace(fitted.ik, {"pelvis.limit": 0.0})
-    tight = limit_activity.active_limits(ik, scene, playback.run(ik, scene))
+    (tight,) = limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
@@ -329,7 +330,8 @@ def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitte
 
 def test_activity_counts_locks_releases_and_ground(fitted):
     scene = fitted.problem.data[0]
-    activity = limit_activity.measure(fitted.ik, scene, playback.run(fitted.ik, scene))
+    result = playback.run(fitted.ik, scene)
+    (activity,) = limit_activity.measure(fitted.ik, (scene,), (result,))
     result = jaxik.run(fitted.ik, scene.rig, scene.terrain, scene.frames)
     locked = np.asarray(result.trace.advanced.state.lock.locked)
     assert activity.frames == 30 and activity.seconds == pytest.approx(2.0)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from fitting.runtime import cluster
+from fitting.runtime.parallel import cluster
 from fitting.runtime.precision import in_float64
 
 

@@ -290,3 +290,31 @@ print(float(at.cost), *traced)
     ]
     assert outputs[0][0] == outputs[1][0]
     assert {"begin", "step"} <= set(outputs[0][1:]) and outputs[1][1:] == []
+
+
+def test_arrays_are_compiled_for_once_wherever_they_come_from(folder):
+    """Those that come out of a kept program are committed to a device, unlike fresh ones."""
+    compiled = []
+
+    def count(event: str, duration_secs: float, **named: object) -> None:
+        if event.endswith("backend_compile_duration") and named.get("fun_name") == "jit(stretch)":
+            compiled.append(duration_secs)
+
+    call, points = program_cache.cached(stretch), jnp.ones((4, 3))
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        first = call(jnp.asarray(2.0), points)["longer"]
+        call(jnp.asarray(2.0), first)
+        call(*program_cache.committed((jnp.asarray(2.0), points)))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    assert first.committed and not points.committed
+    assert len(compiled) == 1
+
+
+def test_what_is_committed_already_or_lies_on_no_device_stays_as_it_is():
+    tree = {"points": jnp.ones(3), "name": "here", "count": 3, "host": np.ones(2)}
+    bound = program_cache.committed(tree)
+    assert bound["points"].committed and not tree["points"].committed
+    assert (bound["name"], bound["count"], bound["host"]) == ("here", 3, tree["host"])
+    assert program_cache.committed(bound) is bound

@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable
 
-from . import animations, files, fits, guides, machine
+from . import animations, files, fits, guides, machine, many
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "init": fits.init,
@@ -11,6 +11,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "ablate": fits.ablate,
     "calibrate": fits.calibrate,
     "population": fits.population,
+    "fit-many": many.fit_many,
     "sample": fits.sample,
     "apply": animations.apply,
     "run": animations.run,

@@ -1,10 +1,12 @@
 """Exit statuses of the commands."""
 
 from fitting.studies.fit import Fit
+from fitting.studies.many.progress import ManyFits
 
 NOT_CONVERGED = 3  # the search of a fit
 DOES_NOT_FIT = 4  # a fit that has converged
 OUTSIDE = 5  # of its bounds, a calibration
+FAILED = 6  # at least one of many fits
 
 
 def of_job(*, interrupted: bool) -> int:
@@ -20,3 +22,11 @@ def of_fit(fitted: Fit) -> int:
     if not fitted.solution.converged:
         return NOT_CONVERGED
     return DOES_NOT_FIT if fitted.has_noise and not fitted.verdict.fits else 0
+
+
+def of_many(fits: ManyFits) -> int:
+    """The exit status of many fits; whether each fits is a result, and no failure."""
+    of_job(interrupted=fits.interrupted)
+    if fits.failed:
+        return FAILED
+    return NOT_CONVERGED if fits.unconverged else 0

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from .many import add_workers
 from .options import (
     Commands,
     add_address,
@@ -136,13 +137,7 @@ def add_calibrate(commands: Commands) -> None:
         "--noise-factor", type=number(1e-3, 1e3), default=1.0, metavar="X",
         help="simulate noise X times as large as the experiment says (default: 1)",
     )  # fmt: skip
-    calibrate.add_argument(
-        "--workers", type=count(0, 1024), default=0, metavar="N",
-        help="compute in N other processes of this machine, with the extra `dask` (default: 0)",
-    )  # fmt: skip
-    calibrate.add_argument(
-        "--scheduler", metavar="ADDRESS", help="compute on the Dask cluster of this scheduler"
-    )
+    add_workers(calibrate, 0, "0")
     add_output(calibrate, "DIR")
 
 

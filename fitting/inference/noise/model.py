@@ -13,7 +13,8 @@ from jaxtyping import Array
 import jaxik
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind
-from fitting.problem.scene import MEASURED, WHITENED, Scene, run_system
+from fitting.problem.scene import MEASURED, WHITENED, Scene
+from fitting.problem.shared_world import run_scenes
 from fitting.problem.space import Vector
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
@@ -92,7 +93,8 @@ def _with_noise(scene: Scene, noise: NoiseModel) -> Scene:
 def likeliest_noise(problem: Problem[jaxik.FootIK], u: Vector, options: NoiseOptions) -> NoiseModel:
     """The noise that makes the errors at `u` likeliest; what is not estimated stays as it is."""
     assumed, ik = noise_of(problem), problem.space.unpack(jnp.asarray(u))
-    by_clip = [_errors_of(ik, scene) for scene in problem.data]
+    pairs = zip(problem.data, _errors_by_kind(ik, problem.data), strict=True)
+    by_clip = [_counted(scene, values) for scene, values in pairs]
     found = {
         kind: _likeliest(
             [errors[kind] for errors in by_clip], problem, options, assumed.correlations[kind]
@@ -153,11 +155,11 @@ def _independent_fraction(
     return min(1.0, count / max(frames, 1e-300))
 
 
-def _errors_of(ik: jaxik.FootIK, scene: Scene) -> dict[str, Errors]:
-    """Errors of each measured kind in one clip."""
+def _counted(scene: Scene, by_kind: Mapping[str, Array]) -> dict[str, Errors]:
+    """Errors of each measured kind in one clip, and which of them count."""
     seen, present = np.asarray(scene.reference.observed), np.asarray(scene.rig.present, bool)
     errors = {}
-    for kind, values in _errors_by_kind(ik, scene).items():
+    for kind, values in by_kind.items():
         array = np.asarray(values, np.float64)
         legs = present if array.ndim == 3 else np.ones(1, bool)
         counts = np.repeat(seen[:, None] & legs, array[0].size // len(legs), axis=1)
@@ -166,7 +168,8 @@ def _errors_of(ik: jaxik.FootIK, scene: Scene) -> dict[str, Errors]:
 
 
 @cached
-def _errors_by_kind(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
-    result = run_system(ik, scene)
-    errors = errors_by_kind(scene, result)
-    return {kind: errors[kind] for kind in MEASURED}
+def _errors_by_kind(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[dict[str, Array]]:
+    """Errors of each measured kind, clip by clip."""
+    pairs = zip(scenes, run_scenes(ik, scenes), strict=True)
+    by_clip = (errors_by_kind(scene, result) for scene, result in pairs)
+    return [{kind: errors[kind] for kind in MEASURED} for errors in by_clip]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.inference.sharding import over_devices
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, values_of_rows
@@ -259,7 +260,7 @@ def _log_probability(problem: Problem, start: WalkerStart, walkers: int) -> floa
     rows = jnp.broadcast_to(
         jnp.asarray(start.u, problem.space.start.dtype), (walkers // 2, problem.space.size)
     )
-    return float(log_probabilities(problem, rows)[0])
+    return float(log_probabilities(over_devices(problem), rows)[0])
 
 
 def _balls(

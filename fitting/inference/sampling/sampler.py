@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.inference.sharding import over_devices
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
 from fitting.runtime.program_cache import cached
@@ -112,6 +113,7 @@ def steps(
     """
     identity = chain.identity
     dtype = problem.space.start.dtype
+    problem = over_devices(problem)
 
     def evaluate(u: np.ndarray) -> np.ndarray:
         """Half of the walkers at a time, as the moves need them: one program."""

@@ -21,6 +21,10 @@ LOCK = ".jaxik.lock"
 LONGEST_COMMAND = 100  # characters of it that the file keeps
 
 
+class InUseError(ValueError):
+    """Another process is at work in the folder; the message says which."""
+
+
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
     """Makes a folder, if there is none, and keeps other processes out of it.
@@ -28,7 +32,7 @@ def claimed(folder: Path) -> Iterator[None]:
     What of it was made and is empty at the end is removed.
 
     Raises:
-        ValueError: another process is at work in the folder; the message says which.
+        InUseError: another process is at work in the folder; the message says which.
         OSError: the folder cannot be made or written to.
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -68,7 +72,7 @@ def _open_locked(path: Path) -> IO[bytes]:
             file.seek(0)
             owner = file.read(1000).decode(errors="replace").strip() or "another process"
             file.close()
-            raise ValueError(
+            raise InUseError(
                 f"{path.parent}: in use by {owner}; wait until it has ended, or name another folder"
             ) from None
         except OSError as error:

@@ -25,7 +25,8 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.inference.sampling.posterior import SamplingProgress
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
-from fitting.runtime import activity, cluster
+from fitting.runtime import activity
+from fitting.runtime.parallel import cluster
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import Content, error_context
 

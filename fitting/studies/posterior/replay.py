@@ -61,8 +61,8 @@ def replay(problem: Problem[jaxik.FootIK], posterior: Posterior, seed: int) -> R
             ik = problem.space.unpack(jnp.asarray(row))
             drawn = {kind: float(values[draw]) for kind, values in sigmas.items()}
             replicated = draw % math.ceil(len(u) / REPLICATES) == 0
-            for clip in clips:
-                clip.add(ik, drawn, replicated)
+            for clip, result in zip(clips, playback.run_all(ik, problem.data), strict=True):
+                clip.add(result, drawn, replicated)
             playing.advance()
     ess = min(row["ess"] for row in posterior.summary)
     values = np.concatenate([clip.log_likelihood for clip in clips], axis=1)
@@ -96,15 +96,15 @@ class _Clip:
         self._channels: dict[str, list[np.ndarray]] = defaultdict(list)
         self._last: Playback | None = None
 
-    def add(self, ik: jaxik.FootIK, sigmas: Mapping[str, float], replicated: bool) -> None:
-        """Runs the system of one draw, and makes a replicate of its motion.
+    def add(self, result: jaxik.Result, sigmas: Mapping[str, float], replicated: bool) -> None:
+        """Takes in what the system of one draw makes of the clip, and replicates its motion.
 
         Args:
-            ik: the system.
+            result: of the system.
             sigmas: of this draw, by kind; others are the scene's.
             replicated: whether to make one.
         """
-        played = playback.play(self._scene, playback.run(ik, self._scene))
+        played = playback.play(self._scene, result)
         given = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
         ratios = {kind: sigma / given[kind] for kind, sigma in sigmas.items()}
         frames = likelihoods.of_frames(played, self._scene, self._density, ratios)

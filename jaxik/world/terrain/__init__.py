@@ -12,6 +12,7 @@ from .building import combine as combine
 from .building import function as function
 from .building import heightfield as heightfield
 from .building import layer_mask as layer_mask
+from .building import merge as merge
 from .building import mesh as mesh
 from .building import moving as moving
 from .building import plane as plane

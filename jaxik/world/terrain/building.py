@@ -1,5 +1,7 @@
 """Makes terrains: of planes, meshes, heightfields and functions, combined, and on platforms."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -182,6 +184,44 @@ def combine(*terrains: Terrain) -> Terrain:
             raise ValueError(f"combined terrains must share one up direction; got {listed}")
     surfaces = (surface for terrain in terrains for surface in terrain.surfaces)
     return Terrain(ups[0], tuple(surfaces))
+
+
+def merge(
+    terrains: Sequence[Terrain],
+    offsets_ws: Sequence[Float[np.ndarray, "3"]] | Float[np.ndarray, "terrains 3"],
+) -> Terrain:
+    """One mesh of the triangles of several terrains, each moved; built on the host, not under jit.
+
+    One grid finds them all, so that a ray onto many terrains costs as much as onto one, where those
+    that `combine` has put together cost one look-up each. Put side by side, they are the grounds of
+    many characters in one call.
+
+    Args:
+        terrains: static meshes under one up direction; several surfaces of one count as one.
+        offsets_ws: m, by which each is moved.
+
+    Raises:
+        ValueError: not as many offsets as terrains, none at all, another surface than a static
+            mesh, or different up directions.
+    """
+    if len(offsets_ws) != len(terrains):
+        raise ValueError(f"merge got {len(terrains)} terrains and {len(offsets_ws)} offsets")
+    up_ws = combine(*terrains).up_ws
+    vertices, triangles, layers, count = [], [], [], 0
+    for terrain, offset_ws in zip(terrains, offsets_ws, strict=True):
+        for surface in terrain.surfaces:
+            if not isinstance(surface, Mesh):
+                raise ValueError(f"only static meshes merge; got a {type(surface).__name__}")
+            moved = surface.moved(jnp.asarray(offset_ws, surface.vertices_ws.dtype))
+            vertices.append(np.asarray(moved.vertices_ws) + np.asarray(moved.offset_ws))
+            triangles.append(np.asarray(surface.triangles) + count)
+            layers.append(np.asarray(surface.layers))
+            count += len(vertices[-1])
+    corners, members, bits = (
+        jnp.asarray(np.concatenate(parts)) for parts in (vertices, triangles, layers)
+    )
+    lists = grid.build(corners, members, bits, up_ws, slack=0.0)
+    return Terrain(up_ws, (Mesh(corners, members, bits, lists),))
 
 
 def moving(terrain: Terrain, platform: int, tilts: bool = False) -> Terrain:

@@ -1,0 +1,159 @@
+"""Many systems, clips and fits: time and memory against devices, clips and workers.
+
+Each point is a process of its own, so that its peak of memory is its own, too:
+`python -m fitting.bench.benchmarks.many WHAT COUNT` prints its numbers as JSON. Devices are those
+of this machine, or simulated ones, which share its cores: they show what sharing costs.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fitting.bench import workloads
+from fitting.bench.measurement import Figure, Measurement, Series
+from fitting.bench.sizes import Sizes
+from fitting.runtime.parallel.effort import Stopwatch, peak_mb
+
+FRAMES = 60
+SYSTEMS = 512  # shared out among devices
+FITS = 8  # shared out among workers
+SIMULATED = "--xla_force_host_platform_device_count={}"
+EXPERIMENT = """
+preset = "record"
+faithful = true
+[[clips]]
+reference = "reference.npz"
+base = "base.npz"
+terrain = "ground.ply"
+[free]
+pelvis.on_gain = {}
+foot.max_pitch = { low = 0.1 }
+[fit]
+starts = 1
+"""
+
+
+def many(measurement: Measurement, sizes: Sizes) -> None:
+    """Time and peak of memory against devices, clips and workers."""
+    _vary(measurement, "devices", sizes.devices, f"{SYSTEMS} systems")
+    _vary(measurement, "clips", sizes.clips, "a system")
+    _vary(measurement, "workers", sizes.workers, f"{FITS} fits")
+    measurement.notes.append(
+        "devices are simulated where there is one: they share its cores, so that time should stay; "
+        "seconds are those after compiling, of workers those of all, starting them included; the "
+        "peak of workers is the largest of one process"
+    )
+
+
+def _vary(measurement: Measurement, what: str, counts: Sequence[int], curve: str) -> None:
+    """Adds a series with the memory peak of each point."""
+    series = Series(what, [], {})
+    measurement.series.append(series)
+    for count in counts:
+        measurement.progress(f"many: {count} {what}")
+        environment = os.environ | ({"XLA_FLAGS": _flags(count)} if what == "devices" else {})
+        finished = subprocess.run(
+            [sys.executable, "-m", "fitting.bench.benchmarks.many", what, str(count)],
+            env=environment, check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        point: Mapping[str, float] = json.loads(finished.stdout.splitlines()[-1])
+        series.sizes.append(count)
+        series.seconds.setdefault(curve, []).append(point["seconds"])
+        label = f"{curve}, {count} {what}"
+        note = f"CPU time {point['cpu_seconds']:.2f} s"
+        measurement.add(Figure(label, point["seconds"], "s", note=note))
+        measurement.add(Figure(f"{label}: peak of memory", point["peak_mb"], "MB"))
+
+
+def _flags(devices: int) -> str:
+    """The flags of this process with simulated devices."""
+    return f"{os.environ.get('XLA_FLAGS', '')} {SIMULATED.format(devices)}".strip()
+
+
+def of_devices(count: int) -> dict[str, float]:
+    """Many systems on a clip, on so many devices."""
+    import jax
+
+    import fitting
+
+    problem = workloads.problem(FRAMES)
+    ik = problem.space.unpack(problem.space.start)
+    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.05, 0.9, SYSTEMS)})
+    devices = jax.local_devices()[:count]
+    return _second_time(lambda: fitting.evaluate_many(batch, problem.data, devices=devices))
+
+
+def of_clips(count: int) -> dict[str, float]:
+    """A system on so many clips of different length on one ground."""
+    import fitting
+
+    problem = workloads.problem(FRAMES)
+    ik = problem.space.unpack(problem.space.start)
+    clips = problem.data * count
+    single = fitting.vary(ik, {"pelvis.on_gain": [0.2]})
+    return _second_time(lambda: fitting.evaluate_many(single, clips))
+
+
+def of_workers(count: int) -> dict[str, float]:
+    """Fits of a clip with several seeds, on so many workers of this machine."""
+    import fitting
+    from fitting.datasets.clips import save_clip
+    from fitting.datasets.terrain.mesh_files import save_mesh
+    from fitting.runtime import cache_folder
+
+    cache_folder.use_default()
+    with tempfile.TemporaryDirectory() as folder:
+        reference, base, ground = workloads.recording(FRAMES)
+        save_clip(Path(folder, "reference.npz"), reference)
+        save_clip(Path(folder, "base.npz"), base)
+        save_mesh(Path(folder, "ground.ply"), ground.vertices, ground.faces)
+        path = Path(folder, "walk.toml")
+        path.write_text(EXPERIMENT, encoding="utf-8")
+        fitting.fit_many(path, Path(folder, "first"), workers=1, report=False)  # compiles
+        began = time.monotonic()
+        fits = fitting.fit_many(path, Path(folder, "fits"), seeds=FITS, workers=count, report=False)
+        efforts = [row["effort"] for row in fits.finished if "effort" in row]
+        return {
+            "seconds": time.monotonic() - began,
+            "cpu_seconds": sum(effort["cpu_seconds"] for effort in efforts),
+            "peak_mb": max(effort["peak_mb"] or float("nan") for effort in efforts),
+        }
+
+
+def _second_time(call: Callable[[], object]) -> dict[str, float]:
+    """What a call takes after one that compiles; the peak is that of both."""
+    call()
+    watch = Stopwatch()
+    call()
+    effort = watch.read()
+    return {
+        "seconds": effort["seconds"],
+        "cpu_seconds": effort["cpu_seconds"],
+        "peak_mb": peak_mb() or float("nan"),
+    }
+
+
+POINTS = {"devices": of_devices, "clips": of_clips, "workers": of_workers}
+
+
+def main() -> None:
+    """Measures one point and prints it."""
+    import jax
+
+    import fitting
+
+    fitting.configure_xla()
+    jax.config.update("jax_enable_x64", True)
+    what, count = sys.argv[1:]
+    print(json.dumps(POINTS[what](int(count))))
+
+
+if __name__ == "__main__":
+    main()

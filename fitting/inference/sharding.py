@@ -1,0 +1,125 @@
+"""A problem of many clips whose residuals are computed on all devices, each with its clips.
+
+The clips lie on the devices and stay there; the parameters go to all of them, and one number comes
+back for each point, the sum of what all devices found. It is that of one device up to rounding.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, PyTree
+
+import jaxik
+from fitting.inference.noise.marginal import with_unknown_sigmas
+from fitting.problem import stacking
+from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scene, residuals_of_scenes
+from fitting.problem.scene import Scene
+
+CLIPS = "clips"  # the axis of the devices
+EVERYWHERE, SPLIT = PartitionSpec(), PartitionSpec(CLIPS)
+
+
+class ShardedScenes(eqx.Module):
+    """The clips of a problem, on several devices."""
+
+    stacks: tuple[Scene, ...]
+    """Each with clips on the first axis of its arrays, as many for each device."""
+    stacked: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    """Of each stack, which of its arrays have that axis."""
+    mesh: Mesh = eqx.field(static=True)
+    """The devices."""
+
+
+def over_devices(
+    problem: Problem[jaxik.FootIK], devices: Sequence[Any] | None = None
+) -> Problem[jaxik.FootIK]:
+    """The problem with its clips shared out among devices; the same up to rounding.
+
+    Its residuals come in another order, with zeros where clips were made longer or devices have
+    less to do. With one device or one clip, or residuals of another kind, it stays as it is.
+
+    Args:
+        problem: of clips, as `problem_from_clips` makes it.
+        devices: those of JAX; None takes all of this process.
+    """
+    devices = jax.local_devices() if devices is None else list(devices)
+    if (
+        len(devices) < 2
+        or problem.residual_function is not residuals_of_scenes
+        or len(problem.data) < 2
+    ):
+        return problem
+    mesh = Mesh(np.array(devices), (CLIPS,))
+    stacks = [_filled(stack, len(devices)) for stack in stacking.stack(problem.data)]
+    each = [stack.one(i) for stack in stacks for i in range(len(stack.members))]
+    sharded = dataclasses.replace(
+        problem,
+        data=ShardedScenes(
+            tuple(_placed(stack, mesh) for stack in stacks),
+            tuple(stack.stacked for stack in stacks),
+            mesh,
+        ),
+        residual_function=residuals_of_sharded,
+    )
+    if problem.unknown_sigmas is None:
+        return sharded
+    # Which residual has which sigma, in their new order.
+    unsharded = dataclasses.replace(problem, data=tuple(each), unknown_sigmas=None)
+    unknown = with_unknown_sigmas(unsharded).unknown_sigmas
+    return dataclasses.replace(sharded, unknown_sigmas=unknown)
+
+
+def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, " residuals"]:
+    """Residuals of clips on several devices, one clip after another."""
+    parts = []
+    for scenes, stacked in zip(data.stacks, data.stacked, strict=True):
+        of_clips = jax.vmap(
+            residuals_of_scene, in_axes=(None, stacking.labelled(scenes, stacked, 0))
+        )
+        spread = specifications(scenes, stacked, SPLIT)
+        # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
+        of_devices = jax.shard_map(
+            of_clips,
+            mesh=data.mesh,
+            in_specs=(EVERYWHERE, spread),
+            out_specs=SPLIT,
+            check_vma=False,
+        )
+        parts.append(of_devices(ik, scenes).ravel())
+    return jnp.concatenate(parts)
+
+
+def _filled(stack: stacking.Stack, devices: int) -> stacking.Stack:
+    """The stack with clips that nobody observed, until each device has as many."""
+    count = len(stack.members)
+    whole = -(-count // devices) * devices
+    scenes = stack.part(0, whole)
+    observed = np.array(scenes.reference.observed)
+    observed[count:] = False
+    scenes = dataclasses.replace(
+        scenes, reference=dataclasses.replace(scenes.reference, observed=observed)
+    )
+    return stack._replace(scenes=scenes, members=(*stack.members, *[-1] * (whole - count)))
+
+
+def specifications(tree: PyTree, stacked: Sequence[bool], split: PartitionSpec) -> PyTree:
+    """How the arrays of a tree are split among devices: those that are not stacked are copied."""
+    leaves = [split if flag else EVERYWHERE for flag in stacked]
+    return jax.tree.unflatten(jax.tree.structure(tree), leaves)
+
+
+def _placed(stack: stacking.Stack, mesh: Mesh) -> Scene:
+    """The stack's arrays on their devices."""
+    leaves, structure = jax.tree.flatten(stack.scenes)
+    placed = [
+        jax.device_put(leaf, NamedSharding(mesh, SPLIT if flag else EVERYWHERE))
+        for leaf, flag in zip(leaves, stack.stacked, strict=True)
+    ]
+    return jax.tree.unflatten(structure, placed)

@@ -1,0 +1,1 @@
+"""Jobs that are shared out to many processes."""

@@ -1,0 +1,266 @@
+"""Clips that share one world: run one after another, they need one program and not one each.
+
+Compiling takes most of the time of a fit, and with each clip its own, it would grow with their
+number. So the terrains of all clips are put side by side into one mesh, far enough apart that no
+ray of a clip meets the ground of another, and all frames go through one loop, in which memory
+starts anew at the first frame of each clip. Foot IK is the same wherever a world has its origin.
+
+Terrains that are no static meshes can be shared only by clips that have the same one.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import jaxik
+from jaxik.maths import parameter_tree
+from jaxik.pipeline import Result
+from jaxik.stages.probe import AbstractProbe
+from jaxik.world import grid, places
+from jaxik.world.surfaces import Mesh
+from jaxik.world.terrain import Terrain, merge
+
+from .scene import Place, Scene, own_system
+
+Tree = TypeVar("Tree")
+
+# m, to either side of where a clip goes, that stay its own: further than any ray is cast from its
+# root, also for the next foothold of a sprinter.
+MARGIN = 10.0
+
+
+def share_world(scenes: Sequence[Scene], probe: AbstractProbe) -> list[Scene]:
+    """The scenes with places in worlds that as many as possible share; on the host.
+
+    Args:
+        scenes: of one system.
+        probe: its rule for rays, which may need a terrain prepared.
+    """
+    placed = list(scenes)
+    for numbers in _worlds(scenes):
+        if len(numbers) == 1:
+            continue
+        members = [scenes[number] for number in numbers]
+        distinct = _distinct([scene.terrain for scene in members])
+        offsets = np.zeros((len(members), 3))
+        terrain = members[0].terrain
+        if len(set(distinct)) > 1:
+            offsets = _side_by_side(members, distinct)
+            firsts = [distinct.index(terrain) for terrain in sorted(set(distinct))]
+            grounds = [members[first].terrain for first in firsts]
+            terrain = probe.prepare(merge(grounds, offsets[firsts]))
+        for number, scene, offset in zip(numbers, members, offsets, strict=True):
+            offset_ws = jnp.asarray(offset, scene.frames.dt.dtype)
+            place = Place(terrain, offset_ws, numbers[0])
+            placed[number] = dataclasses.replace(scene, place=place)
+    return placed
+
+
+class Row(NamedTuple):
+    """What a system runs on: one clip, or several that share a world, one after another."""
+
+    ik: jaxik.FootIK
+    rig: jaxik.Rig
+    terrain: Terrain
+    frames: jaxik.Frame
+    tracks: dict[str, Array]
+
+
+def row_of(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> Row:
+    """One scene as it is, or several that share a world, in a row."""
+    first = scenes[0]
+    if len(scenes) == 1:
+        return Row(own_system(ik, first), first.rig, first.terrain, first.frames, first.tracks)
+    assert first.place is not None  # they share a world
+    scaled = any(scene.frames.stride_scale is not None for scene in scenes)
+    frames = in_a_row([_frames_in_world(scene, first.rig, scaled) for scene in scenes])
+    return Row(ik, first.rig, first.place.terrain, frames, _tracks_in_a_row(ik, scenes))
+
+
+def run_scene(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
+    """What a system makes of the clip of one scene, in its own world."""
+    return _run_row(ik, [scene])[0]
+
+
+def run_scenes(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[jaxik.Result, ...]:
+    """What a system makes of the clip of each scene: one loop for those that share a world."""
+    results: dict[int, Result] = {}
+    for numbers in groups(scenes):
+        results |= zip(numbers, _run_row(ik, [scenes[i] for i in numbers]), strict=True)
+    return tuple(results[number] for number in range(len(scenes)))
+
+
+def _run_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> list[Result]:
+    """What a system makes of one scene, or of each of several that share a world."""
+    row = row_of(ik, scenes)
+    # Clips are checked when they are loaded.
+    result = jaxik.run(
+        row.ik, row.rig, row.terrain, row.frames, tracks=row.tracks or None, checked=True
+    )
+    if len(scenes) == 1:
+        return [result]
+    return list(map(_result_at_home, split(result, scenes), scenes))
+
+
+def in_a_row(trees: Sequence[Tree]) -> Tree:
+    """Trees of arrays, one after another along the first axis."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
+
+
+def split(tree: Tree, scenes: Sequence[Scene]) -> list[Tree]:
+    """What was computed for the frames of these scenes in a row, scene by scene."""
+    ends = np.cumsum([len(scene.frames.dt) for scene in scenes])
+    starts = [0, *ends[:-1]]
+    return [
+        jax.tree.map(lambda leaf: leaf[start:end], tree)  # noqa: B023
+        for start, end in zip(starts, ends, strict=True)
+    ]
+
+
+def moved_out(tree: Tree, scene: Scene) -> Tree:
+    """What has places in the world of a scene, moved to where the scene is in the shared one."""
+    return tree if scene.place is None else _moved(tree, scene, scene.place.offset_ws)
+
+
+def _result_at_home(result: Result, scene: Scene) -> Result:
+    """The result in the scene's own world, of a run in the shared one."""
+    assert scene.place is not None and result.trace is not None
+    by_ws, state = -scene.place.offset_ws, result.trace.advanced.state
+    moved = _moved(result, scene, by_ws)
+    if places.centre_about(by_ws) is None:  # else memory is about a centre, which moves instead
+        return moved
+    state = dataclasses.replace(state, centre_ws=state.centre_ws + by_ws)
+    return eqx.tree_at(lambda result: result.trace.advanced.state, moved, state)
+
+
+def _moved(tree: Tree, scene: Scene, by_ws: Float[Array, "3"]) -> Tree:
+    up_ws = scene.terrain.up_ws
+    return places.moved(tree, by_ws, up_ws, up_ws)
+
+
+def _frames_in_world(scene: Scene, rig: jaxik.Rig, scaled: bool) -> jaxik.Frame:
+    """The frames of a scene in the shared world, each with its body."""
+    frames = moved_out(scene.frames, scene)
+    begins = jnp.arange(len(frames.dt)) == 0
+    restart = begins if frames.restart is None else frames.restart | begins
+    scale = frames.stride_scale
+    if scaled and scale is None:
+        scale = jnp.ones_like(frames.dt)
+    # Names and joints are not of a frame, but of the skeleton of a clip.
+    body = dataclasses.replace(scene.rig, names=rig.names, joints=rig.joints, pelvis=rig.pelvis)
+    bodies = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(frames.dt), *x.shape)), body)
+    return dataclasses.replace(frames, restart=restart, stride_scale=scale, rig=bodies)
+
+
+def _tracks_in_a_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> dict[str, Array]:
+    """The parameters that differ between clips or along them, with a value for each frame."""
+    systems = [own_system(ik, scene) for scene in scenes]
+    tracked = {name for scene in scenes for name in scene.tracks}
+    if any(scene.size is not None for scene in scenes):
+        tracked |= {
+            slot.name
+            for slots in zip(*map(parameter_tree.slots, systems), strict=True)
+            for slot in slots[:1]
+            if any(other.value is not slot.value for other in slots)
+        }
+    return {
+        name: jnp.concatenate(
+            [_track(system, scene, name) for system, scene in zip(systems, scenes, strict=True)]
+        )
+        for name in sorted(tracked)
+    }
+
+
+def _track(ik: jaxik.FootIK, scene: Scene, name: str) -> Array:
+    """The value of a parameter in each frame of a scene."""
+    value = jnp.asarray(parameter_tree.get(ik, name))
+    track = scene.tracks.get(name)
+    if track is not None:
+        return track
+    return jnp.broadcast_to(value, (len(scene.frames.dt), *value.shape))
+
+
+def groups(scenes: Sequence[Scene]) -> list[list[int]]:
+    """The numbers of the scenes, those that share a world together."""
+    groups: dict[tuple[bool, int], list[int]] = {}
+    for number, scene in enumerate(scenes):
+        key = (False, number) if scene.place is None else (True, scene.place.world)
+        groups.setdefault(key, []).append(number)
+    return list(groups.values())
+
+
+def _worlds(scenes: Sequence[Scene]) -> list[list[int]]:
+    """The numbers of the scenes that can share a world, together."""
+    worlds: list[list[int]] = []
+    for number, scene in enumerate(scenes):
+        for numbers in worlds:
+            if _can_share(scenes[numbers[0]], scene):
+                numbers.append(number)
+                break
+        else:
+            worlds.append([number])
+    return worlds
+
+
+def _can_share(a: Scene, b: Scene) -> bool:
+    """Whether two clips can run in a row, in one world."""
+    arrays = [(scene.rig.side, scene.frames.platforms.pos[0]) for scene in (a, b)]
+    if jax.tree.map(jnp.shape, arrays[0]) != jax.tree.map(jnp.shape, arrays[1]):
+        return False
+    if _are_equal(a.terrain, b.terrain):
+        return True
+    meshes = all(isinstance(s, Mesh) for scene in (a, b) for s in scene.terrain.surfaces)
+    return meshes and np.allclose(a.terrain.up_ws, b.terrain.up_ws, rtol=0, atol=1e-12)
+
+
+def _distinct(terrains: Sequence[Terrain]) -> list[int]:
+    """For each terrain, the number of the first that equals it."""
+    numbers: list[int] = []
+    for terrain in terrains:
+        firsts = dict.fromkeys(numbers)
+        same = (number for number in firsts if _are_equal(terrains[number], terrain))
+        numbers.append(next(same, len(numbers)))
+    return numbers
+
+
+def _are_equal(a: Terrain, b: Terrain) -> bool:
+    """Whether two terrains are the same ground."""
+    if jax.tree.structure(a) != jax.tree.structure(b):
+        return False
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(x is y or np.array_equal(x, y) for x, y in pairs)
+
+
+def _side_by_side(scenes: Sequence[Scene], distinct: Sequence[int]) -> Float[np.ndarray, "n 3"]:
+    """By how much each clip is moved, m, so that clips on different terrains stay apart.
+
+    By multiples of the lattice of `jaxik.world.places`, so that numbers of 32 bits about the
+    character stay as they are.
+    """
+    across = np.asarray(grid.frame_axes(scenes[0].terrain.up_ws))[0]
+    extents = {terrain: (np.inf, -np.inf) for terrain in distinct}
+    for scene, terrain in zip(scenes, distinct, strict=True):
+        low, high = _extent(scene, across)
+        extents[terrain] = min(extents[terrain][0], low), max(extents[terrain][1], high)
+    shifts, end = {}, -np.inf
+    for terrain, (low, high) in extents.items():
+        shift = 0.0 if np.isinf(end) else places.LATTICE * np.ceil((end - low) / places.LATTICE)
+        shifts[terrain], end = shift, high + shift
+    return np.stack([shifts[terrain] * across for terrain in distinct])
+
+
+def _extent(scene: Scene, across: np.ndarray) -> tuple[float, float]:
+    """From where to where along an axis the ground of a clip and its rays are, m."""
+    frames = scene.frames
+    points = [np.asarray(frames.world_from_model.pos)]
+    points += [np.asarray(s.vertices_ws) for s in scene.terrain.surfaces if isinstance(s, Mesh)]
+    known = np.asarray(frames.stride.known) > 0
+    points += [np.asarray(x)[known] for x in (frames.stride.last_ws, frames.stride.next_ws)]
+    along = np.concatenate([part @ across for part in points])
+    return along.min() - MARGIN, along.max() + MARGIN

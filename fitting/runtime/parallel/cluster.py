@@ -1,0 +1,172 @@
+"""Independent calls in other processes: of this machine, or of a Dask cluster.
+
+Dask schedules them, notices workers that die, and gives their calls to others. Workers of this
+machine are spawned, never forked: a fork of a process in which JAX has started may hang.
+"""
+
+import functools
+import importlib.util
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+
+from fitting.runtime import cache_folder, xla
+from fitting.runtime.precision import in_float64
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+CONNECT_SECONDS = 10  # how long to wait for a scheduler
+WAITING = 2  # calls that each core has or will have, so that none waits for the next one
+DASHBOARD = "127.0.0.1:0"  # any free port, for this machine only
+# Of memory, after which a worker drops its compiled programs: Linux ends a process that asks for
+# more than 65,530, and each program takes some. They are read again from the cache.
+MAX_MAPPINGS = 20_000
+MAPPINGS = Path("/proc/self/maps")
+# Dask would look at every stack a hundred times a second: 7 % of a fit's CPU time.
+UNPROFILED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
+Argument = TypeVar("Argument")
+
+
+@contextmanager
+def connect(
+    workers: int = 0, scheduler: str | None = None, *, dashboard: bool = False
+) -> "Iterator[Client | None]":
+    """A client of a cluster, or None where calls are to be made in this process.
+
+    Args:
+        workers: number of processes to start on this machine, one core each.
+        scheduler: address of a running Dask scheduler. Its workers need this package.
+        dashboard: whether processes on this machine have Dask's page that shows them at work.
+
+    Raises:
+        ValueError: workers below 0; both workers and a scheduler; Dask is not installed; there is
+            no scheduler at the address.
+    """
+    if workers < 0:
+        raise ValueError(f"workers is {workers}; wanted 0 (this process) or more")
+    if workers and scheduler is not None:
+        raise ValueError(f"wanted {workers} workers or the scheduler at {scheduler}, not both")
+    if not workers and scheduler is None:
+        yield None
+        return
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ValueError(
+            f"other processes need Dask ({error}); install it with: pip install 'jaxik[dask]'"
+        ) from None
+    if scheduler is None:
+        options: dict[str, Any] = {
+            "threads_per_worker": 1,
+            "dashboard_address": DASHBOARD if dashboard and has_dashboard() else None,
+            "silence_logs": logging.ERROR,  # a worker that dies is told by the job
+            "env": _environment(),
+        }
+        with LocalCluster(n_workers=workers, **options) as local, Client(local) as client:
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"no Dask scheduler answers at {scheduler!r}: {error}") from None
+    with client:
+        yield client
+
+
+def has_dashboard() -> bool:
+    """Whether what Dask draws its page with is installed."""
+    return importlib.util.find_spec("bokeh") is not None
+
+
+def compute(
+    client: "Client", function: Callable[[Argument], Any], arguments: Sequence[Argument]
+) -> "Iterator[tuple[int, Future]]":
+    """The index of each argument and the function's finished future for it, as they finish.
+
+    The function travels to each worker once, with all that it holds; its arrays keep their 64 bits.
+    A call's error is raised by `result()` of its future. Calls of a worker that dies are made by
+    others; after the fourth death at one call, its error is `KilledWorker`. However many arguments
+    there are, the scheduler knows of as many calls as keep its workers busy.
+    """
+    import cloudpickle
+    from distributed import as_completed
+
+    # A task and no `scatter`: what is lost with a worker is made again from the scheduler's copy.
+    shared = client.submit(bytes, cloudpickle.dumps(function), pure=False)
+    indices: dict[Future, int] = {}
+    completed = as_completed()
+    waiting = iter(enumerate(arguments))
+
+    def submit_more() -> None:
+        room = WAITING * max(sum(_cores(client)), 1) - len(indices)
+        for _ in range(room):
+            if (item := next(waiting, None)) is None:
+                return
+            index, argument = item
+            future = client.submit(_call, shared, argument, pure=False)
+            indices[future] = index
+            completed.add(future)
+
+    submit_more()
+    while indices:
+        future = next(completed)
+        index = indices.pop(future)
+        submit_more()
+        yield index, future
+
+
+def _cores(client: "Client") -> list[int]:
+    """Of each worker."""
+    cores: Any = client.ncores()  # a client of another kind would have to be waited for
+    return list(cores.values())
+
+
+def _environment() -> dict[str, str]:
+    """What makes workers of this machine compute, and keep programs, as this process does."""
+    names = (cache_folder.FOLDER, cache_folder.ENABLED, cache_folder.MIN_SECONDS)
+    settings = {name.upper(): cache_folder.setting(name) for name in names}
+    return (
+        {
+            name: str(int(value) if isinstance(value, bool) else value)
+            for name, value in settings.items()
+            if value is not None
+        }
+        | {name: os.environ[name] for name in (xla.VARIABLE,) if name in os.environ}
+        | UNPROFILED
+    )
+
+
+@in_float64
+def _call(function: bytes, argument: Any) -> Any:
+    _prepare()
+    try:
+        return _loaded(function)(argument)
+    finally:
+        drop_programs_of_too_many()
+
+
+@functools.cache
+def _prepare() -> None:
+    """Has a worker compute as this process does; nothing of JAX has run there before."""
+    xla.configure_xla()
+    cache_folder.use_default()
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(function: bytes) -> Callable[[Any], Any]:
+    """The function, read once: Dask would read its arrays outside `in_float64`, as 32 bits."""
+    import cloudpickle
+
+    return cloudpickle.loads(function)
+
+
+def drop_programs_of_too_many() -> None:
+    """Forgets this process's compiled programs where they take many mappings of memory."""
+    if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MAX_MAPPINGS:
+        jax.clear_caches()

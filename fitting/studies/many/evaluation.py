@@ -1,0 +1,283 @@
+"""Many systems on many clips: a million parameter sets on one, or one on a thousand clips.
+
+Work goes through one program for each shape of clip, in chunks of one size: the last one is filled
+up. A chunk is spread over the devices of this process, and chunks over the processes that
+`jax.distributed` has brought together, which at the end tell each other what they found.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float
+
+import jaxik
+from fitting.experiments.experiment import Experiment
+from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.problems import make_problem
+from fitting.inference.sharding import EVERYWHERE, specifications
+from fitting.problem import stacking
+from fitting.problem.residuals import errors_by_kind, residuals_by_kind
+from fitting.problem.scene import Scene
+from fitting.problem.shared_world import run_scene
+from fitting.runtime import activity
+from fitting.runtime.precision import in_float64, with_floats
+from fitting.runtime.threads import on_all_cores, usable_cores
+from jaxik import lanes
+from jaxik.maths import parameter_tree
+
+BATCH = "batch"  # the axis of the devices
+MEMORY = 1e9  # bytes that chunks take at once, together
+# Bytes of a system on a clip, while it is computed, over those of all its results.
+WORKSPACE = 3.0
+CACHED = 64  # systems at a time on a core, whose arrays stay near it; more are no faster
+Measure: TypeAlias = Callable[[Scene, jaxik.Result], Mapping[str, Float[Array, "*numbers"]]]
+"""What is kept of a system on a clip. It must be a function of a module: a new lambda for each call
+would compile anew. What was not observed should not count, for clips are made longer."""
+Stacked: TypeAlias = tuple[bool, ...] | None
+KINDS = ("ankle", "knee", "pelvis", "foot", "body")
+
+
+def errors_and_cost(scene: Scene, result: jaxik.Result) -> dict[str, Float[Array, ""]]:
+    """Root mean squares of the errors, m and rad, over observed frames; and the cost.
+
+    The cost is half the sum of the squared residuals, without any prior.
+    """
+    errors = errors_by_kind(scene, result)
+    seen = scene.reference.observed
+    present = jnp.sum(scene.rig.present)
+    measured = {}
+    for name in KINDS:
+        squares = jnp.where(seen.reshape(-1, *[1] * (errors[name].ndim - 1)), errors[name] ** 2, 0)
+        each = present if errors[name].ndim == 3 else 1
+        measured[name] = jnp.sqrt(jnp.sum(squares) / jnp.maximum(jnp.sum(seen) * each, 1))
+    residuals = residuals_by_kind(scene, errors)
+    measured["cost"] = 0.5 * sum((jnp.sum(r**2) for r in residuals.values()), jnp.zeros(()))
+    return measured
+
+
+def vary(ik: jaxik.FootIK, values: Mapping[str, Any]) -> jaxik.FootIK:
+    """A batch of systems that differ in some parameters, for `evaluate_many`.
+
+    Args:
+        ik: one system.
+        values: by dotted name, with as many values in each, on the first axis.
+
+    Raises:
+        ValueError: a name is unknown, or a parameter has another number of values than others.
+    """
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    counts = {name: array.shape[0] if array.ndim else None for name, array in arrays.items()}
+    if len(set(counts.values())) != 1 or None in counts.values():
+        raise ValueError(f"values per parameter: {counts}; wanted the same number of each")
+    return parameter_tree.replace(jax.tree.map(lambda leaf: leaf[None], ik), arrays)
+
+
+@in_float64
+def evaluate_many(
+    ik_batch: jaxik.FootIK,
+    clips: Experiment | str | Path | Sequence[Scene],
+    measure: Measure = errors_and_cost,
+    *,
+    chunk: int | None = None,
+    memory: float = MEMORY,
+    devices: Sequence[Any] | None = None,
+) -> dict[str, Float[np.ndarray, "systems clips *numbers"]]:
+    """What every system of a batch makes of every clip, in numbers.
+
+    Memory holds one chunk at a time, or on a CPU one for each core, beside clips and results. A
+    chunk has as many systems, or clips, as `memory` allows by what one takes: three times the bytes
+    of all that `jaxik.run` returns for it; on a CPU at most 64 for each device, which is as fast as
+    any. With several processes (`jax.distributed.initialize`) each computes its part, and all get
+    everything.
+
+    Args:
+        ik_batch: systems, with an axis for them in front of each array; where its length is 1, all
+            share the array. `vary`, and `jax.vmap` of anything that makes a system, make one.
+        clips: an experiment, the path of its file, or the data of a problem. Of any length; each
+            shape of ground has a program of its own, and lengths share a few.
+        measure: what is kept; a mapping of arrays. By default errors and cost.
+        chunk: how many systems, or clips where there are more of these, to compute at once.
+        memory: bytes, of all chunks that are computed at once.
+        devices: of this process; None takes all of them.
+
+    Raises:
+        ValueError: the batch has no axis, or axes of different length; there is no clip; the chunk
+            is below 1; clips cannot be read.
+    """
+    scenes = _scenes(clips)
+    count = _batch_size(ik_batch)
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk is {chunk}; wanted 1 or more, or None")
+    mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), (BATCH,))
+    dtype = scenes[0].frames.dt.dtype
+    ik_batch = jax.tree.map(np.asarray, with_floats(jax.tree.map(jnp.asarray, ik_batch), dtype))
+    results: dict[str, np.ndarray] = {}
+    done = 0
+    with activity.announced(f"Running {count} systems on {len(scenes)} clips", count) as running:
+        for stack in stacking.stack(scenes):
+            calls = _Calls(ik_batch, count, stack, measure, mesh, chunk, memory)
+            for cells, values in calls.results():
+                for name, value in values.items():
+                    if name not in results:
+                        results[name] = np.zeros((count, len(scenes), *value.shape[1:]), dtype)
+                    results[name][cells] = value
+                done += len(cells[0])
+                running.reach(done // len(scenes))
+    return _from_all_processes(results)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Calls:
+    """The chunks of all systems on the clips of a stack: along systems, or along clips."""
+
+    ik_batch: jaxik.FootIK
+    count: int
+    stack: stacking.Stack
+    measure: Measure
+    mesh: Mesh
+    chunk: int | None
+    memory: float
+
+    @property
+    def along_clips(self) -> bool:
+        """Whether a chunk is of clips, with one system, since there are more of them."""
+        return len(self.stack.members) > self.count
+
+    def results(self) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], dict[str, np.ndarray]]]:
+        """For each chunk the systems and clips to which its numbers belong, and the numbers."""
+        size = self._size()
+        outer = self.count if self.along_clips else len(self.stack.members)
+        inner = len(self.stack.members) if self.along_clips else self.count
+        chunks = list(itertools.product(range(outer), range(0, inner, size)))
+        own = chunks[jax.process_index() :: jax.process_count()]
+        together = usable_cores() if self.mesh.size == 1 else 1
+        for first in range(0, len(own), together):
+            wave = own[first : first + together]
+            calls = [functools.partial(self._compute, *each, size) for each in wave]
+            computed = on_all_cores(calls) if together > 1 else [call() for call in calls]
+            for (fixed, start), values in zip(wave, computed, strict=True):
+                present = np.arange(start, min(start + size, inner))
+                members = np.asarray(self.stack.members)
+                systems = np.full_like(present, fixed) if self.along_clips else present
+                clips = members[present if self.along_clips else np.full_like(present, fixed)]
+                yield (systems, clips), {k: v[: len(present)] for k, v in values.items()}
+
+    def _compute(self, fixed: int, start: int, size: int) -> dict[str, np.ndarray]:
+        """One chunk; the last one is filled up, so that all have one program."""
+        if self.along_clips:
+            system = stacking.chosen(self.ik_batch, self._varies, fixed)
+            system = stacking.chosen(system, [not flag for flag in self._varies], 0)
+            stacked = (None, self.stack.stacked)
+            values = _along(self.measure, self.mesh, stacked, system, self.stack.part(start, size))
+        else:
+            numbers = np.minimum(np.arange(start, start + size), self.count - 1)
+            systems = stacking.chosen(self.ik_batch, self._varies, numbers)
+            systems = stacking.chosen(systems, [not flag for flag in self._varies], 0)
+            values = _along(
+                self.measure, self.mesh, (self._varies, None), systems, self.stack.one(fixed)
+            )
+        return {name: np.asarray(value) for name, value in values.items()}
+
+    @functools.cached_property
+    def _varies(self) -> tuple[bool, ...]:
+        """Of each array of the systems, whether they differ in it; of one system, all do."""
+        leaves = jax.tree.leaves(self.ik_batch)
+        return tuple(len(leaf) > 1 or self.count == 1 for leaf in leaves)
+
+    def _size(self) -> int:
+        """Members of a chunk: as many for each device."""
+        inner = len(self.stack.members) if self.along_clips else self.count
+        devices = self.mesh.size
+        if self.chunk is not None:
+            wanted = self.chunk
+        else:
+            together = usable_cores() if devices == 1 else 1
+            wanted = int(self.memory / (together * self._bytes_each()))
+            if self.mesh.devices.flat[0].platform == "cpu":
+                wanted = min(wanted, CACHED * devices)
+        wanted = max(1, min(wanted, math.ceil(inner / jax.process_count())))
+        return math.ceil(wanted / devices) * devices
+
+    def _bytes_each(self) -> float:
+        """What a system on a clip takes while it is computed."""
+        system, scene = jax.tree.map(lambda leaf: leaf[0], self.ik_batch), self.stack.one(0)
+        shapes = jax.tree.leaves(jax.eval_shape(run_scene, system, scene))
+        return WORKSPACE * sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _along(
+    measure: Measure,
+    mesh: Mesh,
+    stacked: tuple[Stacked, Stacked],
+    ik: jaxik.FootIK,
+    scene: Scene,
+) -> dict[str, Array]:
+    """What systems make of a clip, or a system of clips, shared out among devices.
+
+    Args:
+        measure: what is kept.
+        mesh: the devices.
+        stacked: which arrays of system and clip have an axis of the batch; None for none.
+        ik: systems.
+        scene: clips.
+    """
+    arguments = tuple(zip((ik, scene), stacked, strict=True))
+    in_axes = tuple(flags and stacking.labelled(tree, flags, 0) for tree, flags in arguments)
+    split = PartitionSpec(BATCH)
+    specs = tuple(
+        specifications(tree, flags, split) if flags else EVERYWHERE for tree, flags in arguments
+    )
+
+    def of_one(ik: jaxik.FootIK, scene: Scene) -> dict[str, Array]:
+        return dict(measure(scene, run_scene(ik, scene)))
+
+    # Unchecked: loops of the pipeline begin with constants, which are the same everywhere.
+    return jax.shard_map(
+        lanes(of_one, in_axes=in_axes),
+        mesh=mesh,
+        in_specs=specs,
+        out_specs=split,
+        check_vma=False,
+    )(ik, scene)
+
+
+def _scenes(clips: Experiment | str | Path | Sequence[Scene]) -> Sequence[Scene]:
+    if isinstance(clips, str | Path):
+        clips = load_experiment(clips)
+    scenes = make_problem(clips).data if isinstance(clips, Experiment) else clips
+    if not len(scenes):
+        raise ValueError("no clips; wanted one or more")
+    return scenes
+
+
+def _batch_size(ik_batch: jaxik.FootIK) -> int:
+    """How many systems there are."""
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(ik_batch)]
+    if not all(shapes):
+        raise ValueError(
+            "an array of the systems has no axis for them; fitting.vary and jax.vmap make batches"
+        )
+    sizes = {shape[0] for shape in shapes} - {1}
+    if len(sizes) > 1:
+        raise ValueError(f"the systems' arrays are of {sorted(sizes)} systems; wanted one number")
+    return sizes.pop() if sizes else 1
+
+
+def _from_all_processes(results: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What all processes found together: each has zeros where others computed."""
+    if jax.process_count() == 1:
+        return results
+    from jax.experimental import multihost_utils
+
+    gathered = multihost_utils.process_allgather(results)
+    return {name: np.sum(np.asarray(value), axis=0) for name, value in gathered.items()}
