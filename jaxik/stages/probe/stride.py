@@ -130,7 +130,7 @@ class StrideProbe(AbstractSwingProbe):
         climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
-        evened = heights - slope * fractions
+        evened = jnp.concatenate([low[None], heights[1:]]) - slope * fractions
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
         trust *= self._trust_of_way(evened, path.found)
 
