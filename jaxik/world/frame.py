@@ -36,7 +36,8 @@ class Stride:
     """1, or 0 where positions have to be predicted from velocity."""
     aside_ws: Float[Array, "*b legs 3"] | None = None
     """m, by how far the middle of a swing is beside the straight way to the next foothold: round a
-    corner of the ground, or round the other foot. None is 0."""
+    corner of the ground, or round the other foot. An offset: it is the same wherever the world's
+    origin is. None is 0."""
 
     @classmethod
     def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":
