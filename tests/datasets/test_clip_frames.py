@@ -164,6 +164,25 @@ def test_strides_go_from_stance_to_stance(clip):
             )
 
 
+@pytest.mark.parametrize("up_ws", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_strides_say_where_swings_bend(up_ws):
+    """A ball on a parabola, 0.12 m beside the straight way in the middle."""
+    up = np.array(up_ws)
+    ahead = np.roll(up, 1)
+    right = np.cross(up, ahead)
+    part = np.clip((np.arange(40) - 10) / 20, 0.0, 1.0)[:, None]
+    arc = 4.0 * part * (1.0 - part)
+    ball_ws = [0.3, 0.2, -0.4] + 0.7 * part * ahead + arc * (0.1 * up + 0.12 * right)
+    stance = (part[:, 0] == 0.0) | (part[:, 0] == 1.0)
+    aside_ws = contacts.footfalls(ball_ws, stance, up_ws).aside_ws
+    np.testing.assert_allclose(aside_ws, [0.12 * right, np.zeros(3)], rtol=0, atol=1e-12)
+
+
+def test_strides_of_a_straight_walk_bend_nowhere(clip):
+    stride = clip_frames.frames_from_clip(clip).stride
+    assert float(np.abs(stride.aside_ws).max()) < 0.02
+
+
 def test_a_foot_that_never_stands_has_an_unknown_stride(clip):
     stance = clip.stance_labels().copy()
     stance[:, 1] = False

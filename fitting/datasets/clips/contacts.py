@@ -8,10 +8,13 @@ Limits are for an adult. A body twice as large moves twice as fast if it plays t
 and the root of two times as fast at an equal Froude number. Its limit of speed lies between them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+
+from jaxik.world.frame import UP
 
 MAX_SPEED = 0.25  # m/s: the ball of a standing foot is slower, even a runner's
 SPEED_POWER = 0.7  # of a body's size, with which the limit of speed grows
@@ -87,13 +90,16 @@ class Footfalls:
 
 
 def footfalls(
-    ball_ws: Float64[np.ndarray, "frames 3"], stance: Bool[np.ndarray, " frames"]
+    ball_ws: Float64[np.ndarray, "frames 3"],
+    stance: Bool[np.ndarray, " frames"],
+    up_ws: Sequence[float] | np.ndarray = UP,
 ) -> Footfalls:
     """The footfalls of one foot that stands at least once.
 
     Args:
         ball_ws: position of its ball, m.
         stance: True where it stands.
+        up_ws: unit, of the floor.
     """
     stances = runs(stance)
     frames = np.arange(len(stance))
@@ -104,22 +110,31 @@ def footfalls(
     swinging = (frames > leaving) & (next_ > last)
     fraction = np.where(swinging, (frames - leaving) / np.maximum(arriving - leaving, 1), 0.0)
     positions = np.array([np.median(ball_ws[a : b + 1], axis=0) for a, b in stances])
+    level_ws, ends = _level(ball_ws, up_ws), _level(positions, up_ws)
     aside = np.zeros(positions.shape)
     for index in range(len(stances) - 1):
-        swing = ball_ws[lasts[index] + 1 : firsts[index + 1]]
-        aside[index] = _aside(swing, positions[index], positions[index + 1])
+        swing = level_ws[lasts[index] + 1 : firsts[index + 1]]
+        aside[index] = _aside(swing, ends[index], ends[index + 1])
     return Footfalls(positions, last, next_, fraction, aside)
+
+
+def _level(
+    points_ws: Float64[np.ndarray, "n 3"], up_ws: Sequence[float] | np.ndarray
+) -> Float64[np.ndarray, "n 3"]:
+    """The points without their height."""
+    up = np.asarray(up_ws, np.float64)
+    return points_ws - (points_ws @ up)[:, None] * up
 
 
 def _aside(
     swing_ws: Float64[np.ndarray, "frames 3"], last_ws: np.ndarray, next_ws: np.ndarray
 ) -> Float64[np.ndarray, "3"]:
-    """By how far the middle of a swing is beside the straight way, m.
+    """By how far the middle of a swing is beside the straight way, m; points have no height.
 
     It is that of a parabola through both footholds and through the first frame in which the ball
     has covered half of the way.
     """
-    way = (next_ws - last_ws) * [1.0, 0.0, 1.0]
+    way = next_ws - last_ws
     length2 = way @ way
     if not len(swing_ws) or length2 < SHORTEST_WAY**2:
         return np.zeros(3)
@@ -128,7 +143,7 @@ def _aside(
     part = covered[middle]
     if not 0.5 <= part <= 0.75:
         return np.zeros(3)
-    beside = (swing_ws[middle] - last_ws - part * way) * [1.0, 0.0, 1.0]
+    beside = swing_ws[middle] - last_ws - part * way
     return beside / (4.0 * part * (1.0 - part))
 
 
