@@ -143,6 +143,7 @@ def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):
 def test_strides_go_from_stance_to_stance(clip):
     stride, stance = clip_frames.frames_from_clip(clip).stride, clip.stance_labels()
     np.testing.assert_array_equal(stride.standing, stance)
+    assert stride.aside_ws is not None
     balls = clip.joints_ws(3)
     for leg in range(2):
         stances = contacts.runs(stance[:, leg])

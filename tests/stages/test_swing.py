@@ -55,18 +55,18 @@ def test_a_bump_is_one_at_its_peak_and_nothing_at_both_ends(peak: float):
 
 
 def test_on_a_flat_floor_no_foot_is_lifted_or_pitched():
-    found = hits(FLAT, frames_over_a_step())
-    assert np.abs(found.lift).max() == 0.0
-    assert np.abs(found.pitch).max() == 0.0
+    swing = hits(FLAT, frames_over_a_step())
+    assert np.abs(np.asarray(swing.lift)).max() == 0.0
+    assert np.abs(np.asarray(swing.pitch)).max() == 0.0
 
 
 def test_only_swinging_feet_are_lifted_onto_a_step():
     frames = frames_over_a_step()
-    found = hits(STEP_UP, frames, held_lift=0.0)
+    swing = hits(STEP_UP, frames, held_lift=0.0)
     standing = np.asarray(frames.stride.fraction) == 0.0
-    assert np.abs(np.asarray(found.lift)[standing]).max() == 0.0
-    assert np.asarray(found.lift).max() > 0.1
-    assert np.asarray(found.pitch).min() < -0.2
+    assert np.abs(np.asarray(swing.lift)[standing]).max() == 0.0
+    assert np.asarray(swing.lift).max() > 0.1
+    assert np.asarray(swing.pitch).min() < -0.2
 
 
 def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():
