@@ -18,6 +18,9 @@ BENCHMARKS = {
     "jacobian": Benchmark(
         "residuals of twenty parameters and their slopes", "", inference.jacobian, x64=True
     ),
+    "clips": Benchmark(
+        "slopes of one clip and of six", "float64", inference.clips, x64=True, long=True
+    ),
     "fit": Benchmark(
         "a fit of twenty parameters to a clip of 10 s", "float64", inference.fit,
         x64=True, long=True,

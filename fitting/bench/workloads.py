@@ -1,6 +1,7 @@
 """What the benchmarks run on: a walk, terrains, a batch of legs, a crowd, a fit."""
 
 import dataclasses
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -19,6 +20,8 @@ from fitting.experiments.problems import ClipData, make_scene
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
+from fitting.problem.scene import Scene
+from fitting.problem.shared_world import share_world
 from fitting.problem.space import make_space
 from fitting.runtime.precision import with_floats
 from jaxik.maths import parameter_tree, quat
@@ -44,6 +47,11 @@ TRUTH = {
     "foot.max_pitch": 0.26, "foot.min_pitch": -0.3,
     "foot.max_roll": 0.12, "foot.min_roll": -0.2,
 }  # fmt: skip
+# Of the clips of one fit, in this order.
+GROUNDS = (
+    terrain_meshes.uneven_walk, terrain_meshes.terraces, terrain_meshes.rubble,
+    terrain_meshes.steps, terrain_meshes.slope, terrain_meshes.stop_and_go,
+)  # fmt: skip
 # Parameters that differ within a crowd, and the ranges from which they are drawn.
 DRAWN = {
     "pelvis.on_gain": (0.05, 0.5),
@@ -254,10 +262,12 @@ def parameter_names(count: int) -> tuple[str, ...]:
     return (*TRUTH, *others, "probe.toe_ls[2]")[:count]
 
 
-def recording(frame_count: int) -> tuple[Clip, Clip, meshes.Mesh]:
+def recording(
+    frame_count: int, make_ground: Callable[[], meshes.Mesh] = terrain_meshes.uneven_walk
+) -> tuple[Clip, Clip, meshes.Mesh]:
     """A clip that known parameters made, plus noise; its flat animation; and its ground."""
     random = np.random.default_rng(SEED)
-    base, mesh = walk(frame_count, uneven_pace=True), terrain_meshes.uneven_walk()
+    base, mesh = walk(frame_count, uneven_pace=True), make_ground()
     truth = parameter_tree.replace(jaxik.presets.record(faithful=True), TRUTH)
     uneven = terrain.mesh(mesh.vertices, mesh.faces)
     solved = clip_frames.clip_from_result(
@@ -270,18 +280,30 @@ def recording(frame_count: int) -> tuple[Clip, Clip, meshes.Mesh]:
     return reference, base, mesh
 
 
-def problem_from_clip(clip: ClipData, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
-    """The fit of these parameters to a recording."""
+def problem_from_clips(clips: Iterable[ClipData], names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
+    """The fit of these parameters to recordings."""
     ik = jaxik.presets.record(faithful=True)
     space = make_space(ik, [free_parameter(ik, name) for name in names])
-    return Problem(space, (make_scene(clip, SIGMAS),), residuals_of_scenes)
+    scenes = share_world([make_scene(clip, SIGMAS) for clip in clips], ik.probe)
+    return Problem(space, tuple(scenes), residuals_of_scenes)
 
 
-def problem(frame_count: int, names: tuple[str, ...] = tuple(TRUTH)) -> Problem:
-    """The fit of these parameters to a recording of so many frames."""
-    reference, base, mesh = recording(frame_count)
-    ground = terrain.mesh(mesh.vertices, mesh.faces)
-    return problem_from_clip(ClipData(reference, base, ground), names)
+def problem(frame_count: int, names: tuple[str, ...] = tuple(TRUTH), clips: int = 1) -> Problem:
+    """The fit of these parameters to recordings of about so many frames, each on its own ground."""
+    data = []
+    for number, make_ground in enumerate(GROUNDS[:clips]):
+        reference, base, mesh = recording(frame_count + 10 * number, make_ground)
+        data.append(ClipData(reference, base, terrain.mesh(mesh.vertices, mesh.faces)))
+    return problem_from_clips(data, names)
+
+
+def first_frames(scene: Scene, count: int) -> Scene:
+    """The beginning of a clip."""
+    parts = (scene.frames, scene.pelvis, scene.reference, scene.tracks)
+    motion, pelvis, reference, tracks = jax.tree.map(lambda leaf: leaf[:count], parts)
+    return dataclasses.replace(
+        scene, frames=motion, pelvis=pelvis, reference=reference, tracks=tracks
+    )
 
 
 def _with_noise(wxyz: np.ndarray, random: np.random.Generator) -> np.ndarray:

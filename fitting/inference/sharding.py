@@ -6,7 +6,7 @@ back for each point, the sum of what all devices found. It is that of one device
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,6 +21,8 @@ from fitting.problem import stacking
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scene, residuals_of_scenes
 from fitting.problem.scene import Scene
+
+Tree = TypeVar("Tree", bound=PyTree)
 
 CLIPS = "clips"  # the axis of the devices
 EVERYWHERE, SPLIT = PartitionSpec(), PartitionSpec(CLIPS)
@@ -60,7 +62,7 @@ def over_devices(
     stacks = [_filled(stack, len(devices)) for stack in stacking.stack(problem.data)]
     each = [stack.one(i) for stack in stacks for i in range(len(stack.members))]
     sharded = dataclasses.replace(
-        problem,
+        _on_all(dataclasses.replace(problem, data=(), unknown_sigmas=None), mesh),
         data=ShardedScenes(
             tuple(_placed(stack, mesh) for stack in stacks),
             tuple(stack.stacked for stack in stacks),
@@ -73,7 +75,7 @@ def over_devices(
     # Which residual has which sigma, in their new order.
     unsharded = dataclasses.replace(problem, data=tuple(each), unknown_sigmas=None)
     unknown = with_unknown_sigmas(unsharded).unknown_sigmas
-    return dataclasses.replace(sharded, unknown_sigmas=unknown)
+    return dataclasses.replace(sharded, unknown_sigmas=_on_all(unknown, mesh))
 
 
 def residuals_of_sharded(ik: jaxik.FootIK, data: ShardedScenes) -> Float[Array, " residuals"]:
@@ -113,6 +115,14 @@ def specifications(tree: PyTree, stacked: Sequence[bool], split: PartitionSpec) 
     """How the arrays of a tree are split among devices: those that are not stacked are copied."""
     leaves = [split if flag else EVERYWHERE for flag in stacked]
     return jax.tree.unflatten(jax.tree.structure(tree), leaves)
+
+
+def _on_all(tree: Tree, mesh: Mesh) -> Tree:
+    """The tree with a copy of each array on every device, wherever it was before."""
+    everywhere = NamedSharding(mesh, EVERYWHERE)
+    return jax.tree.map(
+        lambda leaf: jax.device_put(leaf, everywhere) if eqx.is_array(leaf) else leaf, tree
+    )
 
 
 def _placed(stack: stacking.Stack, mesh: Mesh) -> Scene:

@@ -1,36 +1,58 @@
 """How far a system's motion is from the reference, as residuals in standard deviations."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxik
 from jaxik.maths import quat, vec
 
 from .scene import Scene, legs_ws, pelvis_ws
-from .shared_world import run_scene, run_scenes
+from .shared_world import groups, run_row, run_scene, scene_in_a_row, split
 
 
 def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " residuals"]:
     """Residuals of several clips in standard deviations, one clip after another."""
-    pairs = zip(scenes, run_scenes(ik, scenes), strict=True)
-    return jnp.concatenate([residuals_of_result(scene, result) for scene, result in pairs])
+    residuals: dict[int, Array] = {}
+    for numbers in groups(scenes):
+        members = [scenes[number] for number in numbers]
+        residuals |= zip(numbers, _residuals_of_row(ik, members), strict=True)
+    return jnp.concatenate([residuals[number] for number in range(len(scenes))])
 
 
 def residuals_of_scene(ik: jaxik.FootIK, scene: Scene) -> Float[Array, " residuals"]:
-    """Residuals of one clip, which runs alone."""
-    return residuals_of_result(scene, run_scene(ik, scene))
+    """Residuals of one clip, which runs alone, one kind after another."""
+    errors = errors_by_kind(scene, run_scene(ik, scene))
+    return jnp.concatenate(
+        [of_kind.ravel() for of_kind in residuals_by_kind(scene, errors).values()]
+    )
 
 
-def residuals_of_result(scene: Scene, result: jaxik.Result) -> Float[Array, " residuals"]:
-    """Residuals of one clip in standard deviations, one kind after another."""
-    residuals = residuals_by_kind(scene, errors_by_kind(scene, result))
-    return jnp.concatenate([of_kind.ravel() for of_kind in residuals.values()])
+def _residuals_of_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> list[Array]:
+    """Residuals of one clip, or of each of several that share a world, computed together."""
+    if len(scenes) == 1:
+        return [residuals_of_scene(ik, scenes[0])]
+    row = scene_in_a_row(scenes)
+    errors = errors_by_kind(row, run_row(ik, scenes))
+    by_kind = residuals_by_kind(row, errors, _begins(scenes))
+    by_clip = {kind: split(r, scenes, r.shape[0]) for kind, r in by_kind.items()}
+    return [
+        jnp.concatenate([parts[number].ravel() for parts in by_clip.values()])
+        for number in range(len(scenes))
+    ]
+
+
+def _begins(scenes: Sequence[Scene]) -> Bool[np.ndarray, " frames"]:
+    """Which frames of clips in a row are the first of a clip."""
+    return np.concatenate([np.arange(len(scene.frames.dt)) == 0 for scene in scenes])
 
 
 def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     """Result minus reference, by kind of residual, in the unit of its sigma."""
     assert result.trace is not None  # `jaxik.run` always has one
-    reference, present = scene.reference, scene.rig.present[:, None]
+    reference, present = scene.reference, scene.rig.present[..., None]
     legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
     ankle = (legs.ankle.pos - reference.ankle.pos) * present
     dt = scene.frames.dt[1:-1, None, None]
@@ -46,18 +68,42 @@ def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     }
 
 
-def residuals_by_kind(scene: Scene, errors: dict[str, Array]) -> dict[str, Array]:
-    """Errors divided by their sigmas and whitened; 0 where the reference was not observed."""
+def residuals_by_kind(
+    scene: Scene, errors: dict[str, Array], begins: Bool[np.ndarray, " frames"] | None = None
+) -> dict[str, Array]:
+    """Errors divided by their sigmas and whitened; 0 where the reference was not observed.
+
+    Args:
+        scene: of the errors.
+        errors: of `errors_by_kind`.
+        begins: which frames are the first of a clip, where several run in a row; None for one clip.
+    """
     observed, sigmas = scene.reference.observed, scene.sigmas
-    three_observed = observed[2:] & observed[1:-1] & observed[:-2]
+    follows = _follows(observed, begins)
     residuals = {}
     for kind, error in errors.items():
-        scaled = error / getattr(sigmas, kind)
+        sigma = getattr(sigmas, kind)
         if kind == "smooth":  # an acceleration takes three frames
-            residuals[kind] = jnp.where(three_observed[:, None, None], scaled, 0.0)
+            counts = follows[:-1] & follows[1:]
+            scaled = error / _over_frames(sigma[1:-1] if sigma.ndim else sigma, error)
+            residuals[kind] = jnp.where(counts[:, None, None], scaled, 0.0)
         else:
-            residuals[kind] = whitened(scaled, observed, sigmas.correlation_of(kind))
+            scaled, rho = error / _over_frames(sigma, error), sigmas.correlation_of(kind)
+            residuals[kind] = whitened(scaled, observed, _over_frames(rho, error), begins)
     return residuals
+
+
+def _follows(
+    observed: Bool[Array, " frames"], begins: Bool[np.ndarray, " frames"] | None
+) -> Bool[Array, " frames_but_one"]:
+    """Which frames but the first are observed, and follow one of their clip that is, too."""
+    both = observed[:-1] & observed[1:]
+    return both if begins is None else both & ~begins[1:]
+
+
+def _over_frames(number: Float[Array, "*#frames"], errors: Float[Array, " frames *r"]) -> Array:
+    """A number of all frames, or one of each, as it is combined with errors."""
+    return number.reshape(*number.shape, *(1,) * (errors.ndim - 1)) if number.ndim else number
 
 
 def rotation_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
@@ -70,17 +116,27 @@ def rotation_between(a: Float[Array, "*b 4"], b: Float[Array, "*b 4"]) -> Float[
 
 
 def whitened(
-    residuals: Float[Array, " frames *r"], observed: Bool[Array, " frames"], correlation: Array
+    residuals: Float[Array, " frames *r"],
+    observed: Bool[Array, " frames"],
+    correlation: Float[Array, "*#frames"],
+    begins: Bool[np.ndarray, " frames"] | None = None,
 ) -> Float[Array, " frames *r"]:
     """Residuals minus what the previous frame predicts of them, in units of what remains.
 
     `(r_t - rho r_{t-1}) / sqrt(1 - rho²)` where both frames were observed, `r_t` where only this
     one was, 0 where it was not. They are independent if the errors are a first-order
     autoregression.
+
+    Args:
+        residuals: in sigmas.
+        observed: which frames were.
+        correlation: from one frame to the next, in a shape that goes with the residuals.
+        begins: as for `residuals_by_kind`.
     """
     per_frame = (slice(None),) + (None,) * (residuals.ndim - 1)
     residuals = jnp.where(observed[per_frame], residuals, 0.0)
     previous = jnp.concatenate([jnp.zeros_like(residuals[:1]), residuals[:-1]])
-    follows = jnp.concatenate([jnp.zeros_like(observed[:1]), observed[:-1] & observed[1:]])
+    follows = _follows(observed, begins)
+    follows = jnp.concatenate([jnp.zeros_like(observed[:1]), follows])
     innovation = (residuals - correlation * previous) / jnp.sqrt(1.0 - correlation**2)
     return jnp.where(follows[per_frame], innovation, residuals)

@@ -36,8 +36,9 @@ class Sigmas(eqx.Module):
 
     def correlation_of(self, kind: str) -> Float[Array, ""]:
         """The correlation of the residuals of a kind."""
-        each = jnp.broadcast_to(self.correlation, len(WHITENED))
-        return each[WHITENED.index(kind)]
+        frames = self.correlation.shape[:-1]  # one where clips run in a row
+        each = jnp.broadcast_to(self.correlation, (*frames, len(WHITENED)))
+        return each[..., WHITENED.index(kind)]
 
 
 class Reference(eqx.Module):

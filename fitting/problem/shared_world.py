@@ -26,7 +26,7 @@ from jaxik.world import grid, places
 from jaxik.world.surfaces import Mesh
 from jaxik.world.terrain import Terrain, merge
 
-from .scene import Place, Scene, own_system
+from .scene import WHITENED, Place, Scene, Sigmas, own_system
 
 Tree = TypeVar("Tree")
 
@@ -85,27 +85,67 @@ def row_of(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> Row:
 
 def run_scene(ik: jaxik.FootIK, scene: Scene) -> jaxik.Result:
     """What a system makes of the clip of one scene, in its own world."""
-    return _run_row(ik, [scene])[0]
+    return run_row(ik, [scene])
 
 
 def run_scenes(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[jaxik.Result, ...]:
     """What a system makes of the clip of each scene: one loop for those that share a world."""
     results: dict[int, Result] = {}
     for numbers in groups(scenes):
-        results |= zip(numbers, _run_row(ik, [scenes[i] for i in numbers]), strict=True)
+        members = [scenes[number] for number in numbers]
+        result = run_row(ik, members)
+        parts = [result]
+        if len(members) > 1:
+            parts = list(map(_result_at_home, split(result, members), members))
+        results |= zip(numbers, parts, strict=True)
     return tuple(results[number] for number in range(len(scenes)))
 
 
-def _run_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> list[Result]:
-    """What a system makes of one scene, or of each of several that share a world."""
+def run_row(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> jaxik.Result:
+    """What a system makes of one scene, or of several in a row, in the world that they share."""
     row = row_of(ik, scenes)
     # Clips are checked when they are loaded.
-    result = jaxik.run(
+    return jaxik.run(
         row.ik, row.rig, row.terrain, row.frames, tracks=row.tracks or None, checked=True
     )
-    if len(scenes) == 1:
-        return [result]
-    return list(map(_result_at_home, split(result, scenes), scenes))
+
+
+def scene_in_a_row(scenes: Sequence[Scene]) -> Scene:
+    """The scenes one after another, each in its own world; body and sigmas are those of frames."""
+    first, plain = scenes[0], {"restart": None, "stride_scale": None, "rig": None}
+    parts = [
+        (
+            _bodies(scene, first.rig),
+            dataclasses.replace(scene.frames, **plain),
+            scene.pelvis,
+            dataclasses.replace(scene.reference, label=first.reference.label),
+            _for_frames(_with_each(scene.sigmas), scene),
+        )
+        for scene in scenes
+    ]
+    rig, frames, pelvis, reference, sigmas = in_a_row(parts)
+    return Scene(rig, first.terrain, frames, pelvis, reference, sigmas)
+
+
+def _with_each(sigmas: Sigmas) -> Sigmas:
+    """The sigmas with a correlation for each kind, also where all share one."""
+    each = jnp.broadcast_to(sigmas.correlation, len(WHITENED))
+    return dataclasses.replace(sigmas, correlation=each)
+
+
+def _bodies(scene: Scene, rig: jaxik.Rig) -> jaxik.Rig:
+    """The body of a scene in each of its frames.
+
+    Names and joints are not of a frame, but of the skeleton of a clip: here of that of `rig`.
+    """
+    body = dataclasses.replace(scene.rig, names=rig.names, joints=rig.joints, pelvis=rig.pelvis)
+    return _for_frames(body, scene)
+
+
+def _for_frames(tree: Tree, scene: Scene) -> Tree:
+    """Arrays that all frames of a scene share, once for each."""
+    count = len(scene.frames.dt)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), tree)
 
 
 def in_a_row(trees: Sequence[Tree]) -> Tree:
@@ -113,13 +153,20 @@ def in_a_row(trees: Sequence[Tree]) -> Tree:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
 
 
-def split(tree: Tree, scenes: Sequence[Scene]) -> list[Tree]:
-    """What was computed for the frames of these scenes in a row, scene by scene."""
-    ends = np.cumsum([len(scene.frames.dt) for scene in scenes])
-    starts = [0, *ends[:-1]]
+def split(tree: Tree, scenes: Sequence[Scene], length: int | None = None) -> list[Tree]:
+    """What was computed for the frames of these scenes in a row, scene by scene.
+
+    Args:
+        tree: of arrays along the frames.
+        scenes: in this order.
+        length: of these arrays, where frames at both ends of a clip have nothing of their own.
+    """
+    counts = [len(scene.frames.dt) for scene in scenes]
+    ends = np.cumsum(counts)
+    missing = 0 if length is None else ends[-1] - length
     return [
-        jax.tree.map(lambda leaf: leaf[start:end], tree)  # noqa: B023
-        for start, end in zip(starts, ends, strict=True)
+        jax.tree.map(lambda leaf: leaf[end - count : end - missing], tree)  # noqa: B023
+        for count, end in zip(counts, ends, strict=True)
     ]
 
 
@@ -152,9 +199,7 @@ def _frames_in_world(scene: Scene, rig: jaxik.Rig, scaled: bool) -> jaxik.Frame:
     scale = frames.stride_scale
     if scaled and scale is None:
         scale = jnp.ones_like(frames.dt)
-    # Names and joints are not of a frame, but of the skeleton of a clip.
-    body = dataclasses.replace(scene.rig, names=rig.names, joints=rig.joints, pelvis=rig.pelvis)
-    bodies = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(frames.dt), *x.shape)), body)
+    bodies = _bodies(scene, rig)
     return dataclasses.replace(frames, restart=restart, stride_scale=scale, rig=bodies)
 
 

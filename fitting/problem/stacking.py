@@ -120,7 +120,7 @@ def _stacked(members: Sequence[tuple[int, Scene]]) -> Stack:
     apart = [_with_terrain(scene, None) if shares_terrain else scene for scene in scenes]
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *apart)
     if shares_terrain:
-        stacked = _with_terrain(stacked, scenes[0].terrain)
+        stacked = _with_terrain(stacked, jax.tree.map(np.asarray, scenes[0].terrain))
     return Stack(stacked, numbers, shares_terrain)
 
 

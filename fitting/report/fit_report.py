@@ -71,6 +71,7 @@ def write_fit(
         plots |= save_plot(run, "cost.png", title, figure)
     with activity.announced("Measuring where limits are in effect"):
         clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
+        limits = _limits(fitted, clips)
     parts = [
         *_result(fitted),
         *opening,
@@ -78,7 +79,7 @@ def write_fit(
         *_parameters(fitted),
         *priors.prior_section(fitted.summary["parameters"]),
         *identifiability_sections(fitted, clips),
-        *_limits(fitted, clips),
+        *limits,
         *worst,
         *details,
         "## Pictures",

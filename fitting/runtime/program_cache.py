@@ -98,8 +98,9 @@ def committed(tree: Tree) -> Tree:
     calls is committed before. Arrays on several devices stay as they are.
     """
     leaves, structure = jax.tree.flatten(tree)
+    arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
     loose = [i for i, leaf in enumerate(leaves) if not getattr(leaf, "committed", True)]
-    if not loose or len({d for leaf in leaves if eqx.is_array(leaf) for d in leaf.devices()}) > 1:
+    if not loose or len({device for array in arrays for device in array.devices()}) > 1:
         return tree
     device = leaves[loose[0]].sharding
     for i, leaf in zip(loose, jax.device_put([leaves[i] for i in loose], device), strict=True):

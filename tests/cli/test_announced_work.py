@@ -56,7 +56,7 @@ LONG = {  # what takes long, and how the work is called that must be going on th
     (search, "search_from"): "Searching",
     (profiling, "lowest"): "Following",
     (run_folder, "save_clip"): "Writing the motions",
-    (playback, "run"): "Playing",
+    (playback, "run"): ("Playing", "Measuring"),
     (fit_report, "_draw_clip"): "Drawing hill",
     (fit_report, "_draw_profiles"): "Drawing the curves",
     (fit_report.limit_activity, "measure"): "Measuring",

@@ -20,8 +20,9 @@ TOLERANCE = 1e-12  # relative: sums in another order
 
 
 @pytest.fixture(scope="module")
-def on_one_device() -> dict[str, np.ndarray]:
-    return on_devices.numbers()
+def evaluations() -> dict[str, np.ndarray]:
+    """On one device."""
+    return on_devices.evaluations()
 
 
 def start(path: Path, devices: int, *process: str) -> subprocess.Popen:
@@ -41,24 +42,24 @@ def assert_alike(path: Path, expected: dict[str, np.ndarray]) -> None:
             np.testing.assert_allclose(archive[name], values, rtol=TOLERANCE, err_msg=name)
 
 
-def test_eight_devices_find_what_one_finds(on_one_device, tmp_path):
+def test_eight_devices_find_what_one_finds(evaluations, tmp_path):
     process = start(tmp_path / "eight.npz", 8)
     _, errors = process.communicate(timeout=500)
     assert process.returncode == 0, errors[-2000:]
-    assert_alike(tmp_path / "eight.npz", on_one_device)
+    assert_alike(tmp_path / "eight.npz", evaluations | on_devices.log_probabilities())
 
 
-def test_two_processes_find_what_one_finds(on_one_device, tmp_path):
+def test_two_processes_find_what_one_finds(evaluations, tmp_path):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{listener.getsockname()[1]}"
     paths = [tmp_path / f"{number}.npz" for number in range(2)]
     processes = [start(path, 2, address, "2", str(number)) for number, path in enumerate(paths)]
-    for process in processes:
-        _, errors = process.communicate(timeout=500)
-        assert process.returncode == 0, errors[-2000:]
+    errors = [process.communicate(timeout=500)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], errors
+    of_systems = {name: values for name, values in evaluations.items() if "systems" in name}
     for path in paths:
-        assert_alike(path, on_one_device)
+        assert_alike(path, of_systems)
 
 
 def test_one_device_or_one_clip_changes_nothing():

@@ -16,6 +16,7 @@ from fitting.experiments.known_values import load_known_values
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
+from fitting.problem.shared_world import share_world
 from support.experiments import CLIP, UNEVEN_WALK, write
 
 pytestmark = pytest.mark.slow
@@ -183,12 +184,23 @@ def test_an_absent_leg_has_zero_residuals(scene):
     assert ankles[:, 0].any() and not ankles[:, 1].any()
 
 
-def test_several_clips_follow_one_another(scene, monkeypatch):
-    monkeypatch.setattr(residuals, "run_scenes", lambda ik, scenes: scenes)
-    monkeypatch.setattr(residuals, "residuals_of_result", lambda scene, result: scene.rig.shin)
-    other = eqx.tree_at(lambda scene: scene.rig.shin, scene, jnp.array([3.0]))
-    joined = residuals.residuals_of_scenes(jaxik.presets.record(), (other, scene))
-    np.testing.assert_array_equal(joined, [3.0, *scene.rig.shin])
+def test_several_clips_follow_one_another(scene, scene_residuals):
+    """Other clips change nothing: neither the first residuals of a clip nor its accelerations."""
+    motion = (scene.frames, scene.pelvis, scene.reference)
+    start = jax.tree.map(lambda x: x[:12], motion)
+    frames, pelvis, reference = start
+    short = dataclasses.replace(scene, frames=frames, pelvis=pelvis, reference=reference)
+    parts = [short, scene]
+    sigmas = dataclasses.replace(scene.sigmas, ankle=jnp.asarray(0.05), smooth=jnp.asarray(3.0))
+    parts[0] = dataclasses.replace(parts[0], sigmas=sigmas)
+    assert np.isfinite(scene.sigmas.smooth)
+    shared = tuple(share_world(parts, jaxik.presets.record().probe))
+    assert all(part.place is not None for part in shared)
+    ik = jaxik.presets.record()
+    together = quick_jit(residuals.residuals_of_scenes)(ik, shared)
+    apart = [compute_residuals(part) for part in parts]
+    np.testing.assert_allclose(together, np.concatenate(apart), atol=1e-6)
+    assert apart[1].size == scene_residuals.size
 
 
 def test_whitening_recovers_the_innovations_of_autoregressive_noise():

@@ -90,15 +90,20 @@ def positions(result: Result) -> list[np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.usefixtures("optimised")
 @in_float64
 def test_a_clip_in_a_row_is_as_it_is_alone(scenes, preset):
-    """Whatever the system remembers, tracks, sizes and bodies included."""
+    """Whatever the system remembers, tracks, sizes and bodies included.
+
+    Compiled as for users: without optimisations XLA 0.10.2 puts an ankle of `stride` in a row 9 cm
+    off the plane onto which it is projected, though its height over that plane is right.
+    """
     ik = getattr(jaxik.presets, preset)()
     apart = tuple(
         scene if preset != "unreal" else dataclasses.replace(scene, tracks={}) for scene in scenes
     )
-    in_a_row = unoptimised(run_scenes, ik, apart)
-    single = unoptimised(run_scenes, ik, alone(apart))
+    run = jax.jit(run_scenes)
+    in_a_row, single = run(ik, apart), run(ik, alone(apart))
     for joined, expected in zip(in_a_row, single, strict=True):
         for ours, theirs in zip(positions(joined), positions(expected), strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-6)  # straight legs

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import fitting
+import jaxik
 from fitting.experiments.problems import make_problem
+from fitting.problem.scene import Scene
 from fitting.problem.shared_world import run_scene
 from fitting.studies.many import evaluation
 from jaxik.maths import parameter_tree
@@ -40,14 +42,24 @@ def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
     assert found["pelvis"][3, 1] == pytest.approx(expected, rel=1e-10)
 
 
+traced: list[int] = []  # frames of the clips for which `cost` was traced
+
+
+def cost(scene: Scene, result: jaxik.Result) -> dict[str, jax.Array]:
+    """The cost; says that a program is compiled for it."""
+    traced.append(scene.frames.dt.shape[-1])
+    return {COST: evaluation.errors_and_cost(scene, result)[COST]}
+
+
 def test_no_chunk_and_no_second_call_compiles_anew(problem, ik):
     batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
-    fitting.evaluate_many(batch, problem.data, chunk=2)
-    before = evaluation._along._cache_size()
-    fitting.evaluate_many(batch, problem.data, chunk=2)
+    fitting.evaluate_many(batch, problem.data, cost, chunk=2)
+    before = len(traced)
+    assert before >= 1
+    fitting.evaluate_many(batch, problem.data, cost, chunk=2)
     more = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, 7)})
-    found = fitting.evaluate_many(more, problem.data, chunk=2)
-    assert evaluation._along._cache_size() == before
+    found = fitting.evaluate_many(more, problem.data, cost, chunk=2)
+    assert len(traced) == before
     assert found[COST].shape == (7, 3)
 
 
@@ -63,10 +75,33 @@ def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik):
         )  # fmt: skip
         return calls._size()
 
-    each = evaluation.WORKSPACE
-    assert each > 1 and size(None, 0.0) == 1 and size(None, 1e15) == evaluation.CACHED
+    assert size(None, 0.0) == 1 and size(None, 1e15) == evaluation.CACHED
     assert 1 < size(None, 1e7) < size(None, 5e7) <= evaluation.CACHED
     assert size(10, 0.0) == 10 and size(5000, 0.0) == 1000
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
+@pytest.mark.parametrize("along_clips", [False, True])
+def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, along_clips):
+    count = 16
+    systems = 1 if along_clips else count
+    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
+    mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
+    (stack,) = evaluation.stacking.stack(problem.data * (count if along_clips else 1))
+    calls = evaluation._Calls(
+        jax.tree.map(np.asarray, batch),
+        systems,
+        stack,
+        evaluation.errors_and_cost,
+        mesh,
+        count,
+        1.0,
+    )
+    memory = evaluation._along.lower(*calls.arguments(0, 0, count)).compile().memory_analysis()
+    assert memory is not None
+    taken = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+    assert 0.1 * count * calls._bytes_each() < taken < count * calls._bytes_each()
 
 
 def test_mistakes_are_told(problem, ik):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,14 @@ def test_numbers_that_make_no_sense_are_refused(experiment_file, tmp_path, optio
         fitting.fit_many(experiment_file, tmp_path / "out", **{"workers": 0} | options)
     with pytest.raises(ValueError, match="no experiments; wanted one or more"):
         fit_many([], tmp_path / "out")
+
+
+def test_a_folder_with_something_else_is_refused(experiment_file, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.md").write_text("of another command")
+    with pytest.raises(ValueError, match=r"there is something in it already: \['summary.md'\]"):
+        fit_many(experiment_file, tmp_path / "out")
+    assert (tmp_path / "out" / "summary.md").read_text() == "of another command"
 
 
 # What is kept
@@ -202,17 +211,21 @@ def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch
         assert len(looks) == 3  # they are kept by now, and nobody waits
 
 
-def processes_below(parent: int) -> dict[int, str]:
-    """Commands of the processes that a process has started, and those that these have."""
+def workers_of(client: subprocess.Popen) -> list[int]:
+    """The processes of a command that compute."""
     lines = subprocess.run(
-        ["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
+        ["ps", "-wweo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     every = [(int(pid), int(ppid), words) for pid, ppid, words in (x.split(None, 2) for x in lines)]
-    below, known = {}, {parent}
-    for _ in range(4):
-        below |= {pid: words for pid, ppid, words in every if ppid in known}
-        known |= set(below)
-    return below
+    return [pid for pid, ppid, words in every if ppid == client.pid and "spawn_main" in words]
+
+
+def is_running(process: int) -> bool:
+    """Whether a process is there, and not only waits for whoever asks how it ended."""
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes() != b""
+    except OSError:
+        return False
 
 
 def start(experiment: Path, out: Path) -> subprocess.Popen:
@@ -225,10 +238,10 @@ def start(experiment: Path, out: Path) -> subprocess.Popen:
     )  # fmt: skip
 
 
-def wait_for(condition, process: subprocess.Popen, seconds: float = 400.0) -> None:
+def wait_for(condition, client: subprocess.Popen, seconds: float = 400.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
-        assert process.poll() is None, process.communicate()
+        assert client.poll() is None, client.communicate()
         assert time.monotonic() < end
         time.sleep(0.1)
 
@@ -237,27 +250,38 @@ def wait_for(condition, process: subprocess.Popen, seconds: float = 400.0) -> No
 @pytest.mark.skipif(sys.platform != "linux", reason="reads processes as Linux lists them")
 def test_killed_workers_and_a_killed_client_lose_only_what_was_being_made(tmp_path):
     experiment, out = write(tmp_path, "walks.toml", clips=TWO, rest=FEW), tmp_path / "out"
+    tasks = plan([load_experiment(experiment)], seeds=3)
 
     def whole() -> set[Path]:
         return set(out.glob(f"runs/**/{rows.ROW}"))
 
-    client = start(experiment, out)
-    try:
-        wait_for(lambda: len(whole()) >= 1, client)
-        workers = [p for p, words in processes_below(client.pid).items() if "spawn_main" in words]
-        os.kill(workers[-1], signal.SIGKILL)
-        wait_for(lambda: len(whole()) >= 2, client)
-    finally:
-        client.send_signal(signal.SIGKILL)
-        client.communicate()
+    with ExitStack() as held:
+        # As another worker does that makes these fits, so that the command cannot end meanwhile.
+        for task in tasks[2::3]:
+            held.enter_context(claimed((out / task.run).with_suffix(".lock")))
+        client = start(experiment, out)
+        workers: list[int] = []
+        try:
+            wait_for(lambda: len(whole()) >= 1, client)
+            first, *_ = workers_of(client)
+            os.kill(first, signal.SIGKILL)
+            wait_for(lambda: len(whole()) >= 2, client)
+            workers = workers_of(client)
+        finally:
+            client.send_signal(signal.SIGKILL)
+            client.communicate()
+        end = time.monotonic() + 60.0
+        while any(map(is_running, workers)):  # nobody may be left who takes the next fit
+            assert time.monotonic() < end
+            time.sleep(0.1)
     before = {path: path.read_bytes() for path in whole()}
-    assert 2 <= len(before) < 6
+    assert 2 <= len(before) <= 4
     client = start(experiment, out)
     output, errors = client.communicate(timeout=500)
     assert client.returncode in (0, 3), errors
     assert {path: path.read_bytes() for path in before} == before
     assert len(whole()) == 6 and len(read(out / table.CSV)) == 6
     assert "Dask's dashboard: http://127.0.0.1:" in output
-    assert f"6 fits of 1 experiment, 3 seeds for each clip; {len(before)} are there" in output
+    assert f"3 seeds for each clip; {len(before)} are there already" in output
     costs = [json.loads(path.read_text())["outcome"]["cost"] for path in sorted(whole())]
     assert all(cost > 0 for cost in costs)

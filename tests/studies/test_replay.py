@@ -23,7 +23,6 @@ from fitting.report.uncertainty import band_plots, predictive
 from fitting.studies.posterior import likelihoods
 from fitting.studies.posterior.replay import Replay, replay
 from fitting.studies.posterior.replay_summary import summarise_replay
-from jaxik.world.skeleton import Transform
 from support.experiments import write
 
 TRUTH = np.array([0.7, -1.2])
@@ -36,15 +35,15 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     path = write(tmp_path_factory.mktemp("replay"))
     loaded = problems.make_problem(experiment_files.load_experiment(path))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "_motion", motion)
+        patch.setattr(simulation, "_motions", motions)
         return simulation.simulate(loaded, TRUTH, seed=3)
 
 
-def motion(ik: jaxik.FootIK, scene: Scene) -> tuple[Transform, Array, Transform, Array]:
+def motions(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[simulation.Motion]:
     """As in a simulation, by the program that a replay needs as well."""
-    result = playback.run(ik, scene)
+    ((scene, result),) = zip(scenes, playback.run_all(ik, scenes), strict=True)
     legs, contact = legs_ws(scene, result), playback.stage_outputs(result).sensed.contact
-    return pelvis_ws(scene, result), legs.knee.pos, legs.ankle, contact.weight
+    return [(pelvis_ws(scene, result), legs.knee.pos, legs.ankle, contact.weight)]
 
 
 def posterior_of(problem: Problem, draws: int = 60) -> Posterior:

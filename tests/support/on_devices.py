@@ -23,33 +23,41 @@ def main() -> None:
     if processes:
         address, count, number = processes
         jax.distributed.initialize(address, int(count), int(number))
-    np.savez(path, allow_pickle=False, **numbers())
+    found = evaluations("systems") if processes else evaluations() | log_probabilities()
+    np.savez(path, allow_pickle=False, **found)
 
 
-def numbers() -> dict[str, np.ndarray]:
-    """Errors of many systems on clips and of one system; log-probabilities of a few points."""
+def evaluations(*kinds: str) -> dict[str, np.ndarray]:
+    """Errors of many `systems` on clips, and of one system on all `clips` at once."""
+    import fitting
+    from fitting.experiments.problems import make_problem
+    from support.scenes import experiment
+
+    problem = make_problem(experiment())
+    ik = problem.space.unpack(problem.space.start)
+    found = {}
+    for kind in kinds or ("systems", "clips"):
+        gains = np.linspace(0.05, 0.9, SYSTEMS) if kind == "systems" else [0.2]
+        batch = fitting.vary(ik, {"pelvis.on_gain": gains})
+        chunk = CHUNK if kind == "systems" else 2
+        values = fitting.evaluate_many(batch, problem.data, chunk=chunk)
+        found |= {f"{kind} {name}": value for name, value in values.items()}
+    return found
+
+
+def log_probabilities() -> dict[str, np.ndarray]:
+    """Log-probabilities of a few points, with the sigmas that are given and with open ones."""
     import jax
     import jax.numpy as jnp
 
-    import fitting
     from fitting.experiments.problems import make_problem
     from fitting.inference.noise.marginal import with_unknown_sigmas
     from fitting.inference.sharding import over_devices
     from support.scenes import experiment
 
     problem = make_problem(experiment())
-    ik = problem.space.unpack(problem.space.start)
-    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.05, 0.9, SYSTEMS)})
-    single = fitting.vary(ik, {"pelvis.on_gain": [0.2]})
-    found = {
-        f"systems {name}": values
-        for name, values in fitting.evaluate_many(batch, problem.data, chunk=CHUNK).items()
-    }
-    found |= {
-        f"clips {name}": values
-        for name, values in fitting.evaluate_many(single, problem.data, chunk=2).items()
-    }
     u = jnp.asarray(np.random.default_rng(0).normal(0.0, 0.3, (4, problem.space.size)))
+    found = {}
     for name, of in (("given", problem), ("open", with_unknown_sigmas(problem))):
         sharded = over_devices(of)
         assert (sharded is of) == (jax.local_device_count() == 1)

@@ -67,7 +67,7 @@ def main() -> None:
     folder = Path(sys.argv[1])
     reference, base = (load_clip(folder / name) for name in CLIPS)
     clip_data = workloads.ClipData(reference, base, load_terrain(folder / GROUND))
-    print(f"{find_best_fit(workloads.problem_from_clip(clip_data)).seconds:.2f}")
+    print(f"{find_best_fit(workloads.problem_from_clips([clip_data])).seconds:.2f}")
 
 
 if __name__ == "__main__":

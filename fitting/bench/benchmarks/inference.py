@@ -57,6 +57,36 @@ def jacobian(measurement: Measurement, sizes: Sizes) -> None:
         measurement.add_ratio(slopes, rows, ratio)
 
 
+def clips(measurement: Measurement, sizes: Sizes) -> None:
+    """Residuals and their Jacobian of several clips, and what they take to compile, in one's."""
+    calls = {}
+    counts = 1, len(workloads.GROUNDS)
+    frames = sizes.frames // len(workloads.GROUNDS)
+    for count in counts:
+        problem = workloads.problem(frames, clips=count)
+        arguments = problem, problem.space.start
+        calls[_clips(count)] = measurement.compile_call(
+            _clips(count), residuals_and_jacobian, *arguments
+        )
+        measurement.samples[_compiling(count)] = [measurement.compile_s[_clips(count)]]
+    measurement.time_in_turns(calls)
+    for count in counts:
+        measurement.add_timing(_clips(count), FigureSpec(what=_clips(count), unit="ms", scale=1e3))
+        spec = FigureSpec(what=_compiling(count), unit="s")
+        measurement.add_timing(_compiling(count), spec)
+    one, several = map(_compiling, counts)
+    what = f"compiling {counts[1]} clips in one's"
+    measurement.add_ratio(several, one, FigureSpec(what=what, at_most=1.5))
+
+
+def _clips(count: int) -> str:
+    return f"{count} {'clip' if count == 1 else 'clips'}"
+
+
+def _compiling(count: int) -> str:
+    return f"compiling {_clips(count)}"
+
+
 def fit(measurement: Measurement, sizes: Sizes) -> None:
     """The whole search for twenty parameters: warm, cold, and SciPy's."""
     problem = workloads.problem(sizes.frames)

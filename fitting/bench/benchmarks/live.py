@@ -26,7 +26,7 @@ def subject(frame_count: int) -> Subject:
     reference, base, mesh = workloads.recording(frame_count)
     reference, base = (edit.resample(clip, RATE) for clip in (reference, base))
     data = ClipData(reference, base, terrain.mesh(mesh.vertices, mesh.faces))
-    problem = workloads.problem_from_clip(data)
+    problem = workloads.problem_from_clips([data])
     take = Take("walk", base, data.terrain, problem.data[0].frames, captured=reference)
     cost = functools.partial(cost_of_problem, problem)
     starts = {DEFAULT: problem.space.system}

@@ -22,6 +22,7 @@ from fitting.bench.sizes import Sizes
 from fitting.runtime.parallel.effort import Stopwatch, peak_mb
 
 FRAMES = 60
+LENGTHS = 33, 50  # frames of the shortest and of the longest of many clips
 SYSTEMS = 512  # shared out among devices
 FITS = 8  # shared out among workers
 SIMULATED = "--xla_force_host_platform_device_count={}"
@@ -48,7 +49,7 @@ def many(measurement: Measurement, sizes: Sizes) -> None:
     measurement.notes.append(
         "devices are simulated where there is one: they share its cores, so that time should stay; "
         "seconds are those after compiling, of workers those of all, starting them included; the "
-        "peak of workers is the largest of one process"
+        "peak of workers is the largest of one process, and every peak includes compiling"
     )
 
 
@@ -94,9 +95,10 @@ def of_clips(count: int) -> dict[str, float]:
     """A system on so many clips of different length on one ground."""
     import fitting
 
-    problem = workloads.problem(FRAMES)
+    problem = workloads.problem(max(LENGTHS))
     ik = problem.space.unpack(problem.space.start)
-    clips = problem.data * count
+    lengths = np.linspace(*LENGTHS, count).astype(int)
+    clips = [workloads.first_frames(problem.data[0], length) for length in lengths]
     single = fitting.vary(ik, {"pelvis.on_gain": [0.2]})
     return _second_time(lambda: fitting.evaluate_many(single, clips))
 

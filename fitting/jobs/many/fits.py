@@ -1,8 +1,8 @@
 """The job that fits clips × experiments × seeds, each in a run folder of its own."""
 
 import functools
-import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,10 +18,11 @@ from fitting.runtime.parallel import cluster
 from fitting.runtime.precision import in_float64
 from fitting.runtime.threads import usable_cores
 from fitting.runtime.validation import in_one_line
+from fitting.studies import run_folder
 from fitting.studies.many import table
-from fitting.studies.many.progress import ManyFits, ManyProgress
-from fitting.studies.many.rows import Row, failed_row, kept_row
-from fitting.studies.many.tasks import FitTask, plan
+from fitting.studies.many.progress import ManyFits, ManyProgress, Tally
+from fitting.studies.many.rows import Row, failed_row
+from fitting.studies.many.tasks import RUNS, FitTask, plan
 
 from .task import fit_task
 
@@ -67,13 +68,11 @@ def fit_many(
 
     Raises:
         ValueError: an experiment cannot be read; there is none, or not one seed; the folder cannot
-            be made or holds the fit of another experiment; there is no such cluster.
+            be made, holds something that is no such fit, or the fit of another experiment; there is
+            no such cluster.
     """
-    if isinstance(experiments, Experiment | str | Path):
-        experiments = [experiments]
-    loaded = [
-        entry if isinstance(entry, Experiment) else load_experiment(entry) for entry in experiments
-    ]
+    loaded = _loaded(experiments)
+    _check_folder(Path(output))
     with output_folder(output) as folder:
         assert folder is not None
         folder = folder.absolute()
@@ -81,54 +80,73 @@ def fit_many(
         loaded = [with_files(entry, inputs / f"{number}") for number, entry in enumerate(loaded, 1)]
         tasks = plan(loaded, seeds, together=together)
         with activity.announced(f"Looking for finished fits among {len(tasks)}"):
-            kept = [kept_row(folder, task) for task in tasks]
-        missing = [task for task, row in zip(tasks, kept, strict=True) if row is None]
-        log(many_report.plan_line(len(loaded), len(tasks), len(missing), seeds))
-        if workers is None:
-            workers = 0 if scheduler is not None else min(usable_cores(), len(missing))
-        elif missing:
-            workers = min(workers, len(missing))
-        rows = dict(zip(tasks_by_run(tasks), kept, strict=True))
-        began, made, interrupted = time.monotonic(), 0, False
-        make = functools.partial(fit_task, folder, report=report)
-        title = f"Fitting {len(tasks)} clips" if seeds == 1 else f"Making {len(tasks)} fits"
+            tally = Tally(folder, tasks)
+        log(many_report.plan_line(len(loaded), len(tasks), len(tally.missing), seeds))
+        if workers is None and scheduler is None:
+            workers = usable_cores()
+        interrupted = False
         try:
-            with (
-                cluster.connect(
-                    workers if missing else 0, scheduler if missing else None, dashboard=True
-                ) as client,
-                activity.announced(title, len(tasks), done=len(tasks) - len(missing)) as fitting,
-            ):
-                log_dashboard(client, log)
-                for row in _computed(client, make, missing):
-                    rows[row["run"]] = row
-                    made += 1
-                    log(many_report.row_line(row))
-                    now = _progress(rows, len(tasks), made, time.monotonic() - began)
-                    fitting.advance()
-                    activity.note(many_report.progress_line(now))
-                    progress(now)
+            with _connected(len(tally.missing), workers, scheduler, log) as client:
+                make = functools.partial(fit_task, folder, report=report)
+                _compute(client, make, tally, progress, log)
         except KeyboardInterrupt:
             interrupted = True
-        present = tuple(row for row in rows.values() if row is not None)
-        elapsed = time.monotonic() - began
-        fits = ManyFits(present, len(tasks), folder, elapsed, made, interrupted)
-        if present:
-            _write(fits, loaded, log)
-        log(joined(["", many_report.many_text(fits)]))
-        log_output(log, folder, many_report.SUMMARY)
+        fits = tally.fits(interrupted=interrupted)
+        _write(fits, loaded, log)
         return fits
 
 
-def tasks_by_run(tasks: Sequence[FitTask]) -> dict[str, FitTask]:
-    """The tasks by their run folders."""
-    return {task.run.as_posix(): task for task in tasks}
+def _loaded(
+    experiments: Experiment | str | Path | Sequence[Experiment | str | Path],
+) -> list[Experiment]:
+    """Experiments, read where they are paths of files."""
+    if isinstance(experiments, Experiment | str | Path):
+        experiments = [experiments]
+    return [
+        entry if isinstance(entry, Experiment) else load_experiment(entry) for entry in experiments
+    ]
 
 
-def log_dashboard(client: "Client | None", log: Log) -> None:
+def _check_folder(folder: Path) -> None:
+    """Raises ValueError where a folder is not of an earlier call, and not a new one either."""
+    if not any((folder / name).is_dir() for name in (RUNS, INPUTS)):
+        run_folder.check_new_folder(folder)
+
+
+@contextmanager
+def _connected(
+    missing: int, workers: int | None, scheduler: str | None, log: Log
+) -> "Iterator[Client | None]":
+    """The cluster that makes the missing fits, no larger than they need; None is this process."""
+    workers = min(workers or 0, missing)
+    with cluster.connect(workers, scheduler if missing else None, dashboard=True) as client:
+        if client is not None:
+            _log_dashboard(client, log)
+        yield client
+
+
+def _compute(
+    client: "Client | None",
+    make: Callable[[FitTask], Row],
+    tally: Tally,
+    progress: Callable[[ManyProgress], None],
+    log: Log,
+) -> None:
+    """Makes the missing fits, and tells of each as it ends."""
+    total, missing = len(tally.tasks), tally.missing
+    title = f"Making {total} fit{'s' * (total != 1)}"
+    with activity.announced(title, total, done=total - len(missing)) as fitting:
+        for row in _computed(client, make, missing):
+            tally.add(row)
+            log(many_report.row_line(row))
+            now = tally.progress()
+            fitting.advance()
+            activity.note(many_report.progress_line(now))
+            progress(now)
+
+
+def _log_dashboard(client: "Client", log: Log) -> None:
     """Logs where Dask shows its workers, or what is missing for that."""
-    if client is None:
-        return
     if cluster.has_dashboard():
         log(f"Dask's dashboard: {client.dashboard_link}")
     else:
@@ -149,18 +167,15 @@ def _computed(
             yield failed_row(tasks[index], in_one_line(error))
 
 
-def _progress(rows: dict[str, Row | None], total: int, made: int, elapsed: float) -> ManyProgress:
-    present = [row for row in rows.values() if row is not None]
-    failed = sum(row["state"] == "failed" for row in present)
-    return ManyProgress(len(present), total, failed, elapsed, made)
-
-
 def _write(fits: ManyFits, experiments: Sequence[Experiment], log: Log) -> None:
-    """The table, the picture and the page of what there is."""
-    with activity.announced("Writing the table"):
-        written = table.write(fits.folder, fits.rows)
-    if table.PARQUET not in written:
-        log(table.MISSING)
-    with activity.announced("Drawing the report"):
-        many_report.write(fits, written)
-        many_page.write(fits, experiments, written)
+    """The table, the picture and the page of what there is, and what the terminal shows."""
+    if fits.rows:
+        with activity.announced("Writing the table"):
+            written = table.write(fits.folder, fits.rows)
+        if table.PARQUET not in written:
+            log(table.MISSING)
+        with activity.announced("Drawing the report"):
+            many_report.write(fits, written)
+            many_page.write(fits, experiments, written)
+    log(joined(["", many_report.many_text(fits)]))
+    log_output(log, fits.folder, many_report.SUMMARY)

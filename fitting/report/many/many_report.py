@@ -59,7 +59,7 @@ def many_text(fits: ManyFits) -> str:
 def remarks(fits: ManyFits) -> list[str]:
     """How the fits went, a sentence each."""
     count, lines = len(fits.finished), []
-    lines.append(f"{count} of {fits.total} fits are finished.")
+    lines.append(f"Finished: {count} of {fits.total} fits.")
     if fits.interrupted:
         lines.append("Interrupted: the same command goes on.")
     if fits.failed:
@@ -67,7 +67,10 @@ def remarks(fits: ManyFits) -> list[str]:
     if fits.unconverged:
         lines.append(f"**Not converged**: {len(fits.unconverged)}.")
     if misfits := sum(not row["outcome"]["fits"] for row in fits.finished if "outcome" in row):
-        lines.append(f"{misfits} do not fit: what they leave over is no noise of the given sigmas.")
+        lines.append(
+            f"Converged or not, {misfits} of them do{'es' * (misfits == 1)} not fit: what is left "
+            "over is no noise of the given sigmas."
+        )
     if made := [row["effort"] for row in fits.finished if "effort" in row]:
         seconds = statistics.median(effort["seconds"] for effort in made)
         cpu = statistics.median(effort["cpu_seconds"] for effort in made)

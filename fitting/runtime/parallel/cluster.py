@@ -51,7 +51,9 @@ def connect(
     if workers < 0:
         raise ValueError(f"workers is {workers}; wanted 0 (this process) or more")
     if workers and scheduler is not None:
-        raise ValueError(f"wanted {workers} workers or the scheduler at {scheduler}, not both")
+        raise ValueError(
+            f"wanted workers on this machine ({workers}) or the scheduler at {scheduler}, not both"
+        )
     if not workers and scheduler is None:
         yield None
         return
