@@ -166,15 +166,7 @@ MEC_TRUTH = {
 }
 STRIDE_TRUTH = {
     "probe.steepness": 2.6,
-    # Feet swing as animated, so that the clip's steps determine what the pelvis does.
-    "probe.held_lift": 0.0,
-    "probe.toe_clearance": 0.0,
-    "probe.lift_per_rise": 0.0,
-    "probe.lift_per_fall": 0.0,
-    "probe.lift_over": 0.0,
-    "probe.toes_up": 0.0,
-    "probe.toes_down": 0.0,
-    "probe.toes_down_per_height": 0.0,
+    "probe.swing_as_animated": True,  # so that the clip's steps determine what the pelvis does
     "lock.enabled": True,  # the feet of the animation slip
     "lock.release_distance": 0.09,
     "lock.unlock_half_life": 0.05,

@@ -94,9 +94,10 @@ CASES: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
         {"footholds_known": False},
     ),
     (
-        "held by the ankle and softened",
+        "held by the ankle, softened and swung as animated",
         "stride",
-        LOCKS | {"lock.hold_ball": False, "leg.as_animated": False},
+        LOCKS
+        | {"lock.hold_ball": False, "leg.as_animated": False, "probe.swing_as_animated": True},
         {},
     ),
     ("on a platform", "stride", LOCKS | {"lock.release_heading": 0.06}, {"rides": True}),

@@ -90,22 +90,13 @@ def swing(fractions: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jax
     return to_frames(frames)
 
 
-AS_ANIMATED = {
-    f"probe.{name}": 0.0
-    for name in (
-        "held_lift", "toe_clearance", "lift_per_rise", "lift_per_fall", "lift_over",
-        "toes_up", "toes_down", "toes_down_per_height",
-    )
-}  # fmt: skip
-
-
 @functools.partial(jax.jit, compiler_options=QUICK)
 def heights(ground: Any, frames: jaxik.Frame, gate: AbstractGate = HARD) -> jax.Array:
     """Ground height under the left ankle by the probe of `stride`, m (frames).
 
     Feet swing as animated, so that edges on the way have to be cleared.
     """
-    ik, rig = to_ik(AS_ANIMATED, "stride"), to_rig(RIG)
+    ik, rig = to_ik({"probe.swing_as_animated": True}, "stride"), to_rig(RIG)
 
     def height(frame: jaxik.Frame) -> jax.Array:
         inputs = Inputs(rig, ground, frame, gate)

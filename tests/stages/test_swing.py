@@ -60,6 +60,11 @@ def test_on_a_flat_floor_no_foot_is_lifted_or_pitched():
     assert np.abs(np.asarray(swing.pitch)).max() == 0.0
 
 
+def test_feet_that_swing_as_animated_are_neither_lifted_nor_pitched():
+    swing = hits(STEP_UP, frames_over_a_step(), swing_as_animated=True)
+    assert np.abs(np.asarray(swing.lift)).max() == np.abs(np.asarray(swing.pitch)).max() == 0.0
+
+
 def test_only_swinging_feet_are_lifted_onto_a_step():
     frames = frames_over_a_step()
     swing = hits(STEP_UP, frames, held_lift=0.0)

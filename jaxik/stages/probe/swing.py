@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
-from jaxik.maths.parameter_tree import Leaf, constant, parameter
+from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Stride, animated_ankles
@@ -145,6 +145,9 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         high=3.0,
         doc="The same per metre that the ground rises, falls, or stands in the way.",
     )
+    swing_as_animated: Leaf = switch(
+        False, doc="Whether feet swing as animated, over uneven ground too; they still clear edges."
+    )
     uneven_height: Leaf = constant(
         0.05, unit="m", doc="Height of a step from which ground counts as uneven."
     )
@@ -173,11 +176,12 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         lift += self.lift_per_fall * fall * bump(x, FALL)
         lift += self.lift_over * over * bump(x, OVER)
         down = uneven * self.toes_down + self.toes_down_per_height * total
-        pitch = trust * (uneven * self.toes_up * bump(x, TOES_UP) - down * bump(x, TOES_DOWN))
+        share = jnp.where(self.swing_as_animated, 0.0, trust)
+        pitch = share * (uneven * self.toes_up * bump(x, TOES_UP) - down * bump(x, TOES_DOWN))
         arm = animated_ankles(inputs.frame).pos - _balls(inputs)
         up = inputs.terrain.leg_up_ws
         turned = quat.rotate(pitch_rotation(inputs, pitch), arm)
-        return Swing(trust * lift + vec.dot(turned - arm, up), pitch)
+        return Swing(share * lift + vec.dot(turned - arm, up), pitch)
 
     def _animated_lift(self, inputs: Inputs) -> Float[Array, " legs"]:
         """m, of the balls over a flat foot's."""

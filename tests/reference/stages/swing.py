@@ -48,6 +48,8 @@ def beyond_animation(
             "toes_up", "toes_down", "toes_down_per_height", "ball_height",
         )
     }  # fmt: skip
+    if parameters.of_leg("probe.swing_as_animated", leg):
+        return 0.0, 0.0
     ball = apply(frame.world_from_model, frame.toe.pos[leg])
     ankle = apply(frame.world_from_model, frame.ankle.pos[leg])
     animated = max(float((ball - frame.world_from_model.pos) @ up) - get["ball_height"], 0.0)
