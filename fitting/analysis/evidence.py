@@ -1,21 +1,19 @@
 """Which clip, and which part of it, determines a parameter."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 import jaxik
 from fitting.inference.profiles.profile import Profile
-from fitting.problem.loss import Loss, apply_loss
+from fitting.problem.loss import rho
 from fitting.problem.problem import Problem
-from fitting.problem.residuals import errors_by_kind, residuals_by_kind
-from fitting.problem.scene import Scene
-from fitting.problem.shared_world import run_scenes
 from fitting.runtime.precision import in_float64
-from fitting.runtime.program_cache import cached
+
+from .playback import Playback, play_all
 
 Side = Literal["below", "above"]
 SPAN = 1.0  # s, length of the part of a clip that tells most
@@ -42,56 +40,50 @@ class Evidence:
 
 @in_float64
 def find_evidence(
-    problem: Problem[jaxik.FootIK], u: Float[np.ndarray, " free"], profile: Profile
+    problem: Problem[jaxik.FootIK], solution: Sequence[Playback], profile: Profile
 ) -> tuple[Evidence, ...]:
     """What keeps a parameter from going below and above its interval, where the data do.
 
     Args:
         problem: with its clips.
-        u: the solution.
+        solution: the clips with the fitted system.
         profile: of the parameter.
     """
     names, evidence = problem.space.names, []
-    before = _costs(problem, u)
+    before = _frame_costs(problem, solution)
     low, high = profile.interval
     below = np.flatnonzero((profile.values <= low) & (profile.data_rises > profile.max_rise))
     above = np.flatnonzero((profile.values >= high) & (profile.data_rises > profile.max_rise))
     sides: tuple[tuple[Side, np.ndarray], ...] = (("below", below[-1:]), ("above", above[:1]))
     for side, outside in sides:
         for k in outside:
-            moved = problem.space.pack(dict(zip(names, profile.path[k], strict=True)))
-            evidence.append(
-                _evidence(problem, side, float(profile.values[k]), before, _costs(problem, moved))
-            )
+            u = problem.space.pack(dict(zip(names, profile.path[k], strict=True)))
+            moved = play_all(problem.space.unpack(jnp.asarray(u)), problem.data)
+            after = _frame_costs(problem, moved)
+            evidence.append(_evidence(problem, side, float(profile.values[k]), before, after))
     return tuple(evidence)
 
 
-def _costs(problem: Problem[jaxik.FootIK], u: Array | np.ndarray) -> list[dict[str, np.ndarray]]:
-    """The cost of every frame by kind of residual, clip by clip."""
-    ik, fraction = problem.space.unpack(jnp.asarray(u)), float(problem.independent_fraction)
-    return [
-        {kind: fraction * np.asarray(cost) for kind, cost in costs.items()}
-        for costs in _frame_costs(ik, problem.data, problem.loss, problem.tails)
-    ]
-
-
-@cached
 def _frame_costs(
-    ik: jaxik.FootIK, scenes: tuple[Scene, ...], loss: Loss, tails: Float[Array, ""]
-) -> list[dict[str, Array]]:
+    problem: Problem[jaxik.FootIK], playbacks: Sequence[Playback]
+) -> list[dict[str, np.ndarray]]:
     """The cost of every frame, (frames), by kind of residual, clip by clip."""
-    pairs = zip(scenes, run_scenes(ik, scenes), strict=True)
-    return [_costs_of_result(scene, result, loss, tails) for scene, result in pairs]
+    return [_frame_costs_of_clip(problem, playback) for playback in playbacks]
 
 
-def _costs_of_result(
-    scene: Scene, result: jaxik.Result, loss: Loss, tails: Float[Array, ""]
-) -> dict[str, Array]:
-    frames, costs = len(scene.frames.dt), {}
-    for kind, residuals in residuals_by_kind(scene, errors_by_kind(scene, result)).items():
-        squares = apply_loss(residuals.ravel(), loss, tails).reshape(len(residuals), -1) ** 2
+def _frame_costs_of_clip(
+    problem: Problem[jaxik.FootIK], playback: Playback
+) -> dict[str, np.ndarray]:
+    frames, costs = len(playback.dt), {}
+    fraction, tails = float(problem.independent_fraction), float(problem.tails)
+    for kind, residuals in playback.residuals.items():
+        squares = rho(
+            np.asarray(residuals).reshape(len(residuals), -1) ** 2, problem.loss, tails, np
+        )
+        of_loss = rho(squares, problem.loss, tails, np)
         missing = frames - len(residuals)  # an acceleration has no first and no last frame
-        costs[kind] = jnp.pad(0.5 * squares.sum(axis=1), (missing // 2, missing - missing // 2))
+        sides = missing // 2, missing - missing // 2
+        costs[kind] = fraction * np.pad(0.5 * of_loss.sum(axis=1), sides)
     return costs
 
 

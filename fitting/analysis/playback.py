@@ -160,6 +160,12 @@ def play(scene: Scene, result: jaxik.Result) -> Playback:
     return jax.tree.map(np.asarray, _play(scene, result))
 
 
+def play_all(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[Playback, ...]:
+    """Each scene's clip with a system."""
+    pairs = zip(scenes, run_all(ik, scenes), strict=True)
+    return tuple(play(scene, result) for scene, result in pairs)
+
+
 @program_cache.cached
 def _play(scene: Scene, result: jaxik.Result) -> Playback:
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxik
+from fitting.analysis.rehearsal import Rehearsal
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.in_memory.saving import with_files
@@ -83,12 +84,20 @@ def fit(
         log("\n".join([heading, *lines]))
         loaded(experiment, problem, clips)
         kept = kept_stages(run, experiment, problem, log)
-        problem, solution = search_with_noise(problem, experiment, progress, kept)
+        rehearsal = Rehearsal(problem) if run is not None and report else None
+
+        def watch(reached: Progress) -> None:
+            if rehearsal is not None:
+                rehearsal.start()  # not before: until now, programs of the search were compiled
+            if progress is not None:
+                progress(reached)
+
+        problem, solution = search_with_noise(problem, experiment, watch, kept)
         shown = Shown(clips, known_values)
         fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
         texts, sections = _price_of_record(fitted, progress, log)
         if run is not None and report:
-            fit_report.write_fit(run, fitted, sections)
+            fit_report.write_fit(run, fitted, sections, rehearsal=rehearsal)
         remove(kept, fitted)
         log(joined(["", fit_report.fit_text(fitted), *texts]))
         log_output(log, run, run_folder.SUMMARY)

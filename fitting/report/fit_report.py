@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from fitting.analysis import limit_activity, playback, worst_window
 from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.playback import Playback
+from fitting.analysis.rehearsal import Rehearsal
 from fitting.runtime import activity, files
 from fitting.runtime.precision import in_float64
 from fitting.studies.assess import MIN_IMPROVEMENT
@@ -44,7 +45,11 @@ def fit_text(fitted: Fit) -> str:
 
 @in_float64
 def write_fit(
-    run: Path, fitted: Fit, opening: Sequence[str] = (), details: Sequence[str] = ()
+    run: Path,
+    fitted: Fit,
+    opening: Sequence[str] = (),
+    details: Sequence[str] = (),
+    rehearsal: Rehearsal | None = None,
 ) -> None:
     """Writes the plots of a fit, a new summary.md and its page into the folder of its run.
 
@@ -53,12 +58,12 @@ def write_fit(
         fitted: the fit.
         opening: paragraphs of Markdown to insert before the parameters.
         details: paragraphs of Markdown to insert before the plots.
+        rehearsal: of the fit's problem, if one has begun.
     """
     plots: Plots = {}
     worst = ["## The worst two seconds"]
-    system = fitted.problem.space.unpack(fitted.problem.space.pack({}))
     with activity.announced("Playing the clips with the system before the fit"):
-        before = playback.run_all(system, fitted.problem.data)
+        before = (rehearsal or Rehearsal(fitted.problem)).results()
     for index, (scene, after) in enumerate(zip(fitted.problem.data, fitted.playbacks, strict=True)):
         with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
             first = playback.play(scene, before[index])

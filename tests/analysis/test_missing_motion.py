@@ -17,6 +17,7 @@ import pytest
 import jaxik
 from fitting.analysis.evidence import find_evidence
 from fitting.analysis.missing_motion import AT_LIMITS, EVENTS, describe_missing_motion
+from fitting.analysis.playback import play_all
 from fitting.datasets.clips import Clip
 from fitting.datasets.synthetic import actions, walker
 from fitting.datasets.synthetic.speed_profile import Slip
@@ -222,7 +223,7 @@ def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
         scene = dataclasses.replace(scene, reference=exact, sigmas=sigmas)
         space = make_space(ik, [free_parameter(ik, "pelvis.limit")])
         problem = Problem(space, (scene,), residuals_of_scenes, "student", tails=jnp.asarray(tails))
-    below, above = find_evidence(problem, np.asarray(space.pack({})), profile)
+    below, above = find_evidence(problem, play_all(ik, problem.data), profile)
     assert (below.side, above.side) == ("below", "above")
     assert below.value < profile.interval[0] and above.value > profile.interval[1]
     rises = dict(zip(profile.values, profile.data_rises, strict=True))

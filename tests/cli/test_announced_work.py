@@ -1,5 +1,6 @@
 """What a fit and a sampling do is announced before it is done, in order."""
 
+import threading
 from pathlib import Path
 from types import ModuleType
 
@@ -56,7 +57,7 @@ LONG = {  # what takes long, and how the work is called that must be going on th
     (search, "search_from"): "Searching",
     (profiling, "lowest"): "Following",
     (run_folder, "save_clip"): "Writing the motions",
-    (playback, "run"): ("Playing", "Measuring"),
+    (playback, "run"): ("Playing", "Measuring", "Finding"),
     (fit_report, "_draw_clip"): "Drawing hill",
     (fit_report, "_draw_profiles"): "Drawing the curves",
     (fit_report.limit_activity, "measure"): "Measuring",
@@ -90,7 +91,8 @@ class Watcher(Recorder):
         function = getattr(place, name)
 
         def called(*arguments, **named):
-            self.done.add((name, self.going_on[-1] if self.going_on else "nothing announced"))
+            if threading.current_thread() is threading.main_thread():  # others keep nobody waiting
+                self.done.add((name, self.going_on[-1] if self.going_on else "nothing announced"))
             return function(*arguments, **named)
 
         patch.setattr(place, name, called)

@@ -5,7 +5,8 @@ the time that 64 bits take under `jax.vmap`. They differ by about a millionth of
 ranks candidates well enough; where one is adopted, a descent computes its cost anew.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.space import Space
 from fitting.runtime.precision import with_floats
 from fitting.runtime.program_cache import cached
+from fitting.runtime.threads import on_all_cores
 from jaxik import lanes
 
 BATCH = 64  # candidates in one call of a program, which is compiled for this number only
@@ -94,12 +96,26 @@ def residuals(
     problem: Problem, candidates: Float[np.ndarray, "candidates free"]
 ) -> Float[np.ndarray, "candidates residuals"]:
     """Residuals of any number of `u`, of the hard program, with 32-bit floats."""
-    parts = []
-    for first in range(0, len(candidates), BATCH):
-        batch = candidates[first : first + BATCH]
+    (rows,) = _of_batches(lambda filled: _evaluate(problem, filled)[1:], candidates)
+    return rows
+
+
+def _of_batches(
+    call: Callable[[Array], Sequence[Array]], candidates: np.ndarray
+) -> list[np.ndarray]:
+    """What a call gives of all candidates, computed BATCH at a time; 64-bit floats.
+
+    The last batch is filled up, so that there is one program. It runs on one core, so batches share
+    the cores out among themselves.
+    """
+    batches = [candidates[first : first + BATCH] for first in range(0, len(candidates), BATCH)]
+
+    def parts(batch: np.ndarray) -> list[np.ndarray]:
         filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), jnp.float32)
-        parts.append(np.asarray(_evaluate(problem, filled)[1], float)[: len(batch)])
-    return np.concatenate(parts)
+        return [np.asarray(output, float)[: len(batch)] for output in call(filled)]
+
+    outputs = on_all_cores([partial(parts, batch) for batch in batches])
+    return [np.concatenate(output) for output in zip(*outputs, strict=True)]
 
 
 def evaluate(
@@ -110,28 +126,24 @@ def evaluate(
     """Costs of any number of `u`, and where one Gauss-Newton step with this Jacobian takes them.
 
     Parameters whose column is zero, as those of thresholds are, stay where they are; without a
-    Jacobian all do. Evaluated BATCH at a time, the last batch filled up, so that there is one
-    program.
+    Jacobian all do.
     """
     # JAX multiplies: two threads of NumPy's library wait on each other, 0.3 s on a busy machine.
     full = None if jacobian is None else jnp.asarray(jacobian, float)
     matrix = None if full is None else full.astype(jnp.float32)
-    costs, gradients = [], []
-    for first in range(0, len(candidates), BATCH):
-        batch = candidates[first : first + BATCH]
-        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), jnp.float32)
+
+    def call(filled: Array) -> tuple[Array, ...]:
         cost, residuals = _evaluate(problem, filled)
-        costs.append(np.asarray(cost, float)[: len(batch)])
-        if matrix is not None:
-            gradients.append(np.asarray(residuals @ matrix, float)[: len(batch)])
-    cost = np.concatenate(costs)
+        return (cost,) if matrix is None else (cost, residuals @ matrix)
+
+    cost, *gradients = _of_batches(call, candidates)
     finite = np.isfinite(cost)
     cost = np.where(finite, cost, np.inf)
     if full is None:
         return Evaluation(cost, candidates, cost)
+    (gradient,) = gradients
     gram = np.asarray(full.T @ full)
     zero = np.diag(gram) == 0
-    gradient = np.concatenate(gradients)
     steps = -np.linalg.solve(gram + np.diag(zero), gradient.T).T
     stepped, predicted = candidates + steps, cost + 0.5 * np.sum(gradient * steps, axis=1)
     return Evaluation(

@@ -54,7 +54,7 @@ def sections(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
     title = f"Finding what determines {len(known.profiles)} parameters"
     with activity.announced(title, len(known.profiles)) as finding:
         for name, profile in known.profiles.items():
-            evidence[name] = find_evidence(fitted.problem, fitted.solution.u, profile)
+            evidence[name] = find_evidence(fitted.problem, fitted.playbacks, profile)
             finding.advance()
     if any(evidence.values()):
         parts.append(
