@@ -100,6 +100,7 @@ CASES: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
         | {"lock.hold_ball": False, "leg.as_animated": False, "probe.swing_as_animated": True},
         {},
     ),
+    ("unused footholds", "stride", {"probe.use_strides": False}, {}),
     ("on a platform", "stride", LOCKS | {"lock.release_heading": 0.06}, {"rides": True}),
     ("as it is", "by speed", {}, {"footholds_known": False, "leaps": True}),
     ("odd and sprung", "by speed", ODD | SUPPORT | SPRUNG, {}),

@@ -65,6 +65,17 @@ def test_feet_that_swing_as_animated_are_neither_lifted_nor_pitched():
     assert np.abs(np.asarray(swing.lift)).max() == np.abs(np.asarray(swing.pitch)).max() == 0.0
 
 
+def test_strides_that_are_not_used_are_as_if_unknown():
+    frames = frames_over_a_step()
+    unknown = dataclasses.replace(frames.stride, known=jnp.zeros_like(frames.stride.known))
+    predicted = hits(STEP_UP, dataclasses.replace(frames, stride=unknown))
+    unused, used = (hits(STEP_UP, frames, use_strides=use) for use in (False, True))
+    for name in ("lift", "pitch"):
+        np.testing.assert_array_equal(getattr(unused, name), getattr(predicted, name))
+    np.testing.assert_array_equal(unused.ankle.point, predicted.ankle.point)
+    assert np.abs(unused.ankle.point - used.ankle.point).max() > 0.1
+
+
 def test_only_swinging_feet_are_lifted_onto_a_step():
     frames = frames_over_a_step()
     swing = hits(STEP_UP, frames, held_lift=0.0)

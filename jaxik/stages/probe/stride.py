@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
@@ -37,9 +37,9 @@ class StrideProbe(AbstractSwingProbe):
     below the ankle along the plane of the hits, so that on a slope the whole sole is on the ground.
     Feet keep the slope of the ground in their swing, so that they neither leave nor meet it level.
 
-    The animation may provide the footholds (`Frame.stride`). If not, they are predicted from the
-    character's velocity: feet stand for `stance_time` and swing for `swing_time`, from as far ahead
-    of the hip to as far behind it (Raibert 1986).
+    The animation may provide the footholds (`Frame.stride`). If not, or with `use_strides` off,
+    they are predicted from the character's velocity: feet stand for `stance_time` and swing for
+    `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986).
 
     A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
     `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
@@ -66,6 +66,9 @@ class StrideProbe(AbstractSwingProbe):
         doc="Depth below the character's level to which rays look.",
     )
     layers: Leaf = parameter_tree.layers()
+    use_strides: Leaf = switch(
+        True, doc="Whether the animation's footholds are used; off, they are predicted."
+    )
     rise_start: Leaf = parameter(
         0.0,
         unit="1",
@@ -182,7 +185,7 @@ class StrideProbe(AbstractSwingProbe):
         until_next = half - ahead + (1.0 - fraction) * self.swing_time
         cycle = zero + self.stance_time + self.swing_time
         until_next = gate.choose(contact.planted, cycle, until_next)
-        known = labelled.known > 0
+        known = (labelled.known > 0) & self.use_strides
         last_ws, next_ws = (
             jnp.where(known[..., None], label, ball + vec.scale(velocity, time))
             for label, time in ((labelled.last_ws, -since_last), (labelled.next_ws, until_next))

@@ -61,7 +61,7 @@ def look(parameters: Parameters, terrain: Ground, leg: int, level_point: Array) 
 def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bool) -> Swing:
     """The swing from the labels of the animation; without them, from the character's velocity."""
     stride = frame.stride
-    if stride.known[leg] > 0.5:
+    if stride.known[leg] > 0.5 and parameters.of_leg("probe.use_strides", leg):
         last_ws = level(frame, up, stride.last_ws[leg])
         next_ws = level(frame, up, stride.next_ws[leg])
         aside = None if stride.aside_ws is None else across(stride.aside_ws[leg], up)

@@ -75,6 +75,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         "probe.toes_down": 0.3,
         "probe.toes_down_per_height": 0.9,
         "probe.swing_as_animated": False,
+        "probe.use_strides": True,
         "probe.stance_time": 0.65,
         "probe.swing_time": 0.45,
         "target.max_ankle_height": 0.8,
