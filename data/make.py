@@ -166,6 +166,7 @@ MEC_TRUTH = {
 }
 STRIDE_TRUTH = {
     "probe.steepness": 2.6,
+    "probe.swing_as_animated": True,  # so that the clip's steps determine what the pelvis does
     "lock.enabled": True,  # the feet of the animation slip
     "lock.release_distance": 0.09,
     "lock.unlock_half_life": 0.05,

@@ -62,7 +62,8 @@ def frames_from_clip(
     def array(values: np.ndarray) -> Array:
         return jax.device_put(values.astype(dtype))  # a conversion in JAX would compile a program
 
-    strides = [_stride(clip.stance_labels()[at], (balls + moved)[at]) for at in clip.pieces]
+    labels = clip.stance_labels()
+    strides = [_stride(labels[at], (balls + moved)[at], up_ws) for at in clip.pieces]
     none = jaxik.Transform(*(array(np.zeros((clip.frame_count, 0, size))) for size in (3, 4)))
     frames = jaxik.Frame(
         world_from_model=world,
@@ -136,18 +137,21 @@ def _scaled_strides(
 
 
 def _stride(
-    stance: Bool[np.ndarray, "frames legs"], balls: Float64[np.ndarray, "frames legs 3"]
+    stance: Bool[np.ndarray, "frames legs"],
+    balls: Float64[np.ndarray, "frames legs 3"],
+    up_ws: Direction,
 ) -> tuple[np.ndarray, ...]:
     """The fields of a `Stride`, in order; unknown where a foot will not stand any more."""
     known = np.cumsum(stance[::-1], axis=0)[::-1] > 0
-    last_ws, next_ws = np.zeros(balls.shape), np.zeros(balls.shape)
+    last_ws, next_ws, aside_ws = (np.zeros(balls.shape) for _ in range(3))
     fraction = np.zeros(stance.shape)
     for leg in np.flatnonzero(stance.any(axis=0)):
-        falls = contacts.footfalls(balls[:, leg], stance[:, leg])
+        falls = contacts.footfalls(balls[:, leg], stance[:, leg], up_ws)
         last_ws[:, leg] = falls.positions_ws[falls.last]
         next_ws[:, leg] = falls.positions_ws[falls.next]
         fraction[:, leg] = falls.swing_fraction
-    return stance, last_ws, next_ws, fraction, known
+        aside_ws[:, leg] = falls.aside_ws[falls.last]
+    return stance, last_ws, next_ws, fraction, known, aside_ws
 
 
 def clip_from_result(

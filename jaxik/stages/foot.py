@@ -56,10 +56,14 @@ class AbstractFoot(Rule):
 
 
 class AbstractAnimatedFoot(AbstractFoot):
-    """Turns feet from their animated rotation."""
+    """Turns feet from their animated rotation, pitched as the probe wants them to swing."""
 
     def sense(self, inputs: Inputs, ground: GroundHits) -> Float[Array, "legs 4"]:
-        return animated_ankles(inputs.frame).rot
+        rot_ws = animated_ankles(inputs.frame).rot
+        if ground.pitch is None:
+            return rot_ws
+        _, right = foot_heading(inputs, inputs.terrain.leg_up_ws)
+        return quat.multiply(quat.from_axis_angle(right, ground.pitch), rot_ws)
 
 
 class PitchRollFoot(AbstractAnimatedFoot):

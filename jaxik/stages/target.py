@@ -115,7 +115,8 @@ class SlopeTarget(AbstractTarget):
         standing = hit.point + vec.scale(up_ws, ankle_height - self.foot_height)
         without_ground = _below(animated_ankles(frame).pos, up_ws, contact.lift)
         point_ws = smoothing.lerp(without_ground, standing, hit.found[..., None])
-        return foothold(frame, up_ws, point_ws, contact.lift, hit.found)
+        lift = contact.lift if ground.lift is None else contact.lift + ground.lift
+        return foothold(frame, up_ws, point_ws, lift, hit.found)
 
     def advance(
         self, now: SensedMoment, state: TargetState

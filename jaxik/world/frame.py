@@ -34,6 +34,10 @@ class Stride:
     """0..1, time of the swing that has passed; 0 while standing."""
     known: Float[Array, "*b legs"]
     """1, or 0 where positions have to be predicted from velocity."""
+    aside_ws: Float[Array, "*b legs 3"] | None = None
+    """m, by how far the middle of a swing is beside the straight way to the next foothold: round a
+    corner of the ground, or round the other foot. An offset: it is the same wherever the world's
+    origin is. None is 0."""
 
     @classmethod
     def unknown(cls, like: Float[Array, "*b legs"]) -> "Stride":
@@ -143,6 +147,10 @@ class GroundHits:
     """0..1, how far swinging feet turn to the ground; standing feet do by their contact."""
     rays: Rays
     """For stages that cast further rays."""
+    lift: Float[Array, " legs"] | None = None
+    """m, how much higher than animated each ankle swings over its ground; None is 0."""
+    pitch: Float[Array, " legs"] | None = None
+    """rad, how much further than animated each foot's toes are up; None is 0."""
 
 
 @struct

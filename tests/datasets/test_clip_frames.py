@@ -143,6 +143,7 @@ def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):
 def test_strides_go_from_stance_to_stance(clip):
     stride, stance = clip_frames.frames_from_clip(clip).stride, clip.stance_labels()
     np.testing.assert_array_equal(stride.standing, stance)
+    assert stride.aside_ws is not None
     balls = clip.joints_ws(3)
     for leg in range(2):
         stances = contacts.runs(stance[:, leg])
@@ -158,10 +159,26 @@ def test_strides_go_from_stance_to_stance(clip):
             np.testing.assert_array_equal(
                 stride.next_ws[first:next_first, leg], [next_position] * (next_first - first)
             )
+            aside_ws = np.asarray(stride.aside_ws[first:next_first, leg])
+            assert np.all(aside_ws == aside_ws[0]) and aside_ws[0, 1] == 0.0 < np.ptp(aside_ws)
             np.testing.assert_array_equal(stride.fraction[first : last + 1, leg], 0.0)
             np.testing.assert_allclose(
                 np.diff(stride.fraction[last:next_first, leg]), 1 / (next_first - last), rtol=1e-9
             )
+
+
+@pytest.mark.parametrize("up_ws", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_strides_say_where_swings_bend(up_ws):
+    """A ball on a parabola, 0.12 m beside the straight way in the middle."""
+    up = np.array(up_ws)
+    ahead = np.roll(up, 1)
+    right = np.cross(up, ahead)
+    part = np.clip((np.arange(40) - 10) / 20, 0.0, 1.0)[:, None]
+    arc = 4.0 * part * (1.0 - part)
+    ball_ws = [0.3, 0.2, -0.4] + 0.7 * part * ahead + arc * (0.1 * up + 0.12 * right)
+    stance = (part[:, 0] == 0.0) | (part[:, 0] == 1.0)
+    aside_ws = contacts.footfalls(ball_ws, stance, up_ws).aside_ws
+    np.testing.assert_allclose(aside_ws, [0.12 * right, np.zeros(3)], rtol=0, atol=1e-12)
 
 
 def test_a_foot_that_never_stands_has_an_unknown_stride(clip):

@@ -298,8 +298,9 @@ def test_a_flat_animation_with_other_frames_is_rejected(tmp_path, change, messag
         problems.make_problem(loaded)
 
 
-def test_the_blocks_experiment_makes_a_problem(mocap):
-    path = ROOT / "data" / "experiments" / "blocks.toml"
+@pytest.mark.parametrize("name", ["blocks", "blocks_walk"])
+def test_the_blocks_experiments_make_a_problem(mocap, name):
+    path = ROOT / "data" / "experiments" / f"{name}.toml"
     problem = problems.make_problem(experiment_files.load_experiment(path))
     (scene,) = problem.data
     assert scene.frames.dt.shape == (1141,)  # 38 s

@@ -37,6 +37,15 @@ ODD: dict[str, Any] = LOCKS | {  # away from the defaults
     "probe.way_slope": 0.7,
     "probe.heel_length": 0.1,
     "probe.ball_height": 0.04,
+    "probe.toe_length": 0.06,
+    "probe.held_lift": 0.4,
+    "probe.toe_clearance": 0.05,
+    "probe.lift_per_rise": 0.3,
+    "probe.lift_per_fall": 0.6,
+    "probe.lift_over": 1.2,
+    "probe.toes_up": 0.2,
+    "probe.toes_down": 0.1,
+    "probe.toes_down_per_height": 1.4,
     "probe.stance_time": 0.5,
     "probe.swing_time": 0.37,
     "target.foot_height": 0.07,
@@ -85,11 +94,13 @@ CASES: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
         {"footholds_known": False},
     ),
     (
-        "held by the ankle and softened",
+        "held by the ankle, softened and swung as animated",
         "stride",
-        LOCKS | {"lock.hold_ball": False, "leg.as_animated": False},
+        LOCKS
+        | {"lock.hold_ball": False, "leg.as_animated": False, "probe.swing_as_animated": True},
         {},
     ),
+    ("unused footholds", "stride", {"probe.use_strides": False}, {}),
     ("on a platform", "stride", LOCKS | {"lock.release_heading": 0.06}, {"rides": True}),
     ("as it is", "by speed", {}, {"footholds_known": False, "leaps": True}),
     ("odd and sprung", "by speed", ODD | SUPPORT | SPRUNG, {}),
@@ -119,13 +130,14 @@ def clip(
     """A walk across all blocks and beyond, with slipping, turning and partly weighted feet.
 
     Even known footholds are unknown for a while, and contact labels are uncertain for another. The
-    walk can leap at the start and once again with feet too fast to stand. Its ground can ride on a
-    platform.
+    ways between known footholds bend. The walk can leap at the start and once again with feet too
+    fast to stand. Its ground can ride on a platform.
     """
     rig, rng = rig_of(legs), np.random.default_rng(5)
     frames = walk(
         rig, FRAMES, known=footholds_known, heading=0.12, start=(-0.5, 0.03, -3.7), speed=0.8
     )
+    aside = np.outer(rig.side, [0.12, 0.03, 0.05])  # also upward, which does not count
     changed = []
     for index, frame in enumerate(frames):
         fraction, time = index / FRAMES, index / 60
@@ -155,7 +167,7 @@ def clip(
                     rot=np.array([maths.multiply(wobble, r) for r in frame.ankle.rot])
                 ),
                 weight=weight,
-                stride=dataclasses.replace(stride, known=known, standing=standing),
+                stride=dataclasses.replace(stride, known=known, standing=standing, aside_ws=aside),
                 platforms=[carousel(time)] if rides else [],
                 platforms_before=[carousel(max(index - 1, 0) / 60)] if rides else [],
             )

@@ -55,8 +55,14 @@ def scenes(problem: Problem) -> tuple[Scene, ...]:
     first, second, third = problem.data
     limits = jnp.linspace(0.02, 0.3, len(second.frames.dt))
     longer = dataclasses.replace(second.rig, foot=1.2 * second.rig.foot, names=("a", "b"))
+    stride = second.frames.stride
+    bent = dataclasses.replace(stride, aside_ws=stride.aside_ws + jnp.asarray([0.1, 0.0, 0.05]))
     second = dataclasses.replace(
-        second, tracks={"leg.soften": 1.0 - limits}, size=jnp.asarray(1.3), rig=longer
+        second,
+        frames=dataclasses.replace(second.frames, stride=bent),
+        tracks={"leg.soften": 1.0 - limits},
+        size=jnp.asarray(1.3),
+        rig=longer,
     )
     scale = jnp.full(len(third.frames.dt), 1.2)
     frames = dataclasses.replace(third.frames, stride_scale=scale)

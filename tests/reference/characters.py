@@ -131,7 +131,8 @@ class Stride:
     `standing` (legs) is 0..1. `last_ws` and `next_ws` (legs 3), m, are where the ball of the foot
     last stood and will stand next; while it stands, `last_ws` is its present position. `fraction`
     (legs) is the part of the swing's time that has passed, 0 while standing. Where `known` (legs)
-    is 0, only `standing` is valid.
+    is 0, only `standing` is valid. `aside_ws` (legs 3), m, is how far the middle of the swing is
+    beside the straight way; None is 0.
     """
 
     standing: Array
@@ -139,6 +140,7 @@ class Stride:
     next_ws: Array
     fraction: Array
     known: Array
+    aside_ws: Array | None = None
 
     @classmethod
     def unknown(cls, legs: int) -> "Stride":
@@ -230,6 +232,7 @@ class Foot:
     """One leg in this frame: animated joints, contact, hits and foothold, world space.
 
     `ball_ws` is the toe joint; `heading_ws` is the unit forward of the foot at right angles to up.
+    `swing_lift`, m, is the part of `lift` that is not animated.
     """
 
     hip_ws: Array
@@ -244,6 +247,7 @@ class Foot:
     toe_hit: Hit
     foothold_ws: Array
     turns_in_swing: bool = False
+    swing_lift: float = 0.0
 
     @property
     def turned(self) -> float:

@@ -155,7 +155,16 @@ StrideProbe.steepness 1 1.875 1 4
 StrideProbe.clearance m 0 -0.1 0.1
 StrideProbe.way_slope 1 1.5 0.2 5
 StrideProbe.heel_length m 0.07 0 0.2
+StrideProbe.toe_length m 0.039999999 0 0.2
 StrideProbe.ball_height m 0.055 0 0.15
+StrideProbe.held_lift 1 0.60000002 0 1
+StrideProbe.toe_clearance m 0.029999999 0 0.15
+StrideProbe.lift_per_rise 1 0.5 0 1.5
+StrideProbe.lift_per_fall 1 0.34999999 0 1.5
+StrideProbe.lift_over 1 1.7 0 3
+StrideProbe.toes_up rad 0.1 0 0.60000002
+StrideProbe.toes_down rad 0.30000001 0 0.80000001
+StrideProbe.toes_down_per_height rad/m 0.89999998 0 3
 StrideProbe.stance_time s 0.64999998 0.2 1.5
 StrideProbe.swing_time s 0.44999999 0.1 1
 GroundRoot.ray_up m 10 0 20
@@ -316,7 +325,8 @@ LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=y
 OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.enabled=yes ReachPelvis.spring=no
 RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
-SupportPelvis.spring=no SweepProbe.check_support=no SweepProbe.limited=yes TwoBone.as_animated=no
+StrideProbe.swing_as_animated=no StrideProbe.use_strides=yes SupportPelvis.spring=no
+SweepProbe.check_support=no SweepProbe.limited=yes TwoBone.as_animated=no
 """
 
 

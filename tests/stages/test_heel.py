@@ -19,7 +19,7 @@ from support.gradients import finite_jacobian
 from support.strides import blocks, walk
 
 COUNT = 240  # frames
-VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.2}
+VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.2, "probe.swing_as_animated": True}
 angle_of = jax.jit(effector.heel_angle)
 
 

@@ -92,8 +92,11 @@ def swing(fractions: np.ndarray, last: float = 0.0, following: Any = 0.8) -> jax
 
 @functools.partial(jax.jit, compiler_options=QUICK)
 def heights(ground: Any, frames: jaxik.Frame, gate: AbstractGate = HARD) -> jax.Array:
-    """Ground height under the left ankle by the probe of `stride`, m (frames)."""
-    ik, rig = to_ik({}, "stride"), to_rig(RIG)
+    """Ground height under the left ankle by the probe of `stride`, m (frames).
+
+    Feet swing as animated, so that edges on the way have to be cleared.
+    """
+    ik, rig = to_ik({"probe.swing_as_animated": True}, "stride"), to_rig(RIG)
 
     def height(frame: jaxik.Frame) -> jax.Array:
         inputs = Inputs(rig, ground, frame, gate)

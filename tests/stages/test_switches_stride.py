@@ -34,6 +34,7 @@ EAGER = {
     "contact.planted_speed": 1.0,
     "contact.raised_speed": 1.5,
 }  # a root that stands while the feet walk
+ANIMATED = {"probe.swing_as_animated": True}
 UPHILL = planes((0.4, 0, 0))
 STEP_UP = planes((0, 0, 0), (1.0, 0, -0.25))  # rises 0.2 m ahead of the ankles
 STEP_DOWN = planes((0, 0, 0), (-1.0, 0, 0.15))  # falls until 0.1 m ahead of the ankles
@@ -96,7 +97,27 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.max_slope", "comes down", UPHILL, (0.3, 0.36), "target height", 1),
         Case("probe.clearance", "lifts off", STEP_UP, (0.0, 0.05), "target height", 1, WIDE),
         Case("probe.way_slope", "lifts off", STEP_UP, (0.5, 1.0), "target height", -1),
-        Case("probe.heel_length", "comes down", STEP_DOWN, (0.05, 0.09), "target height", 1),
+        Case(
+            "probe.heel_length", "comes down", STEP_DOWN, (0.05, 0.09), "target height", 1, ANIMATED
+        ),
+        Case(
+            "probe.toe_length",
+            "lifts off",
+            STEP_UP,
+            (0.03, 0.06),
+            "target height",
+            1,
+            ANIMATED | WIDE,
+        ),
+        Case("probe.held_lift", "lifts off", STEP_DOWN, (0.3, 0.6), "target height", -1),
+        Case("probe.toe_clearance", "comes down", STEP_UP, (0.02, 0.04), "target height", 1),
+        Case("probe.lift_per_rise", "comes down", STEP_UP, (0.3, 0.5), "target height", 1),
+        Case("probe.lift_per_fall", "lifts off", STEP_DOWN, (0.3, 0.5), "target height", 1),
+        Case("probe.toes_up", "lifts off", STEP_DOWN, (0.1, 0.2), "target height", -1),
+        Case("probe.toes_down", "comes down", STEP_UP, (0.1, 0.2), "target height", 1),
+        Case("probe.toes_down_per_height", "comes down", STEP_UP, (0.5, 0.9), "target height", 1),
+        Case("probe.swing_as_animated", "comes down", STEP_UP, (False, True), "target height", -1),
+        Case("probe.use_strides", "comes down", STEP_UP, (False, True), "target height", 1),
         Case("probe.ball_height", "lifts off", STEP_UP, (0.03, 0.06), "target height", 1, WIDE),
         Case(
             "probe.stance_time", "swings, footholds unknown", KINK, (0.5, 0.7), "target height", 1
@@ -240,7 +261,9 @@ def listed(cases: dict[str, tuple[Case, ...]]) -> Any:
 
 # Stages whose numbers have tests of their own, as in `test_switches`; `test_spine_lean` is another.
 WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_narrow_ground`
-IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS)
+OVER = "probe.lift_over"  # in `test_swing`, since planes make no hurdle
+UNEVEN = "probe.uneven_height"  # a constant
+IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS, OVER, UNEVEN)
 SLOPED = {
     preset: tuple(case for case in cases if has_slope(case, preset))
     for preset, cases in CASES.items()

@@ -133,6 +133,7 @@ def to_frames(frames: Sequence[reference.Frame]) -> jaxik.Frame:
             **{
                 field.name: stacked(getattr(frame.stride, field.name) for frame in frames)
                 for field in dataclasses.fields(characters.Stride)
+                if getattr(frames[0].stride, field.name) is not None
             }
         ),
         dt=jnp.asarray([float(frame.dt) for frame in frames]),

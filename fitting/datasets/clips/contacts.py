@@ -8,10 +8,13 @@ Limits are for an adult. A body twice as large moves twice as fast if it plays t
 and the root of two times as fast at an equal Froude number. Its limit of speed lies between them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+
+from jaxik.world.frame import UP
 
 MAX_SPEED = 0.25  # m/s: the ball of a standing foot is slower, even a runner's
 SPEED_POWER = 0.7  # of a body's size, with which the limit of speed grows
@@ -20,6 +23,7 @@ MAX_GAP = 0.05  # s: shorter interruptions of a stance are marker noise
 MIN_STANCE = 0.06  # s: shorter slow spells are no stance; runners stand for 0.075 s
 HANG_WINDOW = 0.2  # s before and after a slow spell, in which a hanging foot shows
 HANG_HEIGHT = 0.03  # m by which a hanging foot is higher than before and after
+SHORTEST_WAY = 0.05  # m between footholds, below which nothing is beside it
 
 
 def detect_stances(
@@ -81,16 +85,21 @@ class Footfalls:
     """Index of the following one; at both ends of a clip `last`."""
     swing_fraction: Float64[np.ndarray, " frames"]
     """0..1, of the swing's duration that has passed."""
+    aside_ws: Float64[np.ndarray, "stances 3"]
+    """m, by how far the middle of the swing after each stance is beside the straight way."""
 
 
 def footfalls(
-    ball_ws: Float64[np.ndarray, "frames 3"], stance: Bool[np.ndarray, " frames"]
+    ball_ws: Float64[np.ndarray, "frames 3"],
+    stance: Bool[np.ndarray, " frames"],
+    up_ws: Sequence[float] | np.ndarray = UP,
 ) -> Footfalls:
     """The footfalls of one foot that stands at least once.
 
     Args:
         ball_ws: position of its ball, m.
         stance: True where it stands.
+        up_ws: unit, of the floor.
     """
     stances = runs(stance)
     frames = np.arange(len(stance))
@@ -101,7 +110,41 @@ def footfalls(
     swinging = (frames > leaving) & (next_ > last)
     fraction = np.where(swinging, (frames - leaving) / np.maximum(arriving - leaving, 1), 0.0)
     positions = np.array([np.median(ball_ws[a : b + 1], axis=0) for a, b in stances])
-    return Footfalls(positions, last, next_, fraction)
+    level_ws, ends = _level(ball_ws, up_ws), _level(positions, up_ws)
+    aside = np.zeros(positions.shape)
+    for index in range(len(stances) - 1):
+        swing = level_ws[lasts[index] + 1 : firsts[index + 1]]
+        aside[index] = _aside(swing, ends[index], ends[index + 1])
+    return Footfalls(positions, last, next_, fraction, aside)
+
+
+def _level(
+    points_ws: Float64[np.ndarray, "n 3"], up_ws: Sequence[float] | np.ndarray
+) -> Float64[np.ndarray, "n 3"]:
+    """The points without their height."""
+    up = np.asarray(up_ws, np.float64)
+    return points_ws - (points_ws @ up)[:, None] * up
+
+
+def _aside(
+    swing_ws: Float64[np.ndarray, "frames 3"], last_ws: np.ndarray, next_ws: np.ndarray
+) -> Float64[np.ndarray, "3"]:
+    """By how far the middle of a swing is beside the straight way, m; points have no height.
+
+    It is that of a parabola through both footholds and through the first frame in which the ball
+    has covered half of the way.
+    """
+    way = next_ws - last_ws
+    length2 = way @ way
+    if not len(swing_ws) or length2 < SHORTEST_WAY**2:
+        return np.zeros(3)
+    covered = (swing_ws - last_ws) @ way / length2
+    middle = int(np.argmax(covered >= 0.5))
+    part = covered[middle]
+    if not 0.5 <= part <= 0.75:
+        return np.zeros(3)
+    beside = swing_ws[middle] - last_ws - part * way
+    return beside / (4.0 * part * (1.0 - part))
 
 
 def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> bool:

@@ -94,3 +94,9 @@ def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Arra
 def requested_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
     """Height from each animated ankle to its target along the leg's up, m."""
     return vec.dot(target_ws - sensed.ankle_ws, sensed.leg_up_ws)
+
+
+def supported_heights(sensed: Sensed, target_ws: Array) -> Float[Array, " legs"]:
+    """The same less what feet swing higher than animated: nobody rises with a lifted foot, m."""
+    requested, lift = requested_heights(sensed, target_ws), sensed.ground.lift
+    return requested if lift is None else requested - lift

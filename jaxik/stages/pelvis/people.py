@@ -24,8 +24,8 @@ from .base import (
     PelvisMoment,
     PelvisState,
     mean_height,
-    requested_heights,
     rise_to_length,
+    supported_heights,
 )
 
 
@@ -45,7 +45,7 @@ class AbstractFollowingPelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        requested = requested_heights(sensed, target.pos)
+        requested = supported_heights(sensed, target.pos)
         resting = jnp.where(now.started, state.goal, mean_height(sensed, requested))
         goal = self.goal(now, target, resting)
         gap = goal - state.height
@@ -88,7 +88,7 @@ class SupportPelvis(AbstractFollowingPelvis):
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
-        requested = requested_heights(sensed, target.pos)
+        requested = supported_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
         total = vec.sum_last(weight)
         active = sensed.weight > 0
@@ -141,7 +141,7 @@ class ReachPelvis(AbstractFollowingPelvis):
 
     def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
         sensed, gate = now.sensed, now.gate
-        requested = requested_heights(sensed, target.pos)
+        requested = supported_heights(sensed, target.pos)
         active = sensed.weight > 0
         mean = mean_height(sensed, requested)
         highest = gate.maximum(jnp.where(active, requested, -FAR), band=HEIGHT_BAND)

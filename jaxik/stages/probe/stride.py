@@ -7,32 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxik.maths import parameter_tree, quat, vec
-from jaxik.maths.parameter_tree import Leaf, parameter
+from jaxik.maths import parameter_tree, vec
+from jaxik.maths.parameter_tree import Leaf, parameter, switch
 from jaxik.maths.smoothing import lerp
-from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
 from jaxik.world.terrain import Hit
 
 from .base import make_rays, no_hit
-from .limits import (
-    AbstractLimitedProbe,
-    climb,
-    clip_to_one,
-    least_rise,
-    smoothstep,
-)
+from .limits import climb, clip_to_one, least_rise, smoothstep
+from .swing import FAR, AbstractSwingProbe, Level, s_curve
 
-HEIGHT_BAND = 0.01  # m
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAIRS = 0.75  # rise over run of the steepest stairs
-ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
-FAR = 1e6  # m, beyond any ground
 
 
-class StrideProbe(AbstractLimitedProbe):
+class StrideProbe(AbstractSwingProbe):
     """Rays at the last and at the next foothold, joined by a smooth curve.
 
     A swinging foot leaves the ground of its last foothold and arrives on that of its next, so the
@@ -46,9 +37,9 @@ class StrideProbe(AbstractLimitedProbe):
     below the ankle along the plane of the hits, so that on a slope the whole sole is on the ground.
     Feet keep the slope of the ground in their swing, so that they neither leave nor meet it level.
 
-    The animation may provide the footholds (`Frame.stride`). If not, they are predicted from the
-    character's velocity: feet stand for `stance_time` and swing for `swing_time`, from as far ahead
-    of the hip to as far behind it (Raibert 1986).
+    The animation may provide the footholds (`Frame.stride`). If not, or with `use_strides` off,
+    they are predicted from the character's velocity: feet stand for `stance_time` and swing for
+    `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986).
 
     A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
     `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
@@ -75,6 +66,9 @@ class StrideProbe(AbstractLimitedProbe):
         doc="Depth below the character's level to which rays look.",
     )
     layers: Leaf = parameter_tree.layers()
+    use_strides: Leaf = switch(
+        True, doc="Whether the animation's footholds are used; off, they are predicted."
+    )
     rise_start: Leaf = parameter(
         0.0,
         unit="1",
@@ -96,32 +90,6 @@ class StrideProbe(AbstractLimitedProbe):
         low=1.0,
         high=4.0,
         doc="How much faster than evenly the height changes in the middle of the swing.",
-    )
-    clearance: Leaf = parameter(
-        0.0,
-        unit="m",
-        low=-0.1,
-        high=0.1,
-        doc="How much of its animated lift a foot may lose as it passes over an edge.",
-    )
-    way_slope: Leaf = parameter(
-        1.5,
-        unit="1",
-        low=0.2,
-        high=5.0,
-        scale="log",
-        doc="Slope, rise over run, at which a foot climbs to an edge and descends from it.",
-    )
-    heel_length: Leaf = parameter(
-        0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
-    )
-    ball_height: Leaf = parameter(
-        0.055,
-        unit="m",
-        follows="ball height",
-        low=0.0,
-        high=0.15,
-        doc="Height of the ball joint above the sole.",
     )
     stance_time: Leaf = parameter(
         0.65,
@@ -147,6 +115,8 @@ class StrideProbe(AbstractLimitedProbe):
         way_ws = stride.next_ws - stride.last_ws
         fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
         path_ws = stride.last_ws + vec.scale(way_ws, fractions)
+        if stride.aside_ws is not None:
+            path_ws += vec.scale(stride.aside_ws, 4.0 * fractions * (1.0 - fractions))
         path = self._ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
         if self.check_support:
             ends = self._ground_at(inputs, level, path_ws[jnp.array([0, -1])], stood_on=True)
@@ -163,8 +133,9 @@ class StrideProbe(AbstractLimitedProbe):
         climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
+        evened = jnp.concatenate([low[None], heights[1:]]) - slope * fractions
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
-        trust *= self._trust_of_way(heights - slope * fractions, path.found)
+        trust *= self._trust_of_way(evened, path.found)
 
         since_start = stride.fraction - self.rise_start
         fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
@@ -177,10 +148,13 @@ class StrideProbe(AbstractLimitedProbe):
         normal += vec.scale(next_.normal - normal, trust * fraction)
         normal = vec.normalize(normal, level.up_ws)
 
-        soles = self._soles(inputs, level, foot_height)
-        under_soles = height + self._climb(normal, soles - ball, level)
         edges = jax.tree.map(lambda x: x[1:-1], path)
-        height += self._clearance_over_edges(inputs, stride, soles, under_soles, top, edges)
+        higher = low + jnp.where(step > 0, step, 0.0)
+        over = self.over_footholds(inputs, evened[1:-1], edges.found, higher)
+        swing = self.swing(inputs, stride, step, over, trust)
+        soles = self.soles(inputs, foot_height)
+        under_soles = height + self._climb(normal, soles - ball, level)
+        height += self.clearance_over_edges(inputs, stride, swing, soles, under_soles, top, edges)
         height += self._climb(normal, ankle - ball, level)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
@@ -190,9 +164,11 @@ class StrideProbe(AbstractLimitedProbe):
             platform = jnp.where(arriving, next_.platform, platform)
         hit = Hit(ankle_ws, normal, self.ray_up - height, found, platform)
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
-        return GroundHits(hit, no_hit(hit), no_hit(hit), jnp.ones_like(found), rays)
+        turns = jnp.ones_like(found)
+        lift, pitch = (jnp.where(found > 0, x, 0.0) for x in (swing.lift, swing.pitch))
+        return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch)
 
-    def _stride(self, inputs: Inputs, contact: Contact, level: "Level") -> Stride:
+    def _stride(self, inputs: Inputs, contact: Contact, level: Level) -> Stride:
         """The stride of the animation where it is known, else one predicted from velocity."""
         frame, gate, labelled = inputs.frame, inputs.gate, inputs.frame.stride
         velocity = vec.reject(frame.velocity_ws, level.up_ws)
@@ -209,16 +185,19 @@ class StrideProbe(AbstractLimitedProbe):
         until_next = half - ahead + (1.0 - fraction) * self.swing_time
         cycle = zero + self.stance_time + self.swing_time
         until_next = gate.choose(contact.planted, cycle, until_next)
-        known = labelled.known > 0
+        known = (labelled.known > 0) & self.use_strides
         last_ws, next_ws = (
             jnp.where(known[..., None], label, ball + vec.scale(velocity, time))
             for label, time in ((labelled.last_ws, -since_last), (labelled.next_ws, until_next))
         )
         fraction = jnp.where(known, labelled.fraction, fraction)
-        return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known)
+        aside_ws = labelled.aside_ws
+        if aside_ws is not None:
+            aside_ws = jnp.where(known[..., None], vec.reject(aside_ws, level.up_ws), 0.0)
+        return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known, aside_ws)
 
     def _ground_at(
-        self, inputs: Inputs, level: "Level", points_ws: Array, stood_on: bool = False
+        self, inputs: Inputs, level: Level, points_ws: Array, stood_on: bool = False
     ) -> Hit:
         """The ground above or below these points."""
         above = level.project(points_ws)
@@ -246,69 +225,9 @@ class StrideProbe(AbstractLimitedProbe):
             excess.append(jnp.where(found[point] > 0, least, FAR))
         return 1.0 - smoothstep(excess[-1] / self.step_fade)
 
-    def _climb(self, normal: Array, way: Array, level: "Level") -> Array:
+    def _climb(self, normal: Array, way: Array, level: Level) -> Array:
         """How much higher ground with this normal is at the end of a way than at its start, m.
 
         Ground that is too steep counts as level: a foot is not to follow a wall.
         """
         return climb(normal, way, level.up_ws) * self.gentleness(normal, level.up_ws)
-
-    def _soles(self, inputs: Inputs, level: "Level", foot_height: Array) -> Array:
-        """Animated heels and balls at sole height, (2 legs 3), m, world space."""
-        frame = inputs.frame
-        ankle = animated_ankles(frame)
-        foot = quat.multiply(ankle.rot, inputs.rig.ankle_from_foot)
-        heel_ls = vec.stack(jnp.zeros_like(self.heel_length), -foot_height, -self.heel_length)
-        heel = ankle.pos + quat.rotate(foot, heel_ls)
-        ball = frame.world_from_model.apply(frame.pose.toe.pos)
-        return jnp.stack([heel, ball - vec.scale(level.up_ws, self.ball_height)])
-
-    def _clearance_over_edges(
-        self, inputs: Inputs, stride: Stride, soles: Array, under_soles: Array, top: Array, hit: Hit
-    ) -> Float[Array, " legs"]:
-        """How much higher each foot goes to clear what lies between its footholds, m.
-
-        `under_soles` is the height of the ground that each sole was lifted from, m; `hit` is the
-        ground between the footholds (points legs).
-        """
-        gate = inputs.gate
-        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
-        ground = level.height(hit.point)
-        fade = 1.0 - smoothstep((ground - top - self.max_step_up) / self.step_fade)
-        away = vec.length(vec.reject(hit.point[:, None] - soles, level.up_ws))  # (rays 2 legs)
-        excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
-        # A sole that the animation sinks into its own floor needs no correction.
-        lift = level.height(soles) - self.clearance
-        lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
-        rise = excess - lift
-        rise = jnp.where(hit.found[:, None] > 0, rise, -FAR)
-        most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *top.shape), 0, -1), band=HEIGHT_BAND)
-        zero = jnp.zeros_like(most)
-        most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)
-        fade_in = smoothstep(stride.fraction / ENDS)
-        return most * fade_in * smoothstep((1.0 - stride.fraction) / ENDS)
-
-
-@struct
-class Level:
-    """The plane through the character's root, perpendicular to each leg's up."""
-
-    origin_ws: Float[Array, "3"]
-    """Metres."""
-    up_ws: Float[Array, "*legs 3"]
-
-    def height(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs"]:
-        """Height of points above the plane, m."""
-        return vec.dot(points_ws - self.origin_ws, self.up_ws)
-
-    def project(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs 3"]:
-        """Points projected onto the plane, m."""
-        return points_ws - vec.scale(self.up_ws, self.height(points_ws))
-
-
-def s_curve(fraction: Array, steepness: Array) -> Array:
-    """Curve from 0 to 1 with slope `steepness` in the middle: `1 / (1 + (1/x - 1)^k)`."""
-    inside = (fraction > 0) & (fraction < 1)
-    x = jnp.where(inside, fraction, 0.5)
-    odds = jnp.exp(steepness * (jnp.log1p(-x) - jnp.log(x)))
-    return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(fraction < 0.5, 0.0, 1.0))

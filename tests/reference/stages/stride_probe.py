@@ -5,25 +5,39 @@ One leg, one frame at a time. World space; heights are above the root along the 
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
+from reference import maths
 from reference.characters import Frame, Ground, Parameters, Rig, world_from_foot
 from reference.maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
 from reference.stages.limits import FADE, gentle, low_enough
+from reference.stages.swing import axis_of_pitch, beyond_animation
 from reference.terrain import Hit
 
 PATH_POINTS = 8
 EDGE_FRACTION = 0.15  # of the swing's time at either end, over which the path fades out
 
 
-class Swing(NamedTuple):
-    """Where a leg is in its stride; positions at the height of the root."""
+@dataclass
+class Swing:
+    """Where a leg is in its stride; positions at the height of the root.
+
+    `lift`, m, and `pitch`, rad, toes up, are what its swing adds to the animation.
+    """
 
     last: Array
     next: Array
     fraction: float
+    aside: Array | None = None
+    lift: float = 0.0
+    pitch: float = 0.0
+
+    def way(self, part: float) -> Array:
+        """The point of the way to the next foothold after a part of it."""
+        point = self.last + (self.next - self.last) * part
+        return point if self.aside is None else point + 4.0 * part * (1.0 - part) * self.aside
 
 
 def level(frame: Frame, up: Array, point: Array) -> Array:
@@ -47,10 +61,11 @@ def look(parameters: Parameters, terrain: Ground, leg: int, level_point: Array) 
 def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bool) -> Swing:
     """The swing from the labels of the animation; without them, from the character's velocity."""
     stride = frame.stride
-    if stride.known[leg] > 0.5:
+    if stride.known[leg] > 0.5 and parameters.of_leg("probe.use_strides", leg):
         last_ws = level(frame, up, stride.last_ws[leg])
         next_ws = level(frame, up, stride.next_ws[leg])
-        return Swing(last_ws, next_ws, float(stride.fraction[leg]))
+        aside = None if stride.aside_ws is None else across(stride.aside_ws[leg], up)
+        return Swing(last_ws, next_ws, float(stride.fraction[leg]), aside)
     stance_time = parameters.of_leg("probe.stance_time", leg)
     swing_time = parameters.of_leg("probe.swing_time", leg)
     velocity = across(frame.travel_ws, up)
@@ -81,6 +96,7 @@ def ground_of_stride(
     last, following = (look(parameters, terrain, leg, pos) for pos in (stride.last, stride.next))
     if not last.found and not following.found:
         return Hit(False, here, up), stride
+    arrives = float(following.found)  # a swing to nowhere stays as animated
     last = last if last.found else following
     following = following if following.found else last
 
@@ -91,8 +107,14 @@ def ground_of_stride(
     slope = shared_rise(high - low, *climbs)
     step = high - low - slope
     sure = gentle(parameters, leg, up, following.normal)
-    sure *= climbable(
-        parameters, leg, [low, *between(parameters, terrain, frame, leg, stride), high], slope
+    on_way = between(parameters, terrain, frame, leg, stride)
+    sure *= climbable(parameters, leg, [low, *on_way, high], slope)
+    parts = [(index + 0.5) / PATH_POINTS for index in range(PATH_POINTS)]
+    evened = [at - slope * part for at, part in zip(on_way, parts, strict=True) if at is not None]
+    over = max(0.0, max(evened, default=0.0) - low - max(step, 0.0)) if evened else 0.0
+    over *= 1.0 - smooth01((over - parameters.of_leg("probe.max_step_up", leg)) / FADE)
+    stride.lift, stride.pitch = beyond_animation(
+        parameters, rig, frame, leg, up, stride.fraction, step, over, sure * arrives
     )
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
@@ -129,7 +151,7 @@ def between(
     """Heights of the ground along the way from one foothold to the other; None without ground."""
     heights: list[float | None] = []
     for index in range(PATH_POINTS):
-        pos = stride.last + (stride.next - stride.last) * (index + 0.5) / PATH_POINTS
+        pos = stride.way((index + 0.5) / PATH_POINTS)
         hit = look(parameters, terrain, leg, pos)
         heights.append(height(frame, terrain.up, hit.point) if hit.found else None)
     return heights
@@ -197,19 +219,25 @@ def lift_over_edges(
     toe = apply(frame.world_from_model, frame.toe.pos[leg])
     ball = toe - up * parameters.of_leg("probe.ball_height", leg)
 
+    tip = ball + rotate(axes, np.array([0.0, 0.0, parameters.of_leg("probe.toe_length", leg)]))
+    ankle = apply(frame.world_from_model, frame.ankle.pos[leg])
+    turn = maths.from_axis_angle(axis_of_pitch(rig, frame, leg, up), stride.pitch)
+
     need = 0.0
     for index in range(PATH_POINTS):
-        pos = stride.last + (stride.next - stride.last) * (index + 0.5) / PATH_POINTS
+        pos = stride.way((index + 0.5) / PATH_POINTS)
         hit = look(parameters, terrain, leg, pos)
         if not hit.found:
             continue
         edge = height(frame, up, hit.point)
         beyond = edge - top - parameters.of_leg("probe.max_step_up", leg)
         counts = 1.0 - smooth01(beyond / FADE)
-        for point in (heel, ball):
-            away = length(across(point - pos, up))
+        for point in (heel, ball, tip):
+            moved = ankle + rotate(turn, point - ankle)
+            away = length(across(moved - pos, up))
             over = edge - parameters.of_leg("probe.way_slope", leg) * away - ground_under(point)
             # The clearance that the animation has over its own floor is subtracted.
             lift = height(frame, up, point) - parameters.of_leg("probe.clearance", leg)
-            need = max(need, counts * over - max(lift, 0.0))
+            added = stride.lift + float((moved - point) @ up)
+            need = max(need, counts * over - max(lift, 0.0) - added)
     return need

@@ -18,6 +18,7 @@ from reference.characters import Followed, Foot, Frame, Ground, Hold, Parameters
 from reference.maths import Array, Motion, Transform, apply, length, lerp
 from reference.stages import contact_by_speed, ground, heel, limb, stride_probe
 from reference.stages.contact_by_speed import Standing
+from reference.stages.swing import axis_of_pitch
 from reference.systems import record
 from reference.terrain import ALL_LAYERS
 
@@ -64,6 +65,17 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         "probe.way_slope": 1.5,
         "probe.heel_length": 0.07,
         "probe.ball_height": 0.055,
+        "probe.toe_length": 0.04,
+        "probe.held_lift": 0.6,
+        "probe.toe_clearance": 0.03,
+        "probe.lift_per_rise": 0.5,
+        "probe.lift_per_fall": 0.35,
+        "probe.lift_over": 1.7,
+        "probe.toes_up": 0.1,
+        "probe.toes_down": 0.3,
+        "probe.toes_down_per_height": 0.9,
+        "probe.swing_as_animated": False,
+        "probe.use_strides": True,
         "probe.stance_time": 0.65,
         "probe.swing_time": 0.45,
         "target.max_ankle_height": 0.8,
@@ -131,7 +143,8 @@ def step(
         swings.append(swing)
         followed.append(memory)
         holds.append(hold)
-        turns.append(turn)
+        pitch = maths.from_axis_angle(axis_of_pitch(rig, frame, leg, up), swing.pitch)
+        turns.append(maths.multiply(turn, pitch))
         footholds.append(foothold)
         targets.append(target + offset)
 
@@ -206,6 +219,10 @@ def sense(
     hit, swing = stride_probe.ground_of_stride(
         parameters, rig, terrain, frame, leg, contact.standing
     )
+    if hit.found:
+        lift += swing.lift
+    else:
+        swing.lift = swing.pitch = 0.0
     foot = Foot(
         hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
         ankle_ws=ankle_ws,
@@ -219,6 +236,7 @@ def sense(
         toe_hit=hit._replace(found=False),
         foothold_ws=ground.foothold(parameters, leg, hit, ankle_ws, lift, terrain.up),
         turns_in_swing=True,
+        swing_lift=swing.lift,
     )
     return foot, swing
 
@@ -236,7 +254,7 @@ def pelvis_goal(
     """Height that the body is to have, m, by the rule of that name."""
     leg_weights = ground.weights_of_legs(parameters, frame)
     requested = [
-        float((target - foot.ankle_ws) @ leg_up)
+        float((target - foot.ankle_ws) @ leg_up) - foot.swing_lift  # none rises with a swing
         for foot, target, leg_up in zip(feet, targets, ups, strict=True)
     ]
     if pelvis == "reach":

@@ -1,0 +1,279 @@
+"""How a foot swings from one foothold to the next: how high, how pitched, and over which edges."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import quat, vec
+from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
+from jaxik.maths.struct import struct
+from jaxik.stages.inputs import Inputs
+from jaxik.world.frame import FORWARD, Stride, animated_ankles
+from jaxik.world.terrain import Hit
+
+from .base import foot_heading
+from .limits import AbstractLimitedProbe, smoothstep
+
+HEIGHT_BAND = 0.01  # m
+ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
+FAR = 1e6  # m, beyond any ground
+SHARPNESS = 7.0  # of the bumps by which a swing changes; each is half as high 0.2 of it aside
+# When a swing changes most, as a fraction of it: measured on people who walk over blocks.
+HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
+TOES_UP, TOES_DOWN = 0.23, 0.75
+
+
+@struct
+class Level:
+    """The plane through the character's root, perpendicular to each leg's up."""
+
+    origin_ws: Float[Array, "3"]
+    """Metres."""
+    up_ws: Float[Array, "*legs 3"]
+
+    def height(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs"]:
+        """Height of points above the plane, m."""
+        return vec.dot(points_ws - self.origin_ws, self.up_ws)
+
+    def project(self, points_ws: Float[Array, "*b legs 3"]) -> Float[Array, "*b legs 3"]:
+        """Points projected onto the plane, m."""
+        return points_ws - vec.scale(self.up_ws, self.height(points_ws))
+
+
+@struct
+class Swing:
+    """How a foot moves beyond the animation and the ground under it."""
+
+    lift: Float[Array, " legs"]
+    """m, of the ankle."""
+    pitch: Float[Array, " legs"]
+    """rad, toes up."""
+
+
+class AbstractSwingProbe(AbstractLimitedProbe):
+    """The parameters of a swing, for probes that know from where to where it goes.
+
+    People who step up, down or over something lift a foot later than on the flat, but higher, and
+    point their toes to the ground on which they will land. How much, follows from the step's height
+    and from how far the ground on the way stands over both footholds. Each part is a bump over the
+    time of the swing, `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape
+    was read off a captured walk over blocks; where the ground is as even as in the animation
+    nothing is added.
+    """
+
+    clearance: Leaf = parameter(
+        0.0,
+        unit="m",
+        low=-0.1,
+        high=0.1,
+        doc="How much of its animated lift a foot may lose as it passes over an edge.",
+    )
+    way_slope: Leaf = parameter(
+        1.5,
+        unit="1",
+        low=0.2,
+        high=5.0,
+        scale="log",
+        doc="Slope, rise over run, at which a foot climbs to an edge and descends from it.",
+    )
+    heel_length: Leaf = parameter(
+        0.07, unit="m", low=0.0, high=0.2, doc="Distance backward from the ankle to the heel."
+    )
+    toe_length: Leaf = parameter(
+        0.04,
+        unit="m",
+        low=0.0,
+        high=0.2,
+        doc="Distance forward from the ball to the tip of the toes, which bend as they pass.",
+    )
+    ball_height: Leaf = parameter(
+        0.055,
+        unit="m",
+        follows="ball height",
+        low=0.0,
+        high=0.15,
+        doc="Height of the ball joint above the sole.",
+    )
+    held_lift: Leaf = parameter(
+        0.6,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        doc="Part of its animated lift that a foot holds back early in a step on uneven ground.",
+    )
+    toe_clearance: Leaf = parameter(
+        0.03,
+        unit="m",
+        low=0.0,
+        high=0.15,
+        doc="How much higher than animated a foot passes the middle of a step on uneven ground.",
+    )
+    lift_per_rise: Leaf = parameter(
+        0.5, unit="1", low=0.0, high=1.5, doc="Height added to a step up, per height of the step."
+    )
+    lift_per_fall: Leaf = parameter(
+        0.35,
+        unit="1",
+        low=0.0,
+        high=1.5,
+        doc="Height added to a step down, early, per height of the step.",
+    )
+    lift_over: Leaf = parameter(
+        1.7,
+        unit="1",
+        low=0.0,
+        high=3.0,
+        doc="Height added over what stands between the footholds, per height over both.",
+    )
+    toes_up: Leaf = parameter(
+        0.1,
+        unit="rad",
+        low=0.0,
+        high=0.6,
+        doc="By how much less a foot points its toes down early in a step on uneven ground.",
+    )
+    toes_down: Leaf = parameter(
+        0.3,
+        unit="rad",
+        low=0.0,
+        high=0.8,
+        doc="By how much more a foot points its toes down late in a step on uneven ground.",
+    )
+    toes_down_per_height: Leaf = parameter(
+        0.9,
+        unit="rad/m",
+        low=0.0,
+        high=3.0,
+        doc="The same per metre that the ground rises, falls, or stands in the way.",
+    )
+    swing_as_animated: Leaf = switch(
+        False, doc="Whether feet swing as animated, over uneven ground too; they still clear edges."
+    )
+    uneven_height: Leaf = constant(
+        0.05, unit="m", doc="Height of a step from which ground counts as uneven."
+    )
+
+    def swing(
+        self, inputs: Inputs, stride: Stride, step: Array, over: Array, trust: Array
+    ) -> Swing:
+        """How much higher and more pitched than animated the feet are.
+
+        Args:
+            inputs: the frame.
+            stride: where the feet are in it.
+            step: by how much the next foothold is higher than the last, m, without the slope.
+            over: how far the ground on the way is over both, m.
+            trust: 0..1, how far the next foothold is accepted.
+        """
+        x = stride.fraction
+        rise, fall = jnp.where(step > 0, step, 0.0), jnp.where(step < 0, -step, 0.0)
+        total = rise + fall + over
+        uneven = smoothstep(total / self.uneven_height)
+        lift = uneven * (
+            self.toe_clearance * bump(x, CLEAR)
+            - self.held_lift * self._animated_lift(inputs) * bump(x, HELD)
+        )
+        lift += self.lift_per_rise * rise * bump(x, RISE)
+        lift += self.lift_per_fall * fall * bump(x, FALL)
+        lift += self.lift_over * over * bump(x, OVER)
+        down = uneven * self.toes_down + self.toes_down_per_height * total
+        share = jnp.where(self.swing_as_animated, 0.0, trust)
+        pitch = share * (uneven * self.toes_up * bump(x, TOES_UP) - down * bump(x, TOES_DOWN))
+        arm = animated_ankles(inputs.frame).pos - _balls(inputs)
+        up = inputs.terrain.leg_up_ws
+        turned = quat.rotate(pitch_rotation(inputs, pitch), arm)
+        return Swing(share * lift + vec.dot(turned - arm, up), pitch)
+
+    def _animated_lift(self, inputs: Inputs) -> Float[Array, " legs"]:
+        """m, of the balls over a flat foot's."""
+        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
+        lift = level.height(_balls(inputs)) - self.ball_height
+        return jnp.where(lift > 0, lift, 0.0)
+
+    def over_footholds(
+        self, inputs: Inputs, heights: Array, found: Array, top: Array
+    ) -> Float[Array, " legs"]:
+        """How far the highest ground on the way is over both footholds, m.
+
+        Args:
+            inputs: the frame.
+            heights: of the ground along the way (points legs), m.
+            found: of that ground.
+            top: height of the higher foothold, m.
+        """
+        gate = inputs.gate
+        over = jnp.where(found > 0, heights - top, -FAR)
+        highest = gate.maximum(jnp.moveaxis(over, 0, -1), band=HEIGHT_BAND)
+        zero = jnp.zeros_like(highest)
+        highest = gate.clip(highest, zero, zero + jnp.inf, band=HEIGHT_BAND)
+        return highest * (1.0 - smoothstep((highest - self.max_step_up) / self.step_fade))
+
+    def soles(self, inputs: Inputs, foot_height: Array) -> Array:
+        """Animated heels, balls and toes' tips at sole height, (3 legs 3), m, world space."""
+        ankle = animated_ankles(inputs.frame)
+        foot = quat.multiply(ankle.rot, inputs.rig.ankle_from_foot)
+        heel_ls = vec.stack(jnp.zeros_like(self.heel_length), -foot_height, -self.heel_length)
+        heel = ankle.pos + quat.rotate(foot, heel_ls)
+        ball = _balls(inputs) - vec.scale(inputs.terrain.leg_up_ws, self.ball_height)
+        ahead = quat.rotate(foot, vec.constant(FORWARD, ball))
+        return jnp.stack([heel, ball, ball + vec.scale(ahead, self.toe_length)])
+
+    def clearance_over_edges(
+        self,
+        inputs: Inputs,
+        stride: Stride,
+        swing: Swing,
+        soles: Array,
+        under_soles: Array,
+        top: Array,
+        hit: Hit,
+    ) -> Float[Array, " legs"]:
+        """How much higher each foot goes to clear what lies between its footholds, m.
+
+        `under_soles` is the height of the ground that each sole was lifted from, m; `hit` is the
+        ground between the footholds (points legs).
+        """
+        gate = inputs.gate
+        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
+        ground = level.height(hit.point)
+        fade = 1.0 - smoothstep((ground - top - self.max_step_up) / self.step_fade)
+        # A sole that the animation sinks into its own floor needs no correction.
+        lift = level.height(soles) - self.clearance
+        lift = gate.clip(lift, jnp.zeros_like(lift), jnp.full_like(lift, jnp.inf), band=HEIGHT_BAND)
+        ankle = animated_ankles(inputs.frame).pos
+        pitched = ankle + quat.rotate(pitch_rotation(inputs, swing.pitch), soles - ankle)
+        lift += swing.lift + level.height(pitched) - level.height(soles)
+        away = vec.length(vec.reject(hit.point[:, None] - pitched, level.up_ws))
+        excess = fade[:, None] * (ground[:, None] - self.way_slope * away - under_soles)
+        rise = excess - lift  # (points 3 legs)
+        rise = jnp.where(hit.found[:, None] > 0, rise, -FAR)
+        most = gate.maximum(jnp.moveaxis(rise.reshape(-1, *top.shape), 0, -1), band=HEIGHT_BAND)
+        zero = jnp.zeros_like(most)
+        most = gate.clip(most, zero, zero + jnp.inf, band=HEIGHT_BAND)
+        fade_in = smoothstep(stride.fraction / ENDS)
+        return most * fade_in * smoothstep((1.0 - stride.fraction) / ENDS)
+
+
+def s_curve(fraction: Array, steepness: Array) -> Array:
+    """Curve from 0 to 1 with slope `steepness` in the middle: `1 / (1 + (1/x - 1)^k)`."""
+    inside = (fraction > 0) & (fraction < 1)
+    x = jnp.where(inside, fraction, 0.5)
+    odds = jnp.exp(steepness * (jnp.log1p(-x) - jnp.log(x)))
+    return jnp.where(inside, 1.0 / (1.0 + odds), jnp.where(fraction < 0.5, 0.0, 1.0))
+
+
+def bump(fraction: Array, peak: float) -> Array:
+    """A bump over 0..1 whose top, 1, is at `peak`, and which leaves both ends without a kink."""
+    inside = (fraction > 0) & (fraction < 1)
+    x = jnp.where(inside, fraction, 0.5)
+    log = peak * jnp.log(x / peak) + (1.0 - peak) * jnp.log((1.0 - x) / (1.0 - peak))
+    return jnp.where(inside, jnp.exp(SHARPNESS * log), 0.0)
+
+
+def pitch_rotation(inputs: Inputs, pitch: Array) -> Float[Array, "legs 4"]:
+    """The rotation that lifts the toes of each foot by an angle, rad, world space."""
+    return quat.from_axis_angle(foot_heading(inputs, inputs.terrain.leg_up_ws)[1], pitch)
+
+
+def _balls(inputs: Inputs) -> Array:
+    """The animated balls (legs), m, world space."""
+    return inputs.frame.world_from_model.apply(inputs.frame.pose.toe.pos)
