@@ -18,6 +18,8 @@ import jax
 from fitting.runtime import cache_folder, xla
 from fitting.runtime.precision import in_float64
 
+from .freed_memory import keep_freed_memory
+
 if TYPE_CHECKING:
     from distributed import Client, Future
 
@@ -158,6 +160,7 @@ def _prepare() -> None:
     """Has a worker compute as this process does; nothing of JAX has run there before."""
     xla.configure_xla()
     cache_folder.use_default()
+    keep_freed_memory()
 
 
 @functools.lru_cache(maxsize=1)
