@@ -28,6 +28,7 @@ def fail(number: int) -> None:
 def test_other_processes_compute_with_the_same_floats_and_settings():
     with cluster.connect(workers=1) as client:
         assert client is not None
+        assert cluster.hosts(client) == ["127.0.0.1"]
         function = functools.partial(describe, jnp.asarray([1.0, 1e-12]))
         computed = dict(cluster.compute(client, function, [1.0, 2.0]))
         results = [computed[index].result() for index in range(2)]

@@ -88,6 +88,12 @@ def has_dashboard() -> bool:
     return importlib.util.find_spec("bokeh") is not None
 
 
+def hosts(client: "Client") -> list[str]:
+    """The machine of each worker."""
+    workers: Any = client.scheduler_info(n_workers=-1)["workers"]
+    return [worker["host"] for worker in workers.values()]
+
+
 def compute(
     client: "Client", function: Callable[[Argument], Any], arguments: Sequence[Argument]
 ) -> "Iterator[tuple[int, Future]]":
