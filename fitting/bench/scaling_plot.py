@@ -29,7 +29,7 @@ def curves(series: Sequence[Series], title: str) -> Figure:
     for axes, one_size in zip(grid, series, strict=False):
         sizes = one_size.sizes
         for colour, (name, seconds) in zip(STAGES, one_size.seconds.items(), strict=False):
-            label = f"{name}, slope {one_size.slope(name):.2f}"
+            label = f"{name}, slope {one_size.slope(name):.2f}" if len(sizes) > 1 else name
             axes.loglog(sizes, seconds, "o-", color=colour, markersize=4, label=label)
         axes.set(xlabel=one_size.size, ylabel="time, s")
         if max(sizes) < FEW_DECADES * min(sizes):  # too few powers of ten for readable ticks

@@ -1,6 +1,7 @@
 """Every benchmark of `jaxik bench` runs at small sizes and measures what it says."""
 
 import dataclasses
+import subprocess
 from pathlib import Path
 
 import jax
@@ -17,6 +18,7 @@ from fitting.bench.benchmarks import (
     crowd,
     inference,
     kernels,
+    many,
     scaling,
 )
 from fitting.bench.measurement import Figure, Measurement
@@ -253,3 +255,53 @@ def test_an_interrupted_fit_adds_no_figure(small_problem, monkeypatch):
     monkeypatch.setattr(inference, "find_best_fit", interrupted)
     measured = run_suite("fit")
     assert measured.interrupted and measured.measurements[-1].figures == []
+
+
+def point(seconds: float) -> dict[str, float]:
+    return {"seconds": seconds, "cpu_seconds": 2.0 * seconds, "peak_mb": 300.0}
+
+
+def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch):
+    calls = []
+
+    def measured(what: str, count: int) -> dict[str, float]:
+        calls.append((what, count))
+        if (what, count) == ("clips", 20):
+            raise subprocess.CalledProcessError(1, "many", stderr="Trace\nMemoryError: full")
+        return point(count)
+
+    monkeypatch.setattr(many, "_measured", measured)
+    monkeypatch.setattr(many, "usable_cores", lambda: 2)
+    sizes = dataclasses.replace(SMALL, devices=(1, 4, 5, 8), clips=(10, 20, 30), workers=(1, 2))
+    measurement = Measurement("many", "", 1)
+    many.many(measurement, sizes)
+    assert calls == [("devices", 1), ("devices", 4), ("clips", 10), ("clips", 20)] + [
+        ("workers", 1), ("workers", 2)
+    ]  # fmt: skip
+    assert measurement.notes[:2] == [
+        "left out: 5, 8 devices, as two share each core already",
+        "left out: 30 clips, as 20 failed",
+    ]
+    assert measurement.failures == ["20 clips: MemoryError: full"]
+    assert [series.sizes for series in measurement.series] == [[1, 4], [10], [1, 2]]
+    assert figures(measurement)["8 fits, 2 workers: CPU time"].value == 4.0
+
+    monkeypatch.setattr(many, "LONGEST", -1.0)
+    many.many(slow := Measurement("many", "", 1), sizes)
+    assert [series.sizes for series in slow.series] == [[1], [10], [1]]
+    assert slow.notes[0] == "left out: 4, 5, 8 devices, as 1 took 0 s"
+
+
+def test_many_keeps_what_was_measured_before_an_interrupt(monkeypatch, tmp_path):
+    def measured(what: str, count: int) -> dict[str, float]:
+        if what == "clips":
+            raise KeyboardInterrupt
+        return point(count)
+
+    monkeypatch.setattr(many, "_measured", measured)
+    monkeypatch.setattr(many, "usable_cores", lambda: 2)
+    timings = run_suite("many", dataclasses.replace(SMALL, devices=(1, 2)))
+    assert timings.interrupted
+    numbers, curves = tmp_path / "bench.json", tmp_path / "bench.png"
+    assert report.write(timings, numbers, curves) == [numbers, curves]
+    assert "4096 systems, 2 devices: peak of memory" in numbers.read_text()

@@ -3,12 +3,15 @@
 import builtins
 import functools
 import os
+import platform
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from fitting.runtime.parallel import cluster
+from fitting.runtime.parallel import cluster, effort
 from fitting.runtime.precision import in_float64
 
 
@@ -25,6 +28,7 @@ def fail(number: int) -> None:
 def test_other_processes_compute_with_the_same_floats_and_settings():
     with cluster.connect(workers=1) as client:
         assert client is not None
+        assert cluster.hosts(client) == ["127.0.0.1"]
         function = functools.partial(describe, jnp.asarray([1.0, 1e-12]))
         computed = dict(cluster.compute(client, function, [1.0, 2.0]))
         results = [computed[index].result() for index in range(2)]
@@ -70,3 +74,41 @@ def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without_dask)
     with pytest.raises(ValueError, match=r"pip install 'jaxik\[dask\]'"), cluster.connect(2):
         pass
+
+
+def test_the_peak_of_a_process_does_not_begin_with_that_of_its_parent():
+    # Of resident memory: what the parent has touched counts.
+    taken = b"1" * 600_000_000
+    words = "from fitting.runtime.parallel.effort import peak_mb; print(peak_mb())"
+    child = subprocess.run(
+        [sys.executable, "-c", words], capture_output=True, text=True, check=True
+    )
+    own = effort.peak_mb()
+    assert own is not None and own > len(taken) / 1e6
+    assert 1.0 < float(child.stdout) < 300.0
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc only")
+def test_a_worker_keeps_the_memory_that_it_has_freed():
+    faults = (
+        "import resource, numpy as np\n"
+        "from fitting.runtime.parallel.freed_memory import keep_freed_memory\n"
+        "def faults():\n"
+        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "    for _ in range(8):\n"
+        "        np.empty(4_000_000, np.uint8).fill(1)\n"
+        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
+        "faults()\n"
+        "first = faults()\n"
+        "assert keep_freed_memory()\n"
+        "faults()\n"
+        "print(first, faults())\n"
+    )
+
+    environment = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536", "NUMPY_MADVISE_HUGEPAGE": "0"}
+    printed = subprocess.run(
+        [sys.executable, "-c", faults],
+        env=environment, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    as_started, changed = map(int, printed.split())
+    assert as_started > 10 * max(changed, 1)

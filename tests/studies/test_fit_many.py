@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -285,3 +286,60 @@ def test_killed_workers_and_a_killed_client_lose_only_what_was_being_made(tmp_pa
     assert f"3 seeds for each clip; {len(before)} are there already" in output
     costs = [json.loads(path.read_text())["outcome"]["cost"] for path in sorted(whole())]
     assert all(cost > 0 for cost in costs)
+
+
+class Terminal:
+    """The command with two workers in a terminal of its own."""
+
+    SPAWN = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))"
+
+    def __init__(self, experiment: Path, out: Path) -> None:
+        words = ["fit-many", str(experiment), "-o", str(out), "--workers", "2", "--no-reports"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", self.SPAWN, sys.executable, "-m", "fitting.cli.main", *words],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=ROOT,
+        )  # fmt: skip
+        self._parts: list[bytes] = []
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        while part := os.read(self.process.stdout.fileno(), 65536):
+            self._parts.append(part)
+
+    def press_ctrl_c(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(b"\x03")  # the terminal sends it to the command and its workers
+        self.process.stdin.flush()
+
+    def end(self, seconds: float) -> str:
+        """What the terminal got, of a command that ends by itself."""
+        try:
+            self.process.wait(seconds)
+        finally:
+            self.process.kill()  # and so its terminal is gone, which ends the command
+            self._reader.join(60.0)
+        return b"".join(self._parts).decode()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
+def test_one_ctrl_c_in_a_terminal_ends_it_and_the_same_command_goes_on(tmp_path):
+    experiment, out = write(tmp_path, "walks.toml", clips=TWO, rest=FEW), tmp_path / "out"
+    _, second = plan([load_experiment(experiment)])
+    with claimed((out / second.run).with_suffix(".lock")):  # so that it cannot end meanwhile
+        terminal = Terminal(experiment, out)
+        try:
+            wait_for(lambda: len(list(out.glob(f"runs/**/{rows.ROW}"))) == 1, terminal.process)
+            terminal.press_ctrl_c()
+        finally:
+            shown = terminal.end(120.0)
+    assert terminal.process.returncode == main.INTERRUPTED
+    assert "Finished: 1 of 2 fits" in shown and "Traceback" not in shown
+    assert "the same command makes the fit that is missing" in shown
+    (first,) = read(out / table.CSV)
+    kept = (out / first["run"] / rows.ROW).read_bytes()
+    shown = (again := Terminal(experiment, out)).end(500.0)
+    assert again.process.returncode in (0, 3) and "1 are there already" in shown
+    assert (out / first["run"] / rows.ROW).read_bytes() == kept and len(read(out / table.CSV)) == 2

@@ -6,6 +6,7 @@ of this machine, or simulated ones, which share its cores: they show what sharin
 """
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -20,11 +21,15 @@ from fitting.bench import workloads
 from fitting.bench.measurement import Figure, Measurement, Series
 from fitting.bench.sizes import Sizes
 from fitting.runtime.parallel.effort import Stopwatch, peak_mb
+from fitting.runtime.threads import usable_cores
 
 FRAMES = 60
 LENGTHS = 33, 50  # frames of the shortest and of the longest of many clips
-SYSTEMS = 512  # shared out among devices
+SYSTEMS = 4096  # shared out among devices
 FITS = 8  # shared out among workers
+LONGEST = (
+    300.0  # s of a point, compiling included, after which larger ones of its curve are left out
+)
 SIMULATED = "--xla_force_host_platform_device_count={}"
 EXPERIMENT = """
 preset = "record"
@@ -43,9 +48,10 @@ starts = 1
 
 def many(measurement: Measurement, sizes: Sizes) -> None:
     """Time and peak of memory against devices, clips and workers."""
-    _vary(measurement, "devices", sizes.devices, f"{SYSTEMS} systems")
+    sharing = 2 * usable_cores()
+    _vary(measurement, "devices", sizes.devices, f"{SYSTEMS} systems", sharing)
     _vary(measurement, "clips", sizes.clips, "a system")
-    _vary(measurement, "workers", sizes.workers, f"{FITS} fits")
+    _vary(measurement, "workers", sizes.workers, f"{FITS} fits", sharing)
     measurement.notes.append(
         "devices are simulated where there is one: they share its cores, so that time should stay; "
         "seconds are those after compiling, of workers those of all, starting them included; the "
@@ -53,24 +59,59 @@ def many(measurement: Measurement, sizes: Sizes) -> None:
     )
 
 
-def _vary(measurement: Measurement, what: str, counts: Sequence[int], curve: str) -> None:
-    """Adds a series with the memory peak of each point."""
+def _vary(
+    measurement: Measurement, what: str, counts: Sequence[int], curve: str, most: float = math.inf
+) -> None:
+    """Adds a series with the memory peak of each point.
+
+    What is left out, and why, is a note: more than `most`, which would share the same cores, and
+    whatever is larger than a point that took long or failed.
+    """
     series = Series(what, [], {})
     measurement.series.append(series)
-    for count in counts:
-        measurement.progress(f"many: {count} {what}")
-        environment = os.environ | ({"XLA_FLAGS": _flags(count)} if what == "devices" else {})
-        finished = subprocess.run(
-            [sys.executable, "-m", "fitting.bench.benchmarks.many", what, str(count)],
-            env=environment, check=True, capture_output=True, text=True,
-        )  # fmt: skip
-        point: Mapping[str, float] = json.loads(finished.stdout.splitlines()[-1])
+    result = ""
+    for index, count in enumerate(counts):
+        if count > most:
+            _leave_out(measurement, what, counts[index:], "two share each core already")
+            return
+        measurement.progress(f"many: {count} {what}, {index + 1} of {len(counts)}{result}")
+        began = time.monotonic()
+        try:
+            point = _measured(what, count)
+        except subprocess.CalledProcessError as error:
+            last = (error.stderr or "").strip().rpartition("\n")[2]
+            measurement.failures.append(f"{count} {what}: {last or error}")
+            _leave_out(measurement, what, counts[index + 1 :], f"{count} failed")
+            return
         series.sizes.append(count)
-        series.seconds.setdefault(curve, []).append(point["seconds"])
         label = f"{curve}, {count} {what}"
-        note = f"CPU time {point['cpu_seconds']:.2f} s"
-        measurement.add(Figure(label, point["seconds"], "s", note=note))
+        for name, key in (("", "seconds"), (": CPU time", "cpu_seconds")):
+            series.seconds.setdefault(f"{curve}{name}", []).append(point[key])
+            measurement.add(Figure(f"{label}{name}", point[key], "s"))
         measurement.add(Figure(f"{label}: peak of memory", point["peak_mb"], "MB"))
+        result = f"; {count}: {point['seconds']:.2g} s"
+        if (took := time.monotonic() - began) > LONGEST:
+            _leave_out(measurement, what, counts[index + 1 :], f"{count} took {took:.0f} s")
+            return
+
+
+def _leave_out(measurement: Measurement, what: str, counts: Sequence[int], why: str) -> None:
+    if counts:
+        measurement.notes.append(f"left out: {', '.join(map(str, counts))} {what}, as {why}")
+
+
+def _measured(what: str, count: int) -> Mapping[str, float]:
+    """The numbers of a point, of a process of its own.
+
+    Raises:
+        subprocess.CalledProcessError: it has failed.
+    """
+    environment = os.environ | ({"XLA_FLAGS": _flags(count)} if what == "devices" else {})
+    finished = subprocess.run(
+        [sys.executable, "-m", "fitting.bench.benchmarks.many", what, str(count)],
+        env=environment, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return json.loads(finished.stdout.splitlines()[-1])
 
 
 def _flags(devices: int) -> str:

@@ -122,6 +122,8 @@ def _connected(
     with cluster.connect(workers, scheduler if missing else None, dashboard=True) as client:
         if client is not None:
             _log_dashboard(client, log)
+            if scheduler is not None:
+                log(_workers_line(cluster.hosts(client), scheduler))
         yield client
 
 
@@ -151,6 +153,17 @@ def _log_dashboard(client: "Client", log: Log) -> None:
         log(f"Dask's dashboard: {client.dashboard_link}")
     else:
         log("no dashboard, as bokeh is not installed: pip install 'jaxik[dask]'")
+
+
+def _workers_line(hosts: Sequence[str], scheduler: str) -> str:
+    """Who will compute on a running cluster: a host for each worker."""
+    if not hosts:
+        return f"no worker has joined yet; fits begin once one has: dask worker {scheduler}"
+    machines = len(set(hosts))
+    return (
+        f"{len(hosts)} worker{'s' * (len(hosts) != 1)} on {machines} "
+        f"machine{'s' * (machines != 1)}; more may join at any time"
+    )
 
 
 def _computed(

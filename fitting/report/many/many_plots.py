@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from fitting.report.plots.style import AFTER, BEFORE, CAPTURED, styled
 from fitting.studies.many.progress import ManyFits
@@ -12,6 +13,7 @@ from fitting.studies.many.rows import FittedValue, Row
 
 COLUMNS = 4
 SHOWN = 15  # parameters
+SHORTEST = 1e-3  # s, of a fit as the histogram shows it
 SINGLE = 150  # fits, up to which each has its interval
 
 
@@ -55,11 +57,12 @@ def _values(axes: Axes, values: Sequence[FittedValue]) -> None:
         axes.hist(known, 40, color=AFTER, label="determined")
         axes.set(xlabel=unit, ylabel="fits")
         return
-    for number, fitted in enumerate(values):
+    for number, fitted in enumerate(values, 1):
         colour = AFTER if fitted["determined"] else BEFORE
         axes.plot([number, number], fitted["interval"], color=colour, linewidth=1.2)
         axes.plot(number, fitted["value"], ".", color=colour)
-    axes.set(xlabel="fit", ylabel=unit)
+    axes.set(xlabel="fit", ylabel=unit, xlim=(0.5, len(values) + 0.5))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
@@ -70,9 +73,12 @@ def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
         if "effort" in row and "outcome" in row
     ]
     whole, search = np.array(pairs).T
-    bins = np.linspace(0.0, max(whole.max(), search.max()), 30).tolist()
+    # Logarithmic, for first fits compile and take a hundred times as long as those that follow.
+    ends = min(whole.min(), search.min()), max(whole.max(), search.max())
+    bins = np.geomspace(max(ends[0], SHORTEST) / 1.1, max(ends[1], SHORTEST) * 1.1, 30).tolist()
     axes.hist(whole, bins, color=AFTER, alpha=0.8, label="fit")
     axes.hist(search, bins, color=CAPTURED, alpha=0.6, label="its search")
-    axes.set(xlabel="time, s", ylabel="fits")
+    axes.set(xlabel="time, s", ylabel="fits", xscale="log")
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_title("time of a fit", fontsize=12)
     axes.legend()

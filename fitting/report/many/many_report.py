@@ -61,15 +61,18 @@ def remarks(fits: ManyFits) -> list[str]:
     count, lines = len(fits.finished), []
     lines.append(f"Finished: {count} of {fits.total} fits.")
     if fits.interrupted:
-        lines.append("Interrupted: the same command goes on.")
+        missing = fits.total - len(fits.rows)
+        rest = "fit that is missing" if missing == 1 else f"{missing} fits that are missing"
+        lines.append(f"Interrupted: the same command makes the {rest}.")
     if fits.failed:
         lines.append(f"**Failed**: {len(fits.failed)}; the same command tries them again.")
     if fits.unconverged:
         lines.append(f"**Not converged**: {len(fits.unconverged)}.")
-    if misfits := sum(not row["outcome"]["fits"] for row in fits.finished if "outcome" in row):
+    if bad := misfits(fits):
+        does = "does" if bad == 1 else "do"
         lines.append(
-            f"Converged or not, {misfits} of them do{'es' * (misfits == 1)} not fit: what is left "
-            "over is no noise of the given sigmas."
+            f"{bad} of {count} finished fits {does} not match the motion to within the given "
+            "sigmas, whether converged or not."
         )
     if made := [row["effort"] for row in fits.finished if "effort" in row]:
         seconds = statistics.median(effort["seconds"] for effort in made)
@@ -78,6 +81,11 @@ def remarks(fits: ManyFits) -> list[str]:
         memory = f", and at most {max(peaks):.0f} MB in a process" if peaks else ""
         lines.append(f"A fit took {seconds:.1f} s, {cpu:.1f} s of CPU time (medians){memory}.")
     return lines
+
+
+def misfits(fits: ManyFits) -> int:
+    """How many finished fits leave more of the motion over than noise of the given sigmas."""
+    return sum(not row["outcome"]["fits"] for row in fits.finished if "outcome" in row)
 
 
 def parameter_table(fits: ManyFits) -> Table:

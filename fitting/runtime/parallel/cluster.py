@@ -18,6 +18,8 @@ import jax
 from fitting.runtime import cache_folder, xla
 from fitting.runtime.precision import in_float64
 
+from .freed_memory import keep_freed_memory
+
 if TYPE_CHECKING:
     from distributed import Client, Future
 
@@ -84,6 +86,12 @@ def connect(
 def has_dashboard() -> bool:
     """Whether what Dask draws its page with is installed."""
     return importlib.util.find_spec("bokeh") is not None
+
+
+def hosts(client: "Client") -> list[str]:
+    """The machine of each worker."""
+    workers: Any = client.scheduler_info(n_workers=-1)["workers"]
+    return [worker["host"] for worker in workers.values()]
 
 
 def compute(
@@ -158,6 +166,7 @@ def _prepare() -> None:
     """Has a worker compute as this process does; nothing of JAX has run there before."""
     xla.configure_xla()
     cache_folder.use_default()
+    keep_freed_memory()
 
 
 @functools.lru_cache(maxsize=1)

@@ -4,20 +4,22 @@ import statistics
 from collections.abc import Sequence
 
 from fitting.experiments.experiment import Experiment
-from fitting.report.formatting import percent
 from fitting.report.many import many_report
 from fitting.report.page import asked, pictures
 from fitting.report.page.sentences import listed
 from fitting.report.page.study_page import Block, Finding, Grid, Points, Section, StudyPage, Text
 from fitting.studies.many.progress import ManyFits
 
-TABLES = {"fits.csv": "the table", "fits.parquet": "it with types"}
+TABLES = {"fits.csv": "a row for each fit", "fits.parquet": "the same for pandas and the like"}
 
 
 def write(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[str]) -> None:
     """Writes the page into the folder of the fits, whose picture is there."""
-    good = not (fits.failed or fits.unconverged or fits.interrupted)
-    caption = f"{fits.total} fits: fitted values with their 95 % intervals, and times"
+    good = not (fits.failed or fits.unconverged or fits.interrupted or many_report.misfits(fits))
+    caption = (
+        "Fitted values with their 95 % intervals, blue where the clip determines the parameter and "
+        "grey where it does not; and how long fits took, on a logarithmic axis"
+    )
     sections = []
     if fits.finished:
         blocks: list[Block] = [
@@ -40,7 +42,7 @@ def write(fits: ManyFits, experiments: Sequence[Experiment], tables: Sequence[st
         findings=findings(fits),
         sections=sections,
         asked=[
-            [experiment.name, f"{asked.system(experiment)}; {len(experiment.clips)} clips"]
+            [experiment.name, f"{asked.system(experiment)}; {_clips(experiment)}"]
             for experiment in experiments[: many_report.MANY]
         ],
         files={many_report.SUMMARY: "the tables"} | {name: TABLES[name] for name in tables},
@@ -52,12 +54,20 @@ def findings(fits: ManyFits) -> list[Finding]:
     return [_completeness(fits), _convergence(fits), _effort(fits)]
 
 
+def _clips(experiment: Experiment) -> str:
+    count = len(experiment.clips)
+    return f"{count} clip{'s' * (count != 1)}"
+
+
 def _verdict(fits: ManyFits) -> str:
     if fits.failed:
         return f"{len(fits.failed)} failed"
     if len(fits.finished) < fits.total:
         return f"{fits.total - len(fits.finished)} are missing"
-    return f"{len(fits.unconverged)} not converged" if fits.unconverged else "All converged"
+    if fits.unconverged:
+        return f"{len(fits.unconverged)} not converged"
+    bad = many_report.misfits(fits)
+    return f"All converged, {bad} do{'es' * (bad == 1)} not match" if bad else "All converged"
 
 
 def _completeness(fits: ManyFits) -> Finding:
@@ -74,12 +84,12 @@ def _convergence(fits: ManyFits) -> Finding:
     outcomes = [row["outcome"] for row in fits.finished if "outcome" in row]
     if not outcomes:
         return Finding("No fit is finished, so nothing was found.", bad=True)
-    fitting = sum(outcome["fits"] for outcome in outcomes)
-    text = f"{percent(fitting / len(outcomes), 0)} of the finished ones fit"
+    bad = many_report.misfits(fits)
+    text = f"{len(outcomes) - bad} of {len(outcomes)} match the motion to within the given sigmas"
     if fits.unconverged:
         runs = listed([row["run"] for row in fits.unconverged])
         return Finding(f"{len(fits.unconverged)} did not converge ({runs}); {text}.", bad=True)
-    return Finding(f"All finished searches converged; {text}.")
+    return Finding(f"All finished searches converged; {text}.", bad=bad > 0)
 
 
 def _effort(fits: ManyFits) -> Finding:
@@ -87,10 +97,11 @@ def _effort(fits: ManyFits) -> Finding:
     if not efforts:
         return Finding("Nothing is known of what a fit takes.")
     seconds = statistics.median(effort["seconds"] for effort in efforts)
-    hours = sum(effort["cpu_seconds"] for effort in efforts) / 3600
+    minutes = sum(effort["cpu_seconds"] for effort in efforts) / 60
+    cpu = f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
     hosts = len({effort["host"] for effort in efforts})
     return Finding(
-        f"A fit took {seconds:.1f} s (median), all together {hours:.2g} h of CPU time on {hosts} "
+        f"A fit took {seconds:.1f} s (median), all together {cpu} of CPU time on {hosts} "
         f"machine{'s' * (hosts != 1)}."
     )
 
