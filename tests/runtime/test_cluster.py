@@ -92,7 +92,7 @@ def test_the_peak_of_a_process_does_not_begin_with_that_of_its_parent():
 def test_a_worker_keeps_the_memory_that_it_has_freed():
     faults = (
         "import resource, numpy as np\n"
-        "from fitting.runtime.parallel.freed_memory import keep_freed_memory\n"
+        "from fitting.runtime.parallel import cluster\n"
         "def faults():\n"
         "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
         "    for _ in range(8):\n"
@@ -100,7 +100,7 @@ def test_a_worker_keeps_the_memory_that_it_has_freed():
         "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
         "faults()\n"
         "first = faults()\n"
-        "assert keep_freed_memory()\n"
+        "cluster._prepare()\n"
         "faults()\n"
         "print(first, faults())\n"
     )

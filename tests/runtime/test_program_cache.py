@@ -334,5 +334,5 @@ def test_work_says_what_is_compiled_for_it_and_for_how_long():
             assert work.compiling == ""
     assert said == ["compiling long sum (0 s)"] * 2
     with pytest.raises(TypeError), activity.announced("Failing") as work:
-        _long_sum("no numbers")
+        _long_sum("no numbers")  # type: ignore[arg-type]
     assert work.compiling == ""

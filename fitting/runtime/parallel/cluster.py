@@ -8,8 +8,10 @@ import functools
 import importlib.util
 import logging
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,8 +19,6 @@ import jax
 
 from fitting.runtime import cache_folder, xla
 from fitting.runtime.precision import in_float64
-
-from .freed_memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -32,6 +32,9 @@ MAX_MAPPINGS = 20_000
 MAPPINGS = Path("/proc/self/maps")
 # Dask would look at every stack a hundred times a second: 7 % of a fit's CPU time.
 UNPROFILED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
+# With this variable, Dask has its workers give freed memory back at once. Each larger array is then
+# mapped, filled with zeros and unmapped again, which takes a fifth of a short fit's CPU time.
+TRIMMED = "MALLOC_TRIM_THRESHOLD_"
 Argument = TypeVar("Argument")
 
 
@@ -72,7 +75,9 @@ def connect(
             "silence_logs": logging.ERROR,  # a worker that dies is told by the job
             "env": _environment(),
         }
-        with LocalCluster(n_workers=workers, **options) as local, Client(local) as client:
+        with _workers_without_interrupts():
+            local = LocalCluster(n_workers=workers, **options)
+        with local, Client(local) as client:
             yield client
         return
     try:
@@ -81,6 +86,24 @@ def connect(
         raise ValueError(f"no Dask scheduler answers at {scheduler!r}: {error}") from None
     with client:
         yield client
+
+
+@contextmanager
+def _workers_without_interrupts() -> Iterator[None]:
+    """Has processes that are started now, and by threads that are, leave Ctrl-C to this one.
+
+    A terminal sends it to all of them, and workers would print where it met them. What this process
+    gets meanwhile, it gets at the end.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which would let interrupts through when it is started
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def has_dashboard() -> bool:
@@ -164,9 +187,9 @@ def _call(function: bytes, argument: Any) -> Any:
 @functools.cache
 def _prepare() -> None:
     """Has a worker compute as this process does; nothing of JAX has run there before."""
+    os.environ.pop(TRIMMED, None)
     xla.configure_xla()
     cache_folder.use_default()
-    keep_freed_memory()
 
 
 @functools.lru_cache(maxsize=1)
