@@ -320,6 +320,9 @@ class Terminal:
         finally:
             self.process.kill()  # and so its terminal is gone, which ends the command
             self._reader.join(60.0)
+            for pipe in (self.process.stdin, self.process.stdout):
+                assert pipe is not None
+                pipe.close()
         return b"".join(self._parts).decode()
 
 
