@@ -77,9 +77,7 @@ def _frame_costs_of_clip(
     frames, costs = len(playback.dt), {}
     fraction, tails = float(problem.independent_fraction), float(problem.tails)
     for kind, residuals in playback.residuals.items():
-        squares = rho(
-            np.asarray(residuals).reshape(len(residuals), -1) ** 2, problem.loss, tails, np
-        )
+        squares = np.asarray(residuals).reshape(len(residuals), -1) ** 2
         of_loss = rho(squares, problem.loss, tails, np)
         missing = frames - len(residuals)  # an acceleration has no first and no last frame
         sides = missing // 2, missing - missing // 2
