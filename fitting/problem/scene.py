@@ -34,7 +34,7 @@ class Sigmas(eqx.Module):
     """AR(1) coefficient between frames, 0 if they are independent: one for all kinds, or one for
     each of `WHITENED`."""
 
-    def correlation_of(self, kind: str) -> Float[Array, ""]:
+    def correlation_of(self, kind: str) -> Float[Array, "*frames"]:
         """The correlation of the residuals of a kind."""
         frames = self.correlation.shape[:-1]  # one where clips run in a row
         each = jnp.broadcast_to(self.correlation, (*frames, len(WHITENED)))
