@@ -68,7 +68,7 @@ def killed(experiment_file, tmp_path, monkeypatch) -> Path:
 
 
 def test_a_killed_fit_goes_on_to_the_fit_of_an_unbroken_one(killed, experiment_file, monkeypatch):
-    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_: None)
+    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_, **__: None)
     lines: list[str] = []
     fitting.fit(experiment_file, killed, log=lines.append)
     assert "a fit that was interrupted here goes on after 14 stages of its search" in lines
@@ -91,7 +91,7 @@ def test_a_fit_that_was_killed_in_its_profiles_goes_on_after_their_last_stage(
     whole = fitting.fit(experiment_file)
     lines: list[str] = []
     monkeypatch.setattr(profiling, "STAGES", [stop] * 4 + stages[4:])
-    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_: None)
+    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_, **__: None)
     again = fitting.fit(experiment_file, killed, log=lines.append)
     (line,) = [line for line in lines if "goes on after" in line]
     assert line.endswith(" stages of its search and 4 of its profiles")
@@ -119,7 +119,7 @@ def test_an_interrupted_fit_goes_on(experiment_file, tmp_path, monkeypatch):
         if len(reports) == 40:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_: None)
+    monkeypatch.setattr(fits.fit_report, "write_fit", lambda *_, **__: None)
     first = fitting.fit(experiment_file, run, progress=interrupt)
     assert first.solution.interrupted and (run / run_folder.SEARCH).is_file()
     second, whole = fitting.fit(experiment_file, run), fitting.fit(experiment_file)
