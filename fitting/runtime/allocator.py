@@ -16,8 +16,8 @@ def keep_freed_memory() -> bool:
     By default the GNU C library returns the memory of large arrays to the system, and each call of
     a program writes its results to new pages. The system clears a page when it is first written
     to, which took 40 % of the time of feet and up to a quarter of that of legs (AMD EPYC, in a
-    virtual machine). A process keeps at most `KEPT` bytes more for it. Another C library, and what the
-    user set in an environment variable, is left alone.
+    virtual machine). A process keeps at most `KEPT` bytes more for it. Another C library, and what
+    the user set in an environment variable, is left alone.
     """
     if any(name in os.environ for name in OF_USER):
         return False
