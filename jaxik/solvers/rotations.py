@@ -20,20 +20,10 @@ def safe_arc(start: Array, aim: Array, side: Array) -> Array:
 
     Of `side` only the part at right angles to `start` counts; where it has none, down is used.
     """
-    left = vec.constant(LEFT, start)
-    return quat.shortest_arc(start, aim, vec.normalize(half_turn_axis(start, side), left))
-
-
-def half_turn_axis(start: Array, side: Array) -> Array:
-    """The part of `side` at right angles to the unit `start`, or of down where it has none.
-
-    Zero where down has none either. Not of length 1.
-    """
-    across, down = vec.reject(side, start), vec.reject(vec.constant(DOWN, start), start)
-    across2, down2 = vec.stacked_barrier(vec.dot(across, across), vec.dot(down, down))
-    least = jnp.finfo(start.dtype).eps ** 2
-    down = jnp.where((down2 > least)[..., None], down, 0.0)
-    return jnp.where((across2 > least)[..., None], across, down)
+    down, left = vec.constant(DOWN, start), vec.constant(LEFT, start)
+    axis = vec.reject(side, start)
+    axis = jnp.where(vec.has_direction(axis)[..., None], axis, vec.reject(down, start))
+    return quat.shortest_arc(start, aim, vec.normalize(axis, left))
 
 
 def rotation_about(axis: Array, start: Array, aim: Array) -> Array:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxik.maths import quat, vec
 from jaxik.maths.struct import struct
 
-from .rotations import DOWN, LEFT, half_turn_axis
+from .rotations import DOWN, clip_cosine, safe_arc
 
 
 @struct
@@ -75,22 +75,18 @@ def triangle_half_angle(
 def _half_angle(
     a2: Array, b2: Array, across2: Array, cos_now: Array, sin_now: Array
 ) -> tuple[Array, Array]:
-    # Cosines and sines are times both sides, for the wanted angle and the present one each.
     ab = vec.safe_sqrt(a2 * b2)
-    open_cos = 0.5 * (a2 + b2 - across2)
-    open_cos = jnp.where(open_cos > ab, ab, jnp.where(open_cos < -ab, -ab, open_cos))
-    open_sin = vec.safe_sqrt((ab - open_cos) * (ab + open_cos))
-    cos, sin = vec.stacked_barrier(
-        open_cos * cos_now + open_sin * sin_now, open_sin * cos_now - open_cos * sin_now
-    )
-    length = jnp.sqrt(cos * cos + sin * sin)
-    half_cos, half_sin = vec.stacked_barrier(*quat.half_direction(cos, sin, length))
-    # At least the square of the length: zero only where that is.
-    square = half_cos * half_cos + half_sin * half_sin
-    bendable = (ab > jnp.finfo(ab.dtype).eps) & (square > 0)
-    inverse = 1.0 / jnp.sqrt(jnp.where(bendable, square, 1.0))
-    return jnp.where(bendable, half_cos * inverse, 1.0), jnp.where(
-        bendable, half_sin * inverse, 0.0
+    bendable = ab > jnp.finfo(ab.dtype).eps
+    inverse = 1.0 / jnp.where(bendable, ab, 1.0)
+    open_cos = clip_cosine(0.5 * (a2 + b2 - across2) * inverse)
+    open_sin = vec.safe_sqrt((1.0 - open_cos) * (1.0 + open_cos))
+    cos = open_cos * cos_now + open_sin * sin_now
+    sin = open_sin * cos_now - open_cos * sin_now
+    norm = vec.safe_sqrt(cos * cos + sin * sin)
+    known = bendable & (norm > 0)
+    inverse = 1.0 / jnp.where(known, norm, 1.0)
+    return quat.half_angle(
+        jnp.where(known, cos * inverse, 1.0), jnp.where(known, sin * inverse, 0.0)
     )
 
 
@@ -135,34 +131,9 @@ def swing_rotation(bent: Array, to_target: Array, hinge: Array, twist: Array) ->
 
 @jax.custom_jvp
 def _aligned_arc(start: Array, aim: Array, hinge: Array) -> Array:
-    """Rotation from one unit vector to another that keeps the hinge in line.
-
-    The shortest arc from s to a is (1 + s.a, s x a), scaled. After it, a rotation about a by half
-    an angle of cosine c and sine d makes it (c (1 + s.a), c s x a + d (s + a)), scaled. The arc
-    leaves the hinge h at an angle about a from where it was; its cosine and sine are
-    (1 + s.a) (h.h + h.s h.a) - (h.(s + a))² and h.(s x a) h.(s + a), scaled alike. No rotation
-    about a where the hinge lies along s or a. Where those are opposed, a rotation by pi about the
-    part of the hinge at right angles to s.
-    """
-    middle, normal = vec.add(start, aim), vec.barrier(vec.cross(start, aim))
-    spread = 0.5 * vec.dot(middle, middle)
-    along, both, beside = vec.dot(hinge, start), vec.dot(hinge, middle), vec.dot(hinge, normal)
-    spread, along, both, beside = vec.stacked_barrier(spread, along, both, beside)
-    level = vec.dot(hinge, hinge) + along * (both - along)
-    cos, sin = vec.stacked_barrier(spread * level - both * both, both * beside)
-    length = jnp.sqrt(cos * cos + sin * sin)
-    eps = jnp.finfo(spread.dtype).eps
-    apart, turns = spread > 4.0 * eps, length > spread * eps**0.5
-    half_cos, half_sin = quat.half_direction(cos, sin, length)
-    # The factor brings both near to 1, however small the spread is.
-    scale = 1.0 / jnp.where(apart, spread, 1.0)
-    half_cos, half_sin = vec.stacked_barrier(
-        jnp.where(turns, half_cos * scale, 1.0), jnp.where(turns, half_sin * scale, 0.0)
-    )
-    axis = vec.scale(normal, half_cos) + vec.scale(middle, half_sin)
-    axis = jnp.where(apart[..., None], axis, half_turn_axis(start, hinge))
-    w = jnp.where(apart, half_cos * spread, 0.0)
-    return vec.normalize(quat.stack(w, *vec.components(axis)), jnp.array((0.0, *LEFT), w.dtype))
+    """Rotation from one unit vector to another that keeps the hinge in line."""
+    facing = quat.from_half_angle(aim, *_realignment(start, aim, hinge))
+    return quat.multiply(facing, safe_arc(start, aim, hinge))
 
 
 @_aligned_arc.defjvp
@@ -187,3 +158,24 @@ def _aligned_arc_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     d_rot = quat.multiply(quat.stack(jnp.zeros_like(x), x, y, z), rot)
     apart = 1.0 + vec.dot(start, aim) > 4.0 * tiny
     return rot, jnp.where(apart[..., None], d_rot, 0.0)
+
+
+def _realignment(start: Array, aim: Array, hinge: Array) -> tuple[Array, Array]:
+    """Cosine and sine of half the rotation about `aim` that lines the hinge up with where it was.
+
+    It follows the shortest arc from `start` to `aim`, which takes v to
+    v - (start + aim) (start + aim).v / (1 + start.aim) + 2 aim (start.v). No rotation where start
+    and aim are opposed, or where the hinge lies along one of them.
+    """
+    before, after = vec.reject(hinge, start), vec.reject(hinge, aim)
+    spread = 1.0 + vec.dot(start, aim)
+    known = spread > 4.0 * jnp.finfo(spread.dtype).eps
+    ratio = vec.dot(before, aim) / jnp.where(known, spread, 1.0)
+    cos = vec.dot(before, after) - ratio * vec.dot(after, start)
+    sin = (vec.dot(hinge, start) + ratio) * vec.dot(hinge, vec.cross(start, aim))
+    span = vec.safe_sqrt(cos * cos + sin * sin)
+    known = known & (span > jnp.finfo(span.dtype).eps ** 0.5)
+    inverse = 1.0 / jnp.where(known, span, 1.0)
+    return quat.half_angle(
+        jnp.where(known, cos * inverse, 1.0), jnp.where(known, sin * inverse, 0.0)
+    )
