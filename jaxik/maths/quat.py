@@ -88,26 +88,15 @@ def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
 def half_angle(cos: Float[Array, "*b"], sin: Float[Array, "*b"]) -> tuple[Array, Array]:
     """Cosine (0 or more) and sine of half of an angle, given the angle's cosine and sine.
 
-    The angle is taken in -pi..pi rad. Exact, with finite gradients everywhere. At an angle of pi,
-    of either sign, the half-angle is +pi/2.
-    """
-    larger = 1.0 + jnp.where(cos >= 0, cos, -cos)
-    inverse = 1.0 / jnp.sqrt(2.0 * larger)
-    half_cos, half_sin = half_direction(cos, sin, jnp.ones_like(cos))
-    return half_cos * inverse, half_sin * inverse
-
-
-def half_direction(
-    cos: Float[Array, "*b"], sin: Float[Array, "*b"], length: Float[Array, "*b"]
-) -> tuple[Array, Array]:
-    """`half_angle` of a cosine and a sine that are both times `length`, times a positive factor.
-
-    Uses the half-angle formula that is better conditioned on either side of a right angle.
+    The angle is taken in -pi..pi rad. Uses the half-angle formula that is better conditioned on
+    either side of a right angle: exact, with finite gradients everywhere. At an angle of pi, of
+    either sign, the half-angle is +pi/2.
     """
     acute = cos >= 0
+    larger = jnp.sqrt(jnp.where(acute, 1.0 + cos, 1.0 - cos) * 0.5)
+    smaller = sin / (2.0 * larger)
     sign = jnp.where(sin < 0, -1.0, 1.0)
-    half_cos = jnp.where(acute, length + cos, sign * sin)
-    return half_cos, jnp.where(acute, sin, sign * (length - cos))
+    return jnp.where(acute, larger, sign * smaller), jnp.where(acute, smaller, sign * larger)
 
 
 def half_cos_sin(angle: Float[Array, "*b"]) -> tuple[Array, Array]:
