@@ -187,10 +187,10 @@ def _prior_interval(problem: Problem, solution: Solution) -> np.ndarray:
 
     By the usual rise of a profile; the other parameters are as fitted.
     """
-    space, u = problem.space, jnp.asarray(solution.u)
+    space, u = problem.space, np.asarray(solution.u)
     rises = np.array([usual_rise(parameter) for parameter in space.parameters])
-    moved = [jnp.where(jnp.eye(space.size, dtype=bool), end, u) for end in space.prior.ends(rises)]
-    return np.stack([np.diag(jax.vmap(space.values)(rows)) for rows in moved], axis=1)
+    moved = [np.where(np.eye(space.size, dtype=bool), end, u) for end in space.prior.ends(rises)]
+    return np.stack([np.diag(space.values(rows)) for rows in moved], axis=1)
 
 
 def _bound(fraction: float) -> Bound:

@@ -18,7 +18,7 @@ from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
 
-from .optimisation.population import BATCH, from_values
+from .optimisation.population import BATCH
 
 FRACTIONS = (np.arange(6) + 0.5) / 6  # of a range, where each parameter is tried
 DRAWS = 2  # random systems besides the given one: there a parameter may matter that here does not
@@ -87,18 +87,17 @@ def sweep(
         scenes: the clips.
         u: where all the others stay.
     """
-    dtype = space.start.dtype
-    present = np.asarray(space.values(jnp.asarray(u, dtype)))
+    present = np.asarray(space.values(u))
     log_odds = np.log(FRACTIONS / (1 - FRACTIONS))
-    grid = np.stack([space.values(jnp.full(space.size, x, dtype)) for x in log_odds])
-    first = _residuals(space, scenes, from_values(space, present[None]))[0]
+    grid = np.asarray(space.values(np.tile(log_odds[:, None], space.size)))
+    first = _residuals(space, scenes, space.pack_values(present[None]))[0]
     together = BATCH // len(FRACTIONS)  # parameters in one call of the program
     for start in range(0, space.size, together):
         indices = range(start, min(start + together, space.size))
         table = np.tile(present, (len(indices), len(FRACTIONS), 1))
         for row, i in enumerate(indices):
             table[row, :, i] = grid[:, i]
-        candidates = from_values(space, table.reshape(-1, space.size))
+        candidates = space.pack_values(table.reshape(-1, space.size))
         changes = np.nan_to_num(_residuals(space, scenes, candidates) - first)
         for row, i in enumerate(indices):
             tried = slice(row * len(FRACTIONS), (row + 1) * len(FRACTIONS))

@@ -16,7 +16,8 @@ enters.
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Literal, get_args
+from types import ModuleType
+from typing import Any, Literal, TypeVar, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,6 +25,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import special
 
+from fitting.runtime.array_library import library_of
+
+Points = TypeVar("Points", bound=Float[Array | np.ndarray, "*points free"])
 Shape = Literal["normal", "uniform"]
 
 SPREAD = 1.6  # of u: the logistic of a normal this wide is nearly uniform
@@ -86,13 +90,15 @@ class Prior(eqx.Module):
         """Standard deviation of u."""
         return self.spread * jnp.where(self.uniform, LOGISTIC_SD, 1.0).astype(self.spread.dtype)
 
-    def residuals(self, u: Float[Array, "*points free"]) -> Float[Array, "*points free"]:
+    def residuals(self, u: Points) -> Points:
         """Half of each square is minus the log density, above its minimum.
 
         For a normal prior that is the distance from its centre in standard deviations.
         """
-        z = (u - self.centre) / self.spread
-        return jnp.where(self.uniform, _logistic_residual(z), z)
+        library = library_of(u, self.centre)
+        centre, spread = library.asarray(self.centre), library.asarray(self.spread)
+        z = (u - centre) / spread
+        return library.where(self.uniform, _logistic_residual(z, library), z)
 
     def quantile(self, probability: Float[np.ndarray, "*points #free"]) -> np.ndarray:
         """The `u` below which each parameter lies with this probability, (*points, free)."""
@@ -120,15 +126,15 @@ class Prior(eqx.Module):
         return np.asarray(self.centre) + np.asarray(self.spread) * z
 
 
-def _logistic_residual(z: Array) -> Array:
+def _logistic_residual(z: Any, library: ModuleType) -> Any:
     """`2 sign(z) sqrt(log cosh(z / 2))`, without the root of 0 and without overflow."""
     half = 0.5 * z
-    near = jnp.abs(half) < 1
-    sinh = jnp.sinh(jnp.where(near, half, 0.0))
+    near = library.abs(half) < 1
+    sinh = library.sinh(library.where(near, half, 0.0))
     square = sinh**2  # log cosh² = log1p(sinh²)
-    nonzero = square > jnp.finfo(z.dtype).eps  # below it the factor rounds to 1
-    safe = jnp.where(nonzero, square, 1.0)
-    at_near = sinh * jnp.sqrt(2.0 * jnp.where(nonzero, jnp.log1p(safe) / safe, 1.0))
-    size = jnp.where(near, 1.0, jnp.abs(half))
-    log_cosh = size + jnp.log1p(jnp.exp(-2.0 * size)) - math.log(2)
-    return jnp.where(near, at_near, 2.0 * jnp.sign(z) * jnp.sqrt(log_cosh))
+    nonzero = square > library.finfo(z.dtype).eps  # below it the factor rounds to 1
+    safe = library.where(nonzero, square, 1.0)
+    at_near = sinh * library.sqrt(2.0 * library.where(nonzero, library.log1p(safe) / safe, 1.0))
+    size = library.where(near, 1.0, library.abs(half))
+    log_cosh = size + library.log1p(library.exp(-2.0 * size)) - math.log(2)
+    return library.where(near, at_near, 2.0 * library.sign(z) * library.sqrt(log_cosh))

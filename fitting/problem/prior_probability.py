@@ -1,14 +1,11 @@
 """How probable the prior makes values of the parameters, in their own units."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitting.runtime.precision import in_float64
-from fitting.runtime.program_cache import cached
 
-from .space import Space, values_of_rows
+from .space import Space
 
 MIXTURE = 200  # draws of the others, where a parameter stays above another free one
 
@@ -25,7 +22,7 @@ def prior_probability(
     probability = _probability(space, values)
     for i in space.dependent:
         draws = space.prior.draw(np.random.default_rng(0), MIXTURE)
-        rows = np.asarray(values_of_rows(space, jnp.asarray(draws, space.start.dtype)))
+        rows = np.asarray(space.values(draws))
         table = np.repeat(rows[:, None], len(values), axis=1)
         table[..., i] = values[:, i]
         mixed = _probability(space, table.reshape(-1, space.size))[:, i]
@@ -35,11 +32,6 @@ def prior_probability(
 
 def _probability(space: Space, rows: np.ndarray) -> np.ndarray:
     """Of the last moved parameter given the others of its row, (rows, free)."""
-    u = np.asarray(_u(space, jnp.asarray(rows, space.start.dtype)))
+    u = space.pack_values(rows)
     below, above = rows <= np.asarray(space.low), rows >= np.asarray(space.high)
     return np.where(below, 0.0, np.where(above, 1.0, space.prior.cumulative(u)))
-
-
-@cached
-def _u(space: Space, rows: Array) -> Array:
-    return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(rows)

@@ -19,16 +19,17 @@ value and the upper bound, whatever that value is.
 import math
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+from scipy import special
 
+from fitting.runtime.array_library import library_of
 from fitting.runtime.precision import in_float64
-from fitting.runtime.program_cache import cached
 from jaxik.maths import parameter_tree
 
 from .free_parameters import FreeParameter, check_inside, present_value
@@ -38,10 +39,12 @@ OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the syste
 CENTRE_LIMIT = 3.0  # of u, for given centres and for starts: at a bound u is infinite
 EDGE = 1e-6  # fraction of the range that `pack` keeps from a bound, where u is infinite
 INTERVAL = (0.025, 0.975)  # the probabilities at the ends of a 95 % interval
+SILENT = np.errstate(all="ignore")  # NumPy about NaN and infinity, as programs are
 DRAWS = 20_000  # from the prior, for the interval of a parameter that depends on another one
 
 System = TypeVar("System", bound=eqx.Module)
 Vector: TypeAlias = Float[Array | np.ndarray, " free"]
+Rows = TypeVar("Rows", bound=Float[Array | np.ndarray, "*rows free"])
 
 
 class Space(eqx.Module, Generic[System]):
@@ -89,51 +92,73 @@ class Space(eqx.Module, Generic[System]):
     @in_float64
     def unpack(self, u: Vector) -> System:
         """The system with the parameters that `u` stands for."""
-        return parameter_tree.replace(self.system, self._leaves_and_values(jnp.asarray(u))[0])
+        return parameter_tree.replace(self.system, self._leaves_and_values(u)[0])
 
     @in_float64
-    @eqx.filter_jit
-    def values(self, u: Vector) -> Float[Array, " free"]:
-        """The free parameters in their own units."""
-        return self._leaves_and_values(jnp.asarray(u))[1]
+    def values(self, u: Rows) -> Rows:
+        """The free parameters in their own units, of any number of `u`; NumPy's for NumPy's."""
+        values = _free_last(self._leaves_and_values(u)[1])
+        return cast(Rows, values if isinstance(u, np.ndarray) else jnp.asarray(values))
 
     @in_float64
-    def pack(self, source: System | Mapping[str, ArrayLike]) -> Float[Array, " free"]:
+    def pack(self, source: System | Mapping[str, ArrayLike]) -> Float[Array, "*rows free"]:
         """`u` of a system, or of values by name; names left out keep this system's values.
 
         Values outside their bounds are clipped. Where the legs of a leaf differ but share one free
         parameter, it takes their mean.
 
+        Args:
+            source: a system, or values; of each name one, or as many as there are rows.
+
         Raises:
             ValueError: for a name that is not free.
         """
         if not isinstance(source, Mapping):
-            return self._pack(source, {})
+            return jnp.asarray(self._pack(source, {}))
         if unknown := sorted(set(source) - set(self.names)):
             raise ValueError(f"not free: {unknown}; free are {list(self.names)}")
-        return self._pack(self.system, {k: jnp.asarray(value) for k, value in source.items()})
+        return jnp.asarray(self._pack(self.system, source))
 
-    @cached  # one program; otherwise every operation would be one
-    def _pack(self, system: eqx.Module, values: Mapping[str, Array]) -> Array:
+    def pack_values(
+        self, values: Float[np.ndarray, "*rows free"]
+    ) -> Float[np.ndarray, "*rows free"]:
+        """`u` of any number of values, in the order of `names`; inverse of `values`."""
+        columns = np.moveaxis(np.asarray(values, self.start.dtype), -1, 0)
+        return np.asarray(self._pack(self.system, dict(zip(self.names, columns, strict=True))))
+
+    @SILENT
+    def _pack(self, system: eqx.Module, values: Mapping[str, ArrayLike]) -> Any:
         leaves = self._leaves(system)
-        u = [jnp.zeros(())] * self.size
+        library = library_of(self.low, *leaves.values(), *values.values())
+        leaves = {name: library.asarray(leaf) for name, leaf in leaves.items()}
+        low, high = library.asarray(self.low), library.asarray(self.high)
+        u = [library.zeros(())] * self.size
         for i in self.order:
             parameter = self.parameters[i]
             leaf = leaves[parameter.leaf]
-            present = jnp.mean(leaf if parameter.leg is None else leaf[parameter.leg])
-            value = jnp.asarray(values.get(parameter.name, present), leaf.dtype)
-            bounds = jnp.stack([self._floor(i, leaves), self.high[i]])
-            start, end = _to_scale(bounds, parameter.scale)
-            coordinate = _to_scale(jnp.clip(value, *bounds), parameter.scale)
-            fraction = jnp.clip((coordinate - start) / (end - start), EDGE, 1 - EDGE)
-            u[i] = jnp.log(fraction) - jnp.log1p(-fraction)
-            leaves[parameter.leaf] = _with_value(leaf, parameter.leg, value)
-        return jnp.stack(u)
+            if parameter.leg is None:
+                present = library.mean(leaf, axis=tuple(range(len(self._shape(parameter.leaf)))))
+            else:
+                present = leaf[parameter.leg]
+            value = library.asarray(values.get(parameter.name, present), leaf.dtype)
+            floor = self._floor(i, leaves, low, library)
+            start = _to_scale(floor, parameter.scale, library)
+            end = _to_scale(high[i], parameter.scale, library)
+            inside = library.clip(value, floor, high[i])
+            coordinate = _to_scale(inside, parameter.scale, library)
+            fraction = library.clip((coordinate - start) / (end - start), EDGE, 1 - EDGE)
+            u[i] = library.log(fraction) - library.log1p(-fraction)
+            leaves[parameter.leaf] = self._with_value(i, leaf, value, library)
+        return _free_last(library.stack(library.broadcast_arrays(*u)))
 
     @in_float64
-    def prior_residuals(self, u: Vector) -> Float[Array, " free"]:
+    def prior_residuals(self, u: Rows) -> Rows:
         """Half of their squares' sum is minus the log density of the prior, up to a constant."""
-        return self.prior.residuals(jnp.asarray(u))
+        return self.prior.residuals(u)
+
+    def prior_costs(self, u: Float[np.ndarray, "*rows free"]) -> Float[np.ndarray, "*rows free"]:
+        """The part of the cost that the prior of each parameter contributes."""
+        return 0.5 * np.square(self.prior.residuals(np.asarray(u, self.start.dtype)))
 
     @in_float64
     def prior_interval(self) -> Float[np.ndarray, "free 2"]:
@@ -145,8 +170,7 @@ class Space(eqx.Module, Generic[System]):
         dependent = list(self.dependent)
         ends = self.prior.quantile(np.array(INTERVAL)[:, None])
         draws = self.prior.draw(np.random.default_rng(0), DRAWS if dependent else 1)
-        u = jnp.asarray(np.concatenate([ends, draws]), self.start.dtype)
-        values = np.asarray(values_of_rows(self, u))
+        values = self.values(np.concatenate([ends, draws]))
         interval = values[:2].T.copy()
         interval[dependent] = np.quantile(values[2:, dependent], INTERVAL, axis=0).T
         return interval
@@ -200,33 +224,60 @@ class Space(eqx.Module, Generic[System]):
         names += [parameter.above for parameter in self.parameters if parameter.above]
         return {name: parameter_tree.get(system, name) for name in names}
 
-    def _floor(self, i: int, leaves: dict[str, Array]) -> Array:
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """That of a leaf in the system: empty, or a value for each leg."""
+        return parameter_tree.get(self.system, name).shape
+
+    def _floor(self, i: int, leaves: Mapping[str, Any], low: Any, library: ModuleType) -> Any:
         """Minimum of the i-th parameter, which depends on the leaf that it stays above."""
         parameter = self.parameters[i]
         if parameter.above is None:
-            return self.low[i]
+            return low[i]
         below = leaves[parameter.above]
-        if below.ndim and parameter.leg is not None:
-            below = below[parameter.leg]
-        elif below.ndim:
-            below = below[jnp.argmax(below)]
-        return jnp.where(below > self.low[i], below, self.low[i])
+        if self._shape(parameter.above):
+            highest = library.argmax(below, axis=0)[None]
+            of_legs = library.take_along_axis(below, highest, axis=0)[0]
+            below = of_legs if parameter.leg is None else below[parameter.leg]
+        return library.where(below > low[i], below, low[i])
 
-    def _leaves_and_values(self, u: Array) -> tuple[dict[str, Array], Array]:
-        """The system's leaves with the free values in them, and those values."""
+    @SILENT
+    def _leaves_and_values(self, u: Any) -> tuple[dict[str, Any], Any]:
+        """The system's leaves with the free values in them, (*legs, *rows), and (free, *rows)."""
         leaves = self._leaves(self.system)
-        values = [u[0]] * self.size
+        library = library_of(u, self.low, *leaves.values())
+        if library is np:
+            u = np.asarray(u, self.start.dtype)  # a program has done so already
+        sigmoid = special.expit if library is np else jax.nn.sigmoid
+        leaves = {name: library.asarray(leaf) for name, leaf in leaves.items()}
+        low, high = library.asarray(self.low), library.asarray(self.high)
+        fractions = sigmoid(library.moveaxis(u, -1, 0))
+        values = list(fractions)
         for i in self.order:
             parameter = self.parameters[i]
-            start = _to_scale(self._floor(i, leaves), parameter.scale)
-            end = _to_scale(self.high[i], parameter.scale)
-            coordinate = start + (end - start) * jax.nn.sigmoid(u[i])
-            values[i] = _from_scale(coordinate, parameter.scale)
-            leaves[parameter.leaf] = _with_value(leaves[parameter.leaf], parameter.leg, values[i])
-        return leaves, jnp.stack(values)
+            start = _to_scale(self._floor(i, leaves, low, library), parameter.scale, library)
+            end = _to_scale(high[i], parameter.scale, library)
+            coordinate = start + (end - start) * fractions[i]
+            values[i] = _from_scale(coordinate, parameter.scale, library)
+            leaf = leaves[parameter.leaf]
+            leaves[parameter.leaf] = self._with_value(i, leaf, values[i], library)
+        return leaves, library.stack(values)
+
+    def _with_value(self, i: int, leaf: Any, value: Any, library: ModuleType) -> Any:
+        """The i-th parameter's leaf with this value for one leg, or for all, (*legs, *rows)."""
+        parameter = self.parameters[i]
+        value = value.astype(leaf.dtype)
+        if parameter.leg is None:
+            return library.broadcast_to(value, (*self._shape(parameter.leaf), *value.shape))
+        legs = [value if leg == parameter.leg else leaf[leg] for leg in range(len(leaf))]
+        return library.stack(library.broadcast_arrays(*legs))
 
 
-def _to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType = jnp) -> Any:
+def _free_last(columns: Any) -> Any:
+    """(free, *rows) as (*rows, free)."""
+    return library_of(columns).moveaxis(columns, 0, -1)
+
+
+def _to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
     """The coordinate in which a range is divided evenly: `g` of the module's docstring."""
     match scale:
         case "log":
@@ -237,7 +288,7 @@ def _to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType = jnp
             return value
 
 
-def _from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType = jnp) -> Any:
+def _from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
     """Inverse of `_to_scale`."""
     match scale:
         case "log":
@@ -269,18 +320,6 @@ def from_fractions(
     """Inverse of `to_fractions`."""
     start, end = _to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
     return _from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
-
-
-def _with_value(leaf: Array, leg: int | None, value: Array) -> Array:
-    """The leaf with this value for one leg, or for all."""
-    value = value.astype(leaf.dtype)
-    return jnp.broadcast_to(value, leaf.shape) if leg is None else leaf.at[leg].set(value)
-
-
-@cached
-def values_of_rows(space: Space, u: Float[Array, "rows free"]) -> Float[Array, "rows free"]:
-    """The free parameters of many `u` in their own units, by one compiled program."""
-    return jax.vmap(space.values)(u)
 
 
 def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,7 +11,7 @@ from fitting.inference.sampling.blocks import BlockLogLikelihood, leave_one_out
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import ParameterPrior, Priors
-from fitting.problem.space import Space, make_space, values_of_rows
+from fitting.problem.space import Space, make_space
 from support import toy
 
 NAMES = ("foot.share", "foot.limit[0]", "lock.height_on")
@@ -34,7 +33,7 @@ def posterior(space) -> Posterior:
         names=NAMES,
         u=u,
         log_probability=-0.5 * np.sum(u**2, axis=-1),
-        values=np.asarray(values_of_rows(space, jnp.asarray(u.reshape(-1, 3)))).reshape(u.shape),
+        values=np.asarray(space.values(u)),
         thin_by=2,
         burn_in=100,
         autocorrelation_time=np.full(3, 2.0),

@@ -26,7 +26,7 @@ from fitting.inference.sampling.settings import SamplerSettings
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import SPREAD, ParameterPrior, Priors
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space, values_of_rows
+from fitting.problem.space import make_space
 from jaxik.maths import parameter_tree
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -175,7 +175,7 @@ def test_the_posterior_of_a_threshold_agrees_with_integration_on_a_grid():
     axes = jnp.linspace(-7, 7, 141), jnp.linspace(-7, 7, 1401)  # cliffs need the finer one
     grid = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     weight = np.exp(np.asarray(sampler.log_probabilities(problem, grid)))
-    values = np.asarray(values_of_rows(problem.space, grid))
+    values = np.asarray(problem.space.values(grid))
     mean = np.average(values, axis=0, weights=weight)
     sd = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
     for i, row in enumerate(sampled.summary):

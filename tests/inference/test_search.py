@@ -470,11 +470,11 @@ def test_evolution_crosses_the_cliff_of_a_threshold():
 def test_variations_keep_the_values_that_they_do_not_move():
     problem = toy.make_problem()
     random = np.random.default_rng(0)
-    values = population.to_values(problem.space, problem.space.prior.draw(random, 20))
+    values = problem.space.values(problem.space.prior.draw(random, 20))
     moved = random.random(values.shape) < 0.3
     redrawn = (random.random(values.shape) < 0.1) & ~moved
     u = evolution.vary(problem.space, values, 0.3 * moved, redrawn, random)
-    kept = np.isclose(population.to_values(problem.space, u), values, rtol=1e-9)
+    kept = np.isclose(problem.space.values(u), values, rtol=1e-9)
     above = [p.above is not None for p in problem.space.parameters]  # may be pushed up
     np.testing.assert_array_equal(
         kept[:, ~np.array(above)], ~(moved | redrawn)[:, ~np.array(above)]

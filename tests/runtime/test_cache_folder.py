@@ -178,7 +178,7 @@ def test_only_kept_programs_count_as_such(tmp_path):
 
 
 # The last two are half-written.
-TRACED_FILES = [("run", ""), ("_to_values", ""), (".run", "x_1ab"), (".run", ".jaxik-vm-7-x_1ab")]
+TRACED_FILES = [("run", ""), ("_evaluate", ""), (".run", "x_1ab"), (".run", ".jaxik-vm-7-x_1ab")]
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")

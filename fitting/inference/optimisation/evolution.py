@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from fitting.problem.space import EDGE, Space
 
 from .descent import descend, jacobian_at
-from .population import ROUNDING, evaluate, from_values, to_values
+from .population import ROUNDING, evaluate
 from .state import Elite, Point, Search, SearchState
 
 CROSSED = 0.6  # fraction of the candidates
@@ -116,7 +116,7 @@ def _children(
     space, thresholds = search.problem.space, search.thresholds
     shape = (count, space.size)
     parents = np.minimum(random.geometric(PARENT_RANK, count) - 1, len(elite.u) - 1)
-    values = to_values(space, np.concatenate([elite.u, donors]))
+    values = space.values(np.concatenate([elite.u, donors]))
     crossed = random.random(shape) < random.choice(CROSSED_VALUES, (count, 1))
     crossed &= random.random((count, 1)) < CROSSED
     others = random.integers(len(values), size=count)
@@ -159,4 +159,4 @@ def vary(
     log_odds = np.log(fraction / (1 - fraction)) + shifts
     log_odds[redrawn] = random.logistic(size=int(redrawn.sum()))
     varied = low + (high - low) / (1 + np.exp(-log_odds))
-    return from_values(space, np.where((shifts != 0) | redrawn, varied, values))
+    return space.pack_values(np.where((shifts != 0) | redrawn, varied, values))

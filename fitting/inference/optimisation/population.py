@@ -1,4 +1,4 @@
-"""Many candidates at once: their values and their costs.
+"""The costs of many candidates at once.
 
 Costs are computed with 32-bit floats, side by side in the lanes of vector registers: a quarter of
 the time that 64 bits take under `jax.vmap`. They differ by about a millionth of themselves, which
@@ -9,13 +9,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.problem.problem import Problem
-from fitting.problem.space import Space
 from fitting.runtime.precision import with_floats
 from fitting.runtime.program_cache import cached
 from fitting.runtime.threads import on_all_cores
@@ -34,54 +32,6 @@ class Evaluation(NamedTuple):
     """After a Gauss-Newton step."""
     predicted: Float[np.ndarray, " candidates"]
     """Cost there if the Jacobian held."""
-
-
-def from_values(
-    space: Space, values: Float[np.ndarray, "candidates free"]
-) -> Float[np.ndarray, "candidates free"]:
-    """`u` of candidates that are given by their values."""
-    return _in_batches(_from_values, space, values)
-
-
-def to_values(
-    space: Space, candidates: Float[np.ndarray, "candidates free"]
-) -> Float[np.ndarray, "candidates free"]:
-    """The parameters of candidates in their own units."""
-    return _in_batches(_to_values, space, candidates)
-
-
-def prior_costs(
-    space: Space, candidates: Float[np.ndarray, "candidates free"]
-) -> Float[np.ndarray, "candidates free"]:
-    """The part of the cost that the prior of each parameter contributes."""
-    return _in_batches(_prior_costs, space, candidates)
-
-
-@cached
-def _prior_costs(space: Space, candidates: Array) -> Array:
-    return 0.5 * jax.vmap(space.prior_residuals)(candidates) ** 2
-
-
-@cached
-def _from_values(space: Space, values: Array) -> Array:
-    return jax.vmap(lambda row: space.pack(dict(zip(space.names, row, strict=True))))(values)
-
-
-@cached
-def _to_values(space: Space, candidates: Array) -> Array:
-    return jax.vmap(space.values)(candidates)
-
-
-def _in_batches(
-    convert: Callable[[Space, Array], Array], space: Space, rows: np.ndarray
-) -> np.ndarray:
-    """Converts any number of rows, BATCH at a time, the last batch filled up: one program."""
-    parts = []
-    for first in range(0, len(rows), BATCH):
-        batch = rows[first : first + BATCH]
-        filled = jnp.asarray(np.resize(batch, (BATCH, batch.shape[1])), space.start.dtype)
-        parts.append(np.asarray(convert(space, filled))[: len(batch)])
-    return np.concatenate(parts)
 
 
 @cached

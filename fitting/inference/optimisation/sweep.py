@@ -11,7 +11,7 @@ from jaxtyping import Float
 from fitting.problem.problem import Problem
 
 from .descent import descend
-from .population import evaluate, from_values, to_values
+from .population import evaluate
 from .state import Point, Search, SearchState
 
 GOLDEN = (5**0.5 - 1) / 2
@@ -63,18 +63,18 @@ def best_of_sweep(
     """
     space = problem.space
     log_odds = np.tile(np.log(fractions / (1 - fractions))[:, None], space.size)
-    start, *grid = to_values(space, np.concatenate([u[None], log_odds]))
+    start, *grid = space.values(np.concatenate([u[None], log_odds]))
     grid = np.asarray(grid)
     alone = np.tile(start, (space.size, len(fractions), 1))
     for i in range(space.size):
         alone[i, :, i] = grid[:, i]
-    candidates = from_values(space, alone.reshape(-1, space.size))
+    candidates = space.pack_values(alone.reshape(-1, space.size))
     costs = evaluate(problem, candidates).cost.reshape(space.size, -1)
 
     combined = np.tile(start, (space.size, 1))
     for rank, i in enumerate(np.argsort(costs.min(axis=1), kind="stable")):
         combined[rank:, i] = grid[np.argmin(costs[i]), i]
-    together = from_values(space, combined)
+    together = space.pack_values(combined)
     candidates = np.concatenate([candidates, together])
     costs = np.concatenate([costs.ravel(), evaluate(problem, together).cost])
     best = int(np.argmin(costs))

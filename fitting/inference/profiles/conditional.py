@@ -94,13 +94,13 @@ class Conditional:
     def points(self, u: Float[np.ndarray, "points free"]) -> Points:
         """Points with their values and costs."""
         cost = population.evaluate(self.problem, u).cost
-        return Points(u, population.to_values(self.problem.space, u), cost)
+        return Points(u, self.problem.space.values(u), cost)
 
     def evaluate(self, u: Float[np.ndarray, "points free"]) -> tuple[Points, np.ndarray]:
         """Points, and the gradients of their costs by the solution's Jacobian."""
         evaluation = population.evaluate(self.problem, u, self.jacobian)
         gradient = -(evaluation.stepped - u) @ self.gram
-        return Points(u, population.to_values(self.problem.space, u), evaluation.cost), gradient
+        return Points(u, self.problem.space.values(u), evaluation.cost), gradient
 
     def move(
         self,
@@ -129,10 +129,10 @@ class Conditional:
         force = gradient + distance[:, None] * self.gram[targets.index]
         steps = np.linalg.solve(matrix, np.where(following, -force, 0.0)[..., None])[..., 0]
         steps = np.clip(steps, -FURTHEST, FURTHEST) + besides
-        moved = population.to_values(space, points.u + steps)
+        moved = space.values(points.u + steps)
         values = np.where(following, moved, points.values)
         values[rows, targets.index] = targets.value
-        return population.from_values(space, values)
+        return space.pack_values(values)
 
     def lowest(
         self, targets: Targets, starts: Sequence[Points], *, descending: bool = True
@@ -207,7 +207,7 @@ class Conditional:
             )
         ]
         u, cost = map(np.asarray, zip(*ends, strict=True))
-        return Points(u, population.to_values(self.problem.space, u), cost)
+        return Points(u, self.problem.space.values(u), cost)
 
     def descend(
         self, u: Float[np.ndarray, " free"], held: int | None, steps: int = STEPS

@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Float
 
-from fitting.inference.optimisation import population
 from fitting.problem.problem import Problem
 from fitting.problem.space import to_fractions
 
@@ -48,7 +47,7 @@ class Curves:
     def data_rises(self, i: int) -> Float[np.ndarray, " points"]:
         """The same of the cost without the parameter's own prior."""
         curve = self.curves[i]
-        cost = curve.cost - population.prior_costs(self.space, curve.u)[:, i]
+        cost = curve.cost - self.space.prior_costs(curve.u)[:, i]
         return cost - cost.min()
 
     def highest(self, i: int) -> float:
@@ -81,7 +80,7 @@ class Curves:
                 curve.values,
                 curve.values[:, i],
                 curve.cost,
-                population.prior_costs(self.space, curve.u)[:, i],
+                self.space.prior_costs(curve.u)[:, i],
             )
             for i, (parameter, curve) in enumerate(
                 zip(self.space.parameters, self.curves, strict=True)

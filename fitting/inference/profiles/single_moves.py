@@ -37,12 +37,12 @@ def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> P
         values = np.repeat(curves.best.values, population.BATCH, axis=0)
         for i in thresholds:
             values[:, i] = random.choice(along[i].values[:, i], population.BATCH)
-        evaluated, gradient = conditional.evaluate(population.from_values(space, values))
+        evaluated, gradient = conditional.evaluate(space.pack_values(values))
         here = Targets(np.full(len(values), thresholds[0]), values[:, thresholds[0]])
         everything = np.ones(evaluated.u.shape, bool)
         found += [conditional.points(conditional.move(evaluated, gradient, here, everything))]
     together = join(found)
-    data_cost = together.cost - population.prior_costs(space, together.u)[:, thresholds].sum(axis=1)
+    data_cost = together.cost - space.prior_costs(together.u)[:, thresholds].sum(axis=1)
     order = np.argsort(together.cost, kind="stable")
     order = order[together.cost[order] < curves.best.cost[0] + CLOSE]
     _, first = np.unique(np.round(data_cost[order] / SAME_PLATEAU), return_index=True)
@@ -74,15 +74,15 @@ def settle(
     """
     space = conditional.problem.space
     for span in spans:
-        base = population.to_values(space, u)
+        base = space.values(u)
         single = [_single_moves(conditional, row, span) for row in u]
         candidates = np.concatenate(single)
         owner = np.repeat(np.arange(len(u)), [len(rows) for rows in single])
-        values = population.to_values(space, candidates)
+        values = space.values(candidates)
         rows = np.arange(len(owner))
         held = targets.index[owner]
         values[rows, held] = base[owner, held]
-        candidates = population.from_values(space, values)
+        candidates = space.pack_values(values)
         cost = population.evaluate(conditional.problem, candidates).cost
         best = [np.flatnonzero(owner == k)[np.argmin(cost[owner == k])] for k in range(len(u))]
         u = candidates[best]
@@ -103,7 +103,7 @@ def vary(conditional: Conditional, curves: Curves, start: Points, held: int) -> 
         places = np.clip(random.uniform(low[0] - reach, low[-1] + reach, VARIANTS), 0, 1)
         chosen = drawn[:, i] & (i != held)
         values[chosen, i] = from_fractions(parameter, places[chosen])
-    u = population.from_values(space, values)
+    u = space.pack_values(values)
     return Points(u, values, np.full(VARIANTS, start.cost[0]))
 
 
@@ -112,7 +112,7 @@ def _single_moves(
 ) -> Float[np.ndarray, "moves free"]:
     """A point, and this point with one parameter moved."""
     space = conditional.problem.space
-    present = population.to_values(space, u[None])[0]
+    present = space.values(u[None])[0]
     sizes = span * np.geomspace(SMALLEST, 1, SIZES)
     steps = np.concatenate([-sizes, sizes])
     moved_values, moved_u = [present[None]], []
@@ -125,5 +125,5 @@ def _single_moves(
         else:
             sd = 1 / np.sqrt(conditional.gram[j, j])
             moved_u.append(u + np.outer(sd * DEVIATIONS, np.arange(space.size) == j))
-    of_values = population.from_values(space, np.concatenate(moved_values))
+    of_values = space.pack_values(np.concatenate(moved_values))
     return np.concatenate([of_values, *moved_u])

@@ -7,10 +7,9 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from fitting.problem.space import Space, values_of_rows
+from fitting.problem.space import Space
 from fitting.runtime.precision import in_float64
 from fitting.runtime.storage.json_files import check_version
 from fitting.runtime.storage.sealed_files import check_seal, write_sealed
@@ -87,7 +86,7 @@ def to_inference_data(posterior: Posterior, space: Space) -> Any:
         p.name: {"units": declared[p.leaf].unit, "kind": p.kind} for p in space.parameters
     }
     u = space.prior.draw(np.random.default_rng(0), PRIOR_DRAWS)
-    drawn = np.asarray(values_of_rows(space, jnp.asarray(u, space.start.dtype)))
+    drawn = np.asarray(space.values(u))
     log_probability = np.delete(
         posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1
     )

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fitting.inference.sharding import over_devices
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
-from fitting.problem.space import Space, values_of_rows
+from fitting.problem.space import Space
 from fitting.runtime import activity
 from fitting.runtime.display.data_frames import data_frame
 from fitting.runtime.display.notebook import Shown
@@ -306,12 +306,7 @@ def _describe_progress(
 def _values(
     space: Space, u: Float[np.ndarray, "steps walkers free"]
 ) -> Float[np.ndarray, "steps walkers free"]:
-    """The parameters of all walkers in their units, by one program for chains of any length."""
-    rows = u.reshape(-1, u.shape[-1])
-    padded = np.concatenate([rows, np.zeros((-len(rows) % ROWS, u.shape[-1]))])
-    blocks = jnp.asarray(padded.reshape(-1, ROWS, u.shape[-1]), space.start.dtype)
-    values = np.concatenate([np.asarray(values_of_rows(space, block)) for block in blocks])
-    return values[: len(rows)].reshape(u.shape)
+    return np.asarray(space.values(u))
 
 
 def _posterior(problem: Problem, chain: Chain, outcome: _Outcome, seconds: float) -> Posterior:

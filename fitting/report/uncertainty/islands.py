@@ -3,12 +3,11 @@
 import math
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.inference.sampling.islands import MIN_EXCHANGES, Island
 from fitting.inference.sampling.posterior import Posterior
-from fitting.problem.space import Space, values_of_rows
+from fitting.problem.space import Space
 from fitting.report.formatting import Table, markdown, number, percent
 
 
@@ -68,8 +67,7 @@ def island_table(islands: tuple[Island, ...]) -> Table:
 
 def median_table(islands: tuple[Island, ...], space: Space, units: Mapping[str, str]) -> Table:
     """Median of each parameter on each island."""
-    medians = jnp.asarray(np.stack([island.median for island in islands]), space.start.dtype)
-    values = np.asarray(values_of_rows(space, medians))
+    values = np.asarray(space.values(np.stack([island.median for island in islands])))
     heading = [f"island {index}" for index in range(1, len(islands) + 1)]
     rows = zip(space.names, values.T, strict=True)
     return [

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import TypedDict
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -12,7 +11,7 @@ from fitting.inference.hierarchy.likelihoods import expand
 from fitting.inference.hierarchy.mixed_model import Draws
 from fitting.inference.hierarchy.population_fit import PopulationFit, model_around
 from fitting.problem.problem import Problem
-from fitting.problem.space import INTERVAL, Space, values_of_rows
+from fitting.problem.space import INTERVAL, Space
 from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree
 
@@ -133,4 +132,4 @@ def _quantiles(
 
 
 def _values(space: Space, u: Float[np.ndarray, "rows free"]) -> Float[np.ndarray, "rows free"]:
-    return np.asarray(values_of_rows(space, jnp.asarray(u, space.start.dtype)))
+    return np.asarray(space.values(u))
