@@ -101,7 +101,10 @@ class StoredSearches(TypedDict):
 
 
 FILE = JsonFile(
-    StoredSearches, "the state of a search", "it is left alone and the search begins anew"
+    StoredSearches,
+    "the state of a search",
+    "it is left alone and the search begins anew",
+    indent=None,
 )
 
 

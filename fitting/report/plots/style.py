@@ -37,6 +37,8 @@ STYLE: Any = {
     "legend.fontsize": 13,
     "lines.linewidth": 1.6,
     "savefig.dpi": 100,
+    "figure.constrained_layout.w_pad": 0.15,  # inches around everything
+    "figure.constrained_layout.h_pad": 0.1,
 }
 styled = matplotlib.rc_context(STYLE)
 
@@ -107,7 +109,7 @@ def save(path: Path, figure: Figure) -> None:
 
 
 def _write(path: Path, figure: Figure) -> None:
-    look = {"bbox_inches": "tight", "pad_inches": 0.2, "facecolor": "white"}
+    look: Any = {"facecolor": "white"}
 
     def fill(temporary: Path) -> None:
         try:

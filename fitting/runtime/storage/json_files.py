@@ -35,10 +35,12 @@ class JsonFile(Generic[Stored]):
     """Of the format that is written; all from 1 on are read."""
     essential: Set[str] | None = None
     """The only keys that a file without a version must have; None is all."""
+    indent: int | None = 2
+    """Spaces; None is one line, which is written ten times as fast."""
 
     def write(self, path: Path, content: Mapping[str, Any]) -> None:
         """Writes a file, its version first."""
-        write_json(path, content, self.version)
+        write_json(path, content, self.version, self.indent)
 
     def read(self, path: Path) -> Stored:
         """What a file holds, its version left out.
@@ -63,9 +65,11 @@ class JsonFile(Generic[Stored]):
         return ValueError(f"{path}: not {self.description}: {problem}; {self.advice}")
 
 
-def write_json(path: Path, content: Mapping[str, Any], version: int = 1) -> None:
+def write_json(
+    path: Path, content: Mapping[str, Any], version: int = 1, indent: int | None = 2
+) -> None:
     """Writes numbers as JSON, with the version of their format first."""
-    text = json.dumps({FORMAT: version, **content}, indent=2, default=float)
+    text = json.dumps({FORMAT: version, **content}, indent=indent, default=float)
     files.write_text(path, text + "\n")
 
 
