@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitting.problem.free_parameters import to_fractions
 from fitting.problem.problem import Problem
-from fitting.problem.space import to_fractions
 from fitting.runtime.precision import in_float64
 
 from .noise import series

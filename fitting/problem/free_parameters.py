@@ -1,12 +1,19 @@
-"""Which numbers of a system a fit may change: range, kind and scale of each."""
+"""Which numbers of a system a fit may change: range, kind and scale of each.
+
+Arrays are JAX's, or NumPy's where `library` says so.
+"""
 
 import dataclasses
 import difflib
 import math
-from typing import cast, get_args
+from types import ModuleType
+from typing import Any, cast, get_args
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jaxtyping import Float
 
 from jaxik.maths import parameter_tree
 from jaxik.world.body import scaled_declarations
@@ -155,3 +162,53 @@ def _check(parameter: FreeParameter, declaration: parameter_tree.Declaration) ->
         raise ValueError(
             f"{bounds}, wanted at most {LARGEST_RATIO:g} times the lower one for the scale 'log'"
         )
+
+
+def library_of(*arrays: object) -> ModuleType:
+    """JAX if any of these is traced, else NumPy, which takes no time to compile or to call."""
+    return jnp if any(isinstance(array, Tracer) for array in arrays) else np
+
+
+def to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
+    """The coordinate in which a range is divided evenly: `g` of `space`'s docstring."""
+    match scale:
+        case "log":
+            return library.log(value)
+        case "gain":
+            return library.log(-library.log1p(-value))
+        case _:
+            return value
+
+
+def from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
+    """Inverse of `to_scale`."""
+    match scale:
+        case "log":
+            return library.exp(coordinate)
+        case "gain":
+            return -library.expm1(-library.exp(coordinate))
+        case _:
+            return coordinate
+
+
+def scale_width(parameter: FreeParameter) -> float:
+    """Width of a parameter's range on its scale."""
+    return float(
+        np.diff(to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np))[0]
+    )
+
+
+def to_fractions(
+    parameter: FreeParameter, values: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Where values lie in a parameter's range, 0..1, evenly on its scale."""
+    start, end = to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
+    return (to_scale(np.asarray(values), parameter.scale, np) - start) / (end - start)
+
+
+def from_fractions(
+    parameter: FreeParameter, fractions: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Inverse of `to_fractions`."""
+    start, end = to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
+    return from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import special
 
-from fitting.runtime.array_library import library_of
+from .free_parameters import library_of
 
 Points = TypeVar("Points", bound=Float[Array | np.ndarray, "*points free"])
 Shape = Literal["normal", "uniform"]

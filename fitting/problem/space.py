@@ -28,11 +28,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy import special
 
-from fitting.runtime.array_library import library_of
 from fitting.runtime.precision import in_float64
 from jaxik.maths import parameter_tree
 
-from .free_parameters import FreeParameter, check_inside, present_value
+from .free_parameters import (
+    FreeParameter,
+    check_inside,
+    from_scale,
+    library_of,
+    present_value,
+    to_scale,
+)
 from .prior import SPREAD, Prior, Priors
 
 OWN_CENTRE_LIMIT = math.log(5)  # of u, for priors that are centred at the system's value: a sixth
@@ -142,10 +148,10 @@ class Space(eqx.Module, Generic[System]):
                 present = leaf[parameter.leg]
             value = library.asarray(values.get(parameter.name, present), leaf.dtype)
             floor = self._floor(i, leaves, low, library)
-            start = _to_scale(floor, parameter.scale, library)
-            end = _to_scale(high[i], parameter.scale, library)
+            start = to_scale(floor, parameter.scale, library)
+            end = to_scale(high[i], parameter.scale, library)
             inside = library.clip(value, floor, high[i])
-            coordinate = _to_scale(inside, parameter.scale, library)
+            coordinate = to_scale(inside, parameter.scale, library)
             fraction = library.clip((coordinate - start) / (end - start), EDGE, 1 - EDGE)
             u[i] = library.log(fraction) - library.log1p(-fraction)
             leaves[parameter.leaf] = self._with_value(i, leaf, value, library)
@@ -254,10 +260,10 @@ class Space(eqx.Module, Generic[System]):
         values = list(fractions)
         for i in self.order:
             parameter = self.parameters[i]
-            start = _to_scale(self._floor(i, leaves, low, library), parameter.scale, library)
-            end = _to_scale(high[i], parameter.scale, library)
+            start = to_scale(self._floor(i, leaves, low, library), parameter.scale, library)
+            end = to_scale(high[i], parameter.scale, library)
             coordinate = start + (end - start) * fractions[i]
-            values[i] = _from_scale(coordinate, parameter.scale, library)
+            values[i] = from_scale(coordinate, parameter.scale, library)
             leaf = leaves[parameter.leaf]
             leaves[parameter.leaf] = self._with_value(i, leaf, values[i], library)
         return leaves, library.stack(values)
@@ -275,51 +281,6 @@ class Space(eqx.Module, Generic[System]):
 def _free_last(columns: Any) -> Any:
     """(free, *rows) as (*rows, free)."""
     return library_of(columns).moveaxis(columns, 0, -1)
-
-
-def _to_scale(value: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
-    """The coordinate in which a range is divided evenly: `g` of the module's docstring."""
-    match scale:
-        case "log":
-            return library.log(value)
-        case "gain":
-            return library.log(-library.log1p(-value))
-        case _:
-            return value
-
-
-def _from_scale(coordinate: Any, scale: parameter_tree.Scale, library: ModuleType) -> Any:
-    """Inverse of `_to_scale`."""
-    match scale:
-        case "log":
-            return library.exp(coordinate)
-        case "gain":
-            return -library.expm1(-library.exp(coordinate))
-        case _:
-            return coordinate
-
-
-def scale_width(parameter: FreeParameter) -> float:
-    """Width of a parameter's range on its scale."""
-    return float(
-        np.diff(_to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np))[0]
-    )
-
-
-def to_fractions(
-    parameter: FreeParameter, values: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n"]:
-    """Where values lie in a parameter's range, 0..1, evenly on its scale."""
-    start, end = _to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
-    return (_to_scale(np.asarray(values), parameter.scale, np) - start) / (end - start)
-
-
-def from_fractions(
-    parameter: FreeParameter, fractions: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n"]:
-    """Inverse of `to_fractions`."""
-    start, end = _to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
-    return _from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
 
 
 def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]:

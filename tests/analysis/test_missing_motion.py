@@ -24,13 +24,13 @@ from fitting.datasets.synthetic.speed_profile import Slip
 from fitting.datasets.synthetic.walker import WalkStyle
 from fitting.experiments.problems import ClipData, make_scene
 from fitting.inference.profiles.profile import Profile, make_profile
-from fitting.problem.free_parameters import free_parameter, present_value
+from fitting.problem.free_parameters import free_parameter, from_fractions, present_value
 from fitting.problem.loss import rho
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
 from fitting.problem.simulation import _motions
-from fitting.problem.space import from_fractions, make_space
+from fitting.problem.space import make_space
 from fitting.runtime.precision import in_float64, with_floats
 from jaxik import presets
 from jaxik.maths import parameter_tree

@@ -5,8 +5,7 @@ import pytest
 import scipy.stats
 
 from fitting.inference.profiles.heights import RISE_OF_SMOOTH, level_of, max_rise
-from fitting.problem.free_parameters import FreeParameter
-from fitting.problem.space import from_fractions
+from fitting.problem.free_parameters import FreeParameter, from_fractions
 from support import toy
 
 U = np.concatenate([np.linspace(-6, 6, 241), np.linspace(-0.02, 0.02, 21)])

@@ -14,9 +14,9 @@ from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation import search
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.profiles import heights
-from fitting.problem.free_parameters import free_parameter
+from fitting.problem.free_parameters import free_parameter, to_fractions
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space, to_fractions
+from fitting.problem.space import make_space
 from jaxik.maths import parameter_tree
 from support import toy
 

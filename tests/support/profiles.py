@@ -6,8 +6,7 @@ import numpy as np
 
 from fitting.inference.profiles.heights import usual_rise
 from fitting.inference.profiles.profile import Profile, make_profile
-from fitting.problem.free_parameters import FreeParameter
-from fitting.problem.space import from_fractions, to_fractions
+from fitting.problem.free_parameters import FreeParameter, from_fractions, to_fractions
 
 
 def parabola(parameter: FreeParameter, interval: tuple[float, float], size: int = 1) -> Profile:

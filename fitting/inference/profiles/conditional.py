@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float, Int
 from fitting.inference.optimisation import levenberg_marquardt, population
 from fitting.inference.optimisation.models import HardModel
 from fitting.inference.optimisation.solution import Solution
+from fitting.problem.free_parameters import to_fractions
 from fitting.problem.problem import Problem
-from fitting.problem.space import EDGE, to_fractions
+from fitting.problem.space import EDGE
 
 from .secants import slopes_of_thresholds
 

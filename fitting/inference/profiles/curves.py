@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from fitting.problem.free_parameters import to_fractions
 from fitting.problem.problem import Problem
-from fitting.problem.space import to_fractions
 
 from .conditional import Points, Targets, join
 from .heights import max_rise

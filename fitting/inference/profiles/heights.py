@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtr
 
-from fitting.problem.free_parameters import FreeParameter
-from fitting.problem.space import EDGE, to_fractions
+from fitting.problem.free_parameters import FreeParameter, to_fractions
+from fitting.problem.space import EDGE
 
 LEVEL = 0.95
 # Rise of the cost at the ends of a 95 % interval. A smooth parameter: half the quantile of the

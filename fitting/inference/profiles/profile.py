@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from fitting.problem.free_parameters import FreeParameter
-from fitting.problem.space import from_fractions, to_fractions
+from fitting.problem.free_parameters import FreeParameter, from_fractions, to_fractions
 
 from .heights import max_rise
 

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from fitting.inference.optimisation import population
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Solution
+from fitting.problem.free_parameters import from_fractions, to_fractions
 from fitting.problem.problem import Problem
-from fitting.problem.space import from_fractions, to_fractions
 from fitting.runtime import activity
 
 from .conditional import Points, Targets, join

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fitting.problem.free_parameters import FreeParameter
-from fitting.problem.space import scale_width, to_fractions
+from fitting.problem.free_parameters import FreeParameter, scale_width, to_fractions
 
 from .profile import Profile
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.inference.optimisation import population
-from fitting.problem.space import from_fractions, to_fractions
+from fitting.problem.free_parameters import from_fractions, to_fractions
 
 from .conditional import Conditional, Points, Targets, join
 from .curves import Curves

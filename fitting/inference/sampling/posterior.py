@@ -30,8 +30,6 @@ from .settings import DEFAULTS, SamplerSettings
 if TYPE_CHECKING:
     import pandas
 
-ROWS = 4096  # of u, whose values are computed at once
-
 
 @dataclasses.dataclass(frozen=True)
 class SamplingProgress:

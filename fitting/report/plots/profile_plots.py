@@ -9,8 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from fitting.inference.profiles.profile import Profile
-from fitting.problem.free_parameters import FreeParameter
-from fitting.problem.space import from_fractions, to_fractions
+from fitting.problem.free_parameters import FreeParameter, from_fractions, to_fractions
 
 from .style import AFTER, BEFORE, CAPTURED, legend, styled
 

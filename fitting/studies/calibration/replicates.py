@@ -22,10 +22,9 @@ from fitting.inference.optimisation.state import Search, SearchState, StepsUsedU
 from fitting.inference.profiles.heights import level_of
 from fitting.inference.profiles.profile import Profile
 from fitting.inference.sampling.posterior import Posterior, SamplingProgress
-from fitting.problem.free_parameters import FreeParameter
+from fitting.problem.free_parameters import FreeParameter, to_fractions
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
-from fitting.problem.space import to_fractions
 from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
 from fitting.studies.assess import assess_solution
