@@ -1,7 +1,8 @@
 """The three phases of a frame: `sense`, `advance` and `pose`.
 
 `sense` and `pose` have no memory, so that a clip's frames are computed all at once; only `advance`
-has to run frame by frame. Contact and root are sensed and advanced before everything else.
+has to run frame by frame. Contact and root are sensed and advanced before everything else, and so
+is what the probe remembers.
 """
 
 import dataclasses
@@ -18,9 +19,9 @@ from jaxik.stages.contact import AbstractContact
 from jaxik.stages.inputs import Inputs, Moment, SensedMoment
 from jaxik.stages.leg import LegGoal
 from jaxik.stages.pelvis import PelvisMoment
-from jaxik.stages.probe import foot_heading
+from jaxik.stages.probe import AbstractProbe, foot_heading
 from jaxik.stages.root import AbstractRoot
-from jaxik.world.frame import Contact, Sensed, animated_ankles
+from jaxik.world.frame import Contact, Frame, Sensed, Stride, animated_ankles
 from jaxik.world.places import centre_about
 from jaxik.world.skeleton import Rig, Transform, bone_lengths, mean_position
 from jaxik.world.terrain import Hit
@@ -41,16 +42,18 @@ class _FirstMemory:
 
 
 def sense_first(
-    stage: Literal["contact", "root"],
+    stage: Literal["contact", "root", "probe"],
     ik: FootIK,
     state: State,
     inputs: Inputs,
     faults: Faults | None,
     tracks: Tracks,
+    contacts: Contact | None = None,
 ) -> tuple[PyTree, PyTree]:
-    """A stage that runs before everything else, for a whole clip.
+    """A stage whose memory advances before everything else, for a whole clip.
 
-    It has a scan of its own, or none if its rule has no memory.
+    It has a scan of its own, or none if its rule has no memory. Of the probe, this is the stride
+    by which it then senses the ground.
 
     Args:
         stage: its name.
@@ -59,16 +62,24 @@ def sense_first(
         inputs: the leaves of `frame` have a leading axis of frames.
         faults: of the frames; None takes all of them.
         tracks: parameters that change along the clip.
+        contacts: which feet stand in each frame; for the probe.
 
     Returns:
         The stage's memory after each frame, and what it returns for each.
     """
     frames, gate, memory = inputs.frame, inputs.gate, getattr(state, stage)
 
-    def rule_at(at: Tracks) -> AbstractContact | AbstractRoot:
+    def rule_at(at: Tracks) -> AbstractContact | AbstractRoot | AbstractProbe:
         return getattr(system_at(ik, at), stage)
 
-    sensed = jax.vmap(lambda frame, at: rule_at(at).sense(inputs.at(frame)))(frames, tracks)
+    def sense_frame(frame: Frame, at: Tracks, contact: Contact | None) -> PyTree:
+        rule = rule_at(at)
+        if isinstance(rule, AbstractProbe):
+            assert contact is not None
+            return watch(system_at(ik, at), inputs.at(frame), contact)
+        return rule.sense(inputs.at(frame))
+
+    sensed = jax.vmap(sense_frame)(frames, tracks, contacts)
     if not jax.tree.leaves(memory):
 
         def advanced(sensed: PyTree, dt: Array, at: Tracks) -> PyTree:
@@ -96,9 +107,29 @@ def sense_first(
     return jax.lax.scan(scanned, _FirstMemory(state.started, state.centre_ws, memory), clip)[1]
 
 
-def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) -> Sensed:
-    """Outputs of the stages that need no memory, given which feet stand and the root's rise, m."""
+def watch(ik: FootIK, inputs: Inputs, contact: Contact) -> PyTree:
+    """What the memory of the probe advances with: it sees feet whose strides have been scaled."""
+    warp_ws = ik.warp.sense(inputs)
+    if warp_ws is not None:
+        inputs = dataclasses.replace(inputs, frame=inputs.frame.with_moved_feet(warp_ws))
+    return ik.probe.watch(inputs, contact)
+
+
+def sense(
+    ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""], stride: Stride | None
+) -> Sensed:
+    """Outputs of the stages that need no memory.
+
+    Args:
+        ik: the system.
+        inputs: the frame.
+        contact: which feet stand.
+        rise: of the root, m.
+        stride: where the feet stood and will stand; None leaves what the animation says.
+    """
     rig, terrain, frame = inputs.rig, inputs.terrain, inputs.frame
+    if stride is not None:
+        frame = dataclasses.replace(frame, stride=stride)
     up = terrain.leg_up_ws
     weight = jnp.where(rig.present, frame.grounded * frame.weight * ik.leg.weight, 0.0)
     root_ws = vec.scale(terrain.up_ws, rise)
@@ -147,14 +178,16 @@ def sense(ik: FootIK, inputs: Inputs, contact: Contact, rise: Float[Array, ""]) 
     )
 
 
-def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, PyTree]) -> Advanced:
+def advance(
+    ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, PyTree, PyTree]
+) -> Advanced:
     """Memory after this frame, and the outputs of the stages that have some.
 
     Args:
         ik: the system.
         now: the sensed frame.
         state: memory after the frame before.
-        first: memory of contact and root after this frame: they advance before `sense`.
+        first: memory of contact, root and probe after this frame: they advance before `sense`.
     """
     sensed, up = now.sensed, now.sensed.leg_up_ws
     with jax.named_scope("target"):
@@ -195,6 +228,7 @@ def advance(ik: FootIK, now: SensedMoment, state: State, first: tuple[PyTree, Py
         centre_ws=state.centre_ws,
         contact=first[0],
         root=first[1],
+        probe=first[2],
         target=target_state,
         lean=lean_state,
         lock=lock_state,

@@ -18,14 +18,20 @@ from jaxik.world.terrain import LegTerrains, Terrain
 
 from .centring import recentred
 from .faults import Faults, clean, per_leg, remembered
-from .phases import advance, pose, sense, sense_first
+from .phases import advance, pose, sense, sense_first, watch
 from .shapes import check_inputs, check_state
 from .system import Advanced, FootIK, Result, State, fresh_memory, init, restarted
 from .tracks import Tracks, read_tracks, system_at
 
 Function = TypeVar("Function", bound=Callable[..., object])
 ScannedFrame: TypeAlias = tuple[
-    Sensed, tuple[PyTree, PyTree], Transform, Array | None, Faults | None, Tracks, Array | None
+    Sensed,
+    tuple[PyTree, PyTree, PyTree],
+    Transform,
+    Array | None,
+    Faults | None,
+    Tracks,
+    Array | None,
 ]
 
 
@@ -84,9 +90,11 @@ def step(
         contact_state, contact = ik.contact.advance(now, ik.contact.sense(inputs), state.contact)
     with jax.named_scope("root"):
         root_state, rise = ik.root.advance(now, ik.root.sense(inputs), state.root)
-    sensed = sense(ik, inputs, contact, rise)
+    with jax.named_scope("probe"):
+        probe_state, stride = ik.probe.advance(now, watch(ik, inputs, contact), state.probe)
+    sensed = sense(ik, inputs, contact, rise, stride)
     sensed_now = SensedMoment(frame.dt, state.started, gate, sensed, inputs.terrain)
-    advanced = advance(ik, sensed_now, state, (contact_state, root_state))
+    advanced = advance(ik, sensed_now, state, (contact_state, root_state, probe_state))
     of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
     after = remembered(now, state, advanced.state, of_legs, faults)
     advanced = dataclasses.replace(advanced, state=after)
@@ -136,9 +144,11 @@ def resume(
         contact_states, contacts = sense_first("contact", ik, state, inputs, faults, values)
     with jax.named_scope("root"):
         root_states, rises = sense_first("root", ik, state, inputs, faults, values)
+    with jax.named_scope("probe"):
+        probe_states, strides = sense_first("probe", ik, state, inputs, faults, values, contacts)
     sensed = jax.vmap(
         lambda frame, faulty, at, *first: sense(system_at(ik, at), inputs.at(frame, faulty), *first)
-    )(frames, faulty, values, contacts, rises)
+    )(frames, faulty, values, contacts, rises, strides)
     of_legs = faults and per_leg(functools.partial(fresh_memory, ik), rig)
 
     def scanned(state: State, frame: ScannedFrame) -> tuple[State, Advanced]:
@@ -151,7 +161,8 @@ def resume(
         after = remembered(now, state, advanced.state, of_legs, faults)
         return after, dataclasses.replace(advanced, state=after)
 
-    first, centres = (contact_states, root_states), centre_about(frames.world_from_model.pos)
+    first = (contact_states, root_states, probe_states)
+    centres = centre_about(frames.world_from_model.pos)
     clip = (sensed, first, frames.platforms, centres, faults, values, frames.restart)
     after, advanced = jax.lax.scan(scanned, state, clip)
     result = jax.vmap(

@@ -70,6 +70,7 @@ class State:
     """m, the origin of all places in this memory; 0 with 64 bits."""
     contact: PyTree
     root: PyTree
+    probe: PyTree
     target: PyTree
     lean: PyTree
     lock: PyTree
@@ -159,6 +160,7 @@ def fresh_memory(ik: FootIK, rig: Rig) -> State:
         jnp.zeros(3, rig.side.dtype),
         ik.contact.init(rig),
         ik.root.init(rig),
+        ik.probe.init(rig),
         ik.target.init(rig),
         ik.lean.init(rig),
         ik.lock.init(rig),

@@ -52,7 +52,7 @@ class TargetState:
     """Smoothed height of each foothold."""
 
     height: Float[Array, " legs"] = place("leg height")
-    """m, along up."""
+    """m, along up, with what a swing adds to the animated lift."""
     velocity: Float[Array, " legs"]
     """m/s, over the ground; 0 unless it follows as a spring."""
     point_ws: Float[Array, "legs 3"] = place("point")
@@ -124,7 +124,9 @@ class SlopeTarget(AbstractTarget):
         foothold, gate, dt = now.sensed.foothold, now.gate, now.dt
         climb = jnp.where(self.follow_slopes, self._climb(now, state), 0.0)
         before = state.height + now.sensed.ground_rise + climb
-        gap = foothold.height - before
+        swing_lift = now.sensed.ground.lift
+        goal = foothold.height if swing_lift is None else foothold.height + swing_lift
+        gap = goal - before
         rising = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         fraction = gate.choose(
             rising,
@@ -133,12 +135,12 @@ class SlopeTarget(AbstractTarget):
         )
         height, velocity = smoothing.follow(
             smoothing.Motion(before, state.velocity),
-            foothold.height,
+            goal,
             now.progress(fraction),
             dt,
             self.spring,
         )
-        rise = height - foothold.height
+        rise = height - goal
         ankle = foothold.ankle_height_ms + rise * foothold.climb
         kept = gate.clip(ankle, self.min_ankle_height, self.max_ankle_height, band=HEIGHT_BAND)
         return TargetState(height, velocity, foothold.point_ws), rise + (kept - ankle)

@@ -10,6 +10,7 @@ from scipy import stats
 
 from fitting.analysis.goodness import verdict
 from fitting.analysis.goodness.groups import Assumed, measure_groups
+from fitting.analysis.goodness.noise import MEDIAN
 from fitting.analysis.goodness.verdict import Verdict
 from fitting.analysis.playback import Playback
 from fitting.problem.residuals import whitened
@@ -72,6 +73,23 @@ def test_noise_as_assumed_fits(made, given):
     verdicts = [judge(play, **given) for play in plays]
     assert sum(verdict.sentence.startswith("Fits: ") for verdict in verdicts) >= 97
     assert all(verdict.fits for verdict in verdicts)
+
+
+def test_a_robust_loss_finds_noise_that_is_in_one_axis_only():
+    """As under an animation that has the captured paths seen from above."""
+    random = np.random.default_rng(0)
+    errors = {kind: np.zeros((FRAMES, *SHAPES[kind])) for kind in KINDS}
+    for kind in KINDS:
+        shape = errors[kind][..., 1].shape
+        errors[kind][..., 1] = np.sqrt(3) * SIGMAS[kind] * random.normal(size=shape)
+        errors[kind][..., 0] = 1e-15 * random.normal(size=shape)
+    play = playback(errors)
+    for loss in ("squares", "cauchy", "student"):
+        found = measure_groups([play], [{}], Assumed(loss=loss))
+        for group in found:
+            expected = MEDIAN / Assumed(loss=loss).median if loss == "student" else 1.0
+            assert group.plain.scale == pytest.approx(expected, rel=0.12), (loss, group.kind)
+            assert not group.has_outliers
 
 
 @pytest.mark.parametrize("scale", [1 / 3, 0.5, 2.0, 3.0])

@@ -298,7 +298,7 @@ def test_a_flat_animation_with_other_frames_is_rejected(tmp_path, change, messag
         problems.make_problem(loaded)
 
 
-@pytest.mark.parametrize("name", ["blocks", "blocks_walk"])
+@pytest.mark.parametrize("name", ["blocks", "blocks_walk", "blocks_causal"])
 def test_the_blocks_experiments_make_a_problem(mocap, name):
     path = ROOT / "data" / "experiments" / f"{name}.toml"
     problem = problems.make_problem(experiment_files.load_experiment(path))

@@ -325,8 +325,8 @@ LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=y
 OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.enabled=yes ReachPelvis.spring=no
 RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
-StrideProbe.swing_as_animated=no StrideProbe.use_strides=yes SupportPelvis.spring=no
-SweepProbe.check_support=no SweepProbe.limited=yes TwoBone.as_animated=no
+StrideProbe.remember_swings=no StrideProbe.swing_as_animated=no StrideProbe.use_strides=yes
+SupportPelvis.spring=no SweepProbe.check_support=no SweepProbe.limited=yes TwoBone.as_animated=no
 """
 
 

@@ -146,7 +146,7 @@ def _measure_group(
     playback: Playback, kind: str, clip: int, correlation: float, used: float, assumed: Assumed
 ) -> Group:
     plain, residuals, active = series(playback, kind)
-    deviation = noise.scale_by_median(residuals[active])
+    deviation = noise.scale_by_median(residuals, active)
     in_deviations = np.abs(residuals) / (deviation or np.inf)
     far = in_deviations > FAR
     isolated = _fraction(~_lasting(far, LONGEST_OUTLIER), far) > 0.5

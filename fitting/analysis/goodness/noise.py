@@ -84,8 +84,10 @@ def measure(
     lags = min(LAGS, len(r))
     spread = 1.0 + 2.0 * float(np.sum(r[:end] ** 2))
     free = 1.0 - used
-    shown = residuals[active]
-    size = float(np.median(np.abs(shown)) / median if median else np.mean(shown**2) ** 0.5)
+    if median:
+        size = _median_size(residuals, active) / median
+    else:
+        size = float(np.mean(residuals[active] ** 2) ** 0.5)
     return Noise(
         count=count,
         degrees=count / spread * free * (MEDIAN_EFFICIENCY if median else 1.0),
@@ -136,16 +138,33 @@ def autocorrelations(
     return of_values[1:] / np.maximum(pairs[1:], 1.0) / variance, pairs[1:]
 
 
-def scale_by_median(residuals: Float[np.ndarray, " count"]) -> float:
-    """Standard deviation of normal residuals from the median of their sizes; 0 without any."""
-    return float(np.median(np.abs(residuals))) / MEDIAN if residuals.size else 0.0
+def scale_by_median(
+    residuals: Float[np.ndarray, "frames columns"], active: Bool[np.ndarray, "frames columns"]
+) -> float:
+    """Standard deviation of normal residuals from the medians of their sizes; 0 without any."""
+    return _median_size(residuals, active) / MEDIAN
+
+
+def _median_size(
+    residuals: Float[np.ndarray, "frames columns"], active: Bool[np.ndarray, "frames columns"]
+) -> float:
+    """Root mean square over the columns, by their counts, of the median size of each.
+
+    Not the median of all columns together: under an animation that has the captured paths seen from
+    above, positions err in height only, and a median over all three axes would be zero.
+    """
+    if not active.any():
+        return 0.0
+    columns = zip(np.abs(residuals).T, active.T, strict=True)
+    medians = [np.median(sizes[seen]) if seen.any() else 0.0 for sizes, seen in columns]
+    return math.sqrt(np.average(np.square(medians), weights=active.sum(axis=0)))
 
 
 def tamed(
     residuals: Float[np.ndarray, "frames columns"], active: Bool[np.ndarray, "frames columns"]
 ) -> Float[np.ndarray, "frames columns"]:
     """Residuals with those that are far out drawn in to `FAR` times their median-based scale."""
-    limit = FAR * scale_by_median(residuals[active])
+    limit = FAR * scale_by_median(residuals, active)
     return np.clip(residuals, -limit, limit)
 
 

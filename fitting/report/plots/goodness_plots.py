@@ -28,7 +28,7 @@ def noise(playback: Playback, title: str) -> Figure:
         _, residuals, active = groups.series(playback, kind)
         _draw_autocorrelation(left, residuals, active, float(np.median(playback.dt)))
         left.set_title(f"{RESIDUALS[kind].name}: correlation with later residuals")
-        _draw_tails(right, residuals[active])
+        _draw_tails(right, residuals, active)
         right.set_title(f"{RESIDUALS[kind].name}: distribution")
     grid[-1, 0].set_xlabel("seconds later")
     grid[-1, 1].set_xlabel("residual, in standard deviations (from the median)")
@@ -53,12 +53,12 @@ def _draw_autocorrelation(axes: Axes, residuals: np.ndarray, active: np.ndarray,
     axes.set_ylim(low, 1.0)
 
 
-def _draw_tails(axes: Axes, residuals: np.ndarray) -> None:
+def _draw_tails(axes: Axes, residuals: np.ndarray, active: np.ndarray) -> None:
     """A histogram over a logarithmic axis, which shows outliers."""
     edges = np.linspace(-WIDEST, WIDEST, 65)
-    scale = scale_by_median(residuals)
+    scale = scale_by_median(residuals, active)
     if scale > 0:
-        values = np.clip(residuals / scale, -WIDEST + 1e-9, WIDEST - 1e-9)
+        values = np.clip(residuals[active] / scale, -WIDEST + 1e-9, WIDEST - 1e-9)
         density = np.histogram(values, edges, density=True)[0]
         axes.stairs(density, edges, fill=True, color=AFTER, alpha=0.6)
     curve = np.linspace(-WIDEST, WIDEST, 321)

@@ -6,13 +6,22 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Rule
 from jaxik.maths.smoothing import lerp
-from jaxik.stages.inputs import Inputs
-from jaxik.world.frame import FORWARD, Contact, Frame, GroundHits, Rays, animated_ankles, heading
+from jaxik.stages.inputs import Inputs, Moment
+from jaxik.world.frame import (
+    FORWARD,
+    Contact,
+    Frame,
+    GroundHits,
+    Rays,
+    Stride,
+    animated_ankles,
+    heading,
+)
 from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit, LegTerrains, Terrain
 
@@ -25,6 +34,21 @@ class AbstractProbe(Rule):
     def prepare(self, terrain: Ground) -> Ground:
         """The terrain with all that this probe needs of it; on the host, so not under jit."""
         return terrain
+
+    def init(self, rig: Rig) -> PyTree:
+        """Memory before the first frame; None for a probe that goes by each frame alone."""
+        return None
+
+    def watch(self, inputs: Inputs, contact: Contact) -> PyTree:
+        """What memory advances with, from this frame alone."""
+        return None
+
+    def advance(self, now: Moment, watched: PyTree, state: PyTree) -> tuple[PyTree, Stride | None]:
+        """Memory after this frame, and the stride that `sense` finds in the frame.
+
+        It runs before `sense`. None leaves the animation's stride.
+        """
+        return None, None
 
     @abstractmethod
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:

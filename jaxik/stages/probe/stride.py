@@ -1,5 +1,6 @@
 """A probe that looks ahead: the ground between the last and the next foothold of each foot."""
 
+import dataclasses
 import functools
 
 import jax
@@ -8,12 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
-from jaxik.maths.parameter_tree import Leaf, parameter, switch
+from jaxik.maths.parameter_tree import Leaf, option, parameter, switch
 from jaxik.maths.smoothing import lerp
-from jaxik.stages.inputs import Inputs
+from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
+from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
 
+from . import foresight
 from .base import make_rays, no_hit
 from .limits import climb, clip_to_one, least_rise, smoothstep
 from .swing import FAR, AbstractSwingProbe, Level, s_curve
@@ -21,6 +24,7 @@ from .swing import FAR, AbstractSwingProbe, Level, s_curve
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
 STAIRS = 0.75  # rise over run of the steepest stairs
+SPREAD = 0.5  # of the way that is left: how far around a predicted foothold the foot may land
 
 
 class StrideProbe(AbstractSwingProbe):
@@ -39,7 +43,10 @@ class StrideProbe(AbstractSwingProbe):
 
     The animation may provide the footholds (`Frame.stride`). If not, or with `use_strides` off,
     they are predicted from the character's velocity: feet stand for `stance_time` and swing for
-    `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986).
+    `swing_time`, from as far ahead of the hip to as far behind it (Raibert 1986). A single frame
+    tells little of that. With `remember_swings` on, the last foothold is where the foot stood and
+    the next where its swing so far leads (see `foresight`). As long as it is uncertain where that
+    is, the ground is the mean of that for five places around it.
 
     A next foothold counts less and less if the way there takes a step of more than `max_step_up` or
     `max_step_down`, or if its ground is steeper than `max_slope`, so that a foot neither drops off
@@ -108,10 +115,53 @@ class StrideProbe(AbstractSwingProbe):
         doc="How long a foot swings, where the animation does not give its footholds.",
     )
 
+    remember_swings: bool = option(
+        False,
+        doc="Whether footholds that the animation does not give are predicted from each swing so "
+        "far, which takes memory and five times as many rays, not from each frame alone.",
+    )
+
+    def init(self, rig: Rig) -> foresight.Swings | None:
+        return foresight.no_swings(rig) if self.remember_swings else None
+
+    def watch(self, inputs: Inputs, contact: Contact) -> foresight.Feet | None:
+        return foresight.watch(inputs, contact) if self.remember_swings else None
+
+    def advance(
+        self, now: Moment, watched: foresight.Feet | None, state: foresight.Swings | None
+    ) -> tuple[foresight.Swings | None, Stride | None]:
+        if watched is None or state is None:
+            return None, None
+        times = self.stance_time, self.swing_time
+        swings, next_ws = foresight.follow_swings(now, watched, state, *times)
+        last_ws = watched.ball_ws - swings.travelled_ws
+        predicted = (last_ws, next_ws, swings.fraction)
+        return swings, self._known_or(watched.stride, *predicted, watched.up_ws)
+
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
-        terrain, frame = inputs.terrain, inputs.frame
-        level = Level(frame.world_from_model.pos, terrain.leg_up_ws)
-        stride = self._stride(inputs, contact, level)
+        level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
+        if not self.remember_swings:
+            stride = self._stride(inputs, contact, level)
+            return self._ground_of(inputs, foot_height, level, stride)
+        stride = inputs.frame.stride
+        ball = inputs.frame.world_from_model.apply(inputs.frame.pose.toe.pos)
+        way = vec.reject(stride.next_ws - ball, level.up_ws)
+        aside = vec.cross(way, level.up_ws)
+        spread = jnp.where(stride.known > 0, 0.0, SPREAD)
+        ways = jnp.stack([jnp.zeros_like(way), way, -way, aside, -aside])
+        places_ws = stride.next_ws + vec.scale(ways, spread)
+        grounds = jax.vmap(
+            lambda next_ws: self._ground_of(
+                inputs, foot_height, level, dataclasses.replace(stride, next_ws=next_ws)
+            )
+        )(places_ws)
+        return _mean_ground(grounds, level.up_ws)
+
+    def _ground_of(
+        self, inputs: Inputs, foot_height: Array, level: Level, stride: Stride
+    ) -> GroundHits:
+        """The ground under feet in these strides."""
+        frame = inputs.frame
         way_ws = stride.next_ws - stride.last_ws
         fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
         path_ws = stride.last_ws + vec.scale(way_ws, fractions)
@@ -170,31 +220,33 @@ class StrideProbe(AbstractSwingProbe):
 
     def _stride(self, inputs: Inputs, contact: Contact, level: Level) -> Stride:
         """The stride of the animation where it is known, else one predicted from velocity."""
-        frame, gate, labelled = inputs.frame, inputs.gate, inputs.frame.stride
+        frame = inputs.frame
         velocity = vec.reject(frame.velocity_ws, level.up_ws)
         ball = level.project(frame.world_from_model.apply(frame.pose.toe.pos))
         ankle, hip = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.hip.pos)
-        half = 0.5 * self.stance_time
-        ahead = vec.safe_divide(vec.dot(ankle - hip, velocity), vec.dot(velocity, velocity))
-        ahead = gate.clip(ahead, -half, half, band=0.02)
-        fraction = 0.5 + ahead / self.stance_time
-        zero = jnp.zeros_like(fraction)
-        fraction = gate.choose(contact.planted, zero, fraction)
-        since_last = half + ahead + fraction * self.swing_time
-        since_last = gate.choose(contact.planted, zero, since_last)
-        until_next = half - ahead + (1.0 - fraction) * self.swing_time
-        cycle = zero + self.stance_time + self.swing_time
-        until_next = gate.choose(contact.planted, cycle, until_next)
+        ahead = foresight.time_ahead(velocity, ankle - hip)
+        times = self.stance_time, self.swing_time
+        now = foresight.instant(ahead, contact.planted, *times, inputs.gate)
+        last_ws = ball + vec.scale(velocity, -now.since_last)
+        next_ws = ball + vec.scale(velocity, now.until_next)
+        return self._known_or(frame.stride, last_ws, next_ws, now.fraction, level.up_ws)
+
+    def _known_or(
+        self, labelled: Stride, last_ws: Array, next_ws: Array, fraction: Array, up_ws: Array
+    ) -> Stride:
+        """The stride of the animation where it is known and wanted, else the one that is given."""
         known = (labelled.known > 0) & self.use_strides
-        last_ws, next_ws = (
-            jnp.where(known[..., None], label, ball + vec.scale(velocity, time))
-            for label, time in ((labelled.last_ws, -since_last), (labelled.next_ws, until_next))
-        )
-        fraction = jnp.where(known, labelled.fraction, fraction)
         aside_ws = labelled.aside_ws
         if aside_ws is not None:
-            aside_ws = jnp.where(known[..., None], vec.reject(aside_ws, level.up_ws), 0.0)
-        return Stride(labelled.standing, last_ws, next_ws, fraction, labelled.known, aside_ws)
+            aside_ws = jnp.where(known[..., None], vec.reject(aside_ws, up_ws), 0.0)
+        return Stride(
+            labelled.standing,
+            jnp.where(known[..., None], labelled.last_ws, last_ws),
+            jnp.where(known[..., None], labelled.next_ws, next_ws),
+            jnp.where(known, labelled.fraction, fraction),
+            known.astype(fraction.dtype),
+            aside_ws,
+        )
 
     def _ground_at(
         self, inputs: Inputs, level: Level, points_ws: Array, stood_on: bool = False
@@ -231,3 +283,15 @@ class StrideProbe(AbstractSwingProbe):
         Ground that is too steep counts as level: a foot is not to follow a wall.
         """
         return climb(normal, way, level.up_ws) * self.gentleness(normal, level.up_ws)
+
+
+def _mean_ground(grounds: GroundHits, up_ws: Array) -> GroundHits:
+    """The mean of several grounds (places legs) under feet that are not sure where they land."""
+    mean = jax.tree.map(lambda x: jnp.mean(x, 0), (grounds.ankle, grounds.lift, grounds.pitch))
+    first = jax.tree.map(lambda x: x[0], grounds)
+    ankle = dataclasses.replace(
+        mean[0],
+        normal=vec.normalize(mean[0].normal, up_ws),
+        platform=first.ankle.platform,
+    )
+    return dataclasses.replace(first, ankle=ankle, lift=mean[1], pitch=mean[2])

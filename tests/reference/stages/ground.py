@@ -144,16 +144,17 @@ def lean(
 def smooth_height(
     parameters: Parameters, leg: int, foot: Foot, up: Array, memory: Followed | None, frame: Frame
 ) -> Followed:
-    """Smoothed height of the foothold along up, m.
+    """Smoothed height along up of the foothold and of what the swing adds to the lift, m.
 
     With `follow_slopes` the height first moves as the plane of the ground does under the foothold.
     """
-    goal, before = float(up @ foot.foothold_ws), None
+    foothold, before = float(up @ foot.foothold_ws), None
+    goal = foothold + foot.swing_lift
     if memory is not None:
         origin = carried(frame, foot.hit, np.zeros(3))
         turn = turned(frame, foot.hit, maths.IDENTITY)
         place_before = rotate(maths.inverse(turn), foot.foothold_ws - origin)
-        height = memory.height.value + goal - float(up @ place_before)
+        height = memory.height.value + foothold - float(up @ place_before)
         if parameters.of_leg("target.follow_slopes", leg):
             way = foot.foothold_ws - carried(frame, foot.hit, memory.foothold_ws)
             height += slope_rise(parameters, leg, foot.hit.normal, way, up)
@@ -177,7 +178,7 @@ def clamped_target(
     parameters: Parameters, leg: int, foot: Foot, up: Array, height: float, frame: Frame
 ) -> tuple[Array, Array]:
     """Foothold at the smoothed height and the ankle target above it, both within the limits."""
-    foothold = foot.foothold_ws + up * (height - up @ foot.foothold_ws)
+    foothold = foot.foothold_ws + up * (height - foot.swing_lift - up @ foot.foothold_ws)
     target = foothold + up * foot.lift
     lowest = parameters.of_leg("target.min_ankle_height", leg)
     highest = parameters.of_leg("target.max_ankle_height", leg)

@@ -1,0 +1,238 @@
+"""Where a swinging foot will land, from its own motion so far: for animations without footholds."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxik.maths import quat, smoothing, vec
+from jaxik.maths.gate import AbstractGate
+from jaxik.maths.struct import place, struct
+from jaxik.stages.inputs import Inputs, Moment
+from jaxik.world.frame import FORWARD, Contact, Stride, animated_ankles
+from jaxik.world.skeleton import Rig
+
+from .limits import clip_to_one, smoothstep
+
+TIME_BAND = 0.02  # s
+# How far a swing is when its toes point down most, and when its sole is level again before it
+# lands: measured on people who walk.
+TOES_DOWN, LEVEL = 0.25, 0.7
+TURN = 0.05  # rad, by which a sole must have turned back before its toes count as down most
+WAITS = 0.2  # of its lowest pitch, up to which a sole that is nearly level may wait for the ground
+PITCHED = 0.5  # rad, of a sole, from which its pitch tells how far the swing is
+LAST = 0.98  # of a swing, where it waits for a foot that lands late
+CORRECTION = 0.035  # s, half-life with which the fraction of a swing goes to what the pitch says
+SETTLED = 0.3  # s, half-life with which a foothold follows a standing ball that slides
+NEAR = 0.04  # m, from the last foothold, up to which a foot has not left it
+STEADY = 0.1  # s, half-life with which the character's velocity is smoothed
+EARLY, LATE = 0.3, 0.7  # of a swing, between which the foot's own motion takes over from the hip's
+SHORTEST, LONGEST = 0.5, 2.0  # duration of a swing, over the usual one
+
+
+@struct
+class Feet:
+    """What one frame shows of the feet and of what carries them."""
+
+    up_ws: Float[Array, "*legs 3"]
+    velocity_ws: Float[Array, "3"]
+    """m/s, of the character over the ground."""
+    from_root_ws: Float[Array, "legs 3"]
+    """m, from the character's root to each animated ball."""
+    ball_ws: Float[Array, "legs 3"] = place("point")
+    """Metres."""
+    hip_ws: Float[Array, "legs 3"] = place("point")
+    """Metres."""
+    ahead: Float[Array, " legs"]
+    """s, in which the hip arrives over the ankle at its velocity now."""
+    pitch: Float[Array, " legs"]
+    """rad, of the animated sole, toes up."""
+    planted: Float[Array, " legs"]
+    stride: Stride
+    """Of the animation."""
+
+
+@struct
+class Swings:
+    """How far each foot is in its swing, and from where."""
+
+    planted: Float[Array, " legs"]
+    time: Float[Array, " legs"]
+    """s, since it last stood."""
+    fraction: Float[Array, " legs"]
+    """0..1, how far the swing is; 0 while it stands."""
+    lowest: Float[Array, " legs"]
+    """rad, the lowest pitch of the sole in this swing."""
+    travelled_ws: Float[Array, "legs 3"]
+    """m, horizontal, from its last foothold to the ball; in a stance, by how far it slides."""
+    from_root_ws: Float[Array, "legs 3"]
+    """m, from the character's root to each animated ball, in the frame before."""
+    velocity_ws: Float[Array, "3"]
+    """m/s, of the character over the ground, smoothed."""
+
+
+def no_swings(rig: Rig) -> Swings:
+    """Memory before the first frame."""
+    zero = jnp.zeros_like(rig.side)
+    offset = jnp.zeros((*zero.shape, 3), zero.dtype)
+    return Swings(zero, zero, zero, zero, offset, offset, offset[0])
+
+
+def watch(inputs: Inputs, contact: Contact) -> Feet:
+    """What this frame shows of the feet."""
+    frame, up = inputs.frame, inputs.terrain.leg_up_ws
+    world, ankle = frame.world_from_model, animated_ankles(frame)
+    hip, ball = world.apply(frame.pose.hip.pos), world.apply(frame.pose.toe.pos)
+    sole = quat.rotate(
+        quat.multiply(ankle.rot, inputs.rig.ankle_from_foot), vec.constant(FORWARD, ball)
+    )
+    return Feet(
+        up_ws=up,
+        velocity_ws=frame.velocity_ws,
+        from_root_ws=ball - world.pos,
+        ball_ws=ball,
+        hip_ws=hip,
+        ahead=time_ahead(vec.reject(frame.velocity_ws, up), ankle.pos - hip),
+        pitch=vec.safe_arctan2(vec.dot(sole, up), vec.length(vec.reject(sole, up))),
+        planted=contact.planted,
+        stride=frame.stride,
+    )
+
+
+def time_ahead(velocity_ws: Array, way_ws: Array) -> Float[Array, "*legs"]:
+    """s, in which something at this horizontal velocity, m/s, covers a way, m; 0 if it stands."""
+    return vec.safe_divide(vec.dot(way_ws, velocity_ws), vec.dot(velocity_ws, velocity_ws))
+
+
+@struct
+class Instant:
+    """Where feet are in their strides, if they pass their hips in the middle of both phases."""
+
+    fraction: Float[Array, "*legs"]
+    """0..1, time of the swing that has passed; 0 while standing."""
+    since_last: Float[Array, "*legs"]
+    """s, since the ball was at its last foothold, if it moved with the character."""
+    until_next: Float[Array, "*legs"]
+    """s, until it is at its next, likewise."""
+
+
+def instant(
+    ahead: Array, planted: Array, stance_time: Array, swing_time: Array, gate: AbstractGate
+) -> Instant:
+    """Where feet are in their strides by a single frame (Raibert 1986).
+
+    Args:
+        ahead: s, in which the hip arrives over the ankle.
+        planted: whether the foot stands.
+        stance_time: s, how long it stands, from as far ahead of the hip to as far behind it.
+        swing_time: s, how long it swings.
+        gate: how it is decided.
+    """
+    half = 0.5 * stance_time
+    ahead = gate.clip(ahead, -half, half, band=TIME_BAND)
+    fraction = 0.5 + ahead / stance_time
+    zero = jnp.zeros_like(fraction)
+    fraction = gate.choose(planted, zero, fraction)
+    since_last = gate.choose(planted, zero, half + ahead + fraction * swing_time)
+    until_next = half - ahead + (1.0 - fraction) * swing_time
+    until_next = gate.choose(planted, zero + stance_time + swing_time, until_next)
+    return Instant(fraction, since_last, until_next)
+
+
+def follow_swings(
+    now: Moment, feet: Feet, before: Swings, stance_time: Array, swing_time: Array
+) -> tuple[Swings, Float[Array, "legs 3"]]:
+    """Memory after this frame, and where each foot will stand next, m, world space.
+
+    A swing goes on with time. Once its toes have pointed down most, the pitch of the sole says how
+    far it is, since the sole turns evenly until it is level again; from then on the swing goes on
+    at the pace that it had. At first a foot is expected as far ahead of its hip as it will be when
+    it lands, later where its own motion takes it, which slows down as a minimum-jerk motion does
+    (Flash and Hogan 1985).
+
+    Args:
+        now: the frame.
+        feet: what it shows.
+        before: memory.
+        stance_time: s, how long a foot usually stands.
+        swing_time: s, how long it usually swings.
+    """
+    gate, dt = now.gate, now.dt
+    guess = _first_guess(feet, stance_time, swing_time, gate)
+    steady = now.progress(smoothing.fraction_of_half_life(jnp.asarray(STEADY, dt.dtype), dt))
+    velocity = smoothing.lerp(before.velocity_ws, feet.velocity_ws, steady)
+    moved = jnp.where(now.started, feet.from_root_ws - before.from_root_ws, 0.0)
+    moved = vec.reject(moved + vec.scale(feet.velocity_ws, dt), feet.up_ws)
+
+    time = before.time + dt
+    time = jnp.where(now.started, time, dt + guess.fraction * swing_time)
+    lowest = jnp.where(feet.pitch < before.lowest, feet.pitch, before.lowest)
+    lowest = jnp.where(now.started, lowest, feet.pitch)
+    start_ws = vec.scale(vec.reject(feet.velocity_ws, feet.up_ws), guess.since_last)
+    travelled = jnp.where(now.started, before.travelled_ws + moved, start_ws)
+    # A foot that is put down where it stood keeps its foothold: contact may flicker.
+    same = 1.0 - (1.0 - before.planted) * smoothstep((vec.length(travelled) - NEAR) / NEAR)
+    settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
+    in_stance = vec.scale(travelled, same * (1.0 - settled))
+    pace = 1.0 / _duration(before.time, before.fraction, swing_time)
+    fraction = _turned(before.fraction, before.fraction + dt * pace, feet.pitch, lowest, dt)
+    fraction = jnp.where(now.started, fraction, guess.fraction)
+    swings = Swings(
+        feet.planted,
+        gate.choose(feet.planted, jnp.zeros_like(time), time),
+        gate.choose(feet.planted, jnp.zeros_like(fraction), fraction),
+        gate.choose(feet.planted, feet.pitch, lowest),
+        gate.choose(feet.planted[:, None], in_stance, travelled),
+        feet.from_root_ws,
+        velocity,
+    )
+    foot_velocity = vec.scale(moved, vec.safe_divide(jnp.ones_like(dt), dt))
+    return swings, _landing(feet, swings, foot_velocity, stance_time, swing_time)
+
+
+def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: AbstractGate) -> Instant:
+    """Where feet are in their strides in a first frame; toes that are up in a swing will land."""
+    guess = instant(feet.ahead, feet.planted, stance_time, swing_time, gate)
+    landing = (feet.planted < 1) & (feet.pitch > 0) & (guess.fraction < LEVEL)
+    fraction = jnp.where(landing, LEVEL, guess.fraction)
+    since_last = guess.since_last + (fraction - guess.fraction) * swing_time
+    return Instant(fraction, since_last, guess.until_next)
+
+
+def _duration(time: Array, fraction: Array, swing_time: Array) -> Array:
+    """s, of each swing: the usual one at first, then that of its pace so far."""
+    pace_known = smoothstep((fraction - TOES_DOWN) / 0.1)
+    so_far = time / jnp.where(fraction > TOES_DOWN, fraction, TOES_DOWN)
+    shortest, longest = SHORTEST * swing_time, LONGEST * swing_time
+    so_far = jnp.where(so_far < shortest, shortest, jnp.where(so_far > longest, longest, so_far))
+    return smoothing.lerp(swing_time + jnp.zeros_like(so_far), so_far, pace_known)
+
+
+def _turned(before: Array, by_time: Array, pitch: Array, lowest: Array, dt: Array) -> Array:
+    """How far each swing is, by time and by the pitch of its sole; it never goes back."""
+    pitched = clip_to_one(-lowest / PITCHED)
+    turned = smoothstep((pitch - lowest) / TURN)
+    latest = LAST - pitched * (1.0 - turned) * (LAST - TOES_DOWN)
+    fraction = jnp.where(by_time < latest, by_time, latest)
+    level = clip_to_one(vec.safe_divide(pitch, lowest))  # 1 where lowest, 0 where level
+    by_pitch = TOES_DOWN + (LEVEL - TOES_DOWN) * (1.0 - level)
+    # Near the level the pitch says nothing more: a foot may wait there until it lands.
+    weight = turned * pitched * smoothstep(level / WAITS)
+    weight *= smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
+    fraction = smoothing.lerp(fraction, by_pitch, weight)
+    return jnp.where(fraction > before, fraction, before)
+
+
+def _landing(
+    feet: Feet, swings: Swings, foot_velocity: Array, stance_time: Array, swing_time: Array
+) -> Float[Array, "legs 3"]:
+    """Where the balls will stand next, m, world space; their height says nothing."""
+    fraction = swings.fraction
+    duration = _duration(swings.time, fraction, swing_time)
+    until = (1.0 - fraction) * duration + 0.5 * stance_time
+    by_hip = feet.hip_ws + vec.scale(swings.velocity_ws, until)
+    # Of a minimum-jerk motion, the way that is left over the speed and the duration.
+    x = jnp.where(fraction > EARLY, fraction, EARLY)
+    left = 1.0 - x
+    left *= (10.0 - 15.0 * left + 6.0 * left * left) / (30.0 * x * x)
+    by_ball = feet.ball_ws + vec.scale(foot_velocity, duration * left)
+    own = smoothstep((fraction - EARLY) / (LATE - EARLY))
+    return smoothing.lerp(by_hip, by_ball, own[:, None])
