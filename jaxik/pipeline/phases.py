@@ -108,11 +108,20 @@ def sense_first(
 
 
 def watch(ik: FootIK, inputs: Inputs, contact: Contact) -> PyTree:
-    """What the memory of the probe advances with: it sees feet whose strides have been scaled."""
+    """What the memory of the probe advances with; None if it has none."""
+    if not jax.tree.leaves(ik.probe.init(inputs.rig)):
+        return None  # and no stride is scaled in vain
+    return ik.probe.watch(_with_scaled_strides(ik, inputs)[0], contact)
+
+
+def _with_scaled_strides(
+    ik: FootIK, inputs: Inputs
+) -> tuple[Inputs, Float[Array, "legs 3"] | None]:
+    """The frame with its feet moved for the character's speed, and by how much, m."""
     warp_ws = ik.warp.sense(inputs)
     if warp_ws is not None:
         inputs = dataclasses.replace(inputs, frame=inputs.frame.with_moved_feet(warp_ws))
-    return ik.probe.watch(inputs, contact)
+    return inputs, warp_ws
 
 
 def sense(
@@ -137,10 +146,8 @@ def sense(
     inputs = dataclasses.replace(inputs, frame=frame)
     thigh, shin = bone_lengths(frame.pose)
     with jax.named_scope("warp"):
-        warp_ws = ik.warp.sense(inputs)
-        if warp_ws is not None:
-            frame = frame.with_moved_feet(warp_ws)
-            inputs = dataclasses.replace(inputs, frame=frame)
+        inputs, warp_ws = _with_scaled_strides(ik, inputs)
+        frame = inputs.frame
     with jax.named_scope("probe"):
         ground = ik.probe.sense(inputs, contact, ik.target.foot_height)
     with jax.named_scope("target"):

@@ -109,14 +109,12 @@ def save(path: Path, figure: Figure) -> None:
 
 
 def _write(path: Path, figure: Figure) -> None:
-    look: Any = {"facecolor": "white"}
-
     def fill(temporary: Path) -> None:
         try:
-            figure.savefig(temporary, **look)
+            figure.savefig(temporary, facecolor="white")
         except ValueError:  # a name of the user's, such as "$x^$", is no mathematics
             for text in figure.findobj(Text):
                 text.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
-            figure.savefig(temporary, **look)
+            figure.savefig(temporary, facecolor="white")
 
     files.write(path, fill)
