@@ -46,6 +46,7 @@ ODD: dict[str, Any] = LOCKS | {  # away from the defaults
     "probe.toes_up": 0.2,
     "probe.toes_down": 0.1,
     "probe.toes_down_per_height": 1.4,
+    "probe.toes_first": 1.1,
     "probe.stance_time": 0.5,
     "probe.swing_time": 0.37,
     "target.foot_height": 0.07,

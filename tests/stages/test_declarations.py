@@ -165,6 +165,7 @@ StrideProbe.lift_over 1 1.7 0 3
 StrideProbe.toes_up rad 0.1 0 0.60000002
 StrideProbe.toes_down rad 0.30000001 0 0.80000001
 StrideProbe.toes_down_per_height rad/m 0.89999998 0 3
+StrideProbe.toes_first rad/m 0.80000001 0 2
 StrideProbe.stance_time s 0.64999998 0.2 1.5
 StrideProbe.swing_time s 0.44999999 0.1 1
 GroundRoot.ray_up m 10 0 20

@@ -155,6 +155,13 @@ class AbstractLimitedProbe(AbstractProbe):
         slope = vec.safe_arctan2(vec.length(vec.cross(normal, up_ws)), cosine)
         return 1.0 - smoothstep((slope - self.max_slope) / SLOPE_FADE)
 
+    def climb(self, normal: Array, way: Array, up_ws: Array) -> Array:
+        """How much higher ground with this normal is at the end of a way than at its start, m.
+
+        Ground that is too steep counts as level: a foot is not to follow a wall.
+        """
+        return climb(normal, way, up_ws) * self.gentleness(normal, up_ws)
+
     def _trust_from(self, root_ws: Array, hits: Hit, up_ws: Array, margin: Array) -> Array:
         """0..1, how far each hit is accepted by a character whose root is there."""
         way = hits.point - root_ws

@@ -18,7 +18,7 @@ from jaxik.world.terrain import Hit
 
 from . import foresight
 from .base import make_rays, no_hit
-from .limits import climb, clip_to_one, least_rise, smoothstep
+from .limits import clip_to_one, least_rise, smoothstep
 from .swing import FAR, AbstractSwingProbe, Level, s_curve
 
 PATH_RAYS = 8  # between two footholds
@@ -180,7 +180,7 @@ class StrideProbe(AbstractSwingProbe):
         normal = lerp(next_.normal, last.normal, last.found[..., None])
 
         way = vec.reject(way_ws, level.up_ws)
-        climbs = self._climb(normal, way, level), self._climb(next_.normal, way, level)
+        climbs = self.climb(normal, way, level.up_ws), self.climb(next_.normal, way, level.up_ws)
         slope = least_rise(high - low, *climbs)
         step = high - low - slope
         evened = jnp.concatenate([low[None], heights[1:]]) - slope * fractions
@@ -201,11 +201,12 @@ class StrideProbe(AbstractSwingProbe):
         edges = jax.tree.map(lambda x: x[1:-1], path)
         higher = low + jnp.where(step > 0, step, 0.0)
         over = self.over_footholds(inputs, evened[1:-1], edges.found, higher)
-        swing = self.swing(inputs, stride, step, over, trust)
+        below = self.below_others(inputs, height, normal, found)
+        swing = self.swing(inputs, stride, step, over, trust, below)
         soles = self.soles(inputs, foot_height)
-        under_soles = height + self._climb(normal, soles - ball, level)
+        under_soles = height + self.climb(normal, soles - ball, level.up_ws)
         height += self.clearance_over_edges(inputs, stride, swing, soles, under_soles, top, edges)
-        height += self._climb(normal, ankle - ball, level)
+        height += self.climb(normal, ankle - ball, level.up_ws)
         height = jnp.where(found > 0, height, 0.0)
         ankle_ws = level.project(ankle) + vec.scale(level.up_ws, height)
         platform = last.platform
@@ -276,13 +277,6 @@ class StrideProbe(AbstractSwingProbe):
             least = functools.reduce(lambda a, b: jnp.where(a < b, a, b), reached)
             excess.append(jnp.where(found[point] > 0, least, FAR))
         return 1.0 - smoothstep(excess[-1] / self.step_fade)
-
-    def _climb(self, normal: Array, way: Array, level: Level) -> Array:
-        """How much higher ground with this normal is at the end of a way than at its start, m.
-
-        Ground that is too steep counts as level: a foot is not to follow a wall.
-        """
-        return climb(normal, way, level.up_ws) * self.gentleness(normal, level.up_ws)
 
 
 def _mean_ground(grounds: GroundHits, up_ws: Array) -> GroundHits:

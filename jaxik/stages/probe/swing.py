@@ -11,7 +11,7 @@ from jaxik.world.frame import FORWARD, Stride, animated_ankles
 from jaxik.world.terrain import Hit
 
 from .base import foot_heading
-from .limits import AbstractLimitedProbe, smoothstep
+from .limits import AbstractLimitedProbe, least_rise, smoothstep
 
 HEIGHT_BAND = 0.01  # m
 ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
@@ -20,6 +20,7 @@ SHARPNESS = 7.0  # of the bumps by which a swing changes; each is half as high 0
 # When a swing changes most, as a fraction of it: measured on people who walk over blocks.
 HELD, CLEAR, RISE, FALL, OVER = 0.28, 0.55, 0.52, 0.31, 0.455
 TOES_UP, TOES_DOWN = 0.23, 0.75
+ON_HEEL = 0.08  # rad, toes up, from which a foot of the animation is on its heel
 
 
 @struct
@@ -145,6 +146,13 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         high=3.0,
         doc="The same per metre that the ground rises, falls, or stands in the way.",
     )
+    toes_first: Leaf = parameter(
+        0.8,
+        unit="rad/m",
+        low=0.0,
+        high=2.0,
+        doc="By how much more a foot points its toes down as it lands, per height below the other.",
+    )
     swing_as_animated: Leaf = switch(
         False, doc="Whether feet swing as animated, over uneven ground too; they still clear edges."
     )
@@ -153,7 +161,13 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     )
 
     def swing(
-        self, inputs: Inputs, stride: Stride, step: Array, over: Array, trust: Array
+        self,
+        inputs: Inputs,
+        stride: Stride,
+        step: Array,
+        over: Array,
+        trust: Array,
+        below: Array,
     ) -> Swing:
         """How much higher and more pitched than animated the feet are.
 
@@ -163,6 +177,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
             step: by how much the next foothold is higher than the last, m, without the slope.
             over: how far the ground on the way is over both, m.
             trust: 0..1, how far the next foothold is accepted.
+            below: how far each foot's ground is below that of another foot, m.
         """
         x = stride.fraction
         rise, fall = jnp.where(step > 0, step, 0.0), jnp.where(step < 0, -step, 0.0)
@@ -178,6 +193,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         down = uneven * self.toes_down + self.toes_down_per_height * total
         share = jnp.where(self.swing_as_animated, 0.0, trust)
         pitch = share * (uneven * self.toes_up * bump(x, TOES_UP) - down * bump(x, TOES_DOWN))
+        first = jnp.where(self.swing_as_animated, 0.0, self.toes_first)
+        pitch -= first * below * smoothstep(self._toe_angle(inputs) / ON_HEEL)
         arm = animated_ankles(inputs.frame).pos - _balls(inputs)
         up = inputs.terrain.leg_up_ws
         turned = quat.rotate(pitch_rotation(inputs, pitch), arm)
@@ -188,6 +205,36 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
         lift = level.height(_balls(inputs)) - self.ball_height
         return jnp.where(lift > 0, lift, 0.0)
+
+    def _toe_angle(self, inputs: Inputs) -> Float[Array, " legs"]:
+        """rad, by which the animation lifts the toes over the heel."""
+        foot = quat.multiply(animated_ankles(inputs.frame).rot, inputs.rig.ankle_from_foot)
+        ahead = quat.rotate(foot, vec.constant(FORWARD, foot[..., :3]))
+        up = inputs.terrain.leg_up_ws
+        return vec.safe_arctan2(vec.dot(ahead, up), vec.length(vec.reject(ahead, up)))
+
+    def below_others(
+        self, inputs: Inputs, height: Array, normal: Array, found: Array
+    ) -> Float[Array, " legs"]:
+        """How far each foot's ground is below that of the highest other foot, m.
+
+        What the ground under both feet and between them rises by as a slope does not count.
+
+        Args:
+            inputs: the frame.
+            height: of the ground under each ball, m.
+            normal: of that ground.
+            found: of that ground; where it is 0, as of absent legs, nothing is below or above.
+        """
+        balls = _balls(inputs)
+        up = jnp.broadcast_to(inputs.terrain.leg_up_ws, balls.shape)
+        rise = height - height[:, None]  # from the foot of a row to that of a column
+        way = balls - balls[:, None]
+        climbs = self.climb(normal, way, up), self.climb(normal[:, None], way, up[:, None])
+        slope = least_rise(rise, *climbs)
+        counts = (found > 0) & (found[:, None] > 0) & inputs.rig.present
+        below = jnp.where(counts & (rise - slope > 0), rise - slope, 0.0)
+        return jnp.max(below, axis=-1)
 
     def over_footholds(
         self, inputs: Inputs, heights: Array, found: Array, top: Array

@@ -5,7 +5,7 @@ One leg, one frame at a time. World space; heights are above the root along the 
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -86,16 +86,30 @@ def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bo
     return Swing(here - velocity * gone, here + velocity * to_come, fraction)
 
 
-def ground_of_stride(
-    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, planted: bool
-) -> tuple[Hit, Swing]:
-    """The ground under the ankle of a leg, and the swing that it was predicted from."""
+@dataclass
+class UnderBall:
+    """The ground under the ball of a leg, as its stride leads from one foothold to the other."""
+
+    stride: Swing
+    found: bool
+    height: float = 0.0
+    normal: Array = field(default_factory=lambda: np.zeros(3))
+    step: float = 0.0
+    over: float = 0.0
+    sure: float = 0.0
+    top: float = 0.0
+    platform: int = -1
+
+
+def under_ball(
+    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, planted: bool
+) -> UnderBall:
+    """The ground under the ball of a leg, and the stride that it was predicted from."""
     up = terrain.up
     stride = swing(parameters, frame, leg, up, planted)
-    here = level(frame, up, apply(frame.world_from_model, frame.ankle.pos[leg]))
     last, following = (look(parameters, terrain, leg, pos) for pos in (stride.last, stride.next))
     if not last.found and not following.found:
-        return Hit(False, here, up), stride
+        return UnderBall(stride, found=False)
     arrives = float(following.found)  # a swing to nowhere stays as animated
     last = last if last.found else following
     following = following if following.found else last
@@ -113,9 +127,6 @@ def ground_of_stride(
     evened = [at - slope * part for at, part in zip(on_way, parts, strict=True) if at is not None]
     over = max(0.0, max(evened, default=0.0) - low - max(step, 0.0)) if evened else 0.0
     over *= 1.0 - smooth01((over - parameters.of_leg("probe.max_step_up", leg)) / FADE)
-    stride.lift, stride.pitch = beyond_animation(
-        parameters, rig, frame, leg, up, stride.fraction, step, over, sure * arrives
-    )
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
 
@@ -129,20 +140,62 @@ def ground_of_stride(
     on_its_way = float((ball - stride.last) @ across_ws) / squared if squared > 0.0 else 0.0
     ground = low + sure * (slope * clip(on_its_way, 0.0, 1.0) + step * risen)
     normal = unit(last.normal + risen * (next_normal - last.normal), up)
+    platform = following.platform if sure * risen > 0.5 else last.platform
+    return UnderBall(
+        stride, True, ground, normal, step, over, sure * arrives, max(low, high), platform
+    )
+
+
+def below_others(
+    parameters: Parameters, frame: Frame, leg: int, ups: list[Array], balls: list[UnderBall]
+) -> float:
+    """How far the ground of this foot is below the highest of the others, m, without slopes."""
+    here = apply(frame.world_from_model, frame.toe.pos[leg])
+    below = 0.0
+    for other, ground in enumerate(balls):
+        if other == leg or not ground.found or not balls[leg].found:
+            continue
+        way = apply(frame.world_from_model, frame.toe.pos[other]) - here
+        rise = ground.height - balls[leg].height
+        climbs = [
+            climb(parameters, end, ups[end], balls[end].normal, way) for end in (leg, other)
+        ]
+        below = max(below, rise - shared_rise(rise, *climbs))
+    return below
+
+
+def ground_of_stride(
+    parameters: Parameters,
+    rig: Rig,
+    terrain: Ground,
+    frame: Frame,
+    leg: int,
+    ball: UnderBall,
+    below: float,
+) -> tuple[Hit, Swing]:
+    """The ground under the ankle of a leg, and its swing.
+
+    `below` is how far its ground is below that of another foot, m.
+    """
+    up, stride = terrain.up, ball.stride
+    here = level(frame, up, apply(frame.world_from_model, frame.ankle.pos[leg]))
+    if not ball.found:
+        return Hit(False, here, up), stride
+    stride.lift, stride.pitch = beyond_animation(
+        parameters, rig, frame, leg, up, stride.fraction, ball.step, ball.over, ball.sure, below
+    )
+    ball_ws = apply(frame.world_from_model, frame.toe.pos[leg])
 
     def beside_ball(point: Array) -> float:
         """Height of the ground under a point of the foot, on the plane under its ball, m."""
-        return ground + climb(parameters, leg, up, normal, point - ball)
+        return ball.height + climb(parameters, leg, up, ball.normal, point - ball_ws)
 
-    need = lift_over_edges(
-        parameters, rig, terrain, frame, leg, stride, beside_ball, max(low, high)
-    )
+    need = lift_over_edges(parameters, rig, terrain, frame, leg, stride, beside_ball, ball.top)
     passed, left = stride.fraction, 1.0 - stride.fraction
     window = smooth01(passed / EDGE_FRACTION) * smooth01(left / EDGE_FRACTION)
     ankle = apply(frame.world_from_model, frame.ankle.pos[leg])
-    platform = following.platform if sure * risen > 0.5 else last.platform
     point = here + up * (beside_ball(ankle) + window * need)
-    return Hit(True, point, normal, platform), stride
+    return Hit(True, point, ball.normal, ball.platform), stride
 
 
 def between(

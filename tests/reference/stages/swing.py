@@ -8,6 +8,7 @@ from reference.maths import Array, across, apply, cross, rotate, smooth01, unit
 
 SHARPNESS = 7.0
 UNEVEN = 0.05  # m
+ON_HEEL = 0.08  # rad
 HELD, CLEAR, RISE, FALL, OVER, TOES_UP, TOES_DOWN = 0.28, 0.55, 0.52, 0.31, 0.455, 0.23, 0.75
 
 
@@ -35,17 +36,19 @@ def beyond_animation(
     step: float,
     over: float,
     sure: float,
+    below: float,
 ) -> tuple[float, float]:
     """How much higher the ankle is, m, and how much further the toes are up, rad.
 
     `step` is how much higher the next foothold is than the last, without the slope, `over` how far
-    the ground between them is over both, m; `sure` is 0..1.
+    the ground between them is over both, m; `sure` is 0..1. `below` is how far the ground of this
+    foot is below that of another, m.
     """
     get = {
         name: parameters.of_leg(f"probe.{name}", leg)
         for name in (
             "held_lift", "toe_clearance", "lift_per_rise", "lift_per_fall", "lift_over",
-            "toes_up", "toes_down", "toes_down_per_height", "ball_height",
+            "toes_up", "toes_down", "toes_down_per_height", "toes_first", "ball_height",
         )
     }  # fmt: skip
     if parameters.of_leg("probe.swing_as_animated", leg):
@@ -62,7 +65,9 @@ def beyond_animation(
     lift += get["lift_over"] * over * bump(fraction, OVER)
     down = uneven * get["toes_down"] + effort * get["toes_down_per_height"]
     pitch = uneven * get["toes_up"] * bump(fraction, TOES_UP) - down * bump(fraction, TOES_DOWN)
-    pitch *= sure
+    forward = rotate(world_from_foot(rig, frame, leg), np.array([0.0, 0.0, 1.0]))
+    animated_pitch = np.arcsin(np.clip(forward @ up, -1.0, 1.0))
+    pitch = sure * pitch - get["toes_first"] * below * smooth01(animated_pitch / ON_HEEL)
     axis = axis_of_pitch(rig, frame, leg, up)
     turned = rotate(maths.from_axis_angle(axis, pitch), ankle - ball)
     return sure * lift + float((turned - (ankle - ball)) @ up), pitch

@@ -74,6 +74,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         "probe.toes_up": 0.1,
         "probe.toes_down": 0.3,
         "probe.toes_down_per_height": 0.9,
+        "probe.toes_first": 0.8,
         "probe.swing_as_animated": False,
         "probe.use_strides": True,
         "probe.stance_time": 0.65,
@@ -119,16 +120,20 @@ def step(
     ups = [characters.under(terrain, leg).up for leg in legs]
     offset_before = np.zeros(3) if state is None else state.pelvis_offset_ws
     standing, feet, followed, holds, footholds, targets = [], [], [], [], [], []
-    swings, turns = [], []
-    for leg, up in zip(legs, ups, strict=True):
+    swings, turns, balls = [], [], []
+    for leg in legs:
         before = None if state is None else state.standing[leg]
         if contact == "speed":
-            contact_of_leg = contact_by_speed.stand(parameters, frame, leg, before)
+            standing.append(contact_by_speed.stand(parameters, frame, leg, before))
         else:
             label = float(frame.stride.standing[leg])
-            contact_of_leg = Standing(label > 0.5, label)
-        below = characters.under(terrain, leg)
-        foot, swing = sense(parameters, rig, below, frame, leg, contact_of_leg)
+            standing.append(Standing(label > 0.5, label))
+        under = characters.under(terrain, leg)
+        balls.append(stride_probe.under_ball(parameters, under, frame, leg, standing[leg].standing))
+    for leg, up in zip(legs, ups, strict=True):
+        under = characters.under(terrain, leg)
+        below = stride_probe.below_others(parameters, frame, leg, ups, balls)
+        foot, swing = sense(parameters, rig, under, frame, leg, standing[leg], balls[leg], below)
 
         memory = None if state is None else state.ground[leg]
         memory = ground.smooth_height(parameters, leg, foot, up, memory, frame)
@@ -138,7 +143,6 @@ def step(
         hold, offset, turn = ground.lock(
             parameters, leg, foot, foothold, up, hold, offset_before, frame
         )
-        standing.append(contact_of_leg)
         feet.append(foot)
         swings.append(swing)
         followed.append(memory)
@@ -211,14 +215,19 @@ def run(
 
 
 def sense(
-    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, contact: Standing
+    parameters: Parameters,
+    rig: Rig,
+    terrain: Ground,
+    frame: Frame,
+    leg: int,
+    contact: Standing,
+    ball: stride_probe.UnderBall,
+    below: float,
 ) -> tuple[Foot, stride_probe.Swing]:
     """One leg in this frame, and where it is in its stride."""
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
     lift = float(frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg))
-    hit, swing = stride_probe.ground_of_stride(
-        parameters, rig, terrain, frame, leg, contact.standing
-    )
+    hit, swing = stride_probe.ground_of_stride(parameters, rig, terrain, frame, leg, ball, below)
     if hit.found:
         lift += swing.lift
     else:
