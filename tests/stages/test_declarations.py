@@ -61,6 +61,8 @@ SpineLean.side_rate 1 0 -1 1
 SpineLean.forward_rate_slide 1 0 -1 1
 SpineLean.side_rate_slide 1 0 -1 1
 SpineLean.head_share 1 0.5 0 1
+SpineLean.pelvis_rate 1 -0.25 -1 1
+SpineLean.pelvis_side_rate 1 0 -1 1
 SpineLean.spacing m 0.30000001 0.05 2
 SpineLean.half_life s 0.2 0.002 0.5
 HintLeg.hint_offset m 0,0,0 -0.5 0.5
@@ -99,6 +101,7 @@ LowestPelvis.off_gain 1/tick 0.116 0.01 0.95
 ReachPelvis.highest_share 1 0.75 0 1.2
 ReachPelvis.extension 1 0.958 0.85 1
 ReachPelvis.softness m 0.025 0.002 0.1
+ReachPelvis.shift 1 0.15000001 0 1
 ReachPelvis.rise_half_life s 0 0.002 0.5
 ReachPelvis.fall_half_life s 0 0.002 0.5
 SupportPelvis.lowest_share 1 0.30000001 0 1

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxik
+from jaxik.maths import quat
 from jaxik.maths.gate import HARD, Smooth
 from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.lean import SpineLean
@@ -28,6 +29,8 @@ VALUES = {
     "forward_rate_slide": 0.8,
     "side_rate_slide": -0.5,
     "head_share": 0.6,
+    "pelvis_rate": -0.25,
+    "pelvis_side_rate": 0.15,
     "spacing": 0.4,
     "half_life": 0.15,
 }
@@ -35,7 +38,7 @@ RULE = SpineLean(**VALUES)
 
 
 def leans(rule, rots, points, normals, weights, slides, *, gate=HARD):
-    """Rotations of spine and head (frames, 4), world axes."""
+    """Rotations of trunk, head and pelvis (frames, 4), world axes."""
     terrain = fragment(Terrain, up_ws=jnp.asarray([0.0, 1.0, 0.0], normals.dtype))
 
     def frame(carry, inputs):
@@ -52,7 +55,8 @@ def leans(rule, rots, points, normals, weights, slides, *, gate=HARD):
         sensed = fragment(Sensed, slope=slope, slide=slide, up_ws=terrain.up_ws)
         now = SensedMoment(jnp.asarray(DT, rot.dtype), started, gate, sensed, terrain)
         state, lean = rule.advance(now, state)
-        return (state, jnp.ones_like(started)), (lean.spine_ws, lean.head_ws)
+        trunk = quat.multiply(lean.spine_ws, lean.rot_ws)
+        return (state, jnp.ones_like(started)), (trunk, lean.head_ws, lean.rot_ws)
 
     rig = fragment(Rig, side=jnp.zeros(2, normals.dtype))
     start = rule.init(rig), jnp.zeros((), bool)
@@ -87,7 +91,7 @@ def uphill(angle, frames=FRAMES, yaw=0.0):
     return rots, points, normals, np.ones((frames, 2)), np.zeros(frames)
 
 
-def test_spine_and_head_turn_as_in_numpy():
+def test_trunk_head_and_pelvis_turn_as_in_numpy():
     clip = hills()
     parameters = Parameters(defaults={f"lean.{name}": value for name, value in VALUES.items()})
     state, expected = None, []
@@ -102,14 +106,14 @@ def test_spine_and_head_turn_as_in_numpy():
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 @pytest.mark.parametrize(("angle", "rate"), [(0.3, -0.4), (-0.3, -0.7), (0.0, 0.0)])
 def test_people_lean_forward_uphill_and_backward_downhill(angle, rate, yaw):
-    trunk, head = (np.asarray(rot)[-1] for rot in lean_all(RULE, *uphill(angle, yaw=yaw)))
+    turned = (np.asarray(rot)[-1] for rot in lean_all(RULE, *uphill(angle, yaw=yaw)))
     forward = Rotation.from_rotvec([0.0, yaw, 0.0]).apply([0.0, 0.0, 1.0])
     tops = [
         Rotation.from_quat(rot, scalar_first=True).apply([0.0, 1.0, 0.0]) @ forward
-        for rot in (trunk, head)
+        for rot in turned
     ]
-    np.testing.assert_allclose(tops[0], np.sin(-rate * angle), atol=1e-12)
-    np.testing.assert_allclose(tops[1], np.sin(0.6 * rate * angle), atol=1e-12)
+    expected = np.sin(np.array([-rate, 0.6 * rate, 0.25]) * angle)
+    np.testing.assert_allclose(tops, expected, atol=1e-12)
 
 
 def test_stairs_are_a_slope_from_foot_to_foot():
@@ -122,7 +126,7 @@ def test_stairs_are_a_slope_from_foot_to_foot():
 
 
 def test_a_head_that_turns_back_all_the_way_stays_level():
-    trunk, head = lean_all(dataclasses.replace(RULE, head_share=jnp.asarray(1.0)), *hills())
+    trunk, head, _ = lean_all(dataclasses.replace(RULE, head_share=jnp.asarray(1.0)), *hills())
     both = Rotation.from_quat(head, scalar_first=True) * Rotation.from_quat(
         trunk, scalar_first=True
     )

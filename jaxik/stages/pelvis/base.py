@@ -32,18 +32,20 @@ class PelvisState:
     """Metres."""
     half_height: Float[Array, ""]
     """m, of the capsule; 0 where a rule has none."""
+    ahead: Float[Array, ""]
+    """m, along the character's heading; 0 where a rule does not shift the body."""
 
     @classmethod
     def level(cls, rig: Rig) -> "PelvisState":
         """No offset."""
         zero = jnp.zeros((), rig.side.dtype)
-        return cls(zero, zero, zero, jnp.zeros(3, rig.side.dtype), zero)
+        return cls(zero, zero, zero, jnp.zeros(3, rig.side.dtype), zero, zero)
 
     @classmethod
     def at(cls, height: Array, goal: Array, up_ws: Array) -> "PelvisState":
         """An offset of `height`, m, along `up_ws`, at rest."""
         zero = jnp.zeros_like(height)
-        return cls(height, zero, goal, vec.scale(up_ws, height), zero)
+        return cls(height, zero, goal, vec.scale(up_ws, height), zero, zero)
 
 
 @struct
@@ -56,7 +58,7 @@ class PelvisMoment(SensedMoment):
 
 
 class AbstractPelvis(Rule):
-    """Moves the body up and down."""
+    """Moves the body up and down, and perhaps forward and back."""
 
     per_leg: ClassVar[bool] = False
 
@@ -80,12 +82,14 @@ def mean_height(sensed: Sensed, requested: Array) -> Float[Array, ""]:
     return vec.safe_divide(vec.sum_last(sensed.weight * requested), vec.sum_last(sensed.weight))
 
 
-def rise_to_length(sensed: Sensed, ankle_ws: Array, length: Array) -> Float[Array, " legs"]:
+def rise_to_length(
+    sensed: Sensed, hip_ws: Array, ankle_ws: Array, length: Array
+) -> Float[Array, " legs"]:
     """How far the body has to rise until each hip is `length` from its ankle, m.
 
     For an ankle further aside than that, the height at which it is nearest.
     """
-    leg = ankle_ws - sensed.hip_ws
+    leg = ankle_ws - hip_ws
     height = vec.dot(leg, sensed.up_ws)
     aside2 = vec.dot(leg, leg) - height**2
     return height + vec.safe_sqrt(length**2 - aside2)

@@ -166,8 +166,8 @@ class LegLengthPelvis(AbstractPelvis):
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
-        lowest = rise_to_length(sensed, target.pos, self.min_length)
-        highest = rise_to_length(sensed, target.pos, self.max_length)
+        lowest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.min_length)
+        highest = rise_to_length(sensed, sensed.hip_ws, target.pos, self.max_length)
         active = (sensed.foothold.found > 0) & (sensed.weight > 0)
         zero = jnp.zeros_like(lowest[:1])
         floors = jnp.concatenate([jnp.where(active, lowest, -FAR), zero])

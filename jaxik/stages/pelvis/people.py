@@ -6,16 +6,17 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxik.maths import smoothing, vec
+from jaxik.maths import quat, smoothing, vec
 from jaxik.maths.parameter_tree import (
     Leaf,
     half_life_parameter,
     parameter,
     switch,
 )
-from jaxik.world.skeleton import Transform
+from jaxik.maths.struct import struct
+from jaxik.world.skeleton import Transform, mean_position
 
 from .base import (
     FAR,
@@ -29,10 +30,21 @@ from .base import (
 )
 
 
+@struct
+class Goal:
+    """Where the body is to go from its animation."""
+
+    height: Float[Array, ""]
+    """Metres."""
+    ahead: Float[Array, ""]
+    """m, along the character's heading."""
+
+
 class AbstractFollowingPelvis(AbstractPelvis):
     """Follows a goal, with one half-life up and one down, as an exponential or a spring.
 
-    A rule of this kind only has to say where to go: the three fields and `goal`.
+    A rule of this kind only has to say where to go: the three fields and `goal`. Forward and back
+    it moves as an exponential with the half-life of rising.
     """
 
     rise_half_life: eqx.AbstractVar[Array]
@@ -40,27 +52,34 @@ class AbstractFollowingPelvis(AbstractPelvis):
     spring: eqx.AbstractVar[Array]
 
     @abstractmethod
-    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
-        """The height above the animation to go to, m; `resting` if no foot requests one."""
+    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
+        """Where to go; to the height `resting`, m, if no foot requests one."""
 
     def advance(self, now: PelvisMoment, target: Transform, state: PelvisState) -> PelvisState:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
         resting = jnp.where(now.started, state.goal, mean_height(sensed, requested))
         goal = self.goal(now, target, resting)
-        gap = goal - state.height
-        fraction = gate.choose(
-            gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND),
-            smoothing.fraction_of_half_life(self.rise_half_life, now.dt),
-            smoothing.fraction_of_half_life(self.fall_half_life, now.dt),
+        gap = goal.height - state.height
+        rising, falling = (
+            smoothing.fraction_of_half_life(half_life, now.dt)
+            for half_life in (self.rise_half_life, self.fall_half_life)
         )
-        fraction = now.progress(fraction)
+        rises = gate.above(gap, jnp.zeros_like(gap), band=HEIGHT_BAND)
         height, velocity = smoothing.follow(
-            smoothing.Motion(state.height, state.velocity), goal, fraction, now.dt, self.spring
+            smoothing.Motion(state.height, state.velocity),
+            goal.height,
+            now.progress(gate.choose(rises, rising, falling)),
+            now.dt,
+            self.spring,
         )
         height = smoothing.lerp(state.height, height, now.awake)
-        after = PelvisState.at(height, goal, sensed.up_ws)
-        return dataclasses.replace(after, velocity=now.awake * velocity)
+        ahead = smoothing.lerp(state.ahead, goal.ahead, now.awake * now.progress(rising))
+        after = PelvisState.at(height, goal.height, sensed.up_ws)
+        offset_ws = after.offset_ws + vec.scale(sensed.slope.forward_ws, ahead)
+        return dataclasses.replace(
+            after, velocity=now.awake * velocity, offset_ws=offset_ws, ahead=ahead
+        )
 
 
 class SupportPelvis(AbstractFollowingPelvis):
@@ -86,7 +105,7 @@ class SupportPelvis(AbstractFollowingPelvis):
     )
     spring: Leaf = switch(False, doc="Whether the pelvis moves as a critically damped spring.")
 
-    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
+    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
         weight = sensed.contact.weight * sensed.foothold.found * sensed.weight
@@ -94,7 +113,8 @@ class SupportPelvis(AbstractFollowingPelvis):
         active = sensed.weight > 0
         lowest = gate.minimum(jnp.where(active, requested, FAR), band=HEIGHT_BAND)
         support = vec.safe_divide(vec.sum_last(weight * requested), total)
-        return jnp.where(total > 0, smoothing.lerp(support, lowest, self.lowest_share), resting)
+        height = smoothing.lerp(support, lowest, self.lowest_share)
+        return Goal(jnp.where(total > 0, height, resting), jnp.zeros_like(resting))
 
 
 class ReachPelvis(AbstractFollowingPelvis):
@@ -106,6 +126,12 @@ class ReachPelvis(AbstractFollowingPelvis):
     soft minimum of the animation is subtracted, so that nothing moves on ground like that of the
     animation, however straight its legs are. On captured people on uneven blocks, reach explains
     most of the pelvis height.
+
+    The body also moves forward or back towards the foot whose leg limits it, the lower of two: by
+    `shift` of how much further ahead of its hip that foot is than in the animation. People stay
+    behind as they step up and go ahead as they step down. Of a captured person's place between
+    the feet that the phase of the gait leaves, this explains 39 and 34 % in the half of the walk
+    that was not fitted, at like rates; aside it explains nothing.
     """
 
     highest_share: Leaf = parameter(
@@ -131,6 +157,13 @@ class ReachPelvis(AbstractFollowingPelvis):
         scale="log",
         doc="Height over which the limits of the legs blend into each other.",
     )
+    shift: Leaf = parameter(
+        0.15,
+        unit="1",
+        low=0.0,
+        high=1.0,
+        doc="Part of the way to the foot whose leg limits it that the pelvis moves ahead or back.",
+    )
     rise_half_life: Leaf = half_life_parameter(
         0.0, doc="Time in which the pelvis covers half its way up."
     )
@@ -139,7 +172,7 @@ class ReachPelvis(AbstractFollowingPelvis):
     )
     spring: Leaf = switch(False, doc="Whether the pelvis moves as a critically damped spring.")
 
-    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Array:
+    def goal(self, now: PelvisMoment, target: Transform, resting: Array) -> Goal:
         sensed, gate = now.sensed, now.gate
         requested = supported_heights(sensed, target.pos)
         active = sensed.weight > 0
@@ -148,11 +181,30 @@ class ReachPelvis(AbstractFollowingPelvis):
         highest = jnp.where(jnp.any(active), highest, mean)
         wanted = smoothing.lerp(mean, highest, self.highest_share)
         longest = self.extension * (sensed.thigh + sensed.shin)
+        forward_ws, hip_ws = sensed.slope.forward_ws, _tilted_hips(now)
 
-        def reachable_height(ankle_ws: Array, wanted: Array) -> Array:
-            heights = jnp.where(active, rise_to_length(sensed, ankle_ws, longest), FAR)
-            heights = jnp.concatenate([heights, wanted[None]])
-            return -self.softness * jax.nn.logsumexp(-heights / self.softness)
+        def heights(hip_ws: Array, ankle_ws: Array) -> Array:
+            return jnp.where(active, rise_to_length(sensed, hip_ws, ankle_ws, longest), FAR)
 
-        animated = reachable_height(sensed.unscaled_ankle_ws, jnp.zeros_like(wanted))
-        return reachable_height(target.pos, wanted) - animated
+        def limiting_ahead(hip_ws: Array, ankle_ws: Array) -> Array:
+            """How far ahead of its hip the foot is whose leg limits the height, m."""
+            limits = jax.nn.softmax(-heights(hip_ws, ankle_ws) / self.softness)
+            return vec.sum_last(active * limits * vec.dot(ankle_ws - hip_ws, forward_ws))
+
+        def reachable_height(hip_ws: Array, ankle_ws: Array, wanted: Array) -> Array:
+            limits = jnp.concatenate([heights(hip_ws, ankle_ws), wanted[None]])
+            return -self.softness * jax.nn.logsumexp(-limits / self.softness)
+
+        animated_ws = sensed.unscaled_ankle_ws
+        ahead = limiting_ahead(hip_ws, target.pos) - limiting_ahead(sensed.hip_ws, animated_ws)
+        ahead *= self.shift
+        shifted_ws = hip_ws + vec.scale(forward_ws, ahead)
+        animated = reachable_height(sensed.hip_ws, animated_ws, jnp.zeros_like(wanted))
+        return Goal(reachable_height(shifted_ws, target.pos, wanted) - animated, ahead)
+
+
+def _tilted_hips(now: PelvisMoment) -> Float[Array, "legs 3"]:
+    """The hips after the pelvis has tilted about their mean, m, world space."""
+    hip_ws = now.sensed.hip_ws
+    pivot = mean_position(hip_ws, now.sensed.present)
+    return pivot + quat.rotate(now.lean.rot_ws, hip_ws - pivot)

@@ -1,4 +1,4 @@
-"""The lean of the spine: forward uphill, backward downhill, with a head that turns back."""
+"""The lean of the trunk: forward uphill, backward downhill, over a pelvis that tilts less."""
 
 import math
 from dataclasses import dataclass
@@ -9,6 +9,19 @@ from reference import maths
 from reference.characters import Parameters
 from reference.maths import Array, cross, lerp
 from reference.stages.ground import forward
+
+DEFAULTS = {
+    "lean.uphill_rate": -0.65,
+    "lean.downhill_rate": -0.25,
+    "lean.side_rate": 0.0,
+    "lean.forward_rate_slide": 0.0,
+    "lean.side_rate_slide": 0.0,
+    "lean.head_share": 0.5,
+    "lean.pelvis_rate": -0.25,
+    "lean.pelvis_side_rate": 0.0,
+    "lean.spacing": 0.3,
+    "lean.half_life": 0.2,
+}
 
 
 @dataclass
@@ -33,8 +46,11 @@ def lean(
     dt: float,
     state: State | None,
     up: Array = maths.Y,
-) -> tuple[State, Array, Array]:
-    """Memory after a frame, and the rotations of spine and head, world axes.
+    legs: Array | None = None,
+) -> tuple[State, Array, Array, Array]:
+    """Memory after a frame, and the rotations of trunk, head and pelvis, world axes.
+
+    The head's comes after the trunk's, the trunk's and the pelvis's are both from the animation.
 
     Args:
         parameters: of the rule, under `lean.`.
@@ -46,13 +62,22 @@ def lean(
         dt: s since the frame before.
         state: memory after the frame before.
         up: unit.
+        legs: how much each foot counts for the slope between the feet; None is 1.
     """
     ahead_ws = forward(root_rot, up)
     right_ws = cross(ahead_ws, up)
     normal = up if weights.sum() == 0 else (weights[:, None] * normals).sum(axis=0)
-    under_soles = math.atan2(-float(normal @ ahead_ws), float(normal @ up))
-    ahead = between_feet(parameters["lean.spacing"], points @ ahead_ws, points @ up, under_soles)
-    aside = math.atan2(-float(normal @ right_ws), float(normal @ up))
+    legs = np.ones(len(points)) if legs is None else legs
+    ahead, aside = (
+        between_feet(
+            parameters["lean.spacing"],
+            points @ along_ws,
+            points @ up,
+            math.atan2(-float(normal @ along_ws), float(normal @ up)),
+            legs,
+        )
+        for along_ws in (ahead_ws, right_ws)
+    )
     if state is not None:
         half_life = parameters["lean.half_life"]
         fraction = maths.fraction_of_half_life(half_life, dt)
@@ -63,19 +88,26 @@ def lean(
     roll = aside * lerp(parameters["lean.side_rate"], parameters["lean.side_rate_slide"], slide)
     bend = right_ws * pitch - ahead_ws * roll
     back = -parameters["lean.head_share"] * bend
-    rotations = maths.from_rotvec(np.asarray(bend)), maths.from_rotvec(np.asarray(back))
+    upright = 1.0 - slide
+    tilt = right_ws * (upright * parameters["lean.pelvis_rate"] * ahead)
+    tilt = tilt - ahead_ws * (upright * parameters["lean.pelvis_side_rate"] * aside)
+    rotations = [maths.from_rotvec(np.asarray(turn)) for turn in (bend, back, tilt)]
     return State(ahead, aside, slide), *rotations
 
 
-def between_feet(spacing: float, places: Array, heights: Array, under_soles: float) -> float:
+def between_feet(
+    spacing: float, places: Array, heights: Array, under_soles: float, legs: Array
+) -> float:
     """Slope, rad, of the line through the feet that is pulled to the slope under their soles.
 
     It is the ridge regression of heights by places with a prior `spacing / 2`, found here as
-    ordinary least squares with one more row, that pulls to the tangent under the soles.
+    weighted least squares with one more row, that pulls to the tangent under the soles.
     """
-    places, heights = places - places.mean(), heights - heights.mean()
-    pull = spacing / 2 * math.sqrt(len(places))
-    rows = np.append(places, pull)
-    goals = np.append(heights, pull * math.tan(under_soles))
+    if legs.sum() == 0.0:
+        return under_soles
+    shares = legs / legs.sum()
+    places, heights = places - shares @ places, heights - shares @ heights
+    rows = np.append(np.sqrt(shares) * places, spacing / 2)
+    goals = np.append(np.sqrt(shares) * heights, spacing / 2 * math.tan(under_soles))
     (tangent,), *_ = np.linalg.lstsq(rows[:, None], goals, rcond=None)
     return math.atan(tangent)

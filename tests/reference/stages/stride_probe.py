@@ -157,9 +157,7 @@ def below_others(
             continue
         way = apply(frame.world_from_model, frame.toe.pos[other]) - here
         rise = ground.height - balls[leg].height
-        climbs = [
-            climb(parameters, end, ups[end], balls[end].normal, way) for end in (leg, other)
-        ]
+        climbs = [climb(parameters, end, ups[end], balls[end].normal, way) for end in (leg, other)]
         below = max(below, rise - shared_rise(rise, *climbs))
     return below
 

@@ -16,7 +16,7 @@ import numpy as np
 from reference import characters, maths
 from reference.characters import Followed, Foot, Frame, Ground, Hold, Parameters, Rig
 from reference.maths import Array, Motion, Transform, apply, length, lerp
-from reference.stages import contact_by_speed, ground, heel, limb, stride_probe
+from reference.stages import contact_by_speed, ground, heel, limb, spine, stride_probe
 from reference.stages.contact_by_speed import Standing
 from reference.stages.swing import axis_of_pitch
 from reference.systems import record
@@ -32,6 +32,7 @@ PELVISES: dict[str, dict[str, Any]] = {
         "pelvis.highest_share": 0.75,
         "pelvis.extension": 0.958,
         "pelvis.softness": 0.025,
+        "pelvis.shift": 0.15,
         "pelvis.rise_half_life": 0.04,
         "pelvis.fall_half_life": 0.04,
         "pelvis.spring": True,
@@ -52,6 +53,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         **{name: value for name, value in record.DEFAULTS.items() if name.startswith(kept)},
         **CONTACTS[contact],
         **PELVISES[pelvis],
+        **spine.DEFAULTS,
         "probe.ray_up": 1.0,
         "probe.ray_down": 1.0,
         "probe.layers": ALL_LAYERS,
@@ -101,8 +103,10 @@ class State:
     standing: list[Standing]
     ground: list[Followed]
     holds: list[Hold]
+    lean: spine.State
     pelvis: Motion
     pelvis_goal: float
+    ahead: float
     pelvis_offset_ws: Array
 
 
@@ -152,12 +156,20 @@ def step(
         footholds.append(foothold)
         targets.append(target + offset)
 
-    goal = pelvis_goal(parameters, pelvis, feet, targets, ups, terrain.up, state, frame)
-    eased = follow_goal(parameters, state, goal, frame.dt)
-    offset_ws = terrain.up * eased.value * frame.grounded
-    body = limb.body(frame, offset_ws, maths.IDENTITY)
-
     forward = ground.forward(frame.world_from_model.rot, terrain.up)
+    leaning, tilt_ws = lean(parameters, terrain.up, feet, state, frame)
+    hips = tilted_hips(frame, tilt_ws)
+    goal, ahead_goal = pelvis_goal(
+        parameters, pelvis, feet, targets, ups, terrain.up, hips, state, frame
+    )
+    eased = follow_goal(parameters, state, goal, frame.dt)
+    ahead = ahead_goal
+    if state is not None:
+        rising = maths.fraction_of_half_life(parameters["pelvis.rise_half_life"], frame.dt)
+        ahead = lerp(state.ahead, ahead_goal, rising)
+    offset_ws = (terrain.up * eased.value + forward * ahead) * frame.grounded
+    body = limb.body(frame, offset_ws, maths.nlerp(maths.IDENTITY, tilt_ws, frame.grounded))
+
     solved, reached, stretches, lifts, aims = [], [], [], [], []
     for leg, up in zip(legs, ups, strict=True):
         aim_ws, rot_ws, lift = heel.raised(
@@ -192,12 +204,13 @@ def step(
         "pelvis_goal": np.array(goal),
         "pelvis_height": np.array(eased.value),
         "pelvis_velocity": np.array(eased.velocity),
+        "pelvis_ahead": np.array(ahead),
         "heel_lift": np.array(lifts),
         "target_ws": np.array(aims),
         "reached": np.array(reached),
         "stretch": np.array(stretches),  # by how much the target is farther than animated
     }
-    after = State(standing, followed, holds, eased, goal, offset_ws)
+    after = State(standing, followed, holds, leaning, eased, goal, ahead, offset_ws)
     return after, output | characters.joints(solved)
 
 
@@ -250,6 +263,32 @@ def sense(
     return foot, swing
 
 
+def lean(
+    parameters: Parameters, up: Array, feet: list[Foot], state: State | None, frame: Frame
+) -> tuple[spine.State, Array]:
+    """Memory of the lean after this frame, and the tilt of the pelvis, world axes."""
+    legs = np.array(ground.weights_of_legs(parameters, frame))
+    found = np.array([float(foot.hit.found) for foot in feet])
+    standing = legs * found * [foot.contact for foot in feet]
+    points, normals = (
+        np.array([getattr(foot.hit, name) for foot in feet]) for name in ("point", "normal")
+    )
+    before = None if state is None else state.lean
+    root = frame.world_from_model
+    after, _, _, tilt = spine.lean(
+        parameters, root.rot, points - root.pos, normals, standing, frame.slide, frame.dt, before,
+        up, legs * found,
+    )  # fmt: skip
+    return after, tilt
+
+
+def tilted_hips(frame: Frame, tilt_ws: Array) -> list[Array]:
+    """The hips after the pelvis has tilted about their middle, m, world space."""
+    hips = [apply(frame.world_from_model, hip) for hip in frame.hip.pos]
+    middle = np.mean(hips, axis=0)
+    return [middle + maths.rotate(tilt_ws, hip - middle) for hip in hips]
+
+
 def pelvis_goal(
     parameters: Parameters,
     pelvis: str,
@@ -257,18 +296,19 @@ def pelvis_goal(
     targets: list[Array],
     ups: list[Array],
     up: Array,
+    hips: list[Array],
     state: State | None,
     frame: Frame,
-) -> float:
-    """Height that the body is to have, m, by the rule of that name."""
+) -> tuple[float, float]:
+    """How far up and ahead the body is to go, m, by the rule of that name."""
     leg_weights = ground.weights_of_legs(parameters, frame)
     requested = [
         float((target - foot.ankle_ws) @ leg_up) - foot.swing_lift  # none rises with a swing
         for foot, target, leg_up in zip(feet, targets, ups, strict=True)
     ]
     if pelvis == "reach":
-        return reach_goal(parameters, feet, targets, leg_weights, requested, up, frame)
-    return support_goal(parameters, feet, leg_weights, requested, state)
+        return reach_goal(parameters, feet, targets, leg_weights, requested, up, hips, frame)
+    return support_goal(parameters, feet, leg_weights, requested, state), 0.0
 
 
 def support_goal(
@@ -297,22 +337,37 @@ def reach_goal(
     leg_weights: list[float],
     requested: list[float],
     up: Array,
+    hips: list[Array],
     frame: Frame,
-) -> float:
-    """Between the mean and the highest of the requested heights, within reach of all legs."""
+) -> tuple[float, float]:
+    """Between the mean and the highest of the requested heights, within reach of all legs.
+
+    Also how far ahead of the animation the body goes, towards the foot that limits it.
+    """
     if sum(leg_weights) == 0.0:
-        return 0.0
+        return 0.0, 0.0
     mean = sum(w * gap for w, gap in zip(leg_weights, requested, strict=True)) / sum(leg_weights)
     highest = max(gap for gap, w in zip(requested, leg_weights, strict=True) if w > 0.0)
-    wanted, untouched = [lerp(mean, highest, parameters["pelvis.highest_share"])], [0.0]
-    for leg, weight in enumerate(leg_weights):
-        if weight > 0.0:
-            hip = feet[leg].hip_ws
-            longest = parameters["pelvis.extension"] * heel.leg_length(frame, leg)
-            wanted.append(highest_hip(targets[leg] - hip, longest, up))
-            untouched.append(highest_hip(feet[leg].ankle_ws - hip, longest, up))
+    wanted = lerp(mean, highest, parameters["pelvis.highest_share"])
     softness = parameters["pelvis.softness"]
-    return soft_minimum(wanted, softness) - soft_minimum(untouched, softness)
+    legs = [leg for leg, weight in enumerate(leg_weights) if weight > 0.0]
+    longest = {leg: parameters["pelvis.extension"] * heel.leg_length(frame, leg) for leg in legs}
+    animated = {leg: feet[leg].ankle_ws - feet[leg].hip_ws for leg in legs}
+    moved = {leg: targets[leg] - hips[leg] for leg in legs}
+    forward = ground.forward(frame.world_from_model.rot, up)
+
+    def limiting_ahead(to_foot: dict[int, Array]) -> float:
+        """How far ahead of its hip the foot is that limits the height, blended softly, m."""
+        heights = np.array([highest_hip(to_foot[leg], longest[leg], up) for leg in legs])
+        shares = np.exp((heights.min() - heights) / softness)
+        places = np.array([float(to_foot[leg] @ forward) for leg in legs])
+        return float(shares @ places / shares.sum())
+
+    ahead = parameters["pelvis.shift"] * (limiting_ahead(moved) - limiting_ahead(animated))
+    shifted = [highest_hip(moved[leg] - ahead * forward, longest[leg], up) for leg in legs]
+    untouched = [highest_hip(animated[leg], longest[leg], up) for leg in legs]
+    height = soft_minimum([wanted, *shifted], softness) - soft_minimum([0.0, *untouched], softness)
+    return height, ahead
 
 
 def highest_hip(to_foot: Array, longest: float, up: Array) -> float:
