@@ -19,7 +19,7 @@ from fitting.runtime.program_cache import cached
 from fitting.runtime.threads import on_all_cores
 from jaxik import lanes
 
-BATCH = 64  # candidates in one call of a program, which is compiled for this number only
+BATCH = 32  # candidates in one call of a program, which is compiled for this number only
 ROUNDING = 1e-5  # relative, of costs: several times what 32-bit floats leave
 
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fitting.inference.optimisation import population
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.free_parameters import from_fractions, to_fractions
@@ -26,7 +25,7 @@ from .state import Profiling
 
 GRID = np.concatenate([[0.001], (np.arange(20) + 0.5) / 20, [0.999]])  # fractions of the range
 FOLLOWED = np.concatenate([GRID[:-1:2], GRID[-1:]])  # where curves are followed outwards
-FINE_GRID = (np.arange(population.BATCH) + 0.5) / population.BATCH  # for plateaus of thresholds
+FINE_GRID = (np.arange(64) + 0.5) / 64  # for plateaus of thresholds
 LOW = 40.0  # rise by the data up to which a curve is followed outwards
 PROMISING = 400.0  # and up to which a minimum of the scan may become a valley
 MINIMA = 2  # of each curve from which descents begin

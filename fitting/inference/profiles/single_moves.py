@@ -13,6 +13,7 @@ from .curves import Curves
 
 CLOSE = 6.0  # rise of the cost up to which another plateau may matter
 GENERATIONS = 2  # of combinations of thresholds
+CHILDREN = 64  # in a generation
 PLATEAUS = 5  # kept, besides the solution's
 SAME_PLATEAU = 0.01  # of the cost
 SMALLEST = 0.01  # move of a threshold in a round, a fraction of the largest
@@ -34,9 +35,9 @@ def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> P
     along = {i: curves.curves[i][curves.rises(i) < CLOSE] for i in thresholds}
     found = [along[i] for i in thresholds]
     for _ in range(GENERATIONS if len(thresholds) > 1 else 0):
-        values = np.repeat(curves.best.values, population.BATCH, axis=0)
+        values = np.repeat(curves.best.values, CHILDREN, axis=0)
         for i in thresholds:
-            values[:, i] = random.choice(along[i].values[:, i], population.BATCH)
+            values[:, i] = random.choice(along[i].values[:, i], CHILDREN)
         evaluated, gradient = conditional.evaluate(space.pack_values(values))
         here = Targets(np.full(len(values), thresholds[0]), values[:, thresholds[0]])
         everything = np.ones(evaluated.u.shape, bool)
