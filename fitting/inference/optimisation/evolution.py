@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from fitting.problem.space import EDGE, Space
 
 from .descent import descend, jacobian_at
-from .population import ROUNDING, evaluate
+from .population import ROUNDING, Slopes, evaluate
 from .state import Elite, Point, Search, SearchState
 
 CROSSED = 0.6  # fraction of the candidates
@@ -81,13 +81,13 @@ def _breed(search: Search, state: SearchState, donors: Candidates) -> tuple[Sear
     settings, jacobian = search.settings, jacobian_at(search, state.point)
     assert state.elite is not None
     elite, random = state.elite, state.generator()
-    uncertainty = _uncertainty(search, jacobian)
+    slopes, uncertainty = Slopes.of(jacobian), _uncertainty(search, jacobian)
     stepped = np.empty((0, donors.shape[1]))
     for _ in range(settings.generations):
         count = settings.population - len(stepped)
         children = _children(search, elite, donors, count, uncertainty, random)
         candidates = np.concatenate([stepped, children])
-        evaluation = evaluate(search.problem, candidates, jacobian)
+        evaluation = evaluate(search.problem, candidates, slopes)
         elite = elite.joined(candidates, evaluation.cost, settings.elite)
         promising = np.argsort(evaluation.predicted, kind="stable")
         stepped = evaluation.stepped[promising[: settings.gauss_newton_children]]

@@ -34,6 +34,22 @@ class Evaluation(NamedTuple):
     """Cost there if the Jacobian held."""
 
 
+class Slopes(NamedTuple):
+    """A Jacobian, as the Gauss-Newton steps of many candidates use it."""
+
+    matrix: Float[Array, "residuals free"]
+    """With 32-bit floats."""
+    gram: Float[np.ndarray, "free free"]
+    """The Jacobian times itself."""
+
+    @classmethod
+    def of(cls, jacobian: Float[np.ndarray, "residuals free"]) -> "Slopes":
+        """Slopes by a Jacobian, in which a parameter without a slope has a column of zeros."""
+        # JAX multiplies: two threads of NumPy's library wait on each other, 0.3 s when busy.
+        full = jnp.asarray(jacobian, float)
+        return cls(full.astype(jnp.float32), np.asarray(full.T @ full))
+
+
 @cached
 def _evaluate(problem: Problem, candidates: Array) -> tuple[Array, Array]:
     single = with_floats(problem, jnp.float32)
@@ -69,32 +85,25 @@ def _of_batches(
 
 
 def evaluate(
-    problem: Problem,
-    candidates: Float[np.ndarray, "candidates free"],
-    jacobian: Float[np.ndarray, "residuals free"] | None = None,
+    problem: Problem, candidates: Float[np.ndarray, "candidates free"], slopes: Slopes | None = None
 ) -> Evaluation:
-    """Costs of any number of `u`, and where one Gauss-Newton step with this Jacobian takes them.
+    """Costs of any number of `u`, and where one Gauss-Newton step with these slopes takes them.
 
-    Parameters whose column is zero, as those of thresholds are, stay where they are; without a
-    Jacobian all do.
+    Parameters without a slope, as thresholds are, stay where they are; without slopes all do.
     """
-    # JAX multiplies: two threads of NumPy's library wait on each other, 0.3 s on a busy machine.
-    full = None if jacobian is None else jnp.asarray(jacobian, float)
-    matrix = None if full is None else full.astype(jnp.float32)
 
     def call(filled: Array) -> tuple[Array, ...]:
         cost, residuals = _evaluate(problem, filled)
-        return (cost,) if matrix is None else (cost, residuals @ matrix)
+        return (cost,) if slopes is None else (cost, residuals @ slopes.matrix)
 
     cost, *gradients = _of_batches(call, candidates)
     finite = np.isfinite(cost)
     cost = np.where(finite, cost, np.inf)
-    if full is None:
+    if slopes is None:
         return Evaluation(cost, candidates, cost)
     (gradient,) = gradients
-    gram = np.asarray(full.T @ full)
-    zero = np.diag(gram) == 0
-    steps = -np.linalg.solve(gram + np.diag(zero), gradient.T).T
+    zero = np.diag(slopes.gram) == 0
+    steps = -np.linalg.solve(slopes.gram + np.diag(zero), gradient.T).T
     stepped, predicted = candidates + steps, cost + 0.5 * np.sum(gradient * steps, axis=1)
     return Evaluation(
         cost,

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.inference.optimisation import levenberg_marquardt, population
 from fitting.inference.optimisation.models import HardModel
+from fitting.inference.optimisation.population import Slopes
 from fitting.inference.optimisation.solution import Solution
 from fitting.problem.free_parameters import to_fractions
 from fitting.problem.problem import Problem
@@ -66,10 +67,8 @@ class Conditional:
     problem: Problem
     solution: Float[np.ndarray, " free"]
     """Its u."""
-    jacobian: Float[np.ndarray, "residuals free"]
+    slopes: Slopes
     """There; 0 for thresholds whose effect is not gradual."""
-    gram: Float[np.ndarray, "free free"]
-    """Of the Jacobian."""
     spread: Float[np.ndarray, "free free"]
     """Turns standard normal numbers into draws from Laplace's approximation; 0 for the others."""
     random: np.random.Generator
@@ -78,14 +77,18 @@ class Conditional:
     def around(cls, problem: Problem, solution: Solution, seed: int = 0) -> "Conditional":
         """The normal equations at a solution."""
         smooth = np.asarray(problem.space.smooth)
-        slopes = slopes_of_thresholds(problem, np.asarray(solution.u))
-        jacobian = np.where(smooth, solution.jacobian, slopes)
-        gram = np.asarray(jnp.asarray(jacobian).T @ jnp.asarray(jacobian))
-        sloping = np.ix_(*[np.diag(gram) > 0] * 2)
-        spread = np.zeros_like(gram)
-        spread[sloping] = np.linalg.inv(np.linalg.cholesky(gram[sloping])).T
+        of_thresholds = slopes_of_thresholds(problem, np.asarray(solution.u))
+        slopes = Slopes.of(np.where(smooth, solution.jacobian, of_thresholds))
+        sloping = np.ix_(*[np.diag(slopes.gram) > 0] * 2)
+        spread = np.zeros_like(slopes.gram)
+        spread[sloping] = np.linalg.inv(np.linalg.cholesky(slopes.gram[sloping])).T
         random = np.random.default_rng(seed)
-        return cls(problem, np.asarray(solution.u), jacobian, gram, spread, random)
+        return cls(problem, np.asarray(solution.u), slopes, spread, random)
+
+    @property
+    def gram(self) -> Float[np.ndarray, "free free"]:
+        """The matrix of the normal equations."""
+        return self.slopes.gram
 
     @property
     def sloping(self) -> Bool[np.ndarray, " free"]:
@@ -99,7 +102,7 @@ class Conditional:
 
     def evaluate(self, u: Float[np.ndarray, "points free"]) -> tuple[Points, np.ndarray]:
         """Points, and the gradients of their costs by the solution's Jacobian."""
-        evaluation = population.evaluate(self.problem, u, self.jacobian)
+        evaluation = population.evaluate(self.problem, u, self.slopes)
         gradient = -(evaluation.stepped - u) @ self.gram
         return Points(u, self.problem.space.values(u), evaluation.cost), gradient
 
