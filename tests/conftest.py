@@ -37,7 +37,7 @@ jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
 plain_lines.PATIENCE = plain_lines.INTERVAL = plain_lines.SILENCE = float("inf")
 
 # Each test process would start others to draw in, only to draw small pictures.
-beside.usable_cores = lambda: 1
+beside.cpu_count = lambda: 1
 
 # Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
 gc.set_threshold(200_000, 50, 100)

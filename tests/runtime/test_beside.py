@@ -12,7 +12,7 @@ from fitting.runtime.parallel import beside
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(beside, "usable_cores", lambda: 2)
+    monkeypatch.setattr(beside, "cpu_count", lambda: 2)
 
 
 def write_process(path: Path) -> None:
@@ -42,14 +42,14 @@ def test_without_it_calls_run_here_and_at_once(tmp_path):
 
 
 def test_on_one_core_they_run_here(tmp_path, monkeypatch):
-    monkeypatch.setattr(beside, "usable_cores", lambda: 1)
+    monkeypatch.setattr(beside, "cpu_count", lambda: 1)
     with beside.calls_beside():
         beside.call(write_process, tmp_path / "file")
         assert int((tmp_path / "file").read_text()) == os.getpid()
 
 
 def draw_in_a_daemon(path: Path) -> None:
-    beside.usable_cores = lambda: 2
+    beside.cpu_count = lambda: 2
     with beside.calls_beside():
         beside.call(write_process, path)
 

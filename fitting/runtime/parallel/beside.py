@@ -2,7 +2,8 @@
 
 Threads would wait for each other, as Python runs one at a time. The processes import what the
 functions need and nothing of the program that runs, so scripts need no guard; they end by
-themselves when they have been idle for a while.
+themselves when they have been idle for a while. What they import decides how soon they begin: JAX,
+for one, takes half a second, and nothing here needs it.
 """
 
 import multiprocessing
@@ -13,9 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, TypeAlias
 
-import loky
-
-from fitting.runtime.threads import usable_cores
+from loky import cpu_count, get_reusable_executor
 
 IDLE = 20  # s after which the processes end
 Notes: TypeAlias = list[warnings.WarningMessage]
@@ -30,7 +29,7 @@ def calls_beside() -> Iterator[None]:
     An error in one of them is raised at the end, and warnings are given there. On one core, and in
     processes that may have no children, they run at once instead.
     """
-    if usable_cores() < 2 or multiprocessing.current_process().daemon:
+    if cpu_count() < 2 or multiprocessing.current_process().daemon:
         yield
         return
     running: list[Future[Notes]] = []
@@ -59,7 +58,7 @@ def call(function: Callable[..., None], *arguments: Any) -> None:
     if (running := _running.get()) is None:
         function(*arguments)
         return
-    executor = loky.get_reusable_executor(usable_cores(), timeout=IDLE)
+    executor = get_reusable_executor(cpu_count(), timeout=IDLE)
     running.append(executor.submit(_with_notes, function, *arguments))
 
 
