@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.signal import lfilter
 
 import jaxik
 from fitting.runtime.precision import in_float64
@@ -104,6 +103,8 @@ def autoregression(innovations: Noise, correlation: float) -> Noise:
 
     `x_t = rho x_{t-1} + sqrt(1 - rho²) e_t`, begun with `x_0 = e_0`.
     """
+    from scipy.signal import lfilter  # here, for it takes a quarter of a second to import
+
     gain = np.sqrt(1 - correlation**2)
     scaled = np.concatenate([innovations[:1], gain * innovations[1:]])
     return np.asarray(lfilter([1.0], [1.0, -correlation], scaled, axis=0))
