@@ -1,6 +1,7 @@
 """The command `jaxik`: runs one command and turns its errors into one line and an exit status."""
 
 import argparse
+import gc
 import os
 import sys
 import warnings
@@ -15,6 +16,9 @@ from .terminal import watched
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
 MISTAKE, INTERRUPTED = 2, 130  # exit statuses
+# Allocations between searches for dead cycles of objects. Imports and traces leave hundreds of
+# thousands of objects that live on; by Python's own numbers a first fit spends 3 s looking at them.
+COLLECTIONS = (200_000, 50, 100)
 RENAMED = {"contribution": "ablate"}  # old commands, which still work in this release
 
 
@@ -53,6 +57,7 @@ def _function(command: str) -> Callable[[argparse.Namespace], int]:
     """The function of a command; only imports JAX, which takes seconds, if that needs it."""
     if command in without_jax.COMMANDS:
         return without_jax.COMMANDS[command]
+    gc.set_threshold(*COLLECTIONS)
     xla.configure_xla()
     with activity.announced("Importing JAX"):
         from . import commands
