@@ -1,6 +1,7 @@
 """The command `jaxik`: runs one command and turns its errors into one line and an exit status."""
 
 import argparse
+import atexit
 import gc
 import os
 import sys
@@ -58,6 +59,7 @@ def _function(command: str) -> Callable[[argparse.Namespace], int]:
     if command in without_jax.COMMANDS:
         return without_jax.COMMANDS[command]
     gc.set_threshold(*COLLECTIONS)
+    atexit.register(gc.freeze)  # or Python, as it ends, looks at all of them several times more
     xla.configure_xla()
     with activity.announced("Importing JAX"):
         from . import commands
