@@ -64,5 +64,6 @@ def _draw_tails(axes: Axes, residuals: np.ndarray, active: np.ndarray) -> None:
     curve = np.linspace(-WIDEST, WIDEST, 321)
     axes.plot(curve, np.exp(-(curve**2) / 2) / np.sqrt(2 * np.pi), "--", color="black")
     axes.set_yscale("log")
+    axes.minorticks_off()  # drawing them takes a quarter of the time of the picture
     axes.set_ylim(1e-5, 1.0)
     axes.set_ylabel("density")
