@@ -189,7 +189,8 @@ class ReachPelvis(AbstractFollowingPelvis):
         def limiting_ahead(hip_ws: Array, ankle_ws: Array) -> Array:
             """How far ahead of its hip the foot is whose leg limits the height, m."""
             limits = jax.nn.softmax(-heights(hip_ws, ankle_ws) / self.softness)
-            return vec.sum_last(active * limits * vec.dot(ankle_ws - hip_ws, forward_ws))
+            reach = limits * vec.dot(ankle_ws - hip_ws, forward_ws)
+            return vec.sum_last(jnp.where(active, reach, 0.0))
 
         def reachable_height(hip_ws: Array, ankle_ws: Array, wanted: Array) -> Array:
             limits = jnp.concatenate([heights(hip_ws, ankle_ws), wanted[None]])
