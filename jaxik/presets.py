@@ -222,7 +222,9 @@ def stride(rig: Rig | None = None) -> FootIK:
     ik = FootIK(
         root=KeepRoot(),
         warp=StrideWarp(),
-        probe=StrideProbe(max_step_up=0.6, max_step_down=0.6, max_slope=1.05),
+        probe=StrideProbe(
+            max_step_up=0.6, max_step_down=0.6, max_slope=1.05, slide_to_support=True
+        ),
         contact=LabelContact(),
         target=SlopeTarget(max_ankle_height=0.8),
         lean=SpineLean(),

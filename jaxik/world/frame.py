@@ -151,6 +151,8 @@ class GroundHits:
     """m, how much higher than animated each ankle swings over its ground; None is 0."""
     pitch: Float[Array, " legs"] | None = None
     """rad, how much further than animated each foot's toes are up; None is 0."""
+    support: Float[Array, " legs"] | None = None
+    """0..1, share of each sole that the ground of its foothold supports; None if not looked for."""
 
 
 @struct

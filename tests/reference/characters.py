@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -117,11 +117,15 @@ class Parameters:
 
 @dataclass
 class Rig:
-    """Constants of a character: knee_axis_ls (legs 3), ankle_from_foot (legs 4), side (legs)."""
+    """Constants of a character: knee_axis_ls (legs 3), ankle_from_foot (legs 4), side (legs).
+
+    `foot` is from an ankle to its ball, m.
+    """
 
     knee_axis_ls: Array
     ankle_from_foot: Array
     side: Array
+    foot: float = 0.15
 
 
 @dataclass
@@ -280,6 +284,17 @@ def world_from_foot(rig: Rig, frame: Frame, leg: int) -> Array:
     """Rotation from the axes of the animated foot (x left, y up, z forward) to the world's."""
     world_from_ankle = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
     return maths.multiply(world_from_ankle, rig.ankle_from_foot[leg])
+
+
+def with_moved_foot(frame: Frame, leg: int, offset_ws: Array) -> Frame:
+    """The frame with the ankle and toe of a leg moved, m; its knee stays."""
+    moved = {}
+    for name in ("ankle", "toe"):
+        joint = getattr(frame, name)
+        pos = np.array(joint.pos)
+        pos[leg] += maths.rotate(maths.inverse(frame.world_from_model.rot), offset_ws)
+        moved[name] = joint._replace(pos=pos)
+    return replace(frame, **moved)
 
 
 def joints(legs: Sequence[Sequence[Transform]]) -> dict[str, Array]:

@@ -169,6 +169,8 @@ StrideProbe.toes_up rad 0.1 0 0.60000002
 StrideProbe.toes_down rad 0.30000001 0 0.80000001
 StrideProbe.toes_down_per_height rad/m 0.89999998 0 3
 StrideProbe.toes_first rad/m 0.80000001 0 2
+StrideProbe.min_sole 1 0.64999998 0 1
+StrideProbe.max_slide m 0.1 0 0.2
 StrideProbe.stance_time s 0.64999998 0.2 1.5
 StrideProbe.swing_time s 0.44999999 0.1 1
 GroundRoot.ray_up m 10 0 20
@@ -306,7 +308,7 @@ mec! fade NoFade
 stride contact LabelContact
 stride root KeepRoot
 stride warp StrideWarp
-stride probe StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05
+stride probe StrideProbe max_step_up=0.6 max_step_down=0.6 max_slope=1.05 slide_to_support=yes
 stride target SlopeTarget max_ankle_height=0.8
 stride lean SpineLean
 stride lock OffsetLock enabled=no hold_ball=yes
@@ -329,7 +331,8 @@ LowestPelvis.vertical_only=yes LowestPelvis.wait_to_rise=no OffsetLock.enabled=y
 OffsetLock.hold_ball=no PlantLock.plant=yes PoleLeg.enabled=yes ReachPelvis.spring=no
 RootProbe.check_support=no RootProbe.limited=yes SlopeLean.spring=no SlopeTarget.follow_slopes=no
 SlopeTarget.spring=no SpineLean.spring=no StrideProbe.check_support=no StrideProbe.limited=yes
-StrideProbe.remember_swings=no StrideProbe.swing_as_animated=no StrideProbe.use_strides=yes
+StrideProbe.remember_swings=no StrideProbe.slide_to_support=no StrideProbe.swing_as_animated=no
+StrideProbe.use_strides=yes
 SupportPelvis.spring=no SweepProbe.check_support=no SweepProbe.limited=yes TwoBone.as_animated=no
 """
 

@@ -42,6 +42,8 @@ STEP_DOWN = planes((0, 0, 0), (-1.0, 0, 0.15))  # falls until 0.1 m ahead of the
 STAIRS_UP, STAIRS_DOWN = planes((0, 0, 0), (2.0, 0, -0.8)), planes((0, 0, 0), (-2.0, 0, 0))
 CLIMBS = {"probe.max_slope": 1.3}  # as steep as these are
 TILTED, STEEP, WALL = (planes((0, left, 0)) for left in (0.4, 0.9, 4.0))  # the left foot higher
+BESIDE = planes((0, 0, 0), (0, 1.0, 0))  # level to the right, steep to the left
+BLOCK = planes((0, 0, 0), (2.0, 0, -0.3))  # too steep for a sole, under the toes
 LOWERED, RAISED = planes((0, 0, -0.5)), planes((0, 0, 0.1))
 
 
@@ -116,6 +118,9 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.toes_up", "lifts off", STEP_DOWN, (0.1, 0.2), "target height", -1),
         Case("probe.toes_down", "comes down", STEP_UP, (0.1, 0.2), "target height", 1),
         Case("probe.toes_down_per_height", "comes down", STEP_UP, (0.5, 0.9), "target height", 1),
+        Case("probe.toes_first", "toes up", BESIDE, (0.4, 0.8), "pitch", -1),
+        Case("probe.min_sole", "standing", BLOCK, (0.4, 0.8), "target forward", -1),
+        Case("probe.max_slide", "standing", BLOCK, (0.08, 0.12), "target forward", -1),
         Case("probe.swing_as_animated", "comes down", STEP_UP, (False, True), "target height", -1),
         Case("probe.use_strides", "comes down", STEP_UP, (False, True), "target height", 1),
         Case("probe.ball_height", "lifts off", STEP_UP, (0.03, 0.06), "target height", 1, WIDE),
@@ -214,6 +219,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         ),
         Case("pelvis.highest_share", "standing", TILTED, (0.3, 0.8), "pelvis height", 1),
         Case("pelvis.extension", "standing", TILTED, (0.92, 0.95), "pelvis height", 1),
+        Case("pelvis.shift", "walks", STEP_UP, (0.1, 0.3), "pelvis forward", -1),
         Case("pelvis.softness", "standing", TILTED, (0.01, 0.05), "pelvis height", 1),
         *followed(),
         Case("effector.by_contact", "lifts off", TILTED, (False, True), "miss", 1),

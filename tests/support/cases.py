@@ -44,6 +44,7 @@ def measures(result: jaxik.Result, frames: jaxik.Frame) -> dict[str, jax.Array]:
         "root height": result.trace.sensed.root_ws[..., 1],
         "target height": effector.target_ws[..., 1],
         "target left": effector.target_ws[..., 0],
+        "target forward": effector.target_ws[..., 2],
         "pelvis height": after.pelvis.height,
         "pelvis forward": after.pelvis.offset_ws[..., 2],
         "half height": after.pelvis.half_height,

@@ -90,7 +90,7 @@ def to_rig(rig: reference.Rig) -> jaxik.Rig:
         ankle_from_foot=jnp.asarray(rig.ankle_from_foot),
         thigh=ones * sample_poses.THIGH,
         shin=ones * sample_poses.SHIN,
-        foot=ones * 0.15,
+        foot=ones * rig.foot,
         ankle_height=ones * 0.085,
         ball_height=ones * 0.05,
         side=jnp.asarray(rig.side, float),

@@ -17,9 +17,10 @@ from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
 
 from . import foresight
-from .base import make_rays, no_hit
+from .base import foot_heading, make_rays, no_hit
 from .limits import clip_to_one, least_rise, smoothstep
-from .swing import FAR, AbstractSwingProbe, Level, s_curve
+from .support import AbstractSupportedProbe
+from .swing import FAR, Level, s_curve
 
 PATH_RAYS = 8  # between two footholds
 WAY = np.array([0.0, *((np.arange(PATH_RAYS) + 0.5) / PATH_RAYS), 1.0])  # part of it, of each ray
@@ -27,7 +28,7 @@ STAIRS = 0.75  # rise over run of the steepest stairs
 SPREAD = 0.5  # of the way that is left: how far around a predicted foothold the foot may land
 
 
-class StrideProbe(AbstractSwingProbe):
+class StrideProbe(AbstractSupportedProbe):
     """Rays at the last and at the next foothold, joined by a smooth curve.
 
     A swinging foot leaves the ground of its last foothold and arrives on that of its next, so the
@@ -161,15 +162,28 @@ class StrideProbe(AbstractSwingProbe):
         self, inputs: Inputs, foot_height: Array, level: Level, stride: Stride
     ) -> GroundHits:
         """The ground under feet in these strides."""
+        since_start = stride.fraction - self.rise_start
+        fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
+        fraction = s_curve(fraction, self.steepness)
+        support = None
+        if self.slide_to_support:
+            ends = jnp.stack([stride.last_ws, stride.next_ws])
+            slides, supports = self.better_support(inputs, level, ends, stride.known, foot_height)
+            slide, support = (lerp(*x, fraction) for x in (slides, supports))
+            ahead = foot_heading(inputs, level.up_ws)[0]
+            last_ws, next_ws = ends + vec.scale(ahead, slides)
+            stride = dataclasses.replace(stride, last_ws=last_ws, next_ws=next_ws)
+            frame = inputs.frame.with_moved_feet(vec.scale(ahead, slide))
+            inputs = dataclasses.replace(inputs, frame=frame)
         frame = inputs.frame
         way_ws = stride.next_ws - stride.last_ws
         fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
         path_ws = stride.last_ws + vec.scale(way_ws, fractions)
         if stride.aside_ws is not None:
             path_ws += vec.scale(stride.aside_ws, 4.0 * fractions * (1.0 - fractions))
-        path = self._ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
+        path = self.ground_at(inputs, level, path_ws)  # (points legs), as `path_ws`
         if self.check_support:
-            ends = self._ground_at(inputs, level, path_ws[jnp.array([0, -1])], stood_on=True)
+            ends = self.ground_at(inputs, level, path_ws[jnp.array([0, -1])], stood_on=True)
             path = jax.tree.map(lambda x, y: jnp.concatenate([y[:1], x[1:-1], y[1:]]), path, ends)
         heights = level.height(path.point)
         low, high = heights[0], heights[-1]
@@ -187,9 +201,6 @@ class StrideProbe(AbstractSwingProbe):
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
         trust *= self._trust_of_way(evened, path.found)
 
-        since_start = stride.fraction - self.rise_start
-        fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
-        fraction = s_curve(fraction, self.steepness)
         ankle, ball = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.toe.pos)
         covered = vec.safe_divide(vec.dot(ball - stride.last_ws, way), vec.dot(way, way))
         height = low + trust * (slope * clip_to_one(covered) + step * fraction)
@@ -217,7 +228,7 @@ class StrideProbe(AbstractSwingProbe):
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         turns = jnp.ones_like(found)
         lift, pitch = (jnp.where(found > 0, x, 0.0) for x in (swing.lift, swing.pitch))
-        return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch)
+        return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch, support)
 
     def _stride(self, inputs: Inputs, contact: Contact, level: Level) -> Stride:
         """The stride of the animation where it is known, else one predicted from velocity."""
@@ -249,7 +260,7 @@ class StrideProbe(AbstractSwingProbe):
             aside_ws,
         )
 
-    def _ground_at(
+    def ground_at(
         self, inputs: Inputs, level: Level, points_ws: Array, stood_on: bool = False
     ) -> Hit:
         """The ground above or below these points."""
@@ -281,11 +292,13 @@ class StrideProbe(AbstractSwingProbe):
 
 def _mean_ground(grounds: GroundHits, up_ws: Array) -> GroundHits:
     """The mean of several grounds (places legs) under feet that are not sure where they land."""
-    mean = jax.tree.map(lambda x: jnp.mean(x, 0), (grounds.ankle, grounds.lift, grounds.pitch))
+    mean = jax.tree.map(
+        lambda x: jnp.mean(x, 0), (grounds.ankle, grounds.lift, grounds.pitch, grounds.support)
+    )
     first = jax.tree.map(lambda x: x[0], grounds)
     ankle = dataclasses.replace(
         mean[0],
         normal=vec.normalize(mean[0].normal, up_ws),
         platform=first.ankle.platform,
     )
-    return dataclasses.replace(first, ankle=ankle, lift=mean[1], pitch=mean[2])
+    return dataclasses.replace(first, ankle=ankle, lift=mean[1], pitch=mean[2], support=mean[3])

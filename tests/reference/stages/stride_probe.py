@@ -5,13 +5,14 @@ One leg, one frame at a time. World space; heights are above the root along the 
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from reference import maths
 from reference.characters import Frame, Ground, Parameters, Rig, world_from_foot
 from reference.maths import Array, across, apply, clip, length, lerp, rotate, smooth01, unit
+from reference.stages import ground, support
 from reference.stages.limits import FADE, gentle, low_enough
 from reference.stages.swing import axis_of_pitch, beyond_animation
 from reference.terrain import Hit
@@ -24,13 +25,15 @@ EDGE_FRACTION = 0.15  # of the swing's time at either end, over which the path f
 class Swing:
     """Where a leg is in its stride; positions at the height of the root.
 
-    `lift`, m, and `pitch`, rad, toes up, are what its swing adds to the animation.
+    The animation gives `known` footholds; others are predicted. `lift`, m, and `pitch`, rad, toes
+    up, are what its swing adds to the animation.
     """
 
     last: Array
     next: Array
     fraction: float
     aside: Array | None = None
+    known: bool = False
     lift: float = 0.0
     pitch: float = 0.0
 
@@ -65,7 +68,7 @@ def swing(parameters: Parameters, frame: Frame, leg: int, up: Array, planted: bo
         last_ws = level(frame, up, stride.last_ws[leg])
         next_ws = level(frame, up, stride.next_ws[leg])
         aside = None if stride.aside_ws is None else across(stride.aside_ws[leg], up)
-        return Swing(last_ws, next_ws, float(stride.fraction[leg]), aside)
+        return Swing(last_ws, next_ws, float(stride.fraction[leg]), aside, known=True)
     stance_time = parameters.of_leg("probe.stance_time", leg)
     swing_time = parameters.of_leg("probe.swing_time", leg)
     velocity = across(frame.travel_ws, up)
@@ -101,12 +104,38 @@ class UnderBall:
     platform: int = -1
 
 
+def eased(parameters: Parameters, leg: int, fraction: float) -> float:
+    """The part of its way between two footholds that a foot has done at a part of its swing."""
+    start = parameters.of_leg("probe.rise_start", leg)
+    end = parameters.of_leg("probe.rise_end", leg)
+    x = clip((fraction - start) / (end - start), 0.0, 1.0)
+    k = parameters.of_leg("probe.steepness", leg)
+    return x**k / (x**k + (1.0 - x) ** k)
+
+
+def slide_to_support(
+    parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int, stride: Swing
+) -> tuple[Swing, support.Slide]:
+    """The stride between footholds that support more of the sole, and how far the foot slides."""
+    slides = [
+        support.slide(parameters, rig, terrain, frame, leg, foothold, stride.known)
+        for foothold in (look(parameters, terrain, leg, pos) for pos in (stride.last, stride.next))
+    ]
+    heading = ground.heading(rig, frame, leg, terrain.up)
+    last, following = (
+        pos + slide.forward * heading
+        for pos, slide in zip((stride.last, stride.next), slides, strict=True)
+    )
+    done = eased(parameters, leg, stride.fraction)
+    forward, share = (lerp(*pair, done) for pair in zip(*slides, strict=True))
+    return replace(stride, last=last, next=following), support.Slide(forward, share)
+
+
 def under_ball(
-    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, planted: bool
+    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, stride: Swing
 ) -> UnderBall:
-    """The ground under the ball of a leg, and the stride that it was predicted from."""
+    """The ground under the ball of a leg in this stride."""
     up = terrain.up
-    stride = swing(parameters, frame, leg, up, planted)
     last, following = (look(parameters, terrain, leg, pos) for pos in (stride.last, stride.next))
     if not last.found and not following.found:
         return UnderBall(stride, found=False)
@@ -130,11 +159,7 @@ def under_ball(
     high = lerp(low, high, sure)
     next_normal = last.normal + sure * (following.normal - last.normal)
 
-    start = parameters.of_leg("probe.rise_start", leg)
-    end = parameters.of_leg("probe.rise_end", leg)
-    x = clip((stride.fraction - start) / (end - start), 0.0, 1.0)
-    k = parameters.of_leg("probe.steepness", leg)
-    risen = x**k / (x**k + (1.0 - x) ** k)
+    risen = eased(parameters, leg, stride.fraction)
     ball = apply(frame.world_from_model, frame.toe.pos[leg])
     squared = float(across_ws @ across_ws)
     on_its_way = float((ball - stride.last) @ across_ws) / squared if squared > 0.0 else 0.0
@@ -152,11 +177,11 @@ def below_others(
     """How far the ground of this foot is below the highest of the others, m, without slopes."""
     here = apply(frame.world_from_model, frame.toe.pos[leg])
     below = 0.0
-    for other, ground in enumerate(balls):
-        if other == leg or not ground.found or not balls[leg].found:
+    for other, beside in enumerate(balls):
+        if other == leg or not beside.found or not balls[leg].found:
             continue
         way = apply(frame.world_from_model, frame.toe.pos[other]) - here
-        rise = ground.height - balls[leg].height
+        rise = beside.height - balls[leg].height
         climbs = [climb(parameters, end, ups[end], balls[end].normal, way) for end in (leg, other)]
         below = max(below, rise - shared_rise(rise, *climbs))
     return below

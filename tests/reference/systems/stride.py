@@ -77,6 +77,8 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         "probe.toes_down": 0.3,
         "probe.toes_down_per_height": 0.9,
         "probe.toes_first": 0.8,
+        "probe.min_sole": 0.65,
+        "probe.max_slide": 0.1,
         "probe.swing_as_animated": False,
         "probe.use_strides": True,
         "probe.stance_time": 0.65,
@@ -124,7 +126,7 @@ def step(
     ups = [characters.under(terrain, leg).up for leg in legs]
     offset_before = np.zeros(3) if state is None else state.pelvis_offset_ws
     standing, feet, followed, holds, footholds, targets = [], [], [], [], [], []
-    swings, turns, balls = [], [], []
+    swings, turns, balls, probed, supports = [], [], [], frame, []
     for leg in legs:
         before = None if state is None else state.standing[leg]
         if contact == "speed":
@@ -133,11 +135,18 @@ def step(
             label = float(frame.stride.standing[leg])
             standing.append(Standing(label > 0.5, label))
         under = characters.under(terrain, leg)
-        balls.append(stride_probe.under_ball(parameters, under, frame, leg, standing[leg].standing))
+        stride = stride_probe.swing(parameters, frame, leg, under.up, standing[leg].standing)
+        stride, slide = stride_probe.slide_to_support(parameters, rig, under, frame, leg, stride)
+        forward_ws = slide.forward * ground.heading(rig, frame, leg, under.up)
+        probed = characters.with_moved_foot(probed, leg, forward_ws)
+        supports.append(slide.support)
+        balls.append(stride_probe.under_ball(parameters, under, probed, leg, stride))
     for leg, up in zip(legs, ups, strict=True):
         under = characters.under(terrain, leg)
-        below = stride_probe.below_others(parameters, frame, leg, ups, balls)
-        foot, swing = sense(parameters, rig, under, frame, leg, standing[leg], balls[leg], below)
+        below = stride_probe.below_others(parameters, probed, leg, ups, balls)
+        foot, swing = sense(
+            parameters, rig, under, frame, probed, leg, standing[leg], balls[leg], below
+        )
 
         memory = None if state is None else state.ground[leg]
         memory = ground.smooth_height(parameters, leg, foot, up, memory, frame)
@@ -195,6 +204,7 @@ def step(
         "fraction": np.array([swing.fraction for swing in swings]),
         "hit_ws": np.array([foot.hit.point for foot in feet]),
         "normal": np.array([foot.hit.normal for foot in feet]),
+        "support": np.array(supports),
         "ground_height": np.array([memory.height.value for memory in followed]),
         "ground_velocity": np.array([memory.height.velocity for memory in followed]),
         "foothold_ws": np.array(footholds),
@@ -232,15 +242,16 @@ def sense(
     rig: Rig,
     terrain: Ground,
     frame: Frame,
+    probed: Frame,
     leg: int,
     contact: Standing,
     ball: stride_probe.UnderBall,
     below: float,
 ) -> tuple[Foot, stride_probe.Swing]:
-    """One leg in this frame, and where it is in its stride."""
+    """One leg in this frame, and where it is in its stride; in `probed` feet have slid."""
     ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
     lift = float(frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg))
-    hit, swing = stride_probe.ground_of_stride(parameters, rig, terrain, frame, leg, ball, below)
+    hit, swing = stride_probe.ground_of_stride(parameters, rig, terrain, probed, leg, ball, below)
     if hit.found:
         lift += swing.lift
     else:
