@@ -168,7 +168,7 @@ StrideProbe.lift_over 1 1.7 0 3
 StrideProbe.toes_up rad 0.1 0 0.60000002
 StrideProbe.toes_down rad 0.30000001 0 0.80000001
 StrideProbe.toes_down_per_height rad/m 0.89999998 0 3
-StrideProbe.toes_first rad/m 0.80000001 0 2
+StrideProbe.toes_first rad/m 0.5 0 2
 StrideProbe.min_sole 1 0.64999998 0 1
 StrideProbe.max_slide m 0.1 0 0.2
 StrideProbe.stance_time s 0.64999998 0.2 1.5

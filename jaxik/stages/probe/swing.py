@@ -147,7 +147,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         doc="The same per metre that the ground rises, falls, or stands in the way.",
     )
     toes_first: Leaf = parameter(
-        0.8,
+        0.5,
         unit="rad/m",
         low=0.0,
         high=2.0,

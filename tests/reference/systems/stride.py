@@ -76,7 +76,7 @@ def defaults(contact: str = "label", pelvis: str = "reach") -> dict[str, Any]:
         "probe.toes_up": 0.1,
         "probe.toes_down": 0.3,
         "probe.toes_down_per_height": 0.9,
-        "probe.toes_first": 0.8,
+        "probe.toes_first": 0.5,
         "probe.min_sole": 0.65,
         "probe.max_slide": 0.1,
         "probe.swing_as_animated": False,
