@@ -41,6 +41,7 @@ def sense_all(ik: jaxik.FootIK, rig, ground, frames, gate):
         inputs = Inputs(rig, ground, frame, gate)
         hits = ik.probe.sense(inputs, ik.contact.sense(inputs), ik.target.foot_height)
         slide = hits.ankle.point - frame.world_from_model.apply(frame.pose.ankle.pos)
+        assert hits.support is not None
         return slide[0, 2], hits.support[0], hits.ankle.point[0, 1]
 
     return jax.vmap(sense)(frames)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxik.maths import parameter_tree, vec
+from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, option, parameter, switch
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs, Moment
@@ -73,7 +73,6 @@ class StrideProbe(AbstractSupportedProbe):
         kind="threshold",
         doc="Depth below the character's level to which rays look.",
     )
-    layers: Leaf = parameter_tree.layers()
     use_strides: Leaf = switch(
         True, doc="Whether the animation's footholds are used; off, they are predicted."
     )
@@ -169,7 +168,7 @@ class StrideProbe(AbstractSupportedProbe):
         if self.slide_to_support:
             ends = jnp.stack([stride.last_ws, stride.next_ws])
             slides, supports = self.better_support(inputs, level, ends, stride.known, foot_height)
-            slide, support = (lerp(*x, fraction) for x in (slides, supports))
+            slide, support = (lerp(x[0], x[1], fraction) for x in (slides, supports))
             ahead = foot_heading(inputs, level.up_ws)[0]
             last_ws, next_ws = ends + vec.scale(ahead, slides)
             stride = dataclasses.replace(stride, last_ws=last_ws, next_ws=next_ws)

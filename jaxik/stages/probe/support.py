@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxik.maths import vec
+from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, option, parameter
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
@@ -42,6 +42,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
     In a swing the slide goes from that of the last foothold to that of the next.
     """
 
+    layers: Leaf = parameter_tree.layers()
     min_sole: Leaf = parameter(
         0.65,
         unit="1",
@@ -106,7 +107,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
                 blocked += block / len(SOLE)
             return share, blocked
 
-        shares, blocked = (jnp.stack(x) for x in zip(*map(fit, SLIDES), strict=True))
+        shares, blocked = (jnp.stack(x) for x in zip(*(fit(int(x)) for x in SLIDES), strict=True))
         slides = spacing * jnp.asarray(SLIDES, spacing.dtype)[:, None, None]
         fits = shares - blocked  # (slides ends legs)
         enough = jnp.where(fits < self.min_sole, fits, self.min_sole)

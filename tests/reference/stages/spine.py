@@ -91,8 +91,8 @@ def lean(
     upright = 1.0 - slide
     tilt = right_ws * (upright * parameters["lean.pelvis_rate"] * ahead)
     tilt = tilt - ahead_ws * (upright * parameters["lean.pelvis_side_rate"] * aside)
-    rotations = [maths.from_rotvec(np.asarray(turn)) for turn in (bend, back, tilt)]
-    return State(ahead, aside, slide), *rotations
+    bent, turned_back, tilted = (maths.from_rotvec(np.asarray(x)) for x in (bend, back, tilt))
+    return State(ahead, aside, slide), bent, turned_back, tilted
 
 
 def between_feet(

@@ -127,7 +127,7 @@ def slide_to_support(
         for pos, slide in zip((stride.last, stride.next), slides, strict=True)
     )
     done = eased(parameters, leg, stride.fraction)
-    forward, share = (lerp(*pair, done) for pair in zip(*slides, strict=True))
+    forward, share = (lerp(start, end, done) for start, end in zip(*slides, strict=True))
     return replace(stride, last=last, next=following), support.Slide(forward, share)
 
 

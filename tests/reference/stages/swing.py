@@ -66,7 +66,7 @@ def beyond_animation(
     down = uneven * get["toes_down"] + effort * get["toes_down_per_height"]
     pitch = uneven * get["toes_up"] * bump(fraction, TOES_UP) - down * bump(fraction, TOES_DOWN)
     forward = rotate(world_from_foot(rig, frame, leg), np.array([0.0, 0.0, 1.0]))
-    animated_pitch = np.arcsin(np.clip(forward @ up, -1.0, 1.0))
+    animated_pitch = float(np.arcsin(np.clip(forward @ up, -1.0, 1.0)))
     pitch = sure * pitch - get["toes_first"] * below * smooth01(animated_pitch / ON_HEEL)
     axis = axis_of_pitch(rig, frame, leg, up)
     turned = rotate(maths.from_axis_angle(axis, pitch), ankle - ball)
