@@ -19,7 +19,7 @@ JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
 MISTAKE, INTERRUPTED = 2, 130  # exit statuses
 # Allocations between searches for dead cycles of objects. Imports and traces leave hundreds of
 # thousands of objects that live on; by Python's own numbers a first fit spends 3 s looking at them.
-COLLECTIONS = (200_000, 50, 100)
+COLLECTIONS = (200_000, 10, 10)
 RENAMED = {"contribution": "ablate"}  # old commands, which still work in this release
 
 

@@ -37,14 +37,15 @@ def test_every_parameter_convention_and_switch_is_read_back_exactly(tmp_path):
 
 def test_options_are_read_back_and_only_true_or_false(tmp_path):
     ik = jaxik.presets.stride()
-    for name in ("probe.limited", "probe.check_support", "probe.remember_swings"):
-        ik = parameter_tree.with_option(ik, name, not parameter_tree.options(ik)[name])
+    for name, is_on in parameter_tree.options(ik).items():
+        ik = parameter_tree.with_option(ik, name, not is_on)
     text = parameter_files.system_to_toml(ik, Preset("stride"))
     back, _ = parameter_files.load_system(write_file(tmp_path, text))
     assert parameter_tree.options(back) == {
         "probe.limited": False,
         "probe.check_support": True,
         "probe.remember_swings": True,
+        "probe.slide_to_support": False,
     }
     with pytest.raises(ValueError, match="probe.limited is 0; wanted true or false"):
         parameter_files.load_system(write_file(tmp_path, "probe.limited = 0"))
