@@ -44,6 +44,7 @@ gc.set_threshold(200_000, 50, 100)
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530
+MAX_RESIDENT = 5e9  # bytes, of one of two workers on a machine with 16 GB
 LONGEST = ("test_notebooks.py", "test_translation.py", "test_documents.py")
 
 
@@ -60,11 +61,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def bounded_memory() -> Iterator[None]:
-    """Drops all compiled programs after a file if they take many mappings of memory."""
+    """Drops all compiled programs after a file if they take much memory, or many mappings of it."""
     yield
-    mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > MAX_MAPPINGS:
+    mappings, sizes = Path("/proc/self/maps"), Path("/proc/self/statm")  # on Linux only
+    if not mappings.exists():
+        return
+    resident = int(sizes.read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+    if resident > MAX_RESIDENT or mappings.read_bytes().count(b"\n") > MAX_MAPPINGS:
         jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="module")
