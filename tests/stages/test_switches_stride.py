@@ -43,7 +43,7 @@ STAIRS_UP, STAIRS_DOWN = planes((0, 0, 0), (2.0, 0, -0.8)), planes((0, 0, 0), (-
 CLIMBS = {"probe.max_slope": 1.3}  # as steep as these are
 TILTED, STEEP, WALL = (planes((0, left, 0)) for left in (0.4, 0.9, 4.0))  # the left foot higher
 BESIDE = planes((0, 0, 0), (0, 1.0, 0))  # level to the right, steep to the left
-BLOCK = planes((0, 0, 0), (2.0, 0, -0.3))  # too steep for a sole, under the toes
+BLOCK = planes((0, 0, 0), (2.0, 0, -1.1))  # too steep for a sole, under the toes that land
 LOWERED, RAISED = planes((0, 0, -0.5)), planes((0, 0, 0.1))
 
 
@@ -119,8 +119,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("probe.toes_down", "comes down", STEP_UP, (0.1, 0.2), "target height", 1),
         Case("probe.toes_down_per_height", "comes down", STEP_UP, (0.5, 0.9), "target height", 1),
         Case("probe.toes_first", "toes up", BESIDE, (0.4, 0.8), "pitch", -1),
-        Case("probe.min_sole", "standing", BLOCK, (0.4, 0.8), "target forward", -1),
-        Case("probe.max_slide", "standing", BLOCK, (0.08, 0.12), "target forward", -1),
+        Case("probe.min_sole", "comes down", BLOCK, (0.4, 0.8), "target forward", -1),
+        Case("probe.max_slide", "comes down", BLOCK, (0.08, 0.12), "target forward", -1),
         Case("probe.swing_as_animated", "comes down", STEP_UP, (False, True), "target height", -1),
         Case("probe.use_strides", "comes down", STEP_UP, (False, True), "target height", 1),
         Case("probe.ball_height", "lifts off", STEP_UP, (0.03, 0.06), "target height", 1, WIDE),

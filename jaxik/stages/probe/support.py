@@ -21,12 +21,12 @@ from .swing import AbstractSwingProbe, Level
 SOLE = np.arange(-4, 2)
 SLIDES = np.arange(-2, 3)
 LINE = np.arange(SOLE[0] + SLIDES[0], SOLE[-1] + SLIDES[-1] + 1)
-EVEN, UNEVEN = 0.015, 0.035  # m, from the plane of the sole: ground that supports it, and does not
+EVEN, UNEVEN = 0.3, 0.7  # fifths, from the plane of the sole: ground that supports it, and does not
 SHARE_FADE = 0.10  # of the sole, over which a sole begins to slide
 SAME_SHARE = 0.01  # of the sole, by which supports hardly differ
 SLIDE_COST = 0.03  # of the sole, to be gained by a slide of a fifth of it
 TOO_FAR = 2.0  # of the sole, more than any slide gains
-HEIGHT_COST = 2.0  # of the sole per m, to be gained by a slide to higher or lower ground
+HEIGHT_COST = 0.1  # of the sole, to be gained by a slide to ground a fifth of it higher or lower
 
 
 class AbstractSupportedProbe(AbstractSwingProbe):
@@ -85,6 +85,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         rise = foot_height - self.ball_height
         ankle_to_ball = vec.safe_sqrt(rig.foot**2 - rise**2)
         spacing = (self.heel_length + ankle_to_ball + self.toe_length) / 5.0
+        fifths = vec.safe_divide(jnp.ones_like(spacing), spacing)  # in a metre
 
         steps = vec.scale(ahead, spacing) * jnp.asarray(LINE, spacing.dtype)[:, None, None, None]
         foothold = self.ground_at(inputs, level, footholds_ws)
@@ -100,7 +101,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
             climbs = climb(line.normal[ball], vec.scale(ahead, spacing), up)
             for point in SOLE:
                 above = heights[ball + point] - heights[ball] - climbs * float(point)
-                above *= line.found[ball + point]
+                above *= line.found[ball + point] * fifths
                 block = smoothstep((above - EVEN) / (UNEVEN - EVEN))
                 hollow = smoothstep((-above - EVEN) / (UNEVEN - EVEN))
                 share += line.found[ball + point] * (1.0 - block - hollow) / len(SOLE)
@@ -112,8 +113,8 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         fits = shares - blocked  # (slides ends legs)
         enough = jnp.where(fits < self.min_sole, fits, self.min_sole)
         other_ground = jnp.abs(heights[SLIDES - LINE[0]] - heights[-LINE[0]])
-        cost = SLIDE_COST * jnp.abs(slides) / spacing + HEIGHT_COST * other_ground
-        too_far = TOO_FAR * smoothstep((jnp.abs(slides) - self.max_slide) / spacing)
+        cost = (SLIDE_COST * jnp.abs(slides) + HEIGHT_COST * other_ground) * fifths
+        too_far = TOO_FAR * smoothstep((jnp.abs(slides) - self.max_slide) * fifths)
         worth = enough - cost - too_far
         choice = jax.nn.softmax(worth / SAME_SHARE, axis=0)
         need = known * foothold.found

@@ -16,10 +16,10 @@ from reference.terrain import Hit
 
 HEEL, TIP = -4, 1  # fifths of a sole from its ball
 FURTHEST = 2  # fifths of a sole, of a slide
-SUPPORTS, DOES_NOT = 0.015, 0.035  # m from the plane of the sole
+SUPPORTS, DOES_NOT = 0.3, 0.7  # fifths of a sole from its plane
 FADE = 0.10  # of the sole
 INDIFFERENCE = 0.01  # of the sole
-FIFTH_COSTS, METRE_COSTS = 0.03, 2.0  # of the sole
+ASIDE_COSTS, HEIGHT_COSTS = 0.03, 0.1  # of the sole, for each fifth of it
 
 
 class Slide(NamedTuple):
@@ -70,7 +70,7 @@ def slide(
         for place in range(ball + HEEL, ball + TIP + 1):
             over = float((hits[place].point - hits[ball].point) @ up)
             over -= slope * fifth * (place - ball)
-            off = smooth01((abs(over) - SUPPORTS) / (DOES_NOT - SUPPORTS))
+            off = smooth01((abs(over) / fifth - SUPPORTS) / (DOES_NOT - SUPPORTS))
             found = hits[place].found
             on.append(1.0 - off if found else 0.0)
             stuck.append(off if found and over > 0.0 else 0.0)
@@ -85,7 +85,9 @@ def slide(
     for place in places:
         share, stuck = supported[place]
         climbed = abs(float((hits[place].point - hits[0].point) @ up))
-        gain = min(share - stuck, enough) - FIFTH_COSTS * abs(place) - METRE_COSTS * climbed
+        gain = (
+            min(share - stuck, enough) - ASIDE_COSTS * abs(place) - HEIGHT_COSTS * climbed / fifth
+        )
         gains.append(gain - 2.0 * smooth01((abs(place) * fifth - furthest) / fifth))
     chance = np.exp((np.array(gains) - max(gains)) / INDIFFERENCE)
     chance /= chance.sum()
