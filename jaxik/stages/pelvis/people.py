@@ -129,10 +129,10 @@ class ReachPelvis(AbstractFollowingPelvis):
 
     The body also moves forward or back towards the foot whose leg limits it, the lower of two: by
     `shift` of how much further ahead of its hip that foot is than in the animation. People stay
-    behind as they step up and go ahead as they step down.
-    Where the animated pelvis knew the phase of the gait alone, this brought captured hips from 3.3
-    to 3.0 and from 3.5 to 3.1 cm ahead or back (rms) in the halves of a walk over blocks
-    (`tests/phase_pelvis`). Aside, the ground explains nothing of where they are.
+    behind as they step up and go ahead as they step down. Where the animated pelvis knew the phase
+    of the gait alone, this brought its place ahead or back from 3.3 to 3.0 and from 3.5 to 3.1 cm
+    of the captured (rms) in the halves of a walk over blocks (`tests/phase_pelvis`). Aside, the
+    ground explains nothing of where it is.
     """
 
     highest_share: Leaf = parameter(

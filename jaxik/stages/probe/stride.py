@@ -17,7 +17,7 @@ from jaxik.world.skeleton import Rig
 from jaxik.world.terrain import Hit
 
 from . import foresight
-from .base import foot_heading, make_rays, no_hit
+from .base import make_rays, no_hit
 from .limits import clip_to_one, least_rise, smoothstep
 from .support import AbstractSupportedProbe
 from .swing import FAR, Level, s_curve
@@ -140,10 +140,25 @@ class StrideProbe(AbstractSupportedProbe):
 
     def sense(self, inputs: Inputs, contact: Contact, foot_height: Array) -> GroundHits:
         level = Level(inputs.frame.world_from_model.pos, inputs.terrain.leg_up_ws)
-        if not self.remember_swings:
-            stride = self._stride(inputs, contact, level)
-            return self._ground_of(inputs, foot_height, level, stride)
-        stride = inputs.frame.stride
+        remembered = self.remember_swings
+        stride = inputs.frame.stride if remembered else self._stride(inputs, contact, level)
+        support = None
+        if self.slide_to_support:
+            slides_ws, supports = self.better_support(inputs, level, stride, foot_height)
+            fraction = self._eased(stride)
+            support = lerp(supports[0], supports[1], fraction)
+            moved_ws = lerp(slides_ws[0], slides_ws[1], fraction[..., None])
+            last_ws, next_ws = stride.last_ws + slides_ws[0], stride.next_ws + slides_ws[1]
+            stride = dataclasses.replace(stride, last_ws=last_ws, next_ws=next_ws)
+            frame = inputs.frame.with_moved_feet(moved_ws)
+            inputs = dataclasses.replace(inputs, frame=frame)
+        ground = self._ground_around if remembered else self._ground_of
+        return dataclasses.replace(ground(inputs, foot_height, level, stride), support=support)
+
+    def _ground_around(
+        self, inputs: Inputs, foot_height: Array, level: Level, stride: Stride
+    ) -> GroundHits:
+        """The mean ground of strides to five places, around next footholds that are predicted."""
         ball = inputs.frame.world_from_model.apply(inputs.frame.pose.toe.pos)
         way = vec.reject(stride.next_ws - ball, level.up_ws)
         aside = vec.cross(way, level.up_ws)
@@ -157,23 +172,16 @@ class StrideProbe(AbstractSupportedProbe):
         )(places_ws)
         return _mean_ground(grounds, level.up_ws)
 
+    def _eased(self, stride: Stride) -> Float[Array, " legs"]:
+        """0..1, how far each foot is from its last foothold to its next, eased in and out."""
+        since_start = stride.fraction - self.rise_start
+        fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
+        return s_curve(fraction, self.steepness)
+
     def _ground_of(
         self, inputs: Inputs, foot_height: Array, level: Level, stride: Stride
     ) -> GroundHits:
         """The ground under feet in these strides."""
-        since_start = stride.fraction - self.rise_start
-        fraction = vec.safe_divide(since_start, self.rise_end - self.rise_start)
-        fraction = s_curve(fraction, self.steepness)
-        support = None
-        if self.slide_to_support:
-            ends = jnp.stack([stride.last_ws, stride.next_ws])
-            slides, supports = self.better_support(inputs, level, ends, stride.known, foot_height)
-            slide, support = (lerp(x[0], x[1], fraction) for x in (slides, supports))
-            ahead = foot_heading(inputs, level.up_ws)[0]
-            last_ws, next_ws = ends + vec.scale(ahead, slides)
-            stride = dataclasses.replace(stride, last_ws=last_ws, next_ws=next_ws)
-            frame = inputs.frame.with_moved_feet(vec.scale(ahead, slide))
-            inputs = dataclasses.replace(inputs, frame=frame)
         frame = inputs.frame
         way_ws = stride.next_ws - stride.last_ws
         fractions = jnp.asarray(WAY, way_ws.dtype)[:, None]
@@ -200,6 +208,7 @@ class StrideProbe(AbstractSupportedProbe):
         trust = next_.found * self.gentleness(next_.normal, level.up_ws)
         trust *= self._trust_of_way(evened, path.found)
 
+        fraction = self._eased(stride)
         ankle, ball = animated_ankles(frame).pos, frame.world_from_model.apply(frame.pose.toe.pos)
         covered = vec.safe_divide(vec.dot(ball - stride.last_ws, way), vec.dot(way, way))
         height = low + trust * (slope * clip_to_one(covered) + step * fraction)
@@ -227,7 +236,7 @@ class StrideProbe(AbstractSupportedProbe):
         rays = make_rays(hit, self.ray_up, self.ray_down, self.layers)
         turns = jnp.ones_like(found)
         lift, pitch = (jnp.where(found > 0, x, 0.0) for x in (swing.lift, swing.pitch))
-        return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch, support)
+        return GroundHits(hit, no_hit(hit), no_hit(hit), turns, rays, lift, pitch)
 
     def _stride(self, inputs: Inputs, contact: Contact, level: Level) -> Stride:
         """The stride of the animation where it is known, else one predicted from velocity."""
@@ -291,13 +300,11 @@ class StrideProbe(AbstractSupportedProbe):
 
 def _mean_ground(grounds: GroundHits, up_ws: Array) -> GroundHits:
     """The mean of several grounds (places legs) under feet that are not sure where they land."""
-    mean = jax.tree.map(
-        lambda x: jnp.mean(x, 0), (grounds.ankle, grounds.lift, grounds.pitch, grounds.support)
-    )
+    mean = jax.tree.map(lambda x: jnp.mean(x, 0), (grounds.ankle, grounds.lift, grounds.pitch))
     first = jax.tree.map(lambda x: x[0], grounds)
     ankle = dataclasses.replace(
         mean[0],
         normal=vec.normalize(mean[0].normal, up_ws),
         platform=first.ankle.platform,
     )
-    return dataclasses.replace(first, ankle=ankle, lift=mean[1], pitch=mean[2], support=mean[3])
+    return dataclasses.replace(first, ankle=ankle, lift=mean[1], pitch=mean[2])

@@ -11,6 +11,7 @@ from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, option, parameter
 from jaxik.maths.smoothing import lerp
 from jaxik.stages.inputs import Inputs
+from jaxik.world.frame import Stride
 from jaxik.world.terrain import Hit
 
 from .base import foot_heading
@@ -51,7 +52,11 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         doc="Share of a sole that the ground must support, or the foot slides to where it does.",
     )
     max_slide: Leaf = parameter(
-        0.10, unit="m", low=0.0, high=0.2, doc="Furthest that a foot slides to better support."
+        0.10,
+        unit="m",
+        low=0.0,
+        high=0.2,
+        doc="How far a foot slides to better support; longer slides count less and less.",
     )
     slide_to_support: bool = option(
         False, doc="Whether feet slide to better support, which takes three times as many rays."
@@ -64,21 +69,18 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         """The ground above or below these points."""
 
     def better_support(
-        self,
-        inputs: Inputs,
-        level: Level,
-        footholds_ws: Array,
-        known: Array,
-        foot_height: Array,
-    ) -> tuple[Float[Array, "ends legs"], Float[Array, "ends legs"]]:
-        """How far each foot slides forward from its footholds, m, and the share then supported.
+        self, inputs: Inputs, level: Level, stride: Stride, foot_height: Array
+    ) -> tuple[Float[Array, "2 legs 3"], Float[Array, "2 legs"]]:
+        """How far each foot slides from its last and its next foothold, and what supports it there.
 
         Args:
             inputs: the frame.
             level: of the character.
-            footholds_ws: of the balls (ends legs 3), m.
-            known: 0..1, whether the animation gives them (legs).
+            stride: with the footholds; predicted ones stay.
             foot_height: of the ankles over the soles, m.
+
+        Returns:
+            The slides, m, world space, and the shares of the soles that are supported after them.
         """
         rig, up = inputs.rig, level.up_ws
         ahead, _ = foot_heading(inputs, up)
@@ -88,6 +90,7 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         fifths = vec.safe_divide(jnp.ones_like(spacing), spacing)  # in a metre
 
         steps = vec.scale(ahead, spacing) * jnp.asarray(LINE, spacing.dtype)[:, None, None, None]
+        footholds_ws = jnp.stack([stride.last_ws, stride.next_ws])
         foothold = self.ground_at(inputs, level, footholds_ws)
         starts = foothold.point + steps + vec.scale(up, self.max_step_up)
         reach = self.max_step_up + self.max_step_down
@@ -117,7 +120,8 @@ class AbstractSupportedProbe(AbstractSwingProbe):
         too_far = TOO_FAR * smoothstep((jnp.abs(slides) - self.max_slide) * fifths)
         worth = enough - cost - too_far
         choice = jax.nn.softmax(worth / SAME_SHARE, axis=0)
-        need = known * foothold.found
+        need = stride.known * foothold.found
         need *= smoothstep((self.min_sole - fits[-SLIDES[0]]) / SHARE_FADE)
         support = lerp(shares[-SLIDES[0]], jnp.sum(choice * shares, 0), need)
-        return need * jnp.sum(choice * slides, 0), foothold.found * support
+        slide = need * jnp.sum(choice * slides, 0)
+        return vec.scale(ahead, slide), foothold.found * support
