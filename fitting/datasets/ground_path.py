@@ -29,6 +29,7 @@ REACH = 0.40  # m between an animation's floor and ground that foot IK is left t
 STRAY = 0.02  # fraction of stance frames that may be beyond `REACH`
 FOLLOWING = 0.5  # of the ground's variation that remains under soles which follow it
 SKY = HORIZON / 2  # m, above all ground
+RAYS = 1024  # that are cast in one call
 MISSING = "there is no ground below most of its path"
 USUAL_STRIDE = 1.05  # s, where a clip shows none
 
@@ -133,8 +134,16 @@ def heights_under(
     """
     origins = np.array(points_ws)
     origins[..., 1] = start
-    hit = cast(terrain, jnp.asarray(origins), jnp.inf)
-    return np.where(np.asarray(hit.found) > 0, np.asarray(hit.point, np.float64)[..., 1], np.nan)
+    rays = origins.reshape(-1, 3)
+    heights = [_heights(terrain, rays[i : i + RAYS]) for i in range(0, len(rays), RAYS)]
+    return np.concatenate([np.empty(0), *heights]).reshape(origins.shape[:-1])
+
+
+def _heights(terrain: Terrain, origins_ws: np.ndarray) -> np.ndarray:
+    """`heights_under`, for `RAYS` rays at most; rays are added so that there is one program."""
+    hit = cast(terrain, jnp.asarray(np.resize(origins_ws, (RAYS, 3))), jnp.inf)
+    heights = np.where(np.asarray(hit.found) > 0, np.asarray(hit.point, np.float64)[:, 1], np.nan)
+    return heights[: len(origins_ws)]
 
 
 @jax.jit

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from fitting.datasets.ground_path import heights_under
+from fitting.datasets.ground_path import RAYS, heights_under
 from fitting.datasets.terrain.mesh_files import TerrainOptions, height_function, load_terrain
 
 LEVELS = (np.arange(5)[:, None] * 1000 + np.arange(7) * 10).astype(np.uint16)  # rows along z
@@ -22,6 +22,19 @@ def test_a_picture_of_16_bits_has_metres_per_level_and_cell(tmp_path):
     inner = (x.ravel() < 2.9)[:-1] & (z.ravel() < 1.9)[:-1]
     height = heights_under(ground, points[inner], 100.0)
     np.testing.assert_allclose(height, 1 + 0.001 * LEVELS.ravel()[:-1][inner], atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (RAYS,), (3, RAYS - 1)])
+def test_any_number_of_points_has_heights(tmp_path, shape):
+    x, z = np.meshgrid(np.arange(40), np.arange(30))
+    np.save(tmp_path / "slope.npy", 0.1 * x - 0.2 * z)
+    ground = load_terrain(tmp_path / "slope.npy", cell=1.0)
+    points = np.random.default_rng(1).uniform([-5, 0, 1], [38, 0, 28], (*shape, 3))
+    expected = np.where(points[..., 0] > 0, 0.1 * points[..., 0] - 0.2 * points[..., 2], np.nan)
+    np.testing.assert_allclose(heights_under(ground, points, 100.0), expected, atol=1e-4)
+    starts = np.where(points[..., 2] < 10, 100.0, -100.0)
+    expected = np.where(starts > 0, expected, np.nan)
+    np.testing.assert_allclose(heights_under(ground, points, starts), expected, atol=1e-4)
 
 
 def test_an_array_of_heights_has_a_cell_and_holes(tmp_path):
