@@ -23,6 +23,7 @@ from fitting.problem.problem import Problem
 from fitting.report import fit_report, posterior_report, translation_report
 from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
+from fitting.report.plots import style
 from fitting.runtime.precision import in_float64
 from fitting.studies import record_price, run_folder, translation
 from fitting.studies.assess import assess_solution
@@ -94,6 +95,8 @@ def fit(
 
         problem, solution = search_with_noise(problem, experiment, watch, kept)
         shown = Shown(clips, known_values)
+        if run is not None and report:
+            style.prepare_saving()
         fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
         texts, sections = _price_of_record(fitted, progress, log)
         if run is not None and report:

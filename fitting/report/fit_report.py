@@ -67,17 +67,17 @@ def write_fit(
     with activity.announced("Playing the clips with the system before the fit"):
         before = (rehearsal or Rehearsal(fitted.problem)).results()
     with ExitStack() as drawing, calls_beside():
+        with activity.announced("Drawing the curves of the parameters"):  # which takes longest
+            curves = _draw_profiles(run, fitted)
         plays = zip(fitted.problem.data, fitted.playbacks, strict=True)
         for index, (scene, after) in enumerate(plays):
             with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
                 first = playback.play(scene, before[index])
                 plots |= _draw_clip(run, fitted, index, first, after)
                 worst += _worst_window(run, fitted, index, after)
-        with activity.announced("Drawing the curves of the parameters"):
-            plots |= _draw_profiles(run, fitted)
-            title = f"{fitted.experiment.name}: cost of the fit over time"
-            figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
-            plots |= save_plot(run, "cost.png", title, figure)
+        title = f"{fitted.experiment.name}: cost of the fit over time"
+        figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
+        plots |= curves | save_plot(run, "cost.png", title, figure)
         with activity.announced("Measuring where limits are in effect"):
             clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
             limits = _limits(fitted, clips)
@@ -94,11 +94,11 @@ def write_fit(
             "## Pictures",
             gallery(plots),
         ]
+        if fitted.clips:
+            with activity.announced("Writing the page"):
+                fit_page.write(run, fitted, Measured(before, clips))
         drawing.enter_context(activity.announced("Finishing the pictures"))
     files.write_text(run / SUMMARY, "\n\n".join(parts) + "\n")
-    if fitted.clips:
-        with activity.announced("Writing the page"):
-            fit_page.write(run, fitted, Measured(before, clips))
 
 
 def save_plot(run: Path, name: str, caption: str, figure: Figure) -> Plots:

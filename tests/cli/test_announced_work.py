@@ -34,12 +34,12 @@ FIT = [
     "Writing the motions and numbers of the fit",
     f"{PLAYING}fitted system",
     f"{PLAYING}system before the fit",
-    "Drawing hill",
     "Drawing the curves of the parameters",
+    "Drawing hill",
     "Measuring where limits are in effect",
     "Finding what determines 2 parameters",
-    "Finishing the pictures",
     "Writing the page",
+    "Finishing the pictures",
 ]
 SAMPLE = [
     READING,

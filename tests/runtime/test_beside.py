@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+from loky import get_reusable_executor
 
 from fitting.runtime.parallel import beside
 
@@ -34,6 +35,32 @@ def test_calls_run_elsewhere_and_have_finished_at_the_end(tmp_path):
             beside.call(write_process, path)
     processes = {int(path.read_text()) for path in paths}
     assert os.getpid() not in processes and len(processes) <= 2
+
+
+def mark() -> None:
+    os.environ["JAXIK_TEST_MARK"] = "prepared"
+
+
+def write_mark(path: Path) -> None:
+    path.write_text(os.environ.get("JAXIK_TEST_MARK", "") + f" {os.getpid()}")
+
+
+def test_processes_can_be_prepared(tmp_path):
+    get_reusable_executor(2, timeout=beside.IDLE).shutdown(wait=True)
+    beside.prepare(mark)
+    paths = [tmp_path / str(number) for number in range(20)]
+    with beside.calls_beside():
+        for path in paths:
+            beside.call(write_mark, path)
+    marks = [path.read_text().split() for path in paths]
+    assert ["prepared"] in [mark[:-1] for mark in marks]
+    assert str(os.getpid()) not in [mark[-1] for mark in marks]
+
+
+def test_on_one_core_nothing_is_prepared(monkeypatch):
+    monkeypatch.setattr(beside, "cpu_count", lambda: 1)
+    beside.prepare(mark)
+    assert "JAXIK_TEST_MARK" not in os.environ
 
 
 def test_without_it_calls_run_here_and_at_once(tmp_path):

@@ -1,5 +1,6 @@
 """What all figures share: colours, fonts, ground, time axes, and saving to a file."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,16 @@ def earth(axes: Axes, across: np.ndarray, height: np.ndarray) -> None:
 def legend(figure: Figure, *entries: Artist, columns: int = 4) -> None:
     """Adds a legend below the figure."""
     figure.legend(handles=entries, loc="outside lower center", ncols=min(columns, len(entries)))
+
+
+def prepare_saving() -> None:
+    """Starts the processes in which `save` writes figures, if it is about to be called."""
+    beside.prepare(_import_drawing)
+
+
+def _import_drawing() -> None:
+    """Imports all that writing a figure takes."""
+    Figure().savefig(io.BytesIO())
 
 
 def save(path: Path, figure: Figure) -> None:

@@ -29,7 +29,7 @@ def calls_beside() -> Iterator[None]:
     An error in one of them is raised at the end, and warnings are given there. On one core, and in
     processes that may have no children, they run at once instead.
     """
-    if cpu_count() < 2 or multiprocessing.current_process().daemon:
+    if not _possible():
         yield
         return
     running: list[Future[Notes]] = []
@@ -47,6 +47,20 @@ def calls_beside() -> Iterator[None]:
             warnings.warn_explicit(note.message, note.category, note.filename, note.lineno)
 
 
+def prepare(function: Callable[[], None]) -> None:
+    """Starts the processes, if there are to be any, and calls a function in each.
+
+    Later calls then need not wait for imports, which this makes on a core that would be idle.
+
+    Args:
+        function: of the module whose functions will be called.
+    """
+    if _possible():
+        executor = get_reusable_executor(cpu_count(), timeout=IDLE)
+        for _ in range(cpu_count()):
+            executor.submit(function)
+
+
 def call(function: Callable[..., None], *arguments: Any) -> None:
     """Calls a function: in another process where `calls_beside`, here otherwise.
 
@@ -60,6 +74,10 @@ def call(function: Callable[..., None], *arguments: Any) -> None:
         return
     executor = get_reusable_executor(cpu_count(), timeout=IDLE)
     running.append(executor.submit(_with_notes, function, *arguments))
+
+
+def _possible() -> bool:
+    return cpu_count() > 1 and not multiprocessing.current_process().daemon
 
 
 def _with_notes(function: Callable[..., None], *arguments: Any) -> Notes:
