@@ -2,6 +2,9 @@
 
 import dataclasses
 import functools
+import os
+import subprocess
+import sys
 
 import equinox as eqx
 import jax
@@ -290,6 +293,28 @@ def test_the_triangular_factor_has_the_gram_matrix_of_all_rows(rows):
     np.testing.assert_allclose(triangle.T @ triangle, tall.T @ tall, rtol=1e-10, atol=1e-10)
     if rows >= 5:
         np.testing.assert_allclose(np.abs(triangle), np.abs(np.linalg.qr(tall, "r")), rtol=1e-8)
+
+
+FACTORS_IN_THREADS = """
+import os, threading
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])  # so many threads has XLA's pool
+import jax, jax.numpy as jnp
+from fitting.inference.optimisation.models import triangular_factor
+program = jax.jit(lambda tall: triangular_factor(tall) + triangular_factor(2 * tall))
+tall = jnp.arange(80_000.0).reshape(-1, 10) % 7
+def repeat():
+    for _ in range(50):
+        program(tall).block_until_ready()
+threads = [threading.Thread(target=repeat) for _ in range(4)]
+for thread in threads:
+    thread.start()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+def test_triangular_factors_in_several_threads_do_not_wait_for_each_other():
+    """As jaxlib's decompositions of several matrices at once do."""
+    subprocess.run([sys.executable, "-c", FACTORS_IN_THREADS], check=True, timeout=100)
 
 
 def test_the_same_seed_gives_the_same_solution():
