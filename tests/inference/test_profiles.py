@@ -17,6 +17,7 @@ from fitting.inference.profiles import heights
 from fitting.problem.free_parameters import free_parameter, to_fractions
 from fitting.problem.problem import Problem
 from fitting.problem.space import make_space
+from fitting.runtime import threads
 from jaxik.maths import parameter_tree
 from support import toy
 
@@ -100,6 +101,16 @@ def exact_cost(problem: Problem, u: np.ndarray, held: int, place: float) -> floa
         ftol=1e-12,
     )
     return float(found.cost)
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_profiles_are_the_same_on_any_number_of_cores(monkeypatch, cores):
+    monkeypatch.setattr(threads, "usable_cores", lambda: cores)
+    problem, solution, assessed = coupled()
+    again = identifiability.assess_identifiability(problem, solution)
+    for name, profile in assessed.profiles.items():
+        np.testing.assert_array_equal(again.profiles[name].values, profile.values)
+        np.testing.assert_array_equal(again.profiles[name].rises, profile.rises)
 
 
 def test_a_profile_is_the_exact_one_where_the_cost_is_low():

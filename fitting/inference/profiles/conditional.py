@@ -10,6 +10,7 @@ hold, a descent by Levenberg–Marquardt follows.
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,7 @@ from fitting.inference.optimisation.solution import Solution
 from fitting.problem.free_parameters import to_fractions
 from fitting.problem.problem import Problem
 from fitting.problem.space import EDGE
+from fitting.runtime.threads import on_all_cores
 
 from .secants import slopes_of_thresholds
 
@@ -204,14 +206,18 @@ class Conditional:
         self, points: Points, targets: Targets, chosen: Bool[np.ndarray, " points"]
     ) -> Points:
         """Points of which those chosen have descended, their targets held."""
-        ends = [
-            self.descend(u, int(i)) if descends else (u, cost)
-            for u, cost, i, descends in zip(
-                points.u, points.cost, targets.index, chosen, strict=True
-            )
-        ]
-        u, cost = map(np.asarray, zip(*ends, strict=True))
+        rows = np.flatnonzero(chosen)
+        ends = self.descend_all([(points.u[row], int(targets.index[row])) for row in rows])
+        u, cost = points.u.copy(), points.cost.copy()
+        for row, end in zip(rows, ends, strict=True):
+            u[row], cost[row] = end
         return Points(u, self.problem.space.values(u), cost)
+
+    def descend_all(
+        self, descents: Sequence[tuple[np.ndarray, int | None]], steps: int = STEPS
+    ) -> list[tuple[np.ndarray, float]]:
+        """The ends of several descents, each given by its start and the parameter held."""
+        return on_all_cores([partial(self.descend, u, held, steps) for u, held in descents])
 
     def descend(
         self, u: Float[np.ndarray, " free"], held: int | None, steps: int = STEPS

@@ -131,8 +131,9 @@ def descend_elsewhere(profiling: Profiling) -> None:
         minima = np.flatnonzero(minimum & outside)
         minima = minima[np.argsort(rises[minima], kind="stable")[:MINIMA]]
         if len(minima):
-            ends = [conditional.descend(u, None, FREE_STEPS)[0] for u in curve.u[minima]]
-            points = conditional.points(np.asarray(ends))
+            starts = [(u, None) for u in curve.u[minima]]
+            ends = conditional.descend_all(starts, FREE_STEPS)
+            points = conditional.points(np.asarray([u for u, _ in ends]))
             curves.add(Targets(np.full(len(minima), i), points.values[:, i]), points)
 
 

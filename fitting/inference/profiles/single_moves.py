@@ -48,7 +48,7 @@ def other_plateaus(conditional: Conditional, curves: Curves, seed: int = 0) -> P
     order = order[together.cost[order] < curves.best.cost[0] + CLOSE]
     _, first = np.unique(np.round(data_cost[order] / SAME_PLATEAU), return_index=True)
     distinct = order[np.sort(first)][1 : PLATEAUS + 1]  # the first is the solution's own
-    ends = [conditional.descend(u, None) for u in together.u[distinct]]
+    ends = conditional.descend_all([(u, None) for u in together.u[distinct]])
     if not ends:
         return together[:0]
     return conditional.points(np.asarray([u for u, _ in ends]))
