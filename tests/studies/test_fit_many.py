@@ -16,6 +16,7 @@ from typing import Any
 
 import pyarrow.parquet
 import pytest
+from distributed import LocalCluster
 
 import fitting
 from fitting.cli import main
@@ -121,6 +122,25 @@ def test_each_fit_is_a_run_and_a_row_and_is_not_repeated(experiment_file, tmp_pa
     again = fit_many(experiment_file, out, seeds=2, log=lines.append)
     assert again.rows == fits.rows and again.made == 0
     assert "4 fits of 1 experiment, 2 seeds for each clip; 4 are there already" in lines
+
+
+def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(experiment_file, tmp_path):
+    here = fit_many(experiment_file, tmp_path / "here", seeds=2)
+    options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(n_workers=2, processes=False, **options) as workers:
+        address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
+        out = tmp_path / "there"
+        there = fitting.fit_many(experiment_file, out, seeds=2, scheduler=address, report=False)
+        again = fitting.fit_many(experiment_file, out, seeds=2, scheduler=address, report=False)
+    numbers = [[row[name] for name in ("run", "cost", "state")] for row in cells(here)]
+    assert [[row[name] for name in ("run", "cost", "state")] for row in cells(there)] == numbers
+    assert (there.made, again.made) == (4, 0) and again.rows == there.rows
+    for row in there.rows:
+        run_folder.load_fit(out / row["run"])
+
+
+def cells(fits: fitting.ManyFits) -> list[dict[str, Any]]:
+    return [table.cells(row) for row in fits.rows]
 
 
 def test_the_run_of_another_experiment_is_not_taken_for_ones_own(experiment_file, tmp_path):
