@@ -17,6 +17,7 @@ import jaxik
 from fitting.datasets import coverage
 from fitting.datasets.clip_frames import frames_from_clip, raised
 from fitting.datasets.clips import Clip, edit, flight, load_clip
+from fitting.datasets.cut_off_swings import with_cut_off_swings
 from fitting.datasets.flat_animation import (
     as_flat_animation,
     flatten_clip,
@@ -222,7 +223,7 @@ def _cut(clip: Clip, path: Path, entry: ClipEntry, fps: float | None) -> Clip:
 def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captured") -> Scene:
     """One clip as residuals need it; `sigmas` override the defaults, plots show the label."""
     reference, base, terrain, root, tracks = data
-    frames = frames_from_clip(base, rise=root.rise)
+    frames = with_cut_off_swings(frames_from_clip(base, rise=root.rise), base, terrain)
     placed = raised(base, root.rise)
     legs = reference.leg_pose_ws()
     stance = reference.stance

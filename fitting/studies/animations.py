@@ -21,6 +21,7 @@ from fitting.datasets.clips.edit import at_speed
 from fitting.datasets.clips.formats.npz import is_blocks_file
 from fitting.datasets.clips.load import ClipOptions
 from fitting.datasets.coverage import Coverage
+from fitting.datasets.cut_off_swings import with_cut_off_swings
 from fitting.datasets.flat_animation import load_flat_animation, with_remark_if_uneven
 from fitting.datasets.ground_path import AS_ANIMATED, RootChoice, place_root
 from fitting.datasets.terrain.mesh_files import TerrainOptions, load_terrain
@@ -101,6 +102,8 @@ class Animation:
         frames = frames_from_clip(
             self.clip, floor=self.floor, rise=self.root.rise, stride_scale=stride_scale
         )
+        if stride_scale is None:
+            frames = with_cut_off_swings(frames, self.clip, self.terrain)
         return frames if self.carried is None else carried_frames(frames, self.carried)
 
     @cached_property

@@ -118,6 +118,45 @@ def footfalls(
     return Footfalls(positions, last, next_, fraction, aside)
 
 
+@dataclass(frozen=True)
+class CutOffSwing:
+    """A swing of which a clip shows only the end."""
+
+    last_ws: Float64[np.ndarray, "3"]
+    """m, of the foothold that it left; its height is that of the next one."""
+    next_ws: Float64[np.ndarray, "3"]
+    """m, median position of the ball at the next foothold."""
+    fraction: Float64[np.ndarray, " before"]
+    """0..1, of its duration that has passed, in each frame before the foot stands."""
+
+
+def cut_off_swing(
+    ball_ws: Float64[np.ndarray, "frames 3"],
+    stance: Bool[np.ndarray, " frames"],
+    up_ws: Sequence[float] | np.ndarray = UP,
+) -> CutOffSwing | None:
+    """The swing of one foot that the start of a clip cuts off, as long and far as its next one.
+
+    None if there is none, or no whole one.
+
+    Args:
+        ball_ws: position of the foot's ball, m.
+        stance: True where it stands.
+        up_ws: unit, of the floor.
+    """
+    stances = runs(stance)
+    if len(stances) < 2 or stances[0][0] == 0:
+        return None
+    landing, arriving = stances[0][0], stances[1][0]
+    next_ws, following_ws = (np.median(ball_ws[a : b + 1], axis=0) for a, b in stances[:2])
+    remaining, way = _level(np.stack([next_ws - ball_ws[0], following_ws - next_ws]), up_ws)
+    lengths = np.linalg.norm([remaining, way], axis=1)
+    ahead = remaining if lengths[0] > SHORTEST_WAY else way
+    back = ahead / max(float(np.linalg.norm(ahead)), 1e-9) * lengths.max()
+    fraction = 1.0 - (landing - np.arange(landing)) / (arriving - stances[0][1])
+    return CutOffSwing(next_ws - back, next_ws, np.maximum(fraction, 0.0))
+
+
 def _level(
     points_ws: Float64[np.ndarray, "n 3"], up_ws: Sequence[float] | np.ndarray
 ) -> Float64[np.ndarray, "n 3"]:
