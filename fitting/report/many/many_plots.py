@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from fitting.report.plots.style import AFTER, BEFORE, CAPTURED, styled
 from fitting.studies.many.progress import ManyFits
@@ -79,6 +79,10 @@ def _seconds(axes: Axes, rows: Sequence[Row]) -> None:
     axes.hist(whole, bins, color=AFTER, alpha=0.8, label="fit")
     axes.hist(search, bins, color=CAPTURED, alpha=0.6, label="its search")
     axes.set(xlabel="time, s", ylabel="fits", xscale="log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_title("time of a fit", fontsize=12)
-    axes.legend()
+    axes.margins(y=0.35)  # room for the legend
+    axes.legend(loc="upper right")

@@ -20,6 +20,8 @@ OFF = f"sole off its ground by {100 * VISIBLE:.0f} cm"
 SOLES = STAGES[0], STAGES[1]
 NARROWEST = 1.5  # m along the path
 PANEL = 2.6, 1.45  # inches
+ENTRY = 2.3, 0.32  # inches, an entry of the legend
+ENTRIES = 6
 MARGIN = 0.3  # m, around what is shown
 JUMP = 1.0  # m in a frame, from which a line is interrupted
 HEAD = 0.5, 1.45  # place of a column's heading, in heights of a panel
@@ -30,8 +32,10 @@ SAMPLES = 600  # of the ground
 def page(suite: Suite) -> Figure:
     """Ground, soles, ankles and pelvis of every system in every situation."""
     rows, columns = len(suite.scenes), len(suite.systems)
-    size = PANEL[0] * columns + 1.0, PANEL[1] * rows + 1.0
-    figure = Figure(figsize=size, layout="constrained")
+    width = PANEL[0] * columns + 1.0
+    across = max(1, min(ENTRIES, int(width / ENTRY[0])))  # entries of the legend side by side
+    height = PANEL[1] * rows + 1.0 + ENTRY[1] * -(-ENTRIES // across)
+    figure = Figure(figsize=(width, height), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharex="row", sharey="row")
     for scene, row in zip(suite.scenes, panels, strict=True):
         row[0].set_ylim(_heights(scene))
@@ -49,7 +53,7 @@ def page(suite: Suite) -> Figure:
         Line2D([], [], color=BEFORE, label="ankles"),
         Line2D([], [], color="black", label="pelvis"),
         Line2D([], [], color=RED, marker=".", linestyle="", label=OFF),
-        columns=6,
+        columns=across,
     )  # fmt: skip
     return figure
 
