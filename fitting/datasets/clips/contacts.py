@@ -131,25 +131,22 @@ class CutOffSwing:
 
 
 def cut_off_swing(
-    ball_ws: Float64[np.ndarray, "frames 3"],
-    stance: Bool[np.ndarray, " frames"],
-    up_ws: Sequence[float] | np.ndarray = UP,
+    ball_ws: Float64[np.ndarray, "frames 3"], stance: Bool[np.ndarray, " frames"]
 ) -> CutOffSwing | None:
     """The swing of one foot that the start of a clip cuts off, as long and far as its next one.
 
     None if there is none, or no whole one.
 
     Args:
-        ball_ws: position of the foot's ball, m.
+        ball_ws: position of the foot's ball, m, y up.
         stance: True where it stands.
-        up_ws: unit, of the floor.
     """
     stances = runs(stance)
     if len(stances) < 2 or stances[0][0] == 0:
         return None
     landing, arriving = stances[0][0], stances[1][0]
     next_ws, following_ws = (np.median(ball_ws[a : b + 1], axis=0) for a, b in stances[:2])
-    remaining, way = _level(np.stack([next_ws - ball_ws[0], following_ws - next_ws]), up_ws)
+    remaining, way = _level(np.stack([next_ws - ball_ws[0], following_ws - next_ws]), UP)
     lengths = np.linalg.norm([remaining, way], axis=1)
     ahead = remaining if lengths[0] > SHORTEST_WAY else way
     back = ahead / max(float(np.linalg.norm(ahead)), 1e-9) * lengths.max()
