@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from fitting.cli.terminal import plain_lines
 from fitting.runtime import xla
 from fitting.runtime.parallel import beside
+from fitting.runtime.storage import compiled_programs
 
 xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
@@ -32,6 +33,7 @@ if PROGRAMS not in os.environ:
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
 jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
+compiled_programs.write_complete_files()  # what one process writes another may read
 
 # What commands print must not depend on how fast they are.
 plain_lines.PATIENCE = plain_lines.INTERVAL = plain_lines.SILENCE = float("inf")

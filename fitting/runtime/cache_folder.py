@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 
+from .storage import compiled_programs
 from .validation import in_one_line
 
 FOLDER, ENABLED = "jax_compilation_cache_dir", "jax_enable_compilation_cache"  # settings of JAX
@@ -20,7 +21,7 @@ MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"
 TRACED = "traced"  # inside JAX's folder
 # Names of complete and of half-written files: of ours, and of JAX's.
 TRACED_NAMES = re.compile(r"\.?\w+-[0-9a-f]{64}\w*(\.jaxik-\w+-\d+-\w+)?")
-COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)")
+COMPILED_NAMES = re.compile(r".+-[0-9a-f]{64}-(cache|atime)(\.jaxik-\w+-\d+-\w+)?")
 WARNED: set[str] = set()  # problems that this process has warned of
 
 
@@ -39,8 +40,9 @@ def use_default() -> None:
     """Has JAX keep compiled programs in the user's cache folder, unless it was told where.
 
     Warns, and has nothing kept, where that folder belongs to somebody else or cannot be made:
-    JAX would run what it finds there.
+    JAX would run what it finds there. Its files are complete or missing from now on, wherever.
     """
+    compiled_programs.write_complete_files()
     if setting(FOLDER) is not None:
         return
     try:

@@ -2,5 +2,5 @@
 
 `json_files` reads and writes JSON with a format version and a declared content, which
 `declared_types` checks. `sealed_files` keeps damaged bytes from HDF5. `claimed_folder` keeps a
-second process out of a folder.
+second process out of a folder. `compiled_programs` keeps JAX from leaving half a file.
 """
