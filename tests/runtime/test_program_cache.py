@@ -232,8 +232,12 @@ def test_a_file_in_the_place_of_the_folder_stays(folder):
 
 
 def test_a_full_disk_is_said_once(folder, monkeypatch):
-    def fail(**_):
-        raise OSError(28, "No space left on device")
+    mkstemp = files.tempfile.mkstemp
+
+    def fail(*, dir, **named):
+        if dir == folder:
+            raise OSError(28, "No space left on device")
+        return mkstemp(dir=dir, **named)  # JAX's own files
 
     expected = eqx.filter_jit(stretch)(2.0, points())
     monkeypatch.setattr(files.tempfile, "mkstemp", fail)
