@@ -3,7 +3,8 @@
 A law gives the `fraction` 0..1 of the gap that it closes, and `lerp` closes it. Gain per tick and
 half-life are two notations of the same exponential, exact at any `dt`. Unreal's clamped speed
 depends on the frame rate and is kept that way. The critically damped spring is exact and also has
-a velocity. A weight that moves at constant speed closes its gap in steps (`move_towards`).
+a velocity. A weight that moves at constant speed closes its gap in steps (`move_towards`). What
+goes from 0 to 1 with something else than time follows `smoothstep`.
 """
 
 from typing import NamedTuple
@@ -28,6 +29,17 @@ class Motion(NamedTuple):
 def lerp(value: Array, goal: Array, fraction: Array) -> Array:
     """`value` moved by `fraction` (0..1) of the way to `goal`."""
     return value + fraction * (goal - value)
+
+
+def smoothstep(x: Array) -> Array:
+    """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
+    x = clip_to_one(x)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def clip_to_one(x: Array) -> Array:
+    """`x` limited to 0..1, with zero gradient outside."""
+    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))
 
 
 @vec.remat

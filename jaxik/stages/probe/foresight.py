@@ -10,8 +10,6 @@ from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world.frame import FORWARD, Contact, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
 
-from .limits import clip_to_one, smoothstep
-
 TIME_BAND = 0.02  # s
 # How far a swing is when its toes point down most, and when its sole is level again before it
 # lands: measured on people who walk.
@@ -169,7 +167,9 @@ def follow_swings(
     start_ws = vec.scale(vec.reject(feet.velocity_ws, feet.up_ws), guess.since_last)
     travelled = jnp.where(now.started, before.travelled_ws + moved, start_ws)
     # A foot that is put down where it stood keeps its foothold: contact may flicker.
-    same = 1.0 - (1.0 - before.planted) * smoothstep((vec.length(travelled) - NEAR) / NEAR)
+    same = 1.0 - (1.0 - before.planted) * smoothing.smoothstep(
+        (vec.length(travelled) - NEAR) / NEAR
+    )
     settled = smoothing.fraction_of_half_life(jnp.asarray(SETTLED, dt.dtype), dt)
     in_stance = vec.scale(travelled, same * (1.0 - settled))
     pace = 1.0 / _duration(before.time, before.fraction, swing_time)
@@ -199,7 +199,7 @@ def _first_guess(feet: Feet, stance_time: Array, swing_time: Array, gate: Abstra
 
 def _duration(time: Array, fraction: Array, swing_time: Array) -> Array:
     """s, of each swing: the usual one at first, then that of its pace so far."""
-    pace_known = smoothstep((fraction - TOES_DOWN) / 0.1)
+    pace_known = smoothing.smoothstep((fraction - TOES_DOWN) / 0.1)
     so_far = time / jnp.where(fraction > TOES_DOWN, fraction, TOES_DOWN)
     shortest, longest = SHORTEST * swing_time, LONGEST * swing_time
     so_far = jnp.where(so_far < shortest, shortest, jnp.where(so_far > longest, longest, so_far))
@@ -208,14 +208,14 @@ def _duration(time: Array, fraction: Array, swing_time: Array) -> Array:
 
 def _turned(before: Array, by_time: Array, pitch: Array, lowest: Array, dt: Array) -> Array:
     """How far each swing is, by time and by the pitch of its sole; it never goes back."""
-    pitched = clip_to_one(-lowest / PITCHED)
-    turned = smoothstep((pitch - lowest) / TURN)
+    pitched = smoothing.clip_to_one(-lowest / PITCHED)
+    turned = smoothing.smoothstep((pitch - lowest) / TURN)
     latest = LAST - pitched * (1.0 - turned) * (LAST - TOES_DOWN)
     fraction = jnp.where(by_time < latest, by_time, latest)
-    level = clip_to_one(vec.safe_divide(pitch, lowest))  # 1 where lowest, 0 where level
+    level = smoothing.clip_to_one(vec.safe_divide(pitch, lowest))  # 1 where lowest, 0 where level
     by_pitch = TOES_DOWN + (LEVEL - TOES_DOWN) * (1.0 - level)
     # Near the level the pitch says nothing more: a foot may wait there until it lands.
-    weight = turned * pitched * smoothstep(level / WAITS)
+    weight = turned * pitched * smoothing.smoothstep(level / WAITS)
     weight *= smoothing.fraction_of_half_life(jnp.asarray(CORRECTION, dt.dtype), dt)
     fraction = smoothing.lerp(fraction, by_pitch, weight)
     return jnp.where(fraction > before, fraction, before)
@@ -234,5 +234,5 @@ def _landing(
     left = 1.0 - x
     left *= (10.0 - 15.0 * left + 6.0 * left * left) / (30.0 * x * x)
     by_ball = feet.ball_ws + vec.scale(foot_velocity, duration * left)
-    own = smoothstep((fraction - EARLY) / (LATE - EARLY))
+    own = smoothing.smoothstep((fraction - EARLY) / (LATE - EARLY))
     return smoothing.lerp(by_hip, by_ball, own[:, None])

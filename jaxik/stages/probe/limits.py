@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, constant, option, parameter
-from jaxik.maths.smoothing import lerp
+from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
 from jaxik.world.terrain import Hit, cast
 
@@ -202,14 +202,3 @@ def least_rise(*rises: Array) -> Array:
     lowest = functools.reduce(lambda a, b: jnp.where(a < b, a, b), rises)
     highest = functools.reduce(lambda a, b: jnp.where(a > b, a, b), rises)
     return jnp.where(lowest > 0, lowest, jnp.where(highest < 0, highest, 0.0))
-
-
-def smoothstep(x: Array) -> Array:
-    """`3x² - 2x³` for x in 0..1, a ramp from 0 to 1 without a kink; constant outside."""
-    x = clip_to_one(x)
-    return x * x * (3.0 - 2.0 * x)
-
-
-def clip_to_one(x: Array) -> Array:
-    """`x` limited to 0..1, with zero gradient outside."""
-    return jnp.where(x < 0, 0.0, jnp.where(x > 1, 1.0, x))

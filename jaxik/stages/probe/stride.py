@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import vec
 from jaxik.maths.parameter_tree import Leaf, option, parameter, switch
-from jaxik.maths.smoothing import lerp
+from jaxik.maths.smoothing import clip_to_one, lerp, smoothstep
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world.frame import Contact, GroundHits, Stride, animated_ankles
 from jaxik.world.skeleton import Rig
@@ -18,7 +18,7 @@ from jaxik.world.terrain import Hit
 
 from . import foresight
 from .base import make_rays, no_hit
-from .limits import clip_to_one, least_rise, smoothstep
+from .limits import least_rise
 from .support import AbstractSupportedProbe
 from .swing import FAR, Level, s_curve
 

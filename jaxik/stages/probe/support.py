@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import parameter_tree, vec
 from jaxik.maths.parameter_tree import Leaf, option, parameter
-from jaxik.maths.smoothing import lerp
+from jaxik.maths.smoothing import lerp, smoothstep
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import Stride
 from jaxik.world.terrain import Hit
 
 from .base import foot_heading
-from .limits import climb, smoothstep
+from .limits import climb
 from .swing import AbstractSwingProbe, Level
 
 # In fifths of a sole, from the ball: the points of a sole, and how far it may slide.

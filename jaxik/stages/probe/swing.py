@@ -5,13 +5,14 @@ from jaxtyping import Array, Float
 
 from jaxik.maths import quat, vec
 from jaxik.maths.parameter_tree import Leaf, constant, parameter, switch
+from jaxik.maths.smoothing import smoothstep
 from jaxik.maths.struct import struct
 from jaxik.stages.inputs import Inputs
 from jaxik.world.frame import FORWARD, Stride, animated_ankles
 from jaxik.world.terrain import Hit
 
 from .base import foot_heading
-from .limits import AbstractLimitedProbe, least_rise, smoothstep
+from .limits import AbstractLimitedProbe, least_rise
 
 HEIGHT_BAND = 0.01  # m
 ENDS = 0.15  # fraction of a swing, at either end, over which obstacle clearance fades out
