@@ -4,7 +4,9 @@ import math
 
 from reference import maths
 from reference.characters import Foot, Frame, Parameters
-from reference.maths import Array, across, clip, cross, length, rotate
+from reference.maths import Array, across, clip, cross, length, rotate, smooth01
+
+LEADS = 0.25  # sine of a leg's angle ahead of its hip
 
 
 def leg_length(frame: Frame, leg: int) -> float:
@@ -51,6 +53,9 @@ def raised(
         angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
         angle += math.atan2(by_sine, by_cosine)
         lift = clip(angle, 0.0, parameters.of_leg("effector.max_lift", leg))
+    to_ankle = target - hip
+    ahead = float(to_ankle @ foot.heading_ws) / length(to_ankle)
+    lift *= 1.0 - smooth01(ahead / LEADS)
     ankle = ball + rotate(maths.from_axis_angle(axis, -lift), from_ball)
     # The foot stage tilts the foot after its heel has risen.
     return ankle, maths.multiply(maths.from_axis_angle(level_axis, -lift), rot_ws), lift
