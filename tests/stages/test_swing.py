@@ -29,7 +29,14 @@ def ground(*tops: tuple[float, float, float, float, float]) -> PlainTerrain:
 
 
 FLAT = ground((-2.0, 2.0, -3.0, 3.0, 0.0))
-STEP_UP = ground((-2.0, 2.0, -3.0, 0.3, 0.0), (-2.0, 2.0, 0.3, 3.0, 0.25))
+
+
+def step_up(height: float) -> PlainTerrain:
+    """A step across the way of `frames_over_a_step`, m."""
+    return ground((-2.0, 2.0, -3.0, 0.3, 0.0), (-2.0, 2.0, 0.3, 3.0, height))
+
+
+STEP_UP = step_up(0.25)
 
 
 def frames_over_a_step() -> jaxik.Frame:
@@ -83,6 +90,16 @@ def test_only_swinging_feet_are_lifted_onto_a_step():
     assert np.abs(np.asarray(swing.lift)[standing]).max() == 0.0
     assert np.asarray(swing.lift).max() > 0.1
     assert np.asarray(swing.pitch).min() < -0.2
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["up", "down"])
+def test_steps_higher_than_captured_ones_change_a_swing_no_more(way: float):
+    low, high, higher = (
+        np.stack([swing.lift, swing.pitch])
+        for swing in (hits(step_up(way * x), frames_over_a_step()) for x in (0.2, 0.35, 0.5))
+    )
+    np.testing.assert_allclose(high, higher, rtol=0, atol=1e-9)
+    assert np.abs(high - low).max() > 0.02
 
 
 def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():

@@ -268,8 +268,8 @@ def listed(cases: dict[str, tuple[Case, ...]]) -> Any:
 # Stages whose numbers have tests of their own, as in `test_switches`; `test_spine_lean` is another.
 WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_narrow_ground`
 OVER = "probe.lift_over"  # in `test_swing`, since planes make no hurdle
-UNEVEN = "probe.uneven_height"  # a constant
-IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS, OVER, UNEVEN)
+CONSTANTS = ("probe.uneven_height", "probe.highest_step")
+IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS, OVER, *CONSTANTS)
 SLOPED = {
     preset: tuple(case for case in cases if has_slope(case, preset))
     for preset, cases in CASES.items()

@@ -59,7 +59,8 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     and from how far the ground on the way stands over both footholds. Each part is a bump over the
     time of the swing, `((x/m)^m ((1-x)/(1-m))^(1-m))^7` with its top at its own time `m`. The shape
     was read off a captured walk over blocks; where the ground is as even as in the animation
-    nothing is added.
+    nothing is added. Steps higher than `highest_step`, the highest of that walk, add no more than
+    it does: several stairs at once are no reason to lift a foot far above them.
     """
 
     clearance: Leaf = parameter(
@@ -160,6 +161,9 @@ class AbstractSwingProbe(AbstractLimitedProbe):
     uneven_height: Leaf = constant(
         0.05, unit="m", doc="Height of a step from which ground counts as uneven."
     )
+    highest_step: Leaf = constant(
+        0.30, unit="m", doc="Height of a step up or down, beyond which a higher one adds no more."
+    )
 
     def swing(
         self,
@@ -181,7 +185,7 @@ class AbstractSwingProbe(AbstractLimitedProbe):
             below: how far each foot's ground is below that of another foot, m.
         """
         x = stride.fraction
-        rise, fall = jnp.where(step > 0, step, 0.0), jnp.where(step < 0, -step, 0.0)
+        rise, fall = self._height_of_step(step), self._height_of_step(-step)
         total = rise + fall + over
         uneven = smoothstep(total / self.uneven_height)
         lift = uneven * (
@@ -200,6 +204,11 @@ class AbstractSwingProbe(AbstractLimitedProbe):
         up = inputs.terrain.leg_up_ws
         turned = quat.rotate(pitch_rotation(inputs, pitch), arm)
         return Swing(share * lift + vec.dot(turned - arm, up), pitch)
+
+    def _height_of_step(self, rise: Array) -> Array:
+        """The height of a step that rises, m; 0 if it falls."""
+        rise = jnp.where(rise > 0, rise, 0.0)
+        return jnp.where(rise < self.highest_step, rise, self.highest_step)
 
     def _animated_lift(self, inputs: Inputs) -> Float[Array, " legs"]:
         """m, of the balls over a flat foot's."""

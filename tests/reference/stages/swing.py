@@ -8,6 +8,7 @@ from reference.maths import Array, across, apply, cross, rotate, smooth01, unit
 
 SHARPNESS = 7.0
 UNEVEN = 0.05  # m
+HIGHEST = 0.3  # m, of the steps that people were captured on
 ON_HEEL = 0.08  # rad
 HELD, CLEAR, RISE, FALL, OVER, TOES_UP, TOES_DOWN = 0.28, 0.55, 0.52, 0.31, 0.455, 0.23, 0.75
 
@@ -56,6 +57,7 @@ def beyond_animation(
     ball = apply(frame.world_from_model, frame.toe.pos[leg])
     ankle = apply(frame.world_from_model, frame.ankle.pos[leg])
     animated = max(float((ball - frame.world_from_model.pos) @ up) - get["ball_height"], 0.0)
+    step = float(np.clip(step, -HIGHEST, HIGHEST))
     effort = abs(step) + over
     uneven = smooth01(effort / UNEVEN)
     lift = uneven * get["toe_clearance"] * bump(fraction, CLEAR)
