@@ -95,11 +95,12 @@ def test_only_swinging_feet_are_lifted_onto_a_step():
 @pytest.mark.parametrize("way", [1.0, -1.0], ids=["up", "down"])
 def test_steps_higher_than_captured_ones_change_a_swing_no_more(way: float):
     low, high, higher = (
-        np.stack([swing.lift, swing.pitch])
-        for swing in (hits(step_up(way * x), frames_over_a_step()) for x in (0.2, 0.35, 0.5))
+        hits(step_up(way * height), frames_over_a_step()) for height in (0.2, 0.35, 0.5)
     )
-    np.testing.assert_allclose(high, higher, rtol=0, atol=1e-9)
-    assert np.abs(high - low).max() > 0.02
+    for name in ("lift", "pitch"):
+        highest = np.asarray(getattr(high, name))
+        np.testing.assert_allclose(getattr(higher, name), highest, rtol=0, atol=1e-9)
+        assert np.abs(getattr(low, name) - highest).max() > 0.02
 
 
 def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():
