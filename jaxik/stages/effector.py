@@ -17,7 +17,8 @@ from .pelvis import PelvisState, requested_heights
 
 HEIGHT_BAND = 0.01  # m
 ANGLE_BAND = 0.035  # rad, 2 degrees
-LEADS = 0.25  # sine of the angle by which a leg points ahead, from which its heel stays
+# Sine of the angle by which a leg points ahead, up to which its heel rises and from which it stays.
+RISES, STAYS = 0.2, 0.4
 
 
 @struct
@@ -104,8 +105,8 @@ class HeelEffector(AbstractInstantEffector):
     ankle is `extension` times the length of the leg, or the animated distance if that is longer. It
     turns by at most `max_lift`. Locomotion systems after Johansen (2009) lift heels in this way.
 
-    The more the leg points ahead of its hip, the less its heel rises: that brings the ankle up but
-    also forward, away from the hip, so that a foot about to land would flick its toes down to gain
+    Where a leg points far ahead of its hip, its heel stays: to rise brings the ankle up but also
+    forward, away from the hip, so that a foot about to land would flick its toes down to gain
     little.
     """
 
@@ -142,7 +143,7 @@ class HeelEffector(AbstractInstantEffector):
         angle = now.gate.clip(angle, zero, zero + self.max_lift, band=ANGLE_BAND)
         to_ankle = target.pos - hip
         ahead = vec.safe_divide(vec.dot(to_ankle, sensed.ahead_ws), vec.length(to_ankle))
-        angle *= 1.0 - smoothing.smoothstep(ahead / LEADS)
+        angle *= 1.0 - smoothing.smoothstep((ahead - RISES) / (STAYS - RISES))
         raised = quat.rotate(quat.from_axis_angle(tilted_axis, -angle), arm)
         # The foot rule tilts the foot once it is raised.
         rot_ws = quat.multiply(quat.from_axis_angle(axis, -angle), target.rot)

@@ -19,6 +19,7 @@ from support.gradients import finite_jacobian
 from support.strides import blocks, walk
 
 COUNT = 240  # frames
+RISES, STAYS = 0.2, 0.4  # sine of a leg's angle ahead of its hip
 VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.1, "probe.swing_as_animated": True}
 angle_of = jax.jit(effector.heel_angle)
 
@@ -138,7 +139,7 @@ def heels() -> dict[str, np.ndarray]:
 @pytest.mark.slow
 def test_on_a_walk_a_heel_rises_as_far_as_a_search_finds_within_its_limit():
     walk, max_lift = heels(), VALUES["effector.max_lift"]
-    trails = walk["ahead"] <= 0.0
+    trails = walk["ahead"] <= RISES
     assert 0.02 < (walk["expected"][trails] > 0.0).mean() < 0.9
     assert (walk["expected"][trails] > max_lift).any()
     np.testing.assert_allclose(
@@ -146,18 +147,18 @@ def test_on_a_walk_a_heel_rises_as_far_as_a_search_finds_within_its_limit():
     )
 
 
-def test_the_heel_of_a_leg_that_points_ahead_rises_less_or_not_at_all():
+def test_the_heel_of_a_leg_that_points_ahead_rises_less():
     walk = heels()
     too_long = np.minimum(walk["expected"], VALUES["effector.max_lift"])
-    leads = walk["ahead"] > 0.25
-    assert (too_long[leads] > 0.02).any() and walk["lift"][leads].max() < 1e-7
-    between = (walk["ahead"] > 0.02) & (walk["ahead"] < 0.23) & (too_long > 1e-3)
-    assert between.any() and (walk["lift"] < too_long)[between].all()
+    share = [1.0 - maths.smooth01((x - RISES) / (STAYS - RISES)) for x in walk["ahead"].ravel()]
+    expected = too_long * np.reshape(share, too_long.shape)
+    assert (too_long - expected).max() > 0.02
+    np.testing.assert_allclose(walk["lift"], expected, rtol=0, atol=1e-6)
 
 
 def test_a_rising_heel_keeps_the_leg_at_its_longest():
     walk, max_lift = heels(), VALUES["effector.max_lift"]
-    rises = (walk["lift"] > 1e-6) & (walk["expected"] < max_lift) & (walk["ahead"] <= 0.0)
+    rises = (walk["lift"] > 1e-6) & (walk["expected"] < max_lift) & (walk["ahead"] <= RISES)
     assert rises.mean() > 0.02
     np.testing.assert_allclose(walk["after"][rises], walk["longest"][rises], rtol=0, atol=1e-9)
 

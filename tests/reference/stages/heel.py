@@ -6,7 +6,7 @@ from reference import maths
 from reference.characters import Foot, Frame, Parameters
 from reference.maths import Array, across, clip, cross, length, rotate, smooth01
 
-LEADS = 0.25  # sine of a leg's angle ahead of its hip
+RISES, STAYS = 0.2, 0.4  # sine of a leg's angle ahead of its hip
 
 
 def leg_length(frame: Frame, leg: int) -> float:
@@ -55,7 +55,7 @@ def raised(
         lift = clip(angle, 0.0, parameters.of_leg("effector.max_lift", leg))
     to_ankle = target - hip
     ahead = float(to_ankle @ foot.heading_ws) / length(to_ankle)
-    lift *= 1.0 - smooth01(ahead / LEADS)
+    lift *= 1.0 - smooth01((ahead - RISES) / (STAYS - RISES))
     ankle = ball + rotate(maths.from_axis_angle(axis, -lift), from_ball)
     # The foot stage tilts the foot after its heel has risen.
     return ankle, maths.multiply(maths.from_axis_angle(level_axis, -lift), rot_ws), lift
