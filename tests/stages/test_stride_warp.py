@@ -146,7 +146,10 @@ def test_feet_of_a_faster_or_slower_walk_do_not_skate(speed):
         slides(clip_from_result(played, result), clip.stance_labels()) for result in results
     )
     assert np.median(skating) > 0.10 and np.median(scaled) < 0.005
-    assert float(results[0].reached.mean()) > 0.95
+    reached = np.asarray(results[0].reached) > 0
+    assert reached[clip.stance_labels()].mean() > 0.95
+    # Before it lands, a foot ahead of a leg that is too short for the stride may lag behind.
+    assert reached.mean() > 0.85
     # Longer strides need a lower pelvis; shorter ones do not.
     lowered = np.asarray(results[0].body.pos[:, 1]).min()
     assert (lowered < -0.01) == (speed > 1)
