@@ -40,7 +40,8 @@ def use_default() -> None:
     """Has JAX keep compiled programs in the user's cache folder, unless it was told where.
 
     Warns, and has nothing kept, where that folder belongs to somebody else or cannot be made:
-    JAX would run what it finds there. Its files are complete or missing from now on, wherever.
+    JAX would run what it finds there. In any folder, JAX then writes its files completely or not
+    at all (`compiled_programs`).
     """
     compiled_programs.write_complete_files()
     if setting(FOLDER) is not None:
