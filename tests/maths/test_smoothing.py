@@ -1,50 +1,34 @@
 """Smoothing laws: exact at any frame time, correct at their limits, with correct gradients."""
 
-import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from jax.typing import ArrayLike
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from jaxik.maths import smoothing
-from support.gradients import assert_gradients_match, finite_jacobian, numbers
+from support.gradients import (
+    ROWS,
+    assert_all_gradients_match,
+    finite_jacobian,
+    finite_jacobians,
+)
 
-few = settings(max_examples=15, derandomize=True, deadline=None)
-frame_times = st.sampled_from([1 / 240, 1 / 120, 1 / 60, 1 / 30, 0.5])
-gains = st.sampled_from([0.0, 1e-6, 0.999, 1.0]) | numbers(0, 1)
-half_lives = st.sampled_from([0.0, 1e-6, 1e-3]) | numbers(0.005, 3)
-
-X = np.array([0.1, 0.4, 0.7])
-MOTION = smoothing.Motion(jnp.asarray(X), jnp.asarray(-X))
-FUNCTIONS = {
-    "lerp": (smoothing.lerp, (X, -X, X)),
-    "fraction_of_gain": (smoothing.fraction_of_gain, (X, X, 30 * X)),
-    "fraction_of_half_life": (smoothing.fraction_of_half_life, (X, X)),
-    "fraction_of_speed": (smoothing.fraction_of_speed, (X, X, X)),
-    "spring": (smoothing.spring, (MOTION, 2 * X, X, X)),
-    "follow": (
-        smoothing.follow,
-        (MOTION, 2 * X, X, X, X > 0.3),
-    ),
-    "half_life_of_gain": (smoothing.half_life_of_gain, (X, 30 * X)),
-    "gain_of_half_life": (smoothing.gain_of_half_life, (X, 30 * X)),
-    "half_life_of_speed": (smoothing.half_life_of_speed, (X, X)),
-}
+RNG = np.random.default_rng(0)
+FRAME_TIMES = RNG.permutation(np.resize([1 / 240, 1 / 120, 1 / 60, 1 / 30, 0.5], ROWS))
+TICK_HZ = RNG.choice([30.0, 60.0], ROWS)
+GAINS = np.concatenate([[0.0, 1e-6, 0.999, 1.0], RNG.uniform(0, 1, ROWS - 4)])
+HALF_LIVES = np.concatenate([[0.0, 1e-6, 1e-3], RNG.uniform(0.005, 3, ROWS - 3)])
+VALUE, VELOCITY, GOAL = RNG.uniform(-2, 2, (3, ROWS))
 
 
 def call(function, *args: ArrayLike | smoothing.Motion):
     """The function of these arguments, turned into arrays."""
     return function(*jax.tree.map(jnp.asarray, args))
-
-
-def everything(args):
-    return {name: function(*args[name]) for name, (function, _) in FUNCTIONS.items()}
 
 
 def spring(value, velocity, goal, half_life, dt):
@@ -58,76 +42,36 @@ def follow(value, velocity, goal, fraction, dt, use_spring):
     return call(smoothing.follow, motion, goal, fraction, dt, use_spring)
 
 
-def spring_and_lerp(value, velocity, goal, half_life, dt):
-    return spring(value, velocity, goal, half_life, dt), smoothing.lerp(value, goal, dt)
-
-
-def fractions(gain, half_life, dt, tick_hz):
-    """Several laws in one program: most of a test's time goes into compiling."""
-    return (
-        smoothing.fraction_of_gain(gain, dt, tick_hz),
-        smoothing.fraction_of_half_life(half_life, dt),
-        smoothing.gain_of_half_life(half_life, tick_hz),
-    )
-
-
-def test_dtype_follows_the_inputs():
-    for dtype in (jnp.float32, jnp.float64):
-        cast = functools.partial(jnp.asarray, dtype=dtype)
-        args = {name: jax.tree.map(cast, args) for name, (_, args) in FUNCTIONS.items()}
-        for name, answer in jax.eval_shape(everything, args).items():
-            assert {leaf.dtype for leaf in jax.tree.leaves(answer)} == {jnp.dtype(dtype)}, name
-
-
-def test_a_compiled_batch_equals_the_vmap_of_single_calls():
-    args = {name: jax.tree.map(jnp.asarray, args) for name, (_, args) in FUNCTIONS.items()}
-    batch, singles = jax.jit(everything)(args), jax.jit(jax.vmap(everything))(args)
-    for name in FUNCTIONS:
-        for actual, expected in zip(
-            *map(jax.tree.leaves, (batch[name], singles[name])), strict=True
-        ):
-            assert_allclose(actual, expected, 1e-14, 1e-14, err_msg=name)
-
-
-@few
-@given(gains, half_lives, frame_times)
-def test_two_half_steps_equal_one_step(gain, half_life, dt):
+def test_two_half_steps_equal_one_step():
     start, goal = jnp.asarray(3.0), jnp.asarray(1.0)
     for fraction in (
-        lambda dt: call(smoothing.fraction_of_gain, gain, dt, 30.0),
-        lambda dt: call(smoothing.fraction_of_half_life, half_life, dt),
+        lambda dt: call(smoothing.fraction_of_gain, GAINS, dt, 30.0),
+        lambda dt: call(smoothing.fraction_of_half_life, HALF_LIVES, dt),
     ):
-        half = fraction(dt / 2)
+        half, whole = fraction(FRAME_TIMES / 2), fraction(FRAME_TIMES)
         twice = smoothing.lerp(smoothing.lerp(start, goal, half), goal, half)
-        assert_allclose(twice, smoothing.lerp(start, goal, fraction(dt)), rtol=1e-13)
-        assert 0 <= half <= fraction(dt) <= 1
-
-
-@few
-@given(numbers(), numbers(), numbers(), half_lives, frame_times)
-def test_two_half_steps_of_the_spring_equal_one_step(value, velocity, goal, half_life, dt):
-    expected = spring(value, velocity, goal, half_life, dt)
-    half = spring(value, velocity, goal, half_life, dt / 2)
-    twice = spring(*half, goal, half_life, dt / 2)
+        assert_allclose(twice, smoothing.lerp(start, goal, whole), rtol=1e-13)
+        assert ((half >= 0) & (half <= whole) & (whole <= 1)).all()
+    expected = spring(VALUE, VELOCITY, GOAL, HALF_LIVES, FRAME_TIMES)
+    half = spring(VALUE, VELOCITY, GOAL, HALF_LIVES, FRAME_TIMES / 2)
+    twice = spring(*half, GOAL, HALF_LIVES, FRAME_TIMES / 2)
     assert_allclose(twice, expected, rtol=1e-11, atol=1e-11)
 
 
-@few
-@given(gains, st.sampled_from([30.0, 60.0]))
-def test_a_gain_compounds_over_ticks(gain, tick_hz):
-    assert_allclose(call(smoothing.fraction_of_gain, gain, 1 / tick_hz, tick_hz), gain, rtol=1e-13)
-    seven_ticks = call(smoothing.fraction_of_gain, gain, 7 / tick_hz, tick_hz)
-    assert_allclose(seven_ticks, 1 - (1 - gain) ** 7, rtol=1e-9)
+def test_a_gain_compounds_over_ticks():
+    one, seven = (
+        call(smoothing.fraction_of_gain, GAINS, ticks / TICK_HZ, TICK_HZ) for ticks in (1, 7)
+    )
+    assert_allclose(one, GAINS, rtol=1e-13)
+    assert_allclose(seven, 1 - (1 - GAINS) ** 7, rtol=1e-9)
 
 
-@few
-@given(gains, st.sampled_from([30.0, 60.0]), frame_times)
-def test_a_gain_and_its_half_life_give_the_same_fraction(gain, tick_hz, dt):
-    half_life = call(smoothing.half_life_of_gain, gain, tick_hz)
-    assert_allclose(call(smoothing.gain_of_half_life, half_life, tick_hz), gain, rtol=1e-12)
+def test_a_gain_and_its_half_life_give_the_same_fraction():
+    half_life = call(smoothing.half_life_of_gain, GAINS, TICK_HZ)
+    assert_allclose(call(smoothing.gain_of_half_life, half_life, TICK_HZ), GAINS, rtol=1e-12)
     assert_allclose(
-        call(smoothing.fraction_of_half_life, half_life, dt),
-        call(smoothing.fraction_of_gain, gain, dt, tick_hz),
+        call(smoothing.fraction_of_half_life, half_life, FRAME_TIMES),
+        call(smoothing.fraction_of_gain, GAINS, FRAME_TIMES, TICK_HZ),
         rtol=1e-12,
     )
 
@@ -157,49 +101,37 @@ def test_nothing_moves_in_no_time():
     assert spring(3.0, 2.0, 1.0, 0.3, 0.0) == (3.0, 2.0)
 
 
-@few
-@given(numbers(-1, 40), frame_times, st.sampled_from([0.0, 9e-5, -9e-5, 1.1e-4, -1.1e-4, 1.0]))
-def test_the_clamped_speed_equals_unreals_interp_to(speed, dt, gap):
-    jumps = speed <= 0 or abs(gap) <= smoothing.JUMP_GAP
-    expected = 1.0 if jumps else min(dt * speed, 1.0)
+def test_the_clamped_speed_equals_unreals_interp_to():
+    gaps = [0.0, 9e-5, -9e-5, 1.1e-4, -1.1e-4, 1.0]
+    cases = itertools.product([-1.0, 0.0, 0.7, 25.0, 40.0], [1 / 240, 1 / 30, 0.5], gaps)
+    speed, dt, gap = np.array(list(cases)).T
+    jumps = (speed <= 0) | (np.abs(gap) <= smoothing.JUMP_GAP)
+    expected = np.where(jumps, 1.0, np.minimum(dt * speed, 1.0))
     assert_allclose(call(smoothing.fraction_of_speed, speed, dt, gap), expected, rtol=1e-15)
 
 
-@few
-@given(numbers(-1, 40), frame_times)
-def test_the_half_life_of_a_clamped_speed_depends_on_the_frame_time(speed, dt):
-    half_life = float(call(smoothing.half_life_of_speed, speed, dt))
-    fraction = float(call(smoothing.fraction_of_speed, speed, dt, 1.0))
-    if fraction == 1:
-        assert half_life == 0
-    else:
-        assert_allclose((1 - fraction) ** (half_life / dt), 0.5, rtol=1e-10)
-        assert half_life > call(smoothing.half_life_of_speed, speed, 1.5 * dt)
-
-
-@few
-@given(numbers(), numbers(), numbers(), numbers(0.005, 3), frame_times)
-def test_the_spring_equals_the_exponential_of_its_matrix(value, velocity, goal, half_life, dt):
-    rate = 2 * np.log(2) / half_life
-    transition = expm(dt * np.array([[0, 1], [-(rate**2), -2 * rate]]))
-    gap, speed = transition @ [value - goal, velocity]
-    after = spring(value, velocity, goal, half_life, dt)
-    assert_allclose(after.value, goal + gap, atol=1e-11)
-    assert_allclose(after.velocity, speed, atol=1e-11 * max(1, rate))
-
-
-def test_the_spring_solves_its_differential_equation():
-    rate, goal, times = 2 * np.log(2) / 0.2, 0.7, np.linspace(0.1, 1.5, 8)
-    solution = solve_ivp(
-        lambda _, state: [state[1], -(rate**2) * (state[0] - goal) - 2 * rate * state[1]],
-        (0, 1.5),
-        [2.0, -3.0],
-        t_eval=times,
-        rtol=1e-11,
-        atol=1e-12,
+def test_the_half_life_of_a_clamped_speed_depends_on_the_frame_time():
+    speed = np.concatenate([[-1.0, 0.0], RNG.uniform(0, 40, ROWS - 2)])
+    half_life, longer = (
+        np.asarray(call(smoothing.half_life_of_speed, speed, frames * FRAME_TIMES))
+        for frames in (1.0, 1.5)
     )
-    start, velocity = jnp.full(8, 2.0), jnp.full(8, -3.0)
-    assert_allclose(spring(start, velocity, goal, 0.2, times), solution.y, atol=1e-9)
+    fraction = np.asarray(call(smoothing.fraction_of_speed, speed, FRAME_TIMES, 1.0))
+    jumps = fraction == 1
+    assert jumps.any() and (half_life[jumps] == 0).all()
+    left = (1 - fraction) ** (half_life / FRAME_TIMES)
+    assert_allclose(left[~jumps], 0.5, rtol=1e-10)
+    assert (half_life > longer)[~jumps].all()
+
+
+def test_the_spring_equals_the_exponential_of_its_matrix():
+    half_lives = RNG.uniform(0.005, 3, ROWS)
+    after = spring(VALUE, VELOCITY, GOAL, half_lives, FRAME_TIMES)
+    for row, rate in enumerate(2 * np.log(2) / half_lives):
+        transition = expm(FRAME_TIMES[row] * np.array([[0, 1], [-(rate**2), -2 * rate]]))
+        gap, speed = transition @ [VALUE[row] - GOAL[row], VELOCITY[row]]
+        assert_allclose(after.value[row], GOAL[row] + gap, atol=1e-11)
+        assert_allclose(after.velocity[row], speed, atol=1e-11 * max(1, rate))
 
 
 def test_following_a_goal_that_changes_every_frame_solves_the_equation_of_each_frame():
@@ -239,35 +171,37 @@ def test_a_spring_that_starts_at_rest_reaches_its_goal_without_overshooting():
     assert spring(1.0, 0.0, 1.0, 0.1, 0.5) == (1.0, 0.0)
 
 
-@few
-@given(numbers(0, 0.99), numbers(0.005, 3), frame_times)
-def test_gradients_of_exponential_laws_match_finite_differences(gain, half_life, dt):
-    assert_gradients_match(fractions, gain, half_life, dt, 30.0)
-    assert_gradients_match(smoothing.half_life_of_gain, 0.005 + gain, 30.0)
+def laws(gain, half_life, dt, tick_hz):
+    return (
+        smoothing.fraction_of_gain(gain, dt, tick_hz),
+        smoothing.fraction_of_half_life(half_life, dt),
+        smoothing.gain_of_half_life(half_life, tick_hz),
+    )
 
 
-@few
-@given(numbers(), numbers(), numbers(), numbers(0.01, 3), frame_times)
-def test_gradients_of_the_spring_match_finite_differences(value, velocity, goal, half_life, dt):
-    assert_gradients_match(spring_and_lerp, value, velocity, goal, half_life, dt)
+def springs(value, velocity, goal, half_life, dt):
+    return spring(value, velocity, goal, half_life, dt), smoothing.lerp(value, goal, dt)
 
 
-@few
-@given(st.sampled_from([-1.0, 0.5, 5.0, 25.0, 70.0]), st.sampled_from([0.0, 5e-3, -1.0]))
-def test_gradients_of_the_clamped_speed_match_finite_differences(speed, gap):
-    assert_gradients_match(smoothing.fraction_of_speed, speed, 1 / 50, gap)
-    assert_gradients_match(smoothing.half_life_of_speed, speed, 1 / 50)
+def clamped_speeds(speed, dt, gap):
+    fraction = smoothing.fraction_of_speed(speed, dt, gap)
+    return fraction, smoothing.half_life_of_speed(speed, dt)
+
+
+def test_gradients_match_finite_differences():
+    gain, half_life = RNG.uniform(0, 0.99, ROWS), RNG.uniform(0.01, 3, ROWS)
+    assert_all_gradients_match(laws, gain, half_life, FRAME_TIMES, 30.0)
+    assert_all_gradients_match(smoothing.half_life_of_gain, 0.005 + gain, 30.0)
+    assert_all_gradients_match(springs, VALUE, VELOCITY, GOAL, half_life, FRAME_TIMES)
+    speeds, gaps = np.meshgrid([-1.0, 0.5, 5.0, 25.0, 70.0], [0.0, 5e-3, -1.0])
+    assert_all_gradients_match(clamped_speeds, speeds.ravel(), 1 / 50, gaps.ravel())
 
 
 def test_gradients_stay_finite_at_the_limits():
-    for gain in (0.0, 1e-9, 1 - 1e-9, 1.0):
-        finite_jacobian(fractions, gain, 0.1, 1 / 120, 30.0)
-    assert_allclose(finite_jacobian(fractions, 1.0, 0.1, 1 / 120, 30.0)[0], 0, atol=0)
-    for half_life in (0.0, 1e-9, 1e-6, 1e9):
-        finite_jacobian(fractions, 0.5, half_life, 1 / 60, 30.0)
-        finite_jacobian(spring_and_lerp, 3.0, 2.0, 1.0, half_life, 1 / 60)
-    for speed in (0.0, 60.0, 1e-9):
-        finite_jacobian(smoothing.fraction_of_speed, speed, 1 / 60, 0.0)
-        finite_jacobian(smoothing.fraction_of_speed, speed, 1 / 60, 1e-4)
-        finite_jacobian(smoothing.half_life_of_speed, speed, 1 / 60)
+    gains, half_lives = np.array([0.0, 1e-9, 1 - 1e-9, 1.0]), np.array([0.0, 1e-9, 1e-6, 1e9])
+    jacobians = finite_jacobians(laws, gains, half_lives, 1 / 60, 30.0)
+    assert_allclose(jacobians[-1, 0], 0, atol=0)
+    finite_jacobians(springs, 3.0, 2.0, 1.0, half_lives, 1 / 60)
+    for gap in (0.0, 1e-4):
+        finite_jacobians(clamped_speeds, np.array([0.0, 60.0, 1e-9]), 1 / 60, gap)
     finite_jacobian(smoothing.half_life_of_gain, 1.0, 30.0)

@@ -1,17 +1,21 @@
-"""Gradients compared with finite differences, and draws from where gradients go wrong."""
+"""Gradients compared with finite differences, and arguments for which gradients go wrong.
+
+The arguments are rows of arrays, for all of which one compiled program computes the gradients.
+"""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
+from scipy.spatial.transform import Rotation
 
 STEPS = tuple(10.0**-exponent for exponent in range(3, 10))
 TINY = 1e-5  # small compared with 1, yet many steps of the finest difference
+ROWS = 40
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -30,31 +34,51 @@ def _derivatives(function: Callable, args: tuple) -> tuple[jax.Array, ...]:
     return flat_function(flat), forward, reverse, quotients
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _derivatives_of_rows(function: Callable, rows: tuple) -> tuple[jax.Array, ...]:
+    return jax.vmap(functools.partial(_derivatives, function))(rows)
+
+
 def _flat(function: Callable, restore: Callable, flat: jax.Array) -> jax.Array:
     return ravel_pytree(function(*restore(flat)))[0]
 
 
-def _checked(function: Callable, args: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """The Jacobian (outputs, inputs), finite and equal in both modes, and the differences."""
+def _floats(args: tuple) -> tuple:
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError("finite differences need 64-bit floats: switch jax_enable_x64 on")
-    args = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), args)
-    value, forward, reverse, quotients = map(np.asarray, _derivatives(function, args))
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), args)
+
+
+def _checked(derivatives: Sequence, args: tuple) -> np.ndarray:
+    """The Jacobian (outputs, inputs), finite and equal in both modes."""
+    value, forward, reverse, _ = map(np.asarray, derivatives)
     for name, x in {"value": value, "forward mode": forward, "reverse mode": reverse}.items():
         assert np.isfinite(x).all(), f"{name} {x} at {args}"
     scale = max(1.0, np.abs(forward).max())
-    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-9 * scale)
-    return forward, quotients
+    np.testing.assert_allclose(
+        reverse, forward, rtol=0, atol=1e-9 * scale, err_msg=f"both modes at {args}"
+    )
+    return forward
+
+
+def _assert_differences_match(derivatives: Sequence, args: tuple, tolerance: float) -> None:
+    forward, quotients = _checked(derivatives, args), np.asarray(derivatives[-1])
+    steadiest = np.abs(np.diff(quotients, axis=0)).argmin(axis=0)
+    expected = np.take_along_axis(quotients[1:], steadiest[None], axis=0)[0]
+    scale = max(1.0, np.abs(expected).max())
+    np.testing.assert_allclose(
+        forward, expected, rtol=0, atol=tolerance * scale, err_msg=f"gradients at {args}"
+    )
 
 
 def finite_jacobian(function: Callable, *args: Any) -> np.ndarray:
     """The Jacobian (outputs, inputs), checked to be finite and equal in forward and reverse mode.
 
     For points where a function jumps and differences say nothing. The arguments are trees of
-    numbers, taken as 64-bit floats. Compiles once per function object: pass a function of a
-    module, or one defined outside the hypothesis test.
+    numbers, taken as 64-bit floats. Compiles once per function object: pass a function of a module.
     """
-    return _checked(function, args)[0]
+    args = _floats(args)
+    return _checked(_derivatives(function, args), args)
 
 
 def assert_gradients_match(function: Callable, *args: Any, tolerance: float = 1e-6) -> None:
@@ -64,58 +88,85 @@ def assert_gradients_match(function: Callable, *args: Any, tolerance: float = 1e
     step is used at which the quotient changes least from one step to the next, so that a function
     may bend on the scale of `TINY`. Arguments as for `finite_jacobian`.
     """
-    forward, quotients = _checked(function, args)
-    steadiest = np.abs(np.diff(quotients, axis=0)).argmin(axis=0)
-    expected = np.take_along_axis(quotients[1:], steadiest[None], axis=0)[0]
-    scale = max(1.0, np.abs(expected).max())
-    np.testing.assert_allclose(
-        forward, expected, rtol=0, atol=tolerance * scale, err_msg=f"gradients at {args}"
-    )
+    args = _floats(args)
+    _assert_differences_match(_derivatives(function, args), args, tolerance)
 
 
-def numbers(low: float = -2.0, high: float = 2.0) -> st.SearchStrategy[float]:
-    """Numbers, none of them so small that it vanishes in a difference quotient."""
-    return st.floats(low, high).map(lambda x: round(x, 3))
+def _each_row(function: Callable, rows: tuple) -> Iterator[tuple[Sequence, tuple]]:
+    """The derivatives and the arguments of each row; single numbers are the same in all."""
+    rows = _floats(rows)
+    count = max(len(leaf) for leaf in jax.tree.leaves(rows) if leaf.ndim)
+    # Repeated, so that fewer rows need no program of their own.
+    size = max(count, ROWS)
+    rows = jax.tree.map(lambda leaf: np.resize(leaf, (size, *leaf.shape[1:])), rows)
+    derivatives = [np.asarray(x) for x in _derivatives_of_rows(function, rows)]
+    for row in range(count):
+        yield [x[row] for x in derivatives], jax.tree.map(lambda leaf, row=row: leaf[row], rows)
 
 
-@st.composite
-def vectors(draw: st.DrawFn, sizes: tuple[float, ...] = (1.0, TINY)) -> np.ndarray:
-    """Vectors (3) with a length around one of `sizes`, often along an axis."""
-    along_axis = st.sampled_from([*np.eye(3), *-np.eye(3)])
-    anywhere = st.tuples(numbers(), numbers(), numbers()).map(np.array)
-    v = draw(along_axis | anywhere.filter(lambda v: np.linalg.norm(v) > 0.1))
-    return draw(st.sampled_from(sizes)) * v
+def finite_jacobians(function: Callable, *rows: Any) -> np.ndarray:
+    """`finite_jacobian` of each row of the arguments: (rows, outputs, inputs)."""
+    return np.stack([_checked(*row) for row in _each_row(function, rows)])
 
 
-def angles(small: float = TINY) -> st.SearchStrategy[float]:
+def assert_all_gradients_match(function: Callable, *rows: Any, tolerance: float = 1e-6) -> None:
+    """`assert_gradients_match` of each row of the arguments."""
+    for derivatives, args in _each_row(function, rows):
+        _assert_differences_match(derivatives, args, tolerance)
+
+
+def assert_finite_in_single_precision(function: Callable, *rows: np.ndarray) -> None:
+    """Asserts that results and gradients of all rows stay finite, and stay 32 bits wide."""
+
+    @jax.jit
+    def results_and_gradients(rows):
+        results, vjp = jax.vjp(jax.vmap(function), *rows)
+        # A gradient that is not finite makes a sum of gradients not finite either.
+        return results, vjp(jax.tree.map(jnp.ones_like, results))
+
+    for leaf in jax.tree.leaves(results_and_gradients([jnp.float32(x) for x in rows])):
+        assert leaf.dtype == jnp.float32
+        assert np.isfinite(leaf).all()
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def vectors(rng: np.random.Generator, *sizes: float) -> np.ndarray:
+    """Vectors (rows, 3), some of them along an axis, with lengths around one of `sizes`."""
+    v = np.concatenate([np.eye(3), -np.eye(3), rng.uniform(-2, 2, (ROWS - 6, 3))])
+    return rng.permutation(v) * rng.permutation(np.resize(sizes, (ROWS, 1)))
+
+
+def angles(rng: np.random.Generator, small: float = TINY) -> np.ndarray:
     """Angles -pi..pi, rad, including zero, tiny and right angles and (nearly) half turns."""
-    marked = [0.0, small, np.pi / 2, np.pi - small, np.pi]
-    return st.sampled_from([sign * angle for angle in marked for sign in (1, -1)]) | numbers(-3, 3)
+    marked = np.array([0.0, small, np.pi / 2, np.pi - small, np.pi])
+    return rng.permutation([*marked, *-marked, *rng.uniform(-3, 3, ROWS - 10)])
 
 
-@st.composite
-def directions(
-    draw: st.DrawFn, small: float = TINY, opposed: bool = True
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors `a` and `b`, and the unit `axis` at right angles to both.
-
-    The angle between them is drawn from `angles`; it is never half a turn unless `opposed`.
-    """
-    a = draw(vectors(sizes=(1.0,)))
-    a = a / np.linalg.norm(a)
-    axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-    axis = axis / np.linalg.norm(axis)
-    angle = draw(angles(small).filter(lambda x: opposed or abs(x) != np.pi))
+def directions(rng: np.random.Generator, small: float = TINY) -> tuple[np.ndarray, ...]:
+    """Unit vectors `a` and `b`, `angles` apart, and the unit `axis` at right angles to both."""
+    a, angle = unit(vectors(rng, 1.0)), angles(rng, small)[:, None]
+    axis = unit(np.cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]))
     # A half turn to the last bit: the sine of the nearest float to pi is not quite zero.
-    sin = 0.0 if abs(angle) == np.pi else np.sin(angle)
-    b = np.cos(angle) * a + sin * np.cross(axis, a)
-    return a, b, axis
+    sin = np.where(np.abs(angle) == np.pi, 0.0, np.sin(angle))
+    return a, np.cos(angle) * a + sin * np.cross(axis, a), axis
 
 
-@st.composite
-def quaternions(draw: st.DrawFn, small: float = TINY) -> np.ndarray:
+def quaternions(rng: np.random.Generator, small: float = TINY) -> np.ndarray:
     """Unit quaternions wxyz by one of `angles` about any axis, of either sign."""
-    axis, angle = draw(vectors(sizes=(1.0,))), draw(angles(small))
-    axis = axis / np.linalg.norm(axis)
-    q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-    return draw(st.sampled_from([1.0, -1.0])) * q
+    axis, half = unit(vectors(rng, 1.0)), 0.5 * angles(rng, small)[:, None]
+    return np.hstack([np.cos(half), np.sin(half) * axis]) * rng.choice([1.0, -1.0], (ROWS, 1))
+
+
+def limbs(rng: np.random.Generator, angle: np.ndarray) -> tuple[np.ndarray, ...]:
+    """To hip and to ankle, m, and the unit hinge of limbs in any attitude.
+
+    The interior angle of the knee is `angle`, rad; a negative one is a limb bent backwards.
+    """
+    thigh, shin = rng.uniform(0.2, 0.6, (2, ROWS, 1))
+    across = [np.cos(angle), np.sin(angle), np.zeros(ROWS)]
+    attitude = Rotation.from_quat(quaternions(rng), scalar_first=True)
+    to_hip, to_ankle = thigh * np.eye(3)[0], shin * np.stack(across, axis=-1)
+    return attitude.apply(to_hip), attitude.apply(to_ankle), attitude.apply(np.eye(3)[2])
