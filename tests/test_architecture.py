@@ -27,12 +27,10 @@ ONLY_IMPORTED_BY = {
 
 PACKAGES = {name: house.Package(name) for name in house.PACKAGES}
 TREES = {path: tree for package in PACKAGES.values() for path, tree in package.trees.items()}
-IMPORTERS = [path for path in TREES if path.relative_to(ROOT).parts[1] != "__init__.py"]
 
 
-def each_file(paths: list[Path]) -> pytest.MarkDecorator:
-    names = [path.relative_to(ROOT).as_posix() for path in paths]
-    return pytest.mark.parametrize("path", paths, ids=names)
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
 
 
 def imports(path: Path) -> set[str]:
@@ -49,9 +47,12 @@ def imports(path: Path) -> set[str]:
     return names
 
 
+IMPORTS = {path: imports(path) for path in TREES}
+
+
 def imported_packages(path: Path) -> set[str]:
     """Top-level packages that a module imports."""
-    return {name.partition(".")[0] for name in imports(path)}
+    return {name.partition(".")[0] for name in IMPORTS[path]}
 
 
 def package_and_wing(path: Path) -> tuple[str, str]:
@@ -63,7 +64,7 @@ def package_and_wing(path: Path) -> tuple[str, str]:
 def imported_wings(path: Path) -> set[str]:
     """Wings of a file's own package that it imports, its own left out."""
     package, own = package_and_wing(path)
-    parts = [name.split(".") for name in imports(path)]
+    parts = [name.split(".") for name in IMPORTS[path]]
     return {names[1] for names in parts if names[0] == package and len(names) > 1} - {own}
 
 
@@ -73,44 +74,49 @@ def test_every_wing_has_its_place_in_the_import_order(package):
     assert wings - {"__init__"} == set(WINGS[package])
 
 
-@each_file(IMPORTERS)
-def test_a_wing_imports_only_wings_before_it(path):
-    package, own = package_and_wing(path)
-    order = WINGS[package]
-    later = imported_wings(path) - set(order[: order.index(own)])
-    assert not later, f"{own} comes before {sorted(later)} in {order}"
+def test_a_wing_imports_only_wings_before_it():
+    offenders = {}
+    for path in TREES:
+        package, own = package_and_wing(path)
+        if own != "__init__":
+            order = WINGS[package]
+            offenders[name_of(path)] = imported_wings(path) - set(order[: order.index(own)])
+    assert not {path: sorted(later) for path, later in offenders.items() if later}, WINGS
 
 
 def stage_of(path: Path) -> str:
-    """The stage that a module, or the package it lies in, belongs to; "" if to none."""
+    """The stage that a module of jaxik, or the package it lies in, belongs to; "" if to none."""
     parts = path.relative_to(ROOT / "jaxik").with_suffix("").parts
     return parts[1] if parts[0] == "stages" and parts[1] in STAGES else ""
 
 
-@each_file([path for path in PACKAGES["jaxik"].files if stage_of(path)])
-def test_a_stage_imports_only_stages_before_it(path):
-    stage = stage_of(path)
-    names = [name.split(".") for name in imports(path) if name.startswith("jaxik.stages.")]
-    later = {parts[2] for parts in names} - {stage, *STAGES[: STAGES.index(stage)]}
-    assert not later, f"{stage} comes before {sorted(later)} in {STAGES}"
+def test_a_stage_imports_only_stages_before_it():
+    staged = {path: stage_of(path) for path in PACKAGES["jaxik"].files if stage_of(path)}
+    assert set(staged.values()) == set(STAGES)
+    offenders = {}
+    for path, stage in staged.items():
+        names = [name.split(".") for name in IMPORTS[path] if name.startswith("jaxik.stages.")]
+        later = {parts[2] for parts in names} - {stage, *STAGES[: STAGES.index(stage)]}
+        offenders |= {name_of(path): sorted(later)} if later else {}
+    assert not offenders, STAGES
 
 
-@each_file(PACKAGES["jaxik"].files)
-def test_jaxik_imports_nothing_but_its_libraries_and_touches_no_files(path):
-    foreign = imported_packages(path) - LIBRARIES_OF_JAXIK - sys.stdlib_module_names - {"jaxik"}
-    assert not foreign, f"{path.name} imports {sorted(foreign)}"
-    assert not imported_packages(path) & {"os", "pathlib"}, "reading files is fitting's job"
+def test_jaxik_imports_nothing_but_its_libraries_and_touches_no_files():
+    allowed = {*LIBRARIES_OF_JAXIK, *sys.stdlib_module_names, "jaxik"} - {"os", "pathlib"}
+    foreign = {name_of(path): imported_packages(path) - allowed for path in PACKAGES["jaxik"].files}
+    assert not {path: names for path, names in foreign.items() if names}
 
 
 @pytest.mark.parametrize(("library", "module"), ONLY_IMPORTED_BY.items())
 def test_a_heavy_library_is_imported_by_one_module_only(library, module):
-    assert {path for path in TREES if library in imported_packages(path)} == {ROOT / module}
+    assert {name_of(path) for path in TREES if library in imported_packages(path)} == {module}
 
 
-@each_file(list(TREES))
-def test_everything_public_has_a_docstring(path):
-    assert ast.get_docstring(TREES[path]), "the module has no docstring"
-    assert not PACKAGES[package_and_wing(path)[0]].undocumented(path)
+def test_everything_public_has_a_docstring():
+    bare = [name_of(path) for path, tree in TREES.items() if not ast.get_docstring(tree)]
+    assert bare == [], "modules without a docstring"
+    missing = {path: PACKAGES[package_and_wing(path)[0]].undocumented(path) for path in TREES}
+    assert not {name_of(path): names for path, names in missing.items() if names}
 
 
 @pytest.mark.parametrize("name", house.PACKAGES)

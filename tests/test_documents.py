@@ -1,9 +1,9 @@
-"""Pages and docstrings are true: their snippets run, and what they link to or name exists.
+"""Pages are true: their snippets run, and what they link to or name exists.
 
 In a page, Python snippets share one namespace and run in order, in a scratch folder that looks like
 the repository's root. Commands are checked by the command line's own parser, and executed where
 `<!-- run -->` stands before them. TOML snippets are tables of an experiment file. A snippet after
-`<!-- skip: next "reason" -->` is left out. In a docstring, the lines after `>>>` run.
+`<!-- skip: next "reason" -->` is left out.
 """
 
 import contextlib
@@ -23,8 +23,7 @@ from pathlib import Path
 
 import pytest
 from sybil import Example, Sybil
-from sybil.document import Document
-from sybil.parsers import markdown, rest
+from sybil.parsers import markdown
 
 from fitting.cli.parser import make_parser
 from fitting.datasets.clips import load_clip
@@ -36,20 +35,17 @@ PAGES = sorted([*ROOT.glob("*.md"), *(p for name in FOLDERS for p in (ROOT / nam
 PYTHON_FILES = sorted(path for name in FOLDERS for path in (ROOT / name).rglob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TOOLS = {"bash", "git", "pip", "pre-commit", "pyright", "pytest", "ruff"}
-WRITTEN_PAGES = {
-    "summary.md",
-    "table.md",
-    "compare.md",
-    "runs.md",
-    "suite.md",
-    "notes.md",
-}  # by commands and by tests
+WRITTEN_PAGES = set(
+    "summary.md table.md compare.md runs.md suite.md notes.md".split()
+)  # by commands
 EXPERIMENT = ROOT / "data/experiments/uneven_walk.toml"
 
 
-def each_file(paths: list[Path]) -> pytest.MarkDecorator:
-    names = [path.relative_to(ROOT).as_posix() for path in paths]
-    return pytest.mark.parametrize("path", paths, ids=names)
+TEXTS = {path: path.read_text(encoding="utf-8") for path in [*PAGES, *PYTHON_FILES, *NOTEBOOKS]}
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
 
 
 @pytest.fixture
@@ -128,27 +124,16 @@ PAGE_PARSERS = [
 ]
 
 
-def run_examples(document: Document) -> None:
-    for example in document.examples():
+def page_parameter(path: Path) -> object:
+    marks = [pytest.mark.slow] * (name_of(path) == "jaxik/README.md")  # differentiates all stages
+    return pytest.param(path, id=name_of(path), marks=marks)
+
+
+@pytest.mark.parametrize("path", [page_parameter(path) for path in PAGES])
+def test_the_snippets_of_a_page_run(path, scratch):
+    for example in Sybil(PAGE_PARSERS).parse(path).examples():
         with contextlib.suppress(unittest.SkipTest):
             example.evaluate()
-
-
-@pytest.mark.slow
-@each_file(PAGES)
-def test_the_snippets_of_a_page_run(path, scratch):
-    run_examples(Sybil(PAGE_PARSERS).parse(path))
-
-
-@each_file(
-    [
-        path
-        for path in PYTHON_FILES
-        if path.parent != ROOT / "tests" and ">>> " in path.read_text(encoding="utf-8")
-    ]
-)
-def test_the_examples_of_docstrings_run(path, scratch):
-    run_examples(Sybil([rest.DocTestParser()]).parse(path))
 
 
 def test_the_examples_in_the_help_are_commands_that_exist():
@@ -164,14 +149,13 @@ def test_the_examples_in_the_help_are_commands_that_exist():
         check_command(line)
 
 
-@each_file(PAGES)
-def test_a_skipped_snippet_gives_a_reason_and_every_snippet_a_language(path):
-    text = path.read_text(encoding="utf-8")
-    assert not re.findall(r"<!--+ *skip: *(?:start|next(?! +\"[^\"]{8,}\"))", text)
-    fences = re.findall(r"^ *```(.*)$", text, re.MULTILINE)
-    assert len(fences) % 2 == 0 and all(fences[::2])
-    for source in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
-        if not source.startswith(">>>"):
+def test_a_skipped_snippet_gives_a_reason_and_every_snippet_a_language():
+    for path in PAGES:
+        reasonless = re.findall(r"<!--+ *skip: *(?:start|next(?! +\"[^\"]{8,}\"))", TEXTS[path])
+        assert not reasonless, path
+        fences = re.findall(r"^ *```(.*)$", TEXTS[path], re.MULTILINE)
+        assert len(fences) % 2 == 0 and all(fences[::2]), path
+        for source in re.findall(r"^```python\n(.*?)^```", TEXTS[path], re.MULTILINE | re.DOTALL):
             compile(source, str(path), "exec")
 
 
@@ -181,32 +165,37 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@each_file(PAGES)
-def test_the_links_of_a_page_lead_somewhere(path):
-    links = re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8"))
-    for link in links:
-        if re.match(r"[a-z]+:", link):
-            continue
-        file, _, anchor = link.partition("#")
-        target = (path.parent / file).resolve() if file else path
-        assert target.exists(), link
-        assert not anchor or anchor in anchors(target), link
+def test_the_links_of_all_pages_lead_somewhere():
+    broken = []
+    for path in PAGES:
+        for link in re.findall(r"\]\(([^)\s]+)\)", TEXTS[path]):
+            file, _, anchor = link.partition("#")
+            target = (path.parent / file).resolve() if file else path
+            if not re.match(r"[a-z]+:", link) and not (
+                target.exists() and (not anchor or anchor in anchors(target))
+            ):
+                broken.append((name_of(path), link))
+    assert not broken
 
 
-@each_file([path for path in PAGES if path.name != "CHANGELOG.md"])
-def test_the_files_and_names_in_a_page_exist(path):
-    quoted = re.findall(r"`([^`\n]+)`", path.read_text(encoding="utf-8"))
-    for text in quoted:
-        if re.fullmatch(rf"(?:{'|'.join(FOLDERS)})/[\w./*-]*", text):
-            assert list(ROOT.glob(text.rstrip("/"))), text
-        elif name := re.match(r"(?:jaxik|fitting)(?:\.\w+)+", text):
-            pkgutil.resolve_name(name[0])
+def test_the_files_and_names_in_all_pages_exist():
+    missing = []
+    for path in PAGES:
+        for text in re.findall(r"`([^`\n]+)`", TEXTS[path] * (path.name != "CHANGELOG.md")):
+            if re.fullmatch(rf"(?:{'|'.join(FOLDERS)})/[\w./*-]*", text):
+                missing += [] if list(ROOT.glob(text.rstrip("/"))) else [(name_of(path), text)]
+            elif name := re.match(r"(?:jaxik|fitting)(?:\.\w+)+", text):
+                try:
+                    pkgutil.resolve_name(name[0])
+                except (AttributeError, ImportError):
+                    missing.append((name_of(path), text))
+    assert not missing
 
 
-@each_file([*PAGES, *PYTHON_FILES, *NOTEBOOKS])
-def test_a_file_cites_no_page_that_is_not_in_the_repository(path):
-    text = path.read_text(encoding="utf-8")
-    names = {page.name for page in PAGES} | WRITTEN_PAGES
-    assert set(re.findall(r"[\w-]+\.md\b", text)) - names == set()
-    private = re.findall(r"\bseed 0\d\d\b|\.\./shared", text)
-    assert private == [] or path.parent == ROOT / "tests"
+def test_no_file_cites_a_page_that_is_not_in_the_repository():
+    pages = {page.name for page in PAGES} | WRITTEN_PAGES
+    cited = {path: set(re.findall(r"[\w-]+\.md\b", text)) - pages for path, text in TEXTS.items()}
+    assert not {name_of(path): names for path, names in cited.items() if names}
+    private = re.compile(r"\bseed 0\d\d\b|\.\./shared")
+    texts = {path: text for path, text in TEXTS.items() if path.parent != ROOT / "tests"}
+    assert not [name_of(path) for path, text in texts.items() if private.search(text)]
