@@ -10,7 +10,8 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 NAMES = [path.stem for path in NOTEBOOKS]
-LONG = {"3_fit_and_posterior"}
+FITS = {"3_fit_and_posterior"}
+LONG = {*FITS, "5_other_systems", "6_a_rule_of_your_own"}
 # What only makes a notebook's pictures fuller: the same cells run with less of it.
 SMALLER = {
     "3_fit_and_posterior": {"end=5.0,  # s": "end=2.0,  # s"},
@@ -27,20 +28,23 @@ def test_the_notebooks_are_numbered_in_reading_order_and_listed_on_their_page():
     assert [name for name in NAMES if f"{name}.ipynb" not in page] == []
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
-def test_a_notebook_is_stored_without_outputs(path):
-    notebook = nbformat.read(path, as_version=4)
-    nbformat.validate(notebook)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert code
-    for cell in code:
-        assert cell.outputs == [] and cell.execution_count is None, cell.source
-        assert "execution" not in cell.metadata, cell.source
+def test_notebooks_are_stored_without_outputs():
+    for path in NOTEBOOKS:
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+        assert code, path
+        for cell in code:
+            assert cell.outputs == [] and cell.execution_count is None, (path, cell.source)
+            assert "execution" not in cell.metadata, (path, cell.source)
 
 
-@pytest.mark.slow
+def notebook_parameter(path: Path) -> object:
+    return pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
+
+
 @pytest.mark.filterwarnings("default")  # of nbclient; a notebook's own warnings are on stderr
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
+@pytest.mark.parametrize("path", [notebook_parameter(path) for path in NOTEBOOKS])
 def test_a_notebook_runs_without_errors_or_warnings(path):
     notebook = nbformat.read(path, as_version=4)
     for full, smaller in SMALLER.get(path.stem, {}).items():
@@ -48,7 +52,7 @@ def test_a_notebook_runs_without_errors_or_warnings(path):
         cell.source = cell.source.replace(full, smaller)
     # The kernel starts as a reader's does: without the tests' flags, in the notebook's folder. Only
     # what computes for long is compiled with optimisations.
-    ours = {"XLA_FLAGS"} | ({"JAX_DISABLE_MOST_OPTIMIZATIONS"} if path.stem in LONG else set())
+    ours = {"XLA_FLAGS"} | ({"JAX_DISABLE_MOST_OPTIMIZATIONS"} if path.stem in FITS else set())
     inherited = {name: value for name, value in os.environ.items() if name not in ours}
     environment = inherited | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     client = NotebookClient(
