@@ -2,14 +2,13 @@
 
 Programs are compiled without optimisations, which take longer than the programs run; set
 JAX_DISABLE_MOST_OPTIMIZATIONS=0 to compile them as for users, as notebooks do in any case. All
-processes of a run keep their programs in one folder, so that none compiles what another has.
+processes of a run, and the next run, find compiled programs in one folder.
 """
 
-import atexit
 import gc
 import os
+import resource
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,10 +25,10 @@ xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
 UNOPTIMIZED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # for child processes
 jax.config.update("jax_disable_most_optimizations", UNOPTIMIZED != "0")
+ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
-if PROGRAMS not in os.environ:
-    os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxik-tests-")
-    atexit.register(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True)
+KEPT_PROGRAMS = ROOT / ".pytest_cache" / "programs"  # `--cache-clear` empties it
+os.environ.setdefault(PROGRAMS, str(KEPT_PROGRAMS))
 jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
 jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
@@ -44,21 +43,44 @@ beside.cpu_count = lambda: 1
 # Tracing makes many objects that live for long; looking for dead cycles among them takes a tenth.
 gc.set_threshold(200_000, 50, 100)
 
-ROOT = Path(__file__).resolve().parents[1]
+MAX_KEPT = 1e9  # bytes of programs, of old sources most of them
 MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530
-MAX_RESIDENT = 5e9  # bytes, of one of two workers on a machine with 16 GB
+MAX_RESIDENT = 2e9  # bytes of one test process after a file
 LONGEST = ("test_notebooks.py", "test_translation.py", "test_documents.py")
+PEAKS: list[int] = []  # bytes of memory of each test process
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Lets workers take files in their order, not those with most tests first."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
+    if not hasattr(config, "workerinput"):  # before there are workers
+        kept = [path.stat().st_size for path in KEPT_PROGRAMS.glob("*")]
+        if sum(kept) > MAX_KEPT:
+            shutil.rmtree(KEPT_PROGRAMS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begins with the longest files, so that at the end no worker waits for one of them."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tells the process that started this one how much memory it took."""
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    getattr(session.config, "workeroutput", {})["peak"] = peak
+    PEAKS.append(peak)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    """Takes down the memory of a worker that has ended."""
+    PEAKS.append(getattr(node, "workeroutput", {}).get("peak", 0))  # none where it crashed
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Says how much memory the largest process took."""
+    terminalreporter.write_line(f"largest test process: {max(PEAKS) / 1e9:.1f} GB")
 
 
 @pytest.fixture(scope="module", autouse=True)
