@@ -1,4 +1,4 @@
-"""Mutation testing of jaxik: `PYTHONPATH=tests python -m mutation --count 200 --seed 1`.
+"""Mutation testing: `PYTHONPATH=tests python -m mutation --count 200 --seed 1`.
 
 Changes a line of the source, in a copy of the checkout, and runs the tests until one fails; then
 the next. Prints how many changes the tests caught and lists those that survived. Results are kept
@@ -21,6 +21,7 @@ from .workplace import Workplace
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "build" / "mutation"
+PACKAGES = ("jaxik", "fitting")
 GOAL = 0.95
 BUDGET = 45.0  # CPU seconds of tests for each mutant in the first round; the second has no limit
 # A changed program is another program, so that mutants may share what is compiled.
@@ -51,10 +52,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="mutation", description="Changes code, and tests it.")
     parser.add_argument("--count", type=int, default=200, help="mutants, of all modules together")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="+", default=["jaxik"], help="folders or modules")
+    parser.add_argument(
+        "--only", nargs="+", default=["jaxik", "fitting"], help="folders or modules"
+    )
     parser.add_argument("--report", type=Path, help="a file for what is printed at the end")
     parser.add_argument("--retry", action="store_true", help="test survivors again")
     parser.add_argument("--budget", type=float, help="only so many CPU seconds of tests for each")
+    parser.add_argument("--default", action="store_true", help="ask no tests marked as slow")
     options = parser.parse_args()
     KEPT.mkdir(parents=True, exist_ok=True)
     os.environ.update(ENVIRONMENT)
@@ -64,7 +68,8 @@ def main() -> int:
     chosen = sample(mutants, options.count, options.seed)
     print(f"{len(chosen)} of {len(mutants)} mutants in {len(modules)} modules", flush=True)
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
-        run = Run(Workplace(ROOT, Path(folder)), KEPT, str(options.seed))
+        name = f"{options.seed}-default" if options.default else str(options.seed)
+        run = Run(Workplace(ROOT, Path(folder)), KEPT, name, not options.default)
         if options.retry:
             run.forget_survivors()
         try:

@@ -1,19 +1,32 @@
 """Which tests are asked about a mutant: the likeliest to catch it for their time first."""
 
+import functools
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 # By wing: the folders and files of tests that use it, from near to far.
 RINGS = {
+    "analysis": ["analysis", "report", "studies"],
     "batching": ["batching", "pipeline"],
-    "datasets": ["datasets"],
+    "bench": ["bench"],
+    "cli": ["cli", "studies"],
+    "datasets": ["datasets", "fuzz", "test_data.py"],
+    "experiments": ["experiments", "studies", "cli"],
+    "inference": ["inference", "problem", "studies"],
+    "jobs": ["test_jobs.py", "cli", "studies"],
     "maths": ["maths", "solvers", "world", "stages", "experiments", "pipeline"],
     "pipeline": ["pipeline", "batching", "stages", "problem", "experiments"],
     "presets": ["experiments", "stages", "pipeline"],
+    "problem": ["problem", "inference", "experiments", "studies"],
     "record": ["cli/test_record_command.py", "experiments/test_parameter_files.py", "pipeline"],
+    "report": ["report", "studies", "viewer"],
+    "runtime": ["runtime", "cli", "studies"],
     "solvers": ["solvers", "stages", "pipeline"],
     "stages": ["stages", "pipeline", "experiments"],
+    "studies": ["studies", "cli", "report"],
+    "viewer": ["viewer"],
     "world": ["world", "datasets", "stages", "batching", "pipeline"],
 }
 # By module or folder of the package: files about it that do not bear its name, and those that
@@ -64,11 +77,30 @@ class Group(NamedTuple):
 
 def groups_of(root: Path, module: str) -> Iterator[Group]:
     """The groups of tests that are asked about a module, those of nearer folders first."""
-    for name in RINGS[wing_of(module)]:
-        place = root / "tests" / name
-        for path in [place] if place.is_file() else sorted(place.glob("test_*.py")):
-            file = path.relative_to(root).as_posix()
-            yield from (Group(file, slow) for slow in (False, True))
+    places = [root / "tests" / name for name in RINGS[wing_of(module)]]
+    paths = [
+        path
+        for place in places
+        for path in ([place] if place.is_file() else sorted(place.glob("test_*.py")))
+    ]
+    files = [path.relative_to(root).as_posix() for path in paths]
+    for file in dict.fromkeys([*files, *importers(root, module)]):
+        yield from (Group(file, slow) for slow in (False, True))
+
+
+@functools.cache
+def importers(root: Path, module: str) -> list[str]:
+    """Files of tests that import a module by its own name, from the root of the checkout."""
+    path = Path(module).with_suffix("")
+    package, name = re.escape(".".join(path.parent.parts)), path.name
+    pattern = re.compile(
+        rf"^\s*(?:from {package}\.{name} |import {package}\.{name}\b"
+        rf"|from {package} import (?:[\w, ]*|\([\w,\s]*)\b{name}\b)",
+        re.MULTILINE,
+    )
+    files = sorted((root / "tests").rglob("test_*.py"))
+    texts = {file: file.read_text(encoding="utf-8") for file in files}
+    return [x.relative_to(root).as_posix() for x, text in texts.items() if pattern.search(text)]
 
 
 def wing_of(module: str) -> str:
@@ -81,6 +113,7 @@ def ranked(
     groups: Iterable[Group],
     seconds: Mapping[Group, float],
     catches: Mapping[Group, int],
+    users: Iterable[str] = (),
 ) -> list[Group]:
     """Groups of tests in the order in which they run: by likely catches per second.
 
@@ -89,10 +122,11 @@ def ranked(
         groups: those that `groups_of` returns.
         seconds: CPU time that each took, as far as that is known.
         catches: how many mutants of this module each has caught.
+        users: files that import the module by its name, which count as being about it.
     """
     listed = list(groups)
     folders = list(dict.fromkeys(Path(group.file).parent for group in listed))
-    near = near_files(module)
+    near = near_files(module) | dict.fromkeys(users, 0)
 
     def promise(group: Group) -> float:
         steps = near.get(group.file)

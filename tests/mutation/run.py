@@ -10,7 +10,7 @@ from pathlib import Path
 from .explained import reason_for
 from .ledger import Ledger
 from .mutants import Mutant, diff
-from .ranking import Group, first_part, groups_of, ranked
+from .ranking import Group, first_part, groups_of, importers, ranked
 from .report import CAUGHT, EXPLAINED, SURVIVED, Key, Result, keep_result, load_results
 from .trial import OUTPUT, run_groups, run_test
 from .workplace import Workplace
@@ -22,15 +22,18 @@ Progress = Callable[[list[Result], float, Result], None]
 class Run:
     """Tests mutants, keeping what becomes of each as soon as that is known."""
 
-    def __init__(self, workplace: Workplace, folder: Path, name: str) -> None:
+    def __init__(
+        self, workplace: Workplace, folder: Path, name: str, slow_too: bool = True
+    ) -> None:
         """A run that goes on where an earlier one with this name stopped.
 
         Args:
             workplace: where mutants are tested.
             folder: of what is kept: results, and which tests are known to pass.
             name: of the file of results.
+            slow_too: whether tests marked as slow are asked, too.
         """
-        self.workplace, self.kept = workplace, folder / f"{name}.jsonl"
+        self.workplace, self.kept, self.slow_too = workplace, folder / f"{name}.jsonl", slow_too
         self.ledger = Ledger(folder / "tests.json", workplace.checkout)
         self.results = {result.key: result for result in load_results(self.kept)}
 
@@ -64,7 +67,13 @@ class Run:
         if reason := reason_for(mutant.path, *key[2:]):
             return self._keep(Result(*key, EXPLAINED, reason))
         seconds, checkout = self.ledger.seconds(), self.workplace.checkout
-        groups = ranked(mutant.path, groups_of(checkout, mutant.path), seconds, self._catches(key))
+        groups = ranked(
+            mutant.path,
+            [x for x in groups_of(checkout, mutant.path) if self.slow_too or not x.slow],
+            seconds,
+            self._catches(key),
+            importers(checkout, mutant.path),
+        )
         near, far = first_part(groups, seconds, budget)
         begin = time.monotonic()
         with self.workplace.mutated(mutant):

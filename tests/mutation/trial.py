@@ -22,7 +22,7 @@ from .ranking import Group
 PRELOADED = ["jax", "jax.numpy", "equinox", "scipy.stats", "scipy.spatial", "trimesh"]
 SECONDS = 180.0  # of CPU for one test, beyond which it hangs
 LONGEST = 3600.0  # seconds for all tests together, waiting included
-OPTIONS = ["-x", "-q", "--hypothesis-seed=0", "-p", "no:cacheprovider"]
+OPTIONS = ["-x", "-q", "--hypothesis-seed=0", "-p", "no:cacheprovider", "-m", "slow or not slow"]
 OPTIONS += ["-W", "ignore:Module already imported"]  # among what is preloaded
 OUTPUT = "output.txt"  # beside the checkout: what pytest prints
 NOTES = "notes.json"
