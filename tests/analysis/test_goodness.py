@@ -3,10 +3,10 @@
 import dataclasses
 import re
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from fitting.analysis.goodness import verdict
 from fitting.analysis.goodness.groups import Assumed, measure_groups
@@ -19,14 +19,15 @@ from support.playbacks import FPS, FRAMES, SHAPES, SIGMAS, playback
 KINDS = ("ankle", "knee", "pelvis")
 SEEDS = 20  # each violation must be found in all of them
 RHO = 0.95
+ASSUMED = {"correlation": RHO}
+WHITENED = r"even where the estimate is taken out.*set `correlation = \"counted\"` in \[noise\]"
 
 
 def autoregression(random: np.random.Generator, shape: tuple[int, ...], rho: float) -> np.ndarray:
     """Noise of unit variance, correlated from frame to frame."""
     values = random.normal(size=shape)
-    for t in range(1, len(values)):
-        values[t] = rho * values[t - 1] + np.sqrt(1 - rho**2) * values[t]
-    return values
+    values[1:] *= np.sqrt(1 - rho**2)
+    return signal.lfilter([1.0], [1.0, -rho], values, axis=0)
 
 
 def simulate(seed: int, *, rho: float = 0.0, scale: float = 1.0, outliers: float = 0.0) -> Playback:
@@ -40,14 +41,17 @@ def simulate(seed: int, *, rho: float = 0.0, scale: float = 1.0, outliers: float
     return playback(errors)
 
 
+@jax.jit
+def all_whitened(residuals: dict[str, jax.Array], seen: jax.Array, rho: jax.Array) -> dict:
+    return {kind: whitened(values, seen, rho) for kind, values in residuals.items()}
+
+
 def whiten(play: Playback, rho: float) -> Playback:
     """The playback as a fit sees it to which this correlation was given."""
-    residuals = {
-        kind: np.asarray(whitened(jnp.asarray(values), jnp.asarray(play.seen), jnp.asarray(rho)))
-        for kind, values in play.residuals.items()
-        if kind != "smooth"
-    }
-    return dataclasses.replace(play, residuals={**play.residuals, **residuals})
+    if not rho:
+        return play
+    residuals = all_whitened({kind: play.residuals[kind] for kind in KINDS}, play.seen, rho)
+    return dataclasses.replace(play, residuals=play.residuals | jax.tree.map(np.asarray, residuals))
 
 
 def judge(play: Playback, correlation: float = 0.0, **assumed) -> Verdict:
@@ -92,45 +96,27 @@ def test_a_robust_loss_finds_noise_that_is_in_one_axis_only():
             assert not group.has_outliers
 
 
-@pytest.mark.parametrize("scale", [1 / 3, 0.5, 2.0, 3.0])
-def test_wrong_sigmas_are_named(scale):
+@pytest.mark.parametrize(
+    ("made", "given", "said", "not_said"),
+    [
+        ({"scale": 1 / 3}, {}, "noise is about 0.3.*too wide", "correlated"),
+        ({"scale": 0.5}, {}, "noise is about 0..*too wide", "correlated"),
+        ({"scale": 2.0}, {}, "noise is about .*too narrow", "correlated"),
+        ({"scale": 3.0}, {}, "noise is about .*too narrow", "correlated"),
+        ({"rho": RHO}, {}, r"correlated \(0.9.*too narrow; set `correlation = 0.9", "the noise"),
+        ({}, ASSUMED, r"frame to the next, not by 0.95\): the intervals.*too wide", "noise"),
+        ({"outliers": 0.03}, {}, 'outliers.*set `loss = "cauchy"`', "the noise"),
+        ({}, ASSUMED | {"whitened": True}, WHITENED, "too narrow"),
+        ({"outliers": 0.03}, {"sigmas_estimated": True}, 'set `loss = "student"`', "cauchy"),
+    ],
+)
+def test_what_is_otherwise_than_assumed_is_named(made, given, said, not_said):
     for seed in range(SEEDS):
-        found = judge(simulate(seed, scale=scale))
-        words = f"Fits, but the noise is about {scale:.2g}"
-        assert found.sentence.startswith(words[:-1]), found.sentence
-        assert f"too {'narrow' if scale > 1 else 'wide'}" in found.sentence
-        assert "correlated" not in found.sentence and found.fits
-
-
-def test_ignored_correlation_is_named():
-    for seed in range(SEEDS):
-        found = judge(simulate(seed, rho=RHO))
-        assert found.sentence.startswith("Fits, but the residuals are correlated (0.9"), seed
-        assert "too narrow; set `correlation = 0.9" in found.sentence
-
-
-def test_a_correlation_that_is_not_there_is_named():
-    for seed in range(SEEDS):
-        found = judge(whiten(simulate(seed), RHO), correlation=RHO)
-        assert "from one frame to the next, not by 0.95): the intervals" in found.sentence
-        assert "too wide" in found.sentence and "noise" not in found.sentence
-
-
-def test_outliers_under_squares_are_named():
-    for seed in range(SEEDS):
-        found = judge(simulate(seed, outliers=0.03))
-        assert "are outliers" in found.sentence and 'set `loss = "cauchy"`' in found.sentence
-        assert "the noise" not in found.sentence and found.fits
-        assert 1.5 < float(found.sentence.split("Fits, but ")[1].split(" %")[0]) < 4.5
-
-
-def test_what_is_advised_is_accepted_beside_noise_that_is_estimated():
-    for seed in range(SEEDS):
-        found = judge(whiten(simulate(seed), RHO), correlation=RHO, whitened=True)
-        assert "even where the estimate is taken out" in found.sentence
-        assert 'set `correlation = "counted"` in [noise]' in found.sentence
-        found = judge(simulate(seed, outliers=0.03), sigmas_estimated=True)
-        assert 'set `loss = "student"`' in found.sentence
+        found = judge(whiten(simulate(seed, **made), given.get("correlation", 0.0)), **given)
+        assert re.search(f"^Fits, but .*{said}", found.sentence), found.sentence
+        assert not_said not in found.sentence and found.fits, found.sentence
+        if percent := re.search(r"(\S+) % of the residuals", found.sentence):
+            assert 1.5 < float(percent[1]) < 4.5
 
 
 def with_bump(play: Playback, kind: str, size: float, frames: slice) -> Playback:
@@ -183,13 +169,9 @@ def test_only_tolerances_count_without_noise():
 def test_p_values_are_uniform_where_the_noise_is_as_assumed():
     for rho, given in ((0.0, 0.0), (RHO, RHO), (RHO, 0.0)):
         plays = [whiten(simulate(seed, rho=rho), given) for seed in range(150)]
-        groups = [
-            g
-            for play in plays
-            for g in measure_groups([play], [dict.fromkeys(KINDS, given)], Assumed())
-        ]
-        p = np.array([group.left.p for group in groups])
-        assert stats.kstest(p, "uniform").pvalue > 1e-3, (rho, given)
+        given_of = [dict.fromkeys(KINDS, given)]
+        left = [g.left for play in plays for g in measure_groups([play], given_of, Assumed())]
+        assert stats.kstest([noise.p for noise in left], "uniform").pvalue > 1e-3, (rho, given)
         if rho == given:
-            p = np.array([group.left.autocorrelation_p for group in groups])
+            p = [noise.autocorrelation_p for noise in left]
             assert stats.kstest(p, "uniform").pvalue > 1e-3

@@ -1,23 +1,29 @@
-"""How feet are placed on their ground: against figures by hand and a plain NumPy reference."""
+"""How feet are placed on their ground, and why: by hand and against a plain NumPy reference."""
+
+import functools
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from fitting.analysis import placement
+from fitting.analysis.misplacement import Cause, likely_cause
 from fitting.analysis.placement import Soles
 from fitting.datasets.clip_frames import raised
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import gait, walker
+from fitting.datasets.terrain.meshes import Mesh
 from jaxik.world import terrain
+from jaxik.world.terrain import Terrain
 from support.grounds import flight, hill, terrain_of
 
 FLOOR = terrain.plane()
+rotation = functools.partial(Rotation.from_quat, scalar_first=True)
 
 
 @pytest.fixture(scope="module")
 def walk() -> Clip:
-    return walker.walk(4.0, 60.0, style=walker.WalkStyle(bend=0.0))
+    return walker.walk(8.0, 60.0, style=walker.WalkStyle(bend=0.0))
 
 
 def moved(clip: Clip, joint: int, offset: np.ndarray) -> Clip:
@@ -46,15 +52,11 @@ def test_soles_are_as_high_as_a_reference_of_rotations_and_interpolation_says(wa
     lifted = raised(walk, np.linspace(0.0, 0.4, walk.frame_count))
     feet = placement.soles(lifted, walk, terrain_of(hill()))
     for leg in range(2):
-        ankle, ball = (lifted.joints_ws(role)[:, leg] for role in (2, 3))
-        foot = Rotation.from_quat(
-            lifted.rotations_ws[:, lifted.rig.joints[leg][2]], scalar_first=True
-        ) * Rotation.from_quat(np.asarray(lifted.rig.ankle_from_foot)[leg], scalar_first=True)
-        up = foot.apply([0.0, 1.0, 0.0])
-        for point, (joint, depth) in enumerate(
-            ((ankle, gait.ANKLE_HEIGHT), (ball, gait.BALL_HEIGHT))
-        ):
-            sole = joint - depth * up
+        ankle_rot = lifted.rotations_ws[:, lifted.rig.joints[leg][2]]
+        foot_rot = np.asarray(lifted.rig.ankle_from_foot)[leg]
+        up = rotation(ankle_rot).apply(rotation(foot_rot).apply([0.0, 1.0, 0.0]))
+        for point, depth in enumerate((gait.ANKLE_HEIGHT, gait.BALL_HEIGHT)):
+            sole = lifted.joints_ws(2 + point)[:, leg] - depth * up
             ground = np.interp(sole[:, 2], profile_z, profile)
             np.testing.assert_allclose(feet.ground[:, leg, point], ground, atol=1e-5)
             np.testing.assert_allclose(feet.height[:, leg, point], sole[:, 1] - ground, atol=1e-5)
@@ -121,14 +123,10 @@ def test_a_slide_is_the_path_of_the_ball_beyond_the_animated_one(walk):
     sliding = moved(walk, 3, x[:, None] * [1.0, 0.0, 0.0])
     placed = placement.assess(placement.soles(walk, walk, FLOOR), sliding, walk)
     lengths = []
-    for leg in range(2):
-        stance, ball = walk.stance_labels()[:, leg], sliding.joints_ws(3)[:, leg]
-        starts = np.flatnonzero(np.diff(np.concatenate([[0], stance])) == 1)
-        for start in starts:
-            end = start
-            while end + 1 < len(stance) and stance[end + 1]:
-                end += 1
-            lengths.append(np.abs(np.diff(ball[start : end + 1, 0])).sum())
+    for stance, ball in zip(walk.stance_labels().T, sliding.joints_ws(3)[..., 0].T, strict=True):
+        cuts = np.flatnonzero(np.diff(stance)) + 1
+        parts = zip(np.split(stance, cuts), np.split(ball, cuts), strict=True)
+        lengths += [np.abs(np.diff(path)).sum() for stands, path in parts if stands[0]]
     assert placed.largest_slide.leg == "left"
     assert placed.largest_slide.value == pytest.approx(max(lengths))
     assert placed.slide == pytest.approx(np.median(lengths), abs=1e-6)
@@ -152,3 +150,49 @@ def test_a_clip_of_one_frame_has_neither_slides_nor_pops(walk):
 def test_soles_deep_in_stairs_are_measured_from_the_tread_above(walk):
     feet = placement.soles(walk, walk, terrain_of(flight([1.0, 2.0, 3.0], rise=0.5)))
     assert feet.height.min() == pytest.approx(-1.5, abs=0.05)
+
+
+# The likely cause of feet off their ground: each mistake is made, and must be named.
+
+
+def following(clip: Clip, ground: Mesh, factor: float = 1.0) -> Clip:
+    """The clip raised by the ground below its pelvis, times a factor."""
+    z = clip.positions_ws[:, clip.rig.pelvis, 2]
+    order = np.argsort(ground.vertices[:, 2], kind="stable")
+    return raised(clip, factor * np.interp(z, *ground.vertices[order][:, [2, 1]].T))
+
+
+def cause(clip: Clip, flat: Clip, ground: Terrain) -> Cause:
+    return likely_cause(placement.soles(clip, flat, ground), clip)
+
+
+def test_a_root_that_stays_on_its_floor_is_named(walk):
+    assert cause(walk, walk, terrain_of(hill())).kind == "root"
+
+
+@pytest.mark.parametrize("offset", [0.5, -0.3, 0.05])
+def test_an_offset_is_named_with_its_size(walk, offset):
+    lifted = raised(walk, np.full(walk.frame_count, offset))
+    found = cause(lifted, walk, FLOOR)
+    assert found.kind == "offset" and found.amount == pytest.approx(offset, abs=0.005)
+
+
+def test_an_offset_over_a_hill_is_named(walk):
+    lifted = raised(following(walk, hill()), np.full(walk.frame_count, 0.5))
+    assert cause(lifted, walk, terrain_of(hill())).kind == "offset"
+
+
+@pytest.mark.parametrize("unit", [0.3048, 1 / 0.3048, 1 / 0.0254])
+def test_feet_that_follow_the_ground_by_the_factor_of_a_unit_name_it(walk, unit):
+    found = cause(following(walk, hill(), unit), walk, terrain_of(hill()))
+    assert found.kind == "units" and found.amount == pytest.approx(unit)
+
+
+def test_missing_ground_is_named(walk):
+    mesh = hill()
+    aside = terrain.mesh(mesh.vertices + [9e5, 0.0, 0.0], mesh.faces)
+    assert cause(walk, walk, aside).kind == "missing"
+
+
+def test_feet_on_their_ground_have_no_cause(walk):
+    assert cause(walk, walk, FLOOR).kind == "unknown"
