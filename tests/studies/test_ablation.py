@@ -1,9 +1,8 @@
-"""Ablation: variants, splits, rows, resuming, and the report."""
+"""Ablation: variants, splits, rows, what is not fitted again, and the report."""
 
 import csv
 import dataclasses
 import json
-import signal
 import struct
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from fitting.analysis.accuracy import Accuracy
-from fitting.cli import main, progress
+from fitting.cli import main
 from fitting.datasets.clips import load_clip, save_clip
 from fitting.experiments import problems
 from fitting.experiments.ablations import COMPLETE, Ablation
@@ -27,30 +26,13 @@ from fitting.report.page.studies import ablation_page
 from fitting.report.plots import ablation_plots
 from fitting.studies import ablation, run_folder
 from fitting.studies.ablation import Row
-from fitting.studies.animations import Animation
 from jaxik.maths import parameter_tree
-from support import quick
-from support.experiments import CLIP, write
+from support import small_studies
 from support.pages import Page
+from support.small_studies import SIX_SECONDS, WITHOUT, write_ablation
 
-SIX = CLIP + "end = 6.0\n"  # seconds, of the embedded walk
-WITHOUT = """
-[[without]]
-name = "pitch"
-parameters = { foot.max_pitch = 0.2 }
-[[without]]
-name = "both"
-parameters = { foot.max_pitch = 0.2, pelvis.on_gain = 0.6 }
-"""
 ALL, PITCH, BOTH = COMPLETE, "pitch", "both"
 EVERYTHING = "everything"
-
-
-def lift(animation, ik):
-    """A result that needs no pipeline: everything is raised by the value of a gain, m."""
-    base = animation.clip
-    up = [0.0, float(parameter_tree.get(ik, "pelvis.on_gain")), 0.0]
-    return None, base.with_motion(base.positions_ws + up, base.rotations_ws)
 
 
 class Search:
@@ -58,10 +40,8 @@ class Search:
 
     def __init__(self) -> None:
         self.calls: list = []
-        self.stop_at: int | None = None
 
     def __call__(self, problem, experiment, progress):
-        stopped = self.stop_at is not None and len(self.calls) >= self.stop_at
         self.calls.append((problem, experiment))
         if progress is not None:
             progress(Progress("polish", 0, 1, 2.0, 1.0, 0.5))
@@ -71,8 +51,7 @@ class Search:
         u = np.asarray(problem.space.pack(best))
         values = np.asarray(problem.space.values(jnp.asarray(u)))
         return problem, Solution(
-            names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, len(names))), (), 1, 0.5,
-            interrupted=stopped,
+            names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, len(names))), (), 1, 0.5
         )  # fmt: skip
 
 
@@ -80,33 +59,12 @@ class Search:
 def search(monkeypatch) -> Search:
     counted = Search()
     monkeypatch.setattr(ablation, "search_with_noise", counted)
-    without_pipeline(monkeypatch)
+    small_studies.without_pipeline(monkeypatch)
     return counted
 
 
-SCENES: dict = {}  # by clip: making one takes longer than the test that uses it
-
-
-def without_pipeline(monkeypatch) -> None:
-    """Replaces the pipeline by `lift`, and makes each scene once for all tests."""
-    make_scene = problems.make_scene
-
-    def cached(data, sigmas, label):
-        captured = data.reference
-        mask = b"" if captured.mask is None else captured.mask.tobytes()
-        key = captured.positions_ws.tobytes(), mask, tuple(sigmas.items())
-        if key not in SCENES:
-            SCENES[key] = make_scene(data, sigmas, label)
-        return SCENES[key]
-
-    monkeypatch.setattr(problems, "make_scene", cached)
-    monkeypatch.setattr(Animation, "solve", lift)
-    monkeypatch.setattr(Animation, "check_shapes", lambda *_: None)
-    monkeypatch.setattr(ablation.jax, "clear_caches", lambda: None)
-
-
-def load(folder: Path, rest: str = WITHOUT, clips: str = SIX, **parts: str) -> Experiment:
-    return load_experiment(write(folder, rest=rest, clips=clips, **parts))
+def load(folder: Path, rest: str = WITHOUT, **parts: str) -> Experiment:
+    return load_experiment(write_ablation(folder, rest=rest, **parts))
 
 
 def load_clips(experiment: Experiment) -> list[ClipData]:
@@ -185,18 +143,6 @@ def test_the_held_out_part_is_not_fitted_and_everything_else_is(tmp_path, folds)
     assert splits[-1].measured == [(data, slice(None))]
 
 
-def test_a_part_in_which_a_foot_never_stands_is_rejected_before_any_fit(tmp_path, search):
-    with pytest.raises(ValueError, match=r"uneven_walk.npz: in part \d+ of 40, .* foot never stan"):
-        ablation.ablate(load(tmp_path), tmp_path / "out", folds=40)
-    assert not search.calls and not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("folds", [1, 0, -2])
-def test_fewer_than_two_folds_are_rejected(tmp_path, folds):
-    with pytest.raises(ValueError, match=f"folds is {folds}; wanted 2 or more"):
-        ablation.ablate(load(tmp_path), tmp_path / "out", folds=folds)
-
-
 def test_an_impossible_variant_is_reported_by_name_before_any_fit(tmp_path, search):
     rest = '[[without]]\nname = "high"\nparameters = { contact.planted_height = 9.0 }\n'
     experiment = load(tmp_path, rest, free="contact.raised_height = {}")
@@ -208,7 +154,6 @@ def test_an_impossible_variant_is_reported_by_name_before_any_fit(tmp_path, sear
 # Rows
 
 
-@pytest.mark.slow
 def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tmp_path, search):
     experiment = load(tmp_path, top="fps = 15.0")
     rows = ablation.ablate(experiment, tmp_path / "out")
@@ -234,102 +179,67 @@ def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tm
     assert rows[0].message == "Done." and rows[0].seconds == 0.5
 
 
-def test_the_problem_of_a_variant_has_its_fixed_values_and_the_sigmas(tmp_path, search):
-    rest = WITHOUT + "[sigmas]\nankle = 0.05\n"
+def test_the_problem_of_a_variant_has_its_fixed_values_the_sigmas_and_the_noise(tmp_path, search):
+    rest = WITHOUT + '[sigmas]\nankle = 0.05\n[noise]\nsigmas = "estimated"\n'
     ablation.ablate(load(tmp_path, rest), tmp_path / "out")
     problem, variant = search.calls[3]
     assert float(parameter_tree.get(problem.space.system, "foot.max_pitch")) == 0.2
     assert float(problem.data[0].sigmas.ankle) == 0.05
     assert variant.free == {"pelvis.on_gain": {}}
-
-
-def test_every_variant_estimates_the_noise_that_the_experiment_says(tmp_path, search):
-    ablation.ablate(load(tmp_path, WITHOUT + '[noise]\nsigmas = "estimated"\n'))
     assert {variant.noise for _, variant in search.calls} == {NoiseOptions("estimated")}
 
 
-def test_progress_says_what_is_being_fitted(tmp_path, search):
-    stages: list[str] = []
-    ablation.ablate(load(tmp_path), progress=lambda report: stages.append(report.stage))
+def test_without_a_folder_nothing_is_written_and_progress_says_what_is_fitted(
+    tmp_path, search, monkeypatch
+):
+    experiment, stages = load(tmp_path), []
+    before = set(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    rows = ablation.ablate(experiment, progress=lambda report: stages.append(report.stage))
+    assert len(rows) == 9 and set(tmp_path.iterdir()) == before
     assert stages[0] == "all rules, part 1 of 2: polish"
     assert stages[-1] == "pitch, everything: polish"
 
 
-# Resuming
+# What is not fitted again
 
 
-def test_finished_fits_are_not_repeated(tmp_path, search, monkeypatch):
-    new_rows, clearings = [], []
-    monkeypatch.setattr(ablation.jax, "clear_caches", lambda: clearings.append(len(new_rows)))
+def test_only_changed_variants_are_fitted_again(tmp_path, search, monkeypatch):
+    out, new, clearings = tmp_path / "out", [], []
+    monkeypatch.setattr(ablation.jax, "clear_caches", lambda: clearings.append(len(new)))
 
-    def ablate() -> list[Row]:
-        return ablation.ablate(load(tmp_path), tmp_path / "out", on_row=new_rows.append)
+    def ablate(rest: str = WITHOUT, top: str = "", folds: int = 2) -> list[Row]:
+        return ablation.ablate(load(tmp_path, rest, top=top), out, folds=folds, on_row=new.append)
 
-    rows = ablate()
-    assert new_rows == rows and len(search.calls) == 6
+    first = ablate()
+    assert new == first and len(search.calls) == 6
     assert clearings == [3, 6, 9], "after each variant its programs are dropped"
-    assert ablate() == rows
-    assert len(search.calls) == 6 and len(new_rows) == 9 and len(clearings) == 3
-
-
-def test_without_a_folder_nothing_is_written(tmp_path, search, monkeypatch):
-    experiment = load(tmp_path)
-    before = set(tmp_path.iterdir())
-    monkeypatch.chdir(tmp_path)
-    assert len(ablation.ablate(experiment)) == 9
-    assert set(tmp_path.iterdir()) == before
-
-
-def test_only_changed_variants_are_fitted_again(tmp_path, search):
-    out = tmp_path / "out"
-    first = ablation.ablate(load(tmp_path), out)
-    renamed = ablation.ablate(load(tmp_path, WITHOUT.replace('pitch"', 'tilt"')), out)
-    assert len(search.calls) == 6 and renamed[3].variant == "tilt"
-    assert [dataclasses.replace(row, variant="") for row in renamed] == [
-        dataclasses.replace(row, variant="") for row in first
-    ]
+    renamed = ablate(WITHOUT.replace('pitch"', 'tilt"'))
+    assert len(search.calls) == 6 and len(new) == 9 and len(clearings) == 3
+    assert renamed[3].variant == "tilt"
+    for row, before in zip(renamed, first, strict=True):
+        assert dataclasses.replace(row, variant="") == dataclasses.replace(before, variant="")
     other = WITHOUT.replace("max_pitch = 0.2 }", "max_pitch = 0.25 }")
-    ablation.ablate(load(tmp_path, other), out)
+    ablate(other)
     assert len(search.calls) == 9, "pitch, on two parts and on everything"
-    ablation.ablate(load(tmp_path, other), out, folds=3)
+    ablate(other, folds=3)
     assert len(search.calls) == 15, "both that are free, on three parts"
-    ablation.ablate(load(tmp_path, other, top="seed = 1"), out, folds=3)
+    ablate(other, "seed = 1", folds=3)
     assert len(search.calls) == 23
     kept = json.loads((out / ablation.NUMBERS).read_text())["rows"]
     assert len(kept) == 12, "rows of other variants and folds are dropped"
 
 
 def test_a_changed_clip_is_fitted_again(tmp_path, search):
-    paths = [line.split('"')[1] for line in SIX.splitlines() if '"' in line]
+    paths = [line.split('"')[1] for line in SIX_SECONDS.splitlines() if '"' in line]
     clip = load_clip(paths[0])
     save_clip(tmp_path / "walk.npz", clip)
-    clips = SIX.replace(paths[0], "walk.npz")
-    ablation.ablate(load(tmp_path, "", clips), tmp_path / "out")
+    clips = SIX_SECONDS.replace(paths[0], "walk.npz")
+    ablation.ablate(load(tmp_path, "", clips=clips), tmp_path / "out")
     moved = clip.with_motion(clip.positions_ws + [0.0, 0.001, 0.0], clip.rotations_ws)
     save_clip(tmp_path / "walk.npz", moved)
-    ablation.ablate(load(tmp_path, "", clips), tmp_path / "out")
+    ablation.ablate(load(tmp_path, "", clips=clips), tmp_path / "out")
     assert len(search.calls) == 6
-
-
-def test_an_interrupted_ablation_continues(tmp_path, search):
-    complete = ablation.ablate(load(tmp_path), tmp_path / "complete")
-    search.calls.clear()
-    search.stop_at = 4
-    with pytest.raises(KeyboardInterrupt):
-        ablation.ablate(load(tmp_path), tmp_path / "out")
-    kept = ablation.read(tmp_path / "out")
-    assert kept == complete[:4], "the interrupted fit is not kept"
-    search.stop_at = None
-    assert ablation.ablate(load(tmp_path), tmp_path / "out") == complete
-    assert len(search.calls) == 7
-
-
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"rows": [3]}', '{"rows": [{"key": "x"}]}'])
-def test_a_file_of_something_else_is_rejected(tmp_path, text, search):
-    (tmp_path / ablation.NUMBERS).write_text(text)
-    with pytest.raises(ValueError, match="contribution.json: not written by `jaxik ablate`"):
-        ablation.ablate(load(tmp_path), tmp_path)
-    assert (tmp_path / ablation.NUMBERS).read_text() == text
 
 
 # The report
@@ -420,44 +330,10 @@ def test_the_figure_has_a_bar_per_variant_and_a_point_per_part():
     np.testing.assert_allclose(points, [[3.0, 3.2], [4.1, 2.9]])
 
 
-# The command
-
-
-@pytest.mark.slow
-def test_the_command_continues_after_an_interrupt_and_writes_its_tables(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
-    without_pipeline(monkeypatch)
-    path = write(tmp_path, rest=WITHOUT, clips=SIX)
-    words = ["ablate", str(path), "-o", str(tmp_path / "out")]
-
-    def interrupt(report: Progress) -> str:
-        if report.stage.startswith("all rules, part 2"):
-            signal.raise_signal(signal.SIGINT)
-        return report.stage
-
-    with monkeypatch.context() as patch:
-        patch.setattr(progress, "fit_line", interrupt)
-        assert main.main(words) == main.INTERRUPTED
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {ablation.NUMBERS}
-    assert len(ablation.read(tmp_path / "out")) == 1
+def test_the_command_prints_each_row_and_the_tables(tmp_path, search, undrawn, capsys):
+    path, out = write_ablation(tmp_path), tmp_path / "out"
+    assert main.main(["ablate", str(path), "-o", str(out)]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("all rules, part 1 held out: pelvis ") and text.count("\n") == 1
-    assert main.main(words) == 0
-    text = capsys.readouterr().out
-    assert "without both" in text and f"read {tmp_path / 'out' / 'table.md'}" in text
-    rows = ablation.read(tmp_path / "out")
-    assert len(rows) == 9
-    assert rows[0].values == pytest.approx(quick.TARGETS, abs=0.003)
-
-
-def test_the_command_rejects_more_folds_than_feet_stand_in(tmp_path, capsys):
-    path, out = write(tmp_path, clips=SIX), str(tmp_path / "out")
-    assert main.main(["ablate", str(path), "-o", out, "--folds", "30"]) == main.MISTAKE
-    error = capsys.readouterr().err
-    assert (
-        "foot never stands; take few" in error
-        and error.count("\n") == 1
-        and not (tmp_path / "out").exists()
-    )
+    assert text.startswith("all rules, part 1 held out: pelvis ")
+    assert "\nwithout both, everything: pelvis " in text and f"read {out / 'table.md'}" in text
+    assert len(ablation.read(out)) == 9

@@ -1,12 +1,17 @@
-"""Run folders in which something is damaged: one sentence names it, and nothing is changed."""
+"""Folders in which something is damaged, or whose disk is full: one sentence names what.
+
+Nothing that was whole is changed.
+"""
 
 import json
 import shutil
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import h5py
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -15,19 +20,20 @@ from fitting.experiments import problems
 from fitting.inference.sampling.chain import Chain
 from fitting.inference.sampling.chain_file import Identity
 from fitting.inference.sampling.posterior import digest
+from fitting.runtime import files
 from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
-from support import quick
-from support.experiments import ROOT
+from fuzz import kept_files
+from support import quick, small_studies
+from support.experiments import ROOT, write
+from support.refusals import refusal
 from support.runs import NAMES, invented_fit, save
+from support.small_studies import HALF_SECOND
 
 Damage: TypeAlias = Callable[[Path], object]
-CLIP_FILES = [
-    str(ROOT / "data/clips/uneven_walk_base.npz"),
-    "--terrain",
-    str(ROOT / "data/terrains/uneven_walk.ply"),
-]
+DATA = ROOT / "data"
+CLIP_FILES = [DATA / "clips/uneven_walk_base.npz", "--terrain", DATA / "terrains/uneven_walk.ply"]
 WHOLE_FILES = {
     "cut in half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "empty": lambda path: path.write_bytes(b""),
@@ -65,21 +71,13 @@ def run(sampled, tmp_path, monkeypatch) -> Path:
     return shutil.copytree(sampled, tmp_path / "run")
 
 
-def content(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+def sampling_refused(run: Path, capsys) -> str:
+    return refusal(["sample", run], run, capsys)
 
 
-def refusal(words: list[str], run: Path, capsys) -> str:
-    """The one line that a command says of a folder, in which it changes nothing."""
-    before = content(run)
-    assert main.main(words) == main.MISTAKE
-    (line,) = capsys.readouterr().err.splitlines()
-    assert content(run) == before
-    return line
-
-
-def apply_words(run: Path) -> list[str]:
-    return ["apply", str(run), *CLIP_FILES, "-o", str(run.parent / "out.npz")]
+def applying_refused(run: Path, capsys) -> str:
+    words = ["apply", run, *CLIP_FILES, "-o", run.parent / "out.npz"]
+    return refusal(words, run.parent, capsys)
 
 
 @pytest.mark.parametrize(
@@ -94,8 +92,8 @@ def apply_words(run: Path) -> list[str]:
 def test_a_file_that_is_damaged_as_a_whole_is_named(run, name, damage, capsys):
     damage(run / name)
     applied = name in ("fit.json", "parameters.toml")  # all that `apply` reads
-    words = apply_words(run) if applied else ["sample", str(run)]
-    assert name in refusal(words, run, capsys)
+    refused = applying_refused if applied else sampling_refused
+    assert name in refused(run, capsys)
 
 
 def in_fit(change: Callable[[dict[str, Any]], object]) -> Damage:
@@ -125,6 +123,8 @@ NUMBERS = {
     "same names": (of_row(name="foot.max_pitch"), "wanted one or more, each once"),
     "other names": (of_row(name="pelvis.limit"), "the fit has the parameters"),
     "key": (in_fit(lambda n: n["parameters"][1].pop("u")), "parameters[1] has no u"),
+    "no table": (lambda run: (run / "fit.json").write_text("[]"), "not the numbers of a fit"),
+    "no rows of a table": (in_fit(lambda n: n.update(parameters=[3])), "not the numbers of a fit"),
     "rows": (in_fit(lambda n: n.update(parameters=[])), "its parameters are []"),
     "no rows": (in_fit(lambda n: n.pop("parameters")), "it has no parameters"),
     "noise": (in_fit(lambda n: n.update(noise={"sigmas": {}})), "noise has no correlations"),
@@ -135,7 +135,7 @@ NUMBERS = {
 @pytest.mark.parametrize(("damage", "message"), NUMBERS.values(), ids=NUMBERS)
 def test_a_wrong_number_of_a_fit_is_named(run, damage, message, capsys):
     damage(run)
-    assert message in refusal(["sample", str(run)], run, capsys)
+    assert message in sampling_refused(run, capsys)
 
 
 def test_keys_of_a_later_release_do_no_harm(run):
@@ -148,14 +148,14 @@ def test_a_toml_file_of_a_newer_format_is_refused(run, name, capsys):
     text = (run / name).read_text()
     assert text.startswith("# jaxik run, format 1\n")
     (run / name).write_text(text.replace("format 1", "format 9", 1))
-    words = apply_words(run) if name == run_folder.PARAMETERS else ["sample", str(run)]
-    line = refusal(words, run, capsys)
+    refused = applying_refused if name == run_folder.PARAMETERS else sampling_refused
+    line = refused(run, capsys)
     assert f"{name}: its format is 9; this release reads formats up to 1" in line
 
 
 def test_a_system_without_a_fitted_parameter_is_not_applied(run, capsys):
     (run / run_folder.PARAMETERS).write_text('preset = "record"\n')
-    line = refusal(apply_words(run), run, capsys)
+    line = applying_refused(run, capsys)
     assert "no foot.max_pitch, pelvis.on_gain; `jaxik fit` makes a run" in line
 
 
@@ -206,7 +206,7 @@ CHAINS = {
 @pytest.mark.parametrize(("damage", "message"), CHAINS.values(), ids=CHAINS)
 def test_a_damaged_chain_is_named_and_stays(run, damage, message, capsys):
     damage(run)
-    line = refusal(["sample", str(run)], run, capsys)
+    line = sampling_refused(run, capsys)
     assert "chain.h5" in line and message in line
 
 
@@ -217,11 +217,130 @@ def test_a_chain_with_a_few_other_bytes_is_named_before_hdf5_reads_it(run, capsy
         damaged = whole.copy()
         damaged[place] ^= 1 << random.integers(8)
         path.write_bytes(damaged.tobytes())
-        line = refusal(["sample", str(run)], run, capsys)
+        line = sampling_refused(run, capsys)
         assert "chain.h5 is not a chain of this sampler: its bytes are not those that" in line
 
 
 def test_a_run_that_another_process_samples_is_left_alone(run, capsys):
     with claimed(run):
-        line = refusal(["sample", str(run)], run, capsys)
+        line = sampling_refused(run, capsys)
     assert f"{run}: in use by process" in line
+
+
+# What studies keep
+
+KEPT = {
+    "contribution.json": (kept_files.rows_text(), kept_files.load_rows, "ablate"),
+    "searches/0123.json": (kept_files.found_text(), kept_files.load_found, "population"),
+    **{
+        f"{kind}/0000.json": (kept_files.text_of(whole), kept_files.load_replicate, "calibrate")
+        for kind, whole in kept_files.REPLICATES.items()
+    },
+}
+NOT_KEPT = {"{": "not JSON", "[]": "wanted a table", "{}": "it has no ", "[" * 10**5: "not JSON"}
+CHANGED = [
+    ("contribution.json", {"rows": [3]}, "rows[0] is 3"),
+    ("searches/0123.json", {"u": [0.0]}, "u has 1 numbers; wanted 2"),
+    ("searches/0123.json", {"u": [0.0, float("nan")]}, "u[1] is nan; wanted a finite number"),
+    ("searches/0123.json", {"cost": "low"}, "cost is 'low'; wanted a number"),
+    ("searches/0123.json", {"noise": {"sigmas": {}}}, "noise has no correlations"),
+    ("fits/0000.json", {"number": 3}, "it is of replicate 3"),
+    ("fits/0000.json", {"truth": [0.1, 0.2]}, "its lists have different lengths"),
+    ("fits/0000.json", {"parameters": []}, "parameters has []; wanted"),
+    ("chains/0000.json", {"ranks": {"lean.gain": 3}}, "ranks has "),
+    ("chains/0000.json", {"intervals": {}}, "intervals has []; wanted"),
+    ("chains/0000.json", {"format": 9}, "its format is 9"),
+]
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_a_kept_result_that_is_damaged_is_named(name, tmp_path):
+    whole, load, command = KEPT[name]
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    changes = [(change, message) for changed, change, message in CHANGED if changed == name]
+    texts = {json.dumps(json.loads(whole) | change): message for change, message in changes}
+    for text, message in {**NOT_KEPT, **texts}.items():
+        path.write_text(text)
+        with pytest.raises(ValueError) as refused:
+            load(path)
+        assert str(refused.value).startswith(f"{path}: ") and message in str(refused.value), text
+        assert f"`jaxik {command}`" in str(refused.value) or "format" in message, text
+        assert path.read_text() == text
+    path.write_bytes(whole)
+    load(path)
+
+
+# Full disks
+
+FULL = "cannot be written: No space left on device"
+STATE: Any = np.random.RandomState(0).get_state()
+IDENTITY = Identity(("a", "b"), walkers=8, seed=0, thin_by=1, problem="x" * 64)
+
+
+@pytest.fixture
+def disk(tmp_path) -> Iterator[Path]:
+    """A file system of 64 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
+    try:
+        mounted = subprocess.run(words, capture_output=True).returncode == 0
+    except FileNotFoundError:
+        mounted = False
+    if not mounted:
+        pytest.skip("only root may mount a disk")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_without_room_is_named_and_the_old_one_stays(disk):
+    figure, axes = plt.subplots()
+    axes.imshow(np.random.default_rng(0).random((300, 300)))
+    fills = {
+        "notes.txt": lambda path: path.write_text("x" * 100_000),
+        "clip.npz": lambda path: np.savez(path, a=np.zeros(20_000)),
+        "plot.png": lambda path: figure.savefig(path, dpi=200),
+    }
+    for name, fill in fills.items():
+        files.write_text(disk / name, "old")
+        with pytest.raises(ValueError, match=f"{name}: {FULL}"):
+            files.write(disk / name, fill)
+        assert (disk / name).read_text() == "old"
+    plt.close(figure)
+    assert names(disk) == sorted(fills)
+
+
+def extend(chain: Chain, steps: int) -> None:
+    for _ in range(steps):
+        u = np.full((8, 2), float(len(chain)))
+        chain.append(u, np.zeros(8), np.ones(8, bool), STATE)
+
+
+def test_a_chain_without_room_keeps_the_steps_that_had_some(disk):
+    path = disk / "chain.h5"
+    with pytest.raises(ValueError, match=f"chain.h5: {FULL}"), Chain(IDENTITY, path) as chain:
+        extend(chain, 1000)
+    assert names(disk) == ["chain.h5", "chain.h5.journal"]
+    with pytest.raises(ValueError, match=f"chain.h5: {FULL}"), Chain(IDENTITY, path):
+        pass
+    subprocess.run(["mount", "-o", "remount,size=1m", str(disk)], check=True)
+    with Chain(IDENTITY, path) as chain:
+        assert 10 < len(chain) < 1000
+        assert (chain.u[:, 0, 0] == np.arange(len(chain))).all()
+        extend(chain, 1)
+    assert names(disk) == ["chain.h5"]
+
+
+def test_a_fit_without_room_leaves_no_folder(disk, tmp_path, monkeypatch, capsys):
+    small_studies.quick_fits(monkeypatch)
+    path = write(tmp_path, clips=HALF_SECOND)
+    (disk / "full").write_bytes(bytes(60_000))
+    assert main.main(["fit", str(path), "-o", str(disk / "runs" / "walk")]) == main.MISTAKE
+    *_, line = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"jaxik fit: {disk}/runs/walk/") and line.endswith(FULL)
+    assert names(disk) == ["full"]

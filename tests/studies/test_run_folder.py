@@ -1,4 +1,8 @@
-"""Run folders: what they hold, and what is rejected."""
+"""Run folders: what they hold, where they may be, and those of earlier releases.
+
+`tests/support/released` has a run of each release, written by its own code: two parameters fitted
+with the residuals of `support.quick`, and four steps of a chain.
+"""
 
 import dataclasses
 import json
@@ -11,14 +15,18 @@ import numpy as np
 import pytest
 
 from fitting.experiments import experiment_files, parameter_files, problems, systems
-from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.runtime.storage.claimed_folder import LOCK
 from fitting.studies import run_folder
 from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
+from fitting.studies.sample import walker_start
 from jaxik.maths import parameter_tree
-from support.experiments import write
+from support import quick, small_studies
+from support.experiments import ROOT, write
+from support.refusals import refusal
 from support.runs import NAMES, invented_fit, save
+
+RELEASED = sorted((ROOT / "tests" / "support" / "released").iterdir())
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +57,17 @@ def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, tmp_path)
 
 
 def test_the_experiment_in_a_run_does_not_need_its_original_file(fitted, tmp_path):
-    text = experiment_files.experiment_to_toml(fitted.experiment)
-    (tmp_path / "again.toml").write_text(text)
+    sigmas = {"ankle": 0.01, "body": math.inf, "correlation.ankle": 0.9, "correlation.foot": 0.5}
+    noise = NoiseOptions("estimated", "whitened")
+    changed = dataclasses.replace(fitted.experiment, sigmas=sigmas, noise=noise)
+    (tmp_path / "again.toml").write_text(experiment_files.experiment_to_toml(changed))
     again = experiment_files.load_experiment(tmp_path / "again.toml")
-    for name in ("clips", "free", "preset", "name", "fps", "loss", "seed", "parameters", "fit"):
-        assert getattr(again, name) == getattr(fitted.experiment, name), name
-    assert again.sample == fitted.experiment.sample
-    assert again.sigmas == {"body": math.inf, "correlation": 0.4}
+    for field in ("clips", "free", "preset", "name", "fps", "loss", "seed", "parameters", "fit"):
+        assert getattr(again, field) == getattr(changed, field), field
+    assert (again.sample, again.sigmas, again.noise) == (changed.sample, sigmas, noise)
+    (scene,) = problems.make_problem(again).data
+    found = {kind: float(scene.sigmas.correlation_of(kind)) for kind in ("ankle", "knee", "foot")}
+    assert found == {"ankle": 0.9, "knee": 0.0, "foot": 0.5}
 
 
 def project(folder: Path) -> Path:
@@ -114,18 +126,6 @@ def test_paths_to_another_drive_are_whole(tmp_path, monkeypatch):
     assert terrain_of(run.rename(tmp_path / "alone")) == Path(whole)
 
 
-def test_estimated_noise_and_correlations_by_kind_survive_in_a_run(fitted, tmp_path):
-    sigmas = {"ankle": 0.01, "correlation.ankle": 0.9, "correlation.body": 0.5}
-    noise = NoiseOptions("estimated", "whitened")
-    changed = dataclasses.replace(fitted.experiment, sigmas=sigmas, noise=noise)
-    (tmp_path / "again.toml").write_text(experiment_files.experiment_to_toml(changed))
-    again = experiment_files.load_experiment(tmp_path / "again.toml")
-    assert again.sigmas == sigmas and again.noise == noise
-    (scene,) = problems.make_problem(again).data
-    found = {kind: float(scene.sigmas.correlation_of(kind)) for kind in ("ankle", "knee", "body")}
-    assert found == {"ankle": 0.9, "knee": 0.0, "body": 0.5}
-
-
 def test_a_run_is_unfinished_until_its_numbers_are_written(fitted, tmp_path):
     save(tmp_path, fitted)
     run_folder.save_solution(tmp_path, fitted.experiment, fitted.problem, fitted.solution)
@@ -134,11 +134,8 @@ def test_a_run_is_unfinished_until_its_numbers_are_written(fitted, tmp_path):
 
 
 def test_walkers_start_near_thresholds_and_neither_too_near_nor_too_far(fitted):
-    sd = np.array([np.nan, 9.0])
-    wide = Fit(
-        fitted.experiment, fitted.problem, fitted.solution,
-        Identifiability(**(vars(fitted.identifiability) | {"sd": sd})),
-    )  # fmt: skip
+    known = dataclasses.replace(fitted.identifiability, sd=np.array([np.nan, 9.0]))
+    wide = dataclasses.replace(fitted, identifiability=known)
     np.testing.assert_array_equal(wide.start_sd, [THRESHOLD_SD, MAX_START_SD])
 
 
@@ -147,35 +144,6 @@ def test_a_gain_has_a_half_life_and_gains_at_other_rates():
     assert readings["gain_at_30_hz"] == pytest.approx(0.3)
     assert (1 - readings["gain_at_60_hz"]) ** 2 == pytest.approx(0.7)
     assert 0.7 ** (30 * readings["half_life"]) == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("fit.json", None, "no fit.json; there is"),
-        ("experiment.toml", None, "no experiment.toml"),
-        ("parameters.toml", None, "no parameters.toml"),
-        ("fit.json", "{", "fit.json: not the numbers of a fit"),
-        ("fit.json", "[]", "fit.json: not the numbers of a fit"),
-        ("fit.json", "{}", "fit.json: not the numbers of a fit: it has no parameters; `jaxik fit`"),
-        ("fit.json", '{"parameters": 3}', "fit.json: not the numbers of a fit"),
-        ("fit.json", '{"parameters": [3]}', "fit.json: not the numbers of a fit"),
-        (
-            "fit.json",
-            '{"parameters": [{"name": "x", "u": 1}]}',
-            r"parameters\[0\] has no determined",
-        ),
-        ("experiment.toml", "free = [", "experiment.toml: not TOML"),
-    ],
-)
-def test_an_unfinished_run_is_rejected(fitted, tmp_path, name, text, message):
-    save(tmp_path, fitted)
-    if text is None:
-        (tmp_path / name).unlink()
-    else:
-        (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=message):
-        run_folder.load_fit(tmp_path)
 
 
 def test_a_fitted_system_needs_neither_experiment_nor_clips(fitted, tmp_path):
@@ -194,15 +162,16 @@ def test_a_fitted_system_needs_neither_experiment_nor_clips(fitted, tmp_path):
         run_folder.load_fitted_system(moved)
 
 
-def test_a_missing_or_empty_folder_is_rejected(tmp_path):
-    with pytest.raises(ValueError, match="no such folder; `jaxik fit` makes a run"):
-        run_folder.load_fit(tmp_path / "no")
+def test_what_is_no_folder_of_a_run_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ValueError, match="file: a file; `jaxik fit`"):
-        run_folder.load_fit(tmp_path / "file")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="there is nothing"):
-        run_folder.load_fit(tmp_path / "empty")
+    for name, message in (
+        ("no", "no such folder; `jaxik fit` makes a run"),
+        ("file", "file: a file; `jaxik fit`"),
+        ("empty", "there is nothing"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run_folder.load_fit(tmp_path / name)
 
 
 def test_checking_an_output_folder_makes_nothing(tmp_path, monkeypatch):
@@ -230,3 +199,33 @@ def test_a_folder_in_which_a_search_was_killed_counts_as_new(tmp_path):
 def test_the_numbers_are_plain_json(fitted):
     summary = json.loads(json.dumps(fitted.summary, allow_nan=False))
     assert summary["cost_before"] == 90.0 and summary["converged"] is True
+
+
+# Of earlier releases
+
+
+@pytest.fixture(params=RELEASED, ids=lambda folder: folder.name)
+def released(request, tmp_path) -> Path:
+    run = Path(shutil.copytree(request.param, tmp_path / "run"))
+    experiment = run / run_folder.EXPERIMENT
+    experiment.write_text(experiment.read_text().replace("{data}", str(ROOT / "data")))
+    return run
+
+
+def test_a_released_fit_is_read_applied_and_can_be_sampled_from(released):
+    experiment, summary = run_folder.load_fit(released)
+    values = {row["name"]: row["value"] for row in summary["parameters"]}
+    assert values == pytest.approx(quick.TARGETS, abs=0.001)
+    space = problems.make_problem(experiment).space
+    start = walker_start(summary["parameters"], space)
+    started = dict(zip(space.names, space.values(start.u).tolist(), strict=True))
+    assert started == pytest.approx(values, rel=1e-6)
+    ik = run_folder.load_fitted_system(released)
+    applied = {name: float(parameter_tree.get(ik, name)) for name in values}
+    assert applied == pytest.approx(values, abs=0.001)
+
+
+def test_a_released_chain_is_refused_in_one_sentence(released, monkeypatch, capsys):
+    small_studies.quick_fits(monkeypatch)
+    line = refusal(["sample", released], released, capsys)
+    assert "chain.h5 holds the chain of another run" in line and "delete the file" in line
