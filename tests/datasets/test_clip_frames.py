@@ -1,6 +1,7 @@
 """Conversion of clips to frames of the pipeline, and of its results to clips."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ from scipy.spatial.transform import Rotation
 import jaxik
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import contacts
-from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import gait, speed_profile, walker
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
@@ -32,47 +32,44 @@ def result(clip):
     return jaxik.run(ik, clip.rig, ground, clip_frames.frames_from_clip(clip))
 
 
+def rotation(wxyz) -> Rotation:
+    return Rotation.from_quat(np.asarray(wxyz), scalar_first=True)
+
+
+def placed(world, pose: jaxik.LegPose) -> np.ndarray:
+    """Joints of a pose in model space, m, in world space, (frames, legs, roles, 3)."""
+    joints = np.stack([part.pos for part in (pose.hip, pose.knee, pose.ankle, pose.toe)], axis=2)
+    turned = np.einsum("fij,flrj->flri", rotation(world.rot).as_matrix(), joints)
+    return turned + np.asarray(world.pos)[:, None, None]
+
+
 def test_frames_hold_the_clip_in_model_space_above_the_floor(clip):
     frames = clip_frames.frames_from_clip(clip, floor=-0.1)
+    joints = clip.positions_ws[:, np.array(clip.rig.joints)]
+    found = placed(frames.world_from_model, frames.pose)
+    np.testing.assert_allclose(found, joints, rtol=0, atol=1e-9)
     pose = frames.pose
-    for role, joint in enumerate((pose.hip, pose.knee, pose.ankle, pose.toe)):
-        world = frames.world_from_model
-        for leg in range(2):
-            placed = Rotation.from_quat(np.array(world.rot), scalar_first=True).apply(
-                np.array(joint.pos[:, leg])
-            )
-            np.testing.assert_allclose(
-                placed + world.pos, clip.joints_ws(role)[:, leg], rtol=0, atol=1e-9
-            )
     assert float(pose.ankle.pos[..., 1].min()) == pytest.approx(gait.ANKLE_HEIGHT + 0.1)
     assert frames.weight.shape == (clip.frame_count, 2)
     np.testing.assert_allclose(frames.dt, 1 / FPS)
     np.testing.assert_array_equal(frames.slide, clip.slide)
     np.testing.assert_allclose(frames.speed, gait.STRIDE / gait.PERIOD, rtol=0.02)
-
-
-def test_a_single_frame_has_no_speed_and_no_slide(clip):
-    frames = clip_frames.frames_from_clip(dataclasses.replace(clip, slide=None).select(slice(0, 1)))
-    np.testing.assert_array_equal(frames.speed, [0.0])
-    np.testing.assert_array_equal(frames.slide, [0.0])
+    steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
+    np.testing.assert_allclose(frames.toe_speed[1:], steps, rtol=1e-9)
+    alone = dataclasses.replace(clip, slide=None).select(slice(0, 1))
+    frame = clip_frames.frames_from_clip(alone)
+    np.testing.assert_array_equal([frame.speed, frame.slide], [[0.0], [0.0]])
 
 
 def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(clip, result):
     solved = clip_frames.clip_from_result(clip, result)
-    world = clip.world_from_model()
-    for leg, joints in enumerate(clip.rig.joints):
-        joints_ms = (result.pose.hip, result.pose.knee, result.pose.ankle, result.pose.toe)
-        for joint, part in zip(joints, joints_ms, strict=True):
-            for frame in (0, 40, 119):
-                rot = Rotation.from_quat(np.array(world.rot[frame]), scalar_first=True)
-                position = rot.apply(np.array(part.pos[frame, leg])) + world.pos[frame]
-                np.testing.assert_allclose(solved.positions_ws[frame, joint], position, atol=1e-9)
-    before = clip.positions_ws[:, 1] - clip.positions_ws[:, 0]
-    after = solved.positions_ws[:, 1] - solved.positions_ws[:, 0]
-    lengths = np.linalg.norm(before, axis=-1), np.linalg.norm(after, axis=-1)
+    joints = solved.positions_ws[:, np.array(clip.rig.joints)]
+    np.testing.assert_allclose(joints, placed(clip.world_from_model(), result.pose), atol=1e-9)
+    lengths = [
+        np.linalg.norm(c.positions_ws[:, 1] - c.positions_ws[:, 0], axis=-1) for c in (clip, solved)
+    ]
     np.testing.assert_allclose(*lengths, rtol=0, atol=1e-9)
-    tilt = Rotation.from_quat(solved.rotations_ws[100, 0], scalar_first=True).magnitude()
-    assert tilt > 0.03
+    assert rotation(solved.rotations_ws[100, 0]).magnitude() > 0.03
     assert solved.rig.joints == clip.rig.joints
 
 
@@ -80,7 +77,7 @@ def with_joints(clip, joints):
     """The clip with further joints: name, parent, and offset in the parent's space, m."""
     for name, parent, offset in joints:
         rotations = clip.rotations_ws[:, parent]
-        turned = Rotation.from_quat(rotations, scalar_first=True).apply(offset)
+        turned = rotation(rotations).apply(offset)
         positions = clip.positions_ws[:, parent] + turned
         clip = dataclasses.replace(
             clip,
@@ -94,11 +91,11 @@ def with_joints(clip, joints):
 
 
 def test_joints_above_the_pelvis_and_below_a_foot_stay_rigid_on_their_parents(clip, result):
-    longer = with_joints(clip, [("tip", 4, [0.01, -0.02, 0.05]), ("head", 0, [0.0, 0.6, 0.0])])
-    solved = clip_frames.clip_from_result(longer, result)
-    for joint, parent, offset in ((9, 4, [0.01, -0.02, 0.05]), (10, 0, [0.0, 0.6, 0.0])):
-        parent_rot = Rotation.from_quat(solved.rotations_ws[:, parent], scalar_first=True)
-        attached = solved.positions_ws[:, parent] + parent_rot.apply(offset)
+    added = [("tip", 4, [0.01, -0.02, 0.05]), ("head", 0, [0.0, 0.6, 0.0])]
+    solved = clip_frames.clip_from_result(with_joints(clip, added), result)
+    for joint, (_, parent, offset) in enumerate(added, 9):
+        turned = rotation(solved.rotations_ws[:, parent]).apply(offset)
+        attached = solved.positions_ws[:, parent] + turned
         np.testing.assert_allclose(solved.positions_ws[:, joint], attached, rtol=0, atol=1e-9)
         cosine = np.abs(np.sum(solved.rotations_ws[:, joint] * solved.rotations_ws[:, parent], -1))
         np.testing.assert_allclose(cosine, 1.0, atol=1e-12)
@@ -118,7 +115,7 @@ def test_spine_and_head_lean_as_the_system_says(clip, result):
     leaning = dataclasses.replace(result, corrections=corrections)
     leant = clip_frames.clip_from_result(taller, leaning)
     np.testing.assert_array_equal(leant.positions_ws[:, :10], plain.positions_ws[:, :10])
-    root = Rotation.from_quat(np.array(clip.world_from_model().rot), scalar_first=True)
+    root = rotation(clip.world_from_model().rot)
     turn = root * bend * root.inv()  # world axes
     for joint, pivot in ((10, 9), (11, 9), (12, 9)):
         arm = plain.positions_ws[:, joint] - plain.positions_ws[:, pivot]
@@ -130,8 +127,11 @@ def test_spine_and_head_lean_as_the_system_says(clip, result):
     np.testing.assert_array_equal(legs_only.positions_ws, plain.positions_ws[:, :9])
 
 
+QUIET = {"lock.enabled": jnp.array(False)}
+
+
 def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):
-    quiet = {"lock.enabled": jnp.array(False), "leg.max_knee_angle": 3.1415, "leg.soften": 1.0}
+    quiet = QUIET | {"leg.max_knee_angle": 3.1415, "leg.soften": 1.0}
     ik = parameter_tree.replace(jaxik.presets.record(), quiet)
     result = jaxik.run(ik, clip.rig, terrain.plane(), clip_frames.frames_from_clip(clip))
     solved = clip_frames.clip_from_result(clip, result)
@@ -141,30 +141,25 @@ def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):
 
 
 def test_strides_go_from_stance_to_stance(clip):
-    stride, stance = clip_frames.frames_from_clip(clip).stride, clip.stance_labels()
+    stride = jax.tree.map(np.asarray, clip_frames.frames_from_clip(clip).stride)
+    stance = clip.stance_labels()
     np.testing.assert_array_equal(stride.standing, stance)
     assert stride.aside_ws is not None
     balls = clip.joints_ws(3)
     for leg in range(2):
         stances = contacts.runs(stance[:, leg])
-        np.testing.assert_array_equal(stride.known[: stances[-1][1] + 1, leg], 1.0)
-        np.testing.assert_array_equal(stride.known[stances[-1][1] + 1 :, leg], 0.0)
+        expected = np.arange(clip.frame_count) <= stances[-1][1]
+        np.testing.assert_array_equal(stride.known[:, leg], expected)
         middles = [np.median(balls[a : b + 1, leg], axis=0) for a, b in stances]
-        for (first, last), (next_first, _), position, next_position in zip(
-            stances, stances[1:], middles, middles[1:], strict=False
-        ):
-            np.testing.assert_array_equal(
-                stride.last_ws[first:next_first, leg], [position] * (next_first - first)
-            )
-            np.testing.assert_array_equal(
-                stride.next_ws[first:next_first, leg], [next_position] * (next_first - first)
-            )
-            aside_ws = np.asarray(stride.aside_ws[first:next_first, leg])
+        for n, ((first, last), (landing, _)) in enumerate(itertools.pairwise(stances)):
+            here = slice(first, landing)
+            assert (stride.last_ws[here, leg] == middles[n]).all()
+            assert (stride.next_ws[here, leg] == middles[n + 1]).all()
+            aside_ws = np.asarray(stride.aside_ws[here, leg])
             assert np.all(aside_ws == aside_ws[0]) and aside_ws[0, 1] == 0.0 < np.ptp(aside_ws)
             np.testing.assert_array_equal(stride.fraction[first : last + 1, leg], 0.0)
-            np.testing.assert_allclose(
-                np.diff(stride.fraction[last:next_first, leg]), 1 / (next_first - last), rtol=1e-9
-            )
+            steps = np.diff(stride.fraction[last:landing, leg])
+            np.testing.assert_allclose(steps, 1 / (landing - last), rtol=1e-9)
 
 
 @pytest.mark.parametrize("up_ws", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
@@ -189,34 +184,19 @@ def test_a_foot_that_never_stands_has_an_unknown_stride(clip):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(stride))
 
 
-def test_toe_speed_is_that_of_the_toes(clip):
-    frames = clip_frames.frames_from_clip(clip)
-    steps = np.linalg.norm(np.diff(clip.joints_ws(3), axis=0), axis=-1) * FPS
-    np.testing.assert_allclose(frames.toe_speed[1:], steps, rtol=1e-9)
-
-
-def test_a_raised_character_has_the_pose_and_the_speeds_of_its_floor(clip):
+def test_a_raised_character_has_the_pose_speeds_and_contact_labels_of_its_floor(clip):
     rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
     frames, flat = (clip_frames.frames_from_clip(clip, rise=height) for height in (rise, None))
     moved = np.asarray(frames.world_from_model.pos - flat.world_from_model.pos)
     np.testing.assert_allclose(moved, rise[:, None] * [0.0, 1.0, 0.0], atol=1e-12)
     same = dataclasses.replace(frames, world_from_model=flat.world_from_model)
-    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(flat), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def test_foot_ik_that_changes_nothing_returns_the_raised_clip(clip):
-    rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
-    quiet = {"lock.enabled": jnp.array(False), "leg.weight": jnp.array(0.0)}
-    ik = parameter_tree.replace(jaxik.presets.record(), quiet)
-    far = terrain.plane((0.0, -9.0, 0.0))
-    result = jaxik.run(ik, clip.rig, far, clip_frames.frames_from_clip(clip, rise=rise))
+    jax.tree.map(np.testing.assert_array_equal, same, flat)
+    # Foot IK that changes nothing gives the raised clip.
+    ik = parameter_tree.replace(jaxik.presets.record(), QUIET | {"leg.weight": jnp.array(0.0)})
+    result = jaxik.run(ik, clip.rig, terrain.plane((0.0, -9.0, 0.0)), frames)
     solved = clip_frames.clip_from_result(clip, result, rise=rise)
     raised = clip_frames.raised(clip, rise)
     np.testing.assert_allclose(solved.positions_ws, raised.positions_ws, rtol=0, atol=1e-9)
-
-
-def test_a_raised_clip_keeps_its_contact_labels(clip):
     unlabelled = dataclasses.replace(clip, stance=None)
     raised = clip_frames.raised(unlabelled, np.linspace(0.0, 2.0, clip.frame_count))
     np.testing.assert_array_equal(raised.stance_labels(), unlabelled.stance_labels())
@@ -226,17 +206,11 @@ def test_a_raised_clip_keeps_its_contact_labels(clip):
 # Teleports
 
 
-def teleported(clip: Clip, frame: int) -> Clip:
-    """The clip with all frames from this one on eight metres to the side."""
-    positions = clip.positions_ws.copy()
-    positions[frame:, :, 0] += 8.0
-    return clip.with_motion(positions, clip.rotations_ws)
-
-
 def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
-    jumped = teleported(clip, 70)
-    assert clip.cuts == ()
-    assert jumped.cuts == (70,)
+    positions = clip.positions_ws.copy()
+    positions[70:, :, 0] += 8.0
+    jumped = clip.with_motion(positions, clip.rotations_ws)
+    assert (clip.cuts, jumped.cuts) == ((), (70,))
     frames = clip_frames.frames_from_clip(jumped)
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(frames.restart)), [70])
     assert clip_frames.frames_from_clip(clip).restart is None
@@ -244,9 +218,9 @@ def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
     for name in ("velocity_ws", "foot_speed", "toe_speed"):
         expected = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_allclose(getattr(frames, name), expected, atol=1e-6)
-    for name in ("last_ws", "next_ws", "fraction", "known"):
-        expected = np.concatenate([getattr(part.stride, name) for part in parts])
-        np.testing.assert_allclose(getattr(frames.stride, name), expected, atol=1e-6)
+    leaves = (jax.tree.leaves(each.stride) for each in (frames, *parts))
+    for found, *each in zip(*leaves, strict=True):
+        np.testing.assert_allclose(found, np.concatenate(each), atol=1e-6)
 
 
 @pytest.mark.parametrize("fps", [10.0, 60.0])

@@ -13,8 +13,8 @@ from fitting.datasets.clips import load_clip
 from fitting.datasets.clips.formats.c3d.marker_sets import guess_map
 from fitting.datasets.clips.formats.c3d.plug_in_gait import chord, hip_centres
 from fitting.datasets.clips.summary import as_text, describe
-from support.c3d_files import WIDTHS, both_sides, plug_in_gait, write_c3d
-from support.sample_clips import stair_walk
+from support.c3d_files import MEASURES, plug_in_gait, write_c3d
+from support.sample_clips import flat_floor, stair_walk
 
 pytest.importorskip("ezc3d", reason="C3D files are read by ezc3d, the extra c3d")
 
@@ -25,7 +25,13 @@ ROLES = ("hip", "knee", "ankle", "toe")
 
 @pytest.fixture(scope="module")
 def body():
-    return stair_walk(lambda points: np.zeros(len(points)), strides=2)
+    return stair_walk(flat_floor, strides=2)
+
+
+@pytest.fixture(scope="module")
+def at(body):
+    """Where the body's joints are, by name."""
+    return {name: body.positions_ws[:, i] for i, name in enumerate(body.joint_names)}
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +42,7 @@ def places(body):
 @pytest.fixture(scope="module")
 def walk(places, tmp_path_factory):
     """A whole file."""
-    path = tmp_path_factory.mktemp("c3d") / "walk.c3d"
-    return write_c3d(path, places, measures=both_sides(WIDTHS))
+    return write_c3d(tmp_path_factory.mktemp("c3d") / "walk.c3d", places, measures=MEASURES)
 
 
 def errors(clip, body) -> np.ndarray:
@@ -49,7 +54,7 @@ def errors(clip, body) -> np.ndarray:
     return np.linalg.norm(mine - theirs, axis=-1)
 
 
-def test_joint_centres_are_those_of_the_body(walk, body):
+def test_joint_centres_and_rotations_are_those_of_the_body(walk, body):
     clip = load_clip(walk)
     assert errors(clip, body).max() < TOLERANCE
     assert (clip.fps, clip.up_axis, clip.scale, clip.mask) == (60.0, "z", 0.001, None)
@@ -57,10 +62,6 @@ def test_joint_centres_are_those_of_the_body(walk, body):
     np.testing.assert_allclose(clip.rig.thigh, 0.5, atol=TOLERANCE)
     np.testing.assert_allclose(clip.rig.shin, 0.48, atol=TOLERANCE)
     np.testing.assert_allclose(clip.rig.ball_height, body.rig.ball_height, atol=1e-4)
-
-
-def test_rotations_are_those_of_the_body(walk, body):
-    clip = load_clip(walk)
     for name in body.joint_names:  # whose own axes differ by a constant rotation
         mine, theirs = (
             Rotation.from_quat(c.rotations_ws[:, c.joint_names.index(name)], scalar_first=True)
@@ -70,31 +71,24 @@ def test_rotations_are_those_of_the_body(walk, body):
         assert (between[0].inv() * between).magnitude().max() < 1e-3, name
 
 
-def test_hips_lie_where_the_regression_says():
+def test_hips_lie_where_the_regression_says_and_a_chord_is_at_right_angles_to_its_joint():
     """A pelvis 240 mm wide and 150 mm deep: 0.24 · 150 + 9.9 = 45.9 mm back, 0.30 · 240 + 10.9 =
     82.9 mm down, 0.33 · 240 + 7.3 = 86.5 mm to the side."""
-    left, right, back = (np.array([p]) for p in ([120, 0, 0], [-120, 0, 0], [0, 0, -150]))
-    centres = hip_centres(left / 1000, right / 1000, back / 1000)
-    np.testing.assert_allclose(centres[0], [[0.0865, -0.0829, -0.0459]], atol=1e-12)
-    np.testing.assert_allclose(centres[1], [[-0.0865, -0.0829, -0.0459]], atol=1e-12)
-
-
-def test_a_chord_makes_a_right_angle_at_the_joint():
-    """Legs of 3 and 4 on a diameter of 5: the centre is 3 from the marker and 4 from the hip."""
+    corners = np.array([[0.12, 0, 0], [-0.12, 0, 0], [0, 0, -0.15]])[:, None]
+    expected = [[[0.0865, -0.0829, -0.0459]], [[-0.0865, -0.0829, -0.0459]]]
+    np.testing.assert_allclose(hip_centres(*corners), expected, atol=1e-12)
+    # Legs of 3 and 4 on a diameter of 5: the centre is 3 from the marker and 4 from the hip.
     hip, knee, wand = (np.array([p]) for p in ([0.0, 5, 0], [0.0, 0, 0], [1.0, 2, 0]))
     np.testing.assert_allclose(chord(hip, knee, wand, 3.0), [[-2.4, 1.8, 0.0]], atol=1e-12)
 
 
 def test_frames_with_gaps_are_masked_and_nothing_is_measured_on_them(places, body, tmp_path):
     gaps = {name: place.copy() for name, place in places.items()}
-    gaps["LTHI"][40:50] = np.nan
-    gaps["LASI"][:5] = np.nan
-    gaps["RTOE"][-3:] = np.nan
-    clip = load_clip(write_c3d(tmp_path / "gaps.c3d", gaps, measures=both_sides(WIDTHS)))
+    for name, frames in (("LTHI", slice(40, 50)), ("LASI", slice(5)), ("RTOE", slice(-3, None))):
+        gaps[name][frames] = np.nan
+    clip = load_clip(write_c3d(tmp_path / "gaps.c3d", gaps, measures=MEASURES))
     assert clip.mask is not None
-    masked = np.flatnonzero(~clip.mask).tolist()
-    last = body.frame_count
-    assert masked == [*range(5), *range(40, 50), *range(last - 3, last)]
+    assert np.flatnonzero(~clip.mask).tolist() == [*range(5), *range(40, 50), *range(105, 108)]
     assert errors(clip, body)[clip.mask].max() < TOLERANCE
     assert np.isfinite(clip.positions_ws).all() and np.isfinite(clip.rotations_ws).all()
     np.testing.assert_allclose(clip.rig.shin, 0.48, atol=TOLERANCE)
@@ -105,7 +99,7 @@ def test_frames_with_gaps_are_masked_and_nothing_is_measured_on_them(places, bod
 def test_units_axes_rate_and_names_are_the_files_own(places, body, tmp_path):
     named = {f"Bob:{name}": place for name, place in places.items()}
     stated = {"UNITS": "m", "X_SCREEN": "+X", "Y_SCREEN": "+Z"}
-    options = {"measures": both_sides(WIDTHS), "rate": 120.0}
+    options = {"measures": MEASURES, "rate": 120.0}
     path = write_c3d(tmp_path / "m.c3d", named, point=stated, unit=1.0, **options)
     clip = load_clip(path)
     assert errors(clip, body).max() < TOLERANCE
@@ -126,8 +120,7 @@ def test_what_is_not_stated_is_guessed_with_a_remark(places, body, tmp_path):
     assert load_clip(path, scale=0.002).rig.thigh[0] == pytest.approx(1.0, rel=0.05)
 
 
-def test_joint_centres_in_the_file_are_taken(places, body, tmp_path):
-    at = {name: body.positions_ws[:, i] for i, name in enumerate(body.joint_names)}
+def test_joint_centres_in_the_file_are_taken(places, body, at, tmp_path):
     modelled = dict(places)
     for side, letter in (("left", "L"), ("right", "R")):
         for joint, ending in (("hip", "HJC"), ("knee", "KJC"), ("ankle", "AJC")):
@@ -138,49 +131,39 @@ def test_joint_centres_in_the_file_are_taken(places, body, tmp_path):
     np.testing.assert_allclose(off[..., :3], 0.01, atol=TOLERANCE)
 
 
-def test_a_map_names_markers_and_means_of_markers(places, body, tmp_path):
-    at = {name: body.positions_ws[:, i] for i, name in enumerate(body.joint_names)}
+def test_a_map_names_markers_and_means_of_markers(places, body, at, tmp_path):
     lines = ['pelvis = "LASI + RASI + LPSI + RPSI"']
     own = {name: places[name] for name in ("LASI", "RASI", "LPSI", "RPSI")}
-    for side in ("left", "right"):
-        for role in ROLES:
-            joint = at[f"{side}_{role}"]
-            own |= {
-                f"{side} {role} in": joint - [0.03, 0, 0],
-                f"{side}{role}out": joint + [0.03, 0, 0],
-            }
-            lines.append(f'{role}_{side} = "{side} {role} in + {side}{role}out"')
-    (tmp_path / "map.toml").write_text("\n".join(lines))
-    path = write_c3d(tmp_path / "own.c3d", own)
-    clip = load_clip(path, joints=tmp_path / "map.toml")
+    for joint in [name for name in at if name != "pelvis"]:
+        side, role = joint.split("_")
+        own[f"{side} {role} in"] = at[joint] - [0.03, 0, 0]
+        own[f"{side}{role}out"] = at[joint] + [0.03, 0, 0]
+        lines.append(f'{role}_{side} = "{side} {role} in + {side}{role}out"')
+    path, map_file = write_c3d(tmp_path / "own.c3d", own), tmp_path / "map.toml"
+    map_file.write_text("\n".join(lines))
+    clip = load_clip(path, joints=map_file)
     assert errors(clip, body).max() < TOLERANCE and clip.dialect == "by hand"
     bare = load_clip(path)
     assert set(own) <= set(bare.joint_names) and bare.measured_rig is None
     assert any("no set of markers recognised" in remark for remark in bare.remarks)
     lines[1] = 'hip_left = "LASI + nobody"'
-    (tmp_path / "map.toml").write_text("\n".join(lines))
+    map_file.write_text("\n".join(lines))
     with pytest.raises(ValueError, match="own.c3d: hip_left .* no marker 'nobody'; there are"):
-        load_clip(path, joints=tmp_path / "map.toml")
+        load_clip(path, joints=map_file)
+    with pytest.raises(ValueError, match="there is no pelvis; a joint map names it"):
+        load_clip(path, joints={"hip_left": "LASI"})
 
 
-def test_a_map_of_markers_is_drafted_and_no_map_of_an_npz(walk, body, tmp_path, capsys):
+def test_a_map_of_markers_is_drafted_by_how_their_names_begin_and_no_map_of_an_npz(walk, capsys):
     assert main.main(["inspect", str(walk), "--joints"]) == 0
     draft = capsys.readouterr().out
     assert 'pelvis = "LASI + RASI + LPSI + RPSI"' in draft and 'toe_right = "RTOE"' in draft
     assert "#LTHI" in draft
     assert main.main(["inspect", str(ARCHIVE), "--joints"]) == main.MISTAKE
     assert "takes no joint map" in capsys.readouterr().err
-
-
-def test_markers_are_guessed_by_how_their_names_begin():
     draft = guess_map(("lateral_ankle", "LKNE", "left_toe", "R.KNE", "Bob:RANK"))
     assert (draft["ankle_left"], draft["knee_left"], draft["toe_left"]) == ("", "LKNE", "left_toe")
     assert (draft["knee_right"], draft["ankle_right"]) == ("R.KNE", "Bob:RANK")
-
-
-def test_a_joint_map_in_memory_is_checked_as_a_file_is(walk):
-    with pytest.raises(ValueError, match="there is no pelvis; a joint map names it"):
-        load_clip(walk, joints={"hip_left": "LASI"})
 
 
 def test_files_without_motion_are_refused_in_one_line(walk, places, tmp_path, monkeypatch):

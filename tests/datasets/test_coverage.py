@@ -36,9 +36,8 @@ def covered(
         return load_terrain(folder / "hill.obj", **vars(options))
 
     measured = coverage.measure(walk, load(options), options, load)
-    if measured.remedy is not None:
-        again = coverage.measure(walk, load(measured.remedy), measured.remedy)
-        assert again.is_enough
+    remedy = measured.remedy
+    assert remedy is None or coverage.measure(walk, load(remedy), remedy).is_enough
     return measured
 
 
@@ -49,66 +48,59 @@ def test_a_terrain_in_place_needs_no_remedy(walk, tmp_path):
     assert measured.feet.low[2] < 0.2 and measured.feet.high[2] > 5.0
 
 
-FAR = np.array([480_000.0, 120.0, -5_200_000.0])
+def z_up(vertices: np.ndarray) -> np.ndarray:
+    return vertices @ Z_UP_FROM_Y_UP.T
 
 
-@pytest.mark.parametrize(
-    ("change", "options", "words"),
-    [
-        (lambda v: v @ Z_UP_FROM_Y_UP.T, {}, "--file-up z"),
+def test_the_other_axis_and_other_units_are_named(walk, tmp_path):
+    for change, options, words in (
+        (z_up, {}, "--file-up z"),
         (lambda v: v, {"file_up": "z"}, "--file-up y"),
         (lambda v: v / 100, {}, "--terrain-scale 100"),
         (lambda v: 100 * v, {"scale": 0.0001}, "--terrain-scale 0.01"),
         (lambda v: (v * [1, 1, 0.3] + [0, 0, 1]) / 0.0254, {}, "--terrain-scale 0.0254"),
         (lambda v: (v + [0, 0, 2.1]) * 100, {}, "--terrain-scale 0.01"),
         (
-            lambda v: (v * [1, 0.01, 1] + [0, 0, 2.1]) @ Z_UP_FROM_Y_UP.T * 100,
+            lambda v: z_up(v * [1, 0.01, 1] + [0, 0, 2.1]) * 100,
             {},
             "--file-up z --terrain-scale 0.01",
         ),
-    ],
-)
-def test_the_other_axis_and_other_units_are_named(walk, tmp_path, change, options, words):
-    measured = covered(walk, tmp_path, change(hill().vertices), TerrainOptions(**options))
-    assert measured.share < 0.5
-    assert measured.text().endswith(f"; likely remedy: {words}")
+    ):
+        measured = covered(walk, tmp_path, change(hill().vertices), TerrainOptions(**options))
+        assert measured.share < 0.5
+        assert measured.text().endswith(f"; likely remedy: {words}")
 
 
 def test_a_terrain_far_from_the_origin_is_moved_below_the_feet(walk, tmp_path):
-    measured = covered(walk, tmp_path, hill().vertices + FAR)
+    far = np.array([480_000.0, 120.0, -5_200_000.0])
+    measured = covered(walk, tmp_path, hill().vertices + far)
     assert measured.share == 0.0 and measured.remedy is not None
     moved = np.array(measured.remedy.offset)
-    np.testing.assert_allclose((moved + FAR)[[0, 2]], [0.0, 0.0], atol=16.0)
-    assert abs((moved + FAR)[1]) < 2.5
-    words = " ".join(f"{value:.10g}" for value in moved)
-    assert measured.text().endswith(f"; likely remedy: --terrain-offset {words}")
-    keys = ", ".join(words.split())
-    assert measured.text(as_keys=True).endswith(f"; likely remedy: terrain_offset = [{keys}]")
+    np.testing.assert_allclose((moved + far)[[0, 2]], [0.0, 0.0], atol=16.0)
+    assert abs((moved + far)[1]) < 2.5
+    words = [f"{value:.10g}" for value in moved]
+    assert measured.text().endswith(f"; likely remedy: --terrain-offset {' '.join(words)}")
+    in_keys = f"; likely remedy: terrain_offset = [{', '.join(words)}]"
+    assert measured.text(as_keys=True).endswith(in_keys)
 
 
-def test_a_terrain_that_is_aside_and_upright_is_laid_down_and_moved(walk, tmp_path):
-    vertices = (hill().vertices + [500.0, 0.0, 0.0]) @ Z_UP_FROM_Y_UP.T
-    measured = covered(walk, tmp_path, vertices)
-    assert measured.remedy is not None and measured.remedy.file_up == "z"
-    assert measured.remedy.offset[0] == pytest.approx(-500.0, abs=0.5)
+def test_a_terrain_that_is_aside_is_moved_from_a_given_offset_or_after_it_is_laid_down(
+    walk, tmp_path
+):
+    upright = z_up(hill().vertices + [500.0, 0.0, 0.0])
+    aside = TerrainOptions(offset=(300.0, 0.0, 0.0))
+    cases = (upright, AS_IS, "z", -500.0), (hill().vertices, aside, "y", 0.0)
+    for vertices, options, file_up, moved in cases:
+        remedy = covered(walk, tmp_path, vertices, options).remedy
+        assert remedy is not None and remedy.file_up == file_up
+        assert remedy.offset[0] == pytest.approx(moved, abs=0.5)
 
 
-def test_an_offset_that_was_given_is_corrected(walk, tmp_path):
-    options = TerrainOptions(offset=(300.0, 0.0, 0.0))
-    measured = covered(walk, tmp_path, hill().vertices, options)
-    assert measured.remedy is not None and abs(measured.remedy.offset[0]) < 0.5
-
-
-def test_a_terrain_smaller_than_the_path_has_no_remedy(walk, tmp_path):
-    vertices = hill().vertices * [1.0, 1.0, 0.01]
-    measured = covered(walk, tmp_path, vertices * [1, 1, 1] + [50.0, 0.0, 0.0])
+def test_a_terrain_below_no_or_only_a_part_of_the_path_has_no_remedy(walk, tmp_path):
+    measured = covered(walk, tmp_path, hill().vertices * [1.0, 1.0, 0.01] + [50.0, 0.0, 0.0])
     assert measured.remedy is None
     assert measured.text().endswith("offset helps: does the terrain cover the whole path?")
-
-
-def test_a_terrain_below_a_part_of_the_path_is_in_the_right_unit(walk, tmp_path):
-    part = hill().vertices * [1.0, 1.0, 0.1] + [0.0, 0.0, 1.0]
-    measured = covered(walk, tmp_path, part)
+    measured = covered(walk, tmp_path, hill().vertices * [1.0, 1.0, 0.1] + [0.0, 0.0, 1.0])
     assert 0.2 < measured.share < 0.5 and measured.remedy is None
 
 

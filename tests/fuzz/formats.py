@@ -6,7 +6,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from fitting.runtime.validation import error_context
 from fitting.studies import run_folder, translation
 from jaxik import presets, record
 from support import experiments
-from support.c3d_files import WIDTHS, both_sides, plug_in_gait, write_c3d
+from support.c3d_files import MEASURES, plug_in_gait, write_c3d
 from support.gltf_files import walker
 from support.records import packed
 from support.sample_clips import AMC, ASF, BVH, stair_walk
@@ -44,6 +44,7 @@ from .damage import (
 )
 
 DATA = experiments.ROOT / "data"
+TRUTH = DATA / "clips" / "uneven_walk_truth.toml"
 TRACKS = """
 [grounded]
 times = [0.0, 0.2, 0.4]
@@ -91,12 +92,27 @@ name = "locks"
 parameters = { lock.enabled = false }
 free = { pelvis.limit = {} }
 """
-RUN = {
-    "parameters": [
-        {"name": "lean.gain", "unit": "1", "u": 0.5, "start_sd": 0.1, "value": 0.2}
-        | {"determined": True}
-    ]
-}
+FITTED = {"name": "lean.gain", "unit": "1", "u": 0.5, "start_sd": 0.1, "value": 0.2}
+RUN = {"parameters": [FITTED | {"determined": True}]}
+
+
+def system_as(suffix: str) -> bytes:
+    """All parameters of a system."""
+    write = {".toml": parameter_files.system_to_toml, ".json": parameter_files.system_to_json}
+    return write[suffix](presets.record()).encode()
+
+
+def load_system(path: Path) -> None:
+    soundness.check_system(parameter_files.load_system(path)[0])
+
+
+def load_settings(path: Path) -> None:
+    soundness.check_system(settings_files.load_settings(path)[0])
+
+
+def load_truth(path: Path) -> None:
+    experiment = experiments.write(path.parent, clip=f'truth = "{path}"\n')
+    load_known_values(load_experiment(experiment))
 
 
 def settings_of_mec(suffix: str = ".toml") -> bytes:
@@ -140,7 +156,7 @@ def capture_bytes() -> bytes:
         path = Path(folder) / "walk.c3d"
         places = plug_in_gait(stair_walk().select(slice(0, 12)))
         places["LTHI"][4] = np.nan
-        return write_c3d(path, places, measures=both_sides(WIDTHS), channels=2).read_bytes()
+        return write_c3d(path, places, measures=MEASURES, channels=2).read_bytes()
 
 
 def blocks_archive() -> bytes:
@@ -163,14 +179,8 @@ def heightfield_archive() -> bytes:
     """A heightfield of four rows and five columns with a hole."""
     heights = np.arange(20.0).reshape(4, 5) / 50
     heights[0, 0] = np.nan
-    return archive_of(
-        {
-            "heights": heights,
-            "spacing": np.array([0.5, 0.4]),
-            "origin": np.zeros(3),
-            "interpolation": np.array("triangulated"),
-        }
-    )
+    arrays = {"heights": heights, "spacing": np.array([0.5, 0.4]), "origin": np.zeros(3)}
+    return archive_of(arrays | {"interpolation": np.array("triangulated")})
 
 
 def heights_array() -> bytes:
@@ -188,9 +198,11 @@ def heights_picture() -> bytes:
     return file.getvalue()
 
 
-def load_heights(path: Path) -> None:
-    """Reads a heightfield that does not say how far its heights are apart, nor how high."""
-    soundness.check_terrain(load_terrain(path, cell=0.5, scale=0.001))
+def load_ground(path: Path, **options: float) -> None:
+    soundness.check_terrain(load_terrain(path, **options))
+
+
+load_heights = partial(load_ground, cell=0.5, scale=0.001)  # which the file does not say
 
 
 def load_with_map(path: Path) -> None:
@@ -211,10 +223,7 @@ def mesh_bytes(kind: str) -> bytes:
     """A hill of 18 triangles as trimesh writes it."""
     x, z = (part.ravel() for part in np.meshgrid(np.arange(4.0), np.arange(4.0)))
     corner = (np.arange(3)[:, None] * 4 + np.arange(3)).ravel()
-    near, far = corner, corner + 4
-    faces = np.concatenate(
-        [np.stack([near, far, far + 1], -1), np.stack([near, far + 1, near + 1], -1)]
-    )
+    faces = np.concatenate([corner[:, None] + [0, 4, 5], corner[:, None] + [0, 5, 1]])
     hill = trimesh.Trimesh(np.stack([x, 0.1 * x * z, z], -1), faces, process=False)
     options = {"encoding": "ascii"} if kind == "ply_ascii" else {}
     content = hill.export(file_type=kind.removesuffix("_ascii") if options else kind, **options)
@@ -248,17 +257,7 @@ def clip_format(name: str, whole: Callable[[], bytes], **options) -> Format:
 def mesh_format(kind: str, damage: Callable[[Random, bytes], bytes]) -> Format:
     """A kind of mesh."""
     suffix = kind.removesuffix("_ascii")
-    return Format(
-        f"hill.{suffix}",
-        lambda: mesh_bytes(kind),
-        lambda path: soundness.check_terrain(load_terrain(path)),
-        damage,
-    )
-
-
-def text_of(path: Path) -> Callable[[], bytes]:
-    """A file of this repository."""
-    return path.read_bytes
+    return Format(f"hill.{suffix}", lambda: mesh_bytes(kind), load_ground, damage)
 
 
 FORMATS: dict[str, Format] = {
@@ -275,12 +274,7 @@ FORMATS: dict[str, Format] = {
     "clip, C3D": clip_format("walk.c3d", capture_bytes, damage=damage_bytes),
     "clip, NPZ": clip_format("walk.npz", lambda: clip_bytes(".npz"), damage=damage_arrays),
     "clip, blocks": clip_format("blocks.npz", blocks_archive, damage=damage_arrays),
-    "heightfield": Format(
-        "hill.npz",
-        heightfield_archive,
-        lambda path: soundness.check_terrain(load_terrain(path)),
-        damage_arrays,
-    ),
+    "heightfield": Format("hill.npz", heightfield_archive, load_ground, damage_arrays),
     "heights, NPY": Format("hill.npy", heights_array, load_heights, damage_bytes),
     "heights, PNG": Format("hill.png", heights_picture, load_heights, damage_bytes),
     "joint map": Format(
@@ -299,37 +293,13 @@ FORMATS: dict[str, Format] = {
         lambda path: soundness.check_experiment(load_experiment(path)),
         damage_toml,
     ),
-    "parameters": Format(
-        "footik.toml",
-        lambda: parameter_files.system_to_toml(presets.record()).encode(),
-        lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
-        damage_toml,
-    ),
+    "parameters": Format("footik.toml", partial(system_as, ".toml"), load_system, damage_toml),
     "parameters, JSON": Format(
-        "footik.json",
-        lambda: parameter_files.system_to_json(presets.record()).encode(),
-        lambda path: soundness.check_system(parameter_files.load_system(path)[0]),
-        damage_json,
+        "footik.json", partial(system_as, ".json"), load_system, damage_json
     ),
-    "settings": Format(
-        "mec.toml",
-        settings_of_mec,
-        lambda path: soundness.check_system(settings_files.load_settings(path)[0]),
-        damage_toml,
-    ),
-    "settings, CSV": Format(
-        "mec.csv",
-        lambda: settings_of_mec(".csv"),
-        lambda path: soundness.check_system(settings_files.load_settings(path)[0]),
-    ),
-    "truth": Format(
-        "truth.toml",
-        text_of(DATA / "clips" / "uneven_walk_truth.toml"),
-        lambda path: load_known_values(
-            load_experiment(experiments.write(path.parent, clip=f'truth = "{path}"\n'))
-        ),
-        damage_toml,
-    ),
+    "settings": Format("mec.toml", settings_of_mec, load_settings, damage_toml),
+    "settings, CSV": Format("mec.csv", partial(settings_of_mec, ".csv"), load_settings),
+    "truth": Format("truth.toml", TRUTH.read_bytes, load_truth, damage_toml),
     "free parameters": Format(
         "free.toml",
         FREE.encode,

@@ -26,6 +26,12 @@ def armature():
     return next(thing for thing in bpy.data.objects if thing.type == "ARMATURE")
 
 
+def y_up(points) -> np.ndarray:
+    """Positions, m, of Blender's scene, (..., 3), y up."""
+    x, y, z = np.moveaxis(np.array(points, np.float64), -1, 0)
+    return np.stack([x, z, -y], axis=-1)
+
+
 def save_heads(path: Path) -> None:
     """Writes where the heads of all bones are in each frame of the scene's animation."""
     scene, skeleton = bpy.context.scene, armature()
@@ -35,19 +41,16 @@ def save_heads(path: Path) -> None:
     for frame in range(first, last + 1):
         scene.frame_set(frame)
         heads.append([skeleton.matrix_world @ bone.head for bone in skeleton.pose.bones])
-    x, y, z = np.moveaxis(np.array(heads, np.float64), -1, 0)
     names = np.array([bone.name for bone in skeleton.pose.bones])
-    np.savez(path.with_name(path.name + ".npz"), names=names, heads=np.stack([x, z, -y], axis=-1))
+    np.savez(path.with_name(path.name + ".npz"), names=names, heads=y_up(heads))
 
 
 def save_body(path: Path) -> None:
     """Writes where the vertices of the mesh on the skeleton are in the last frame, m, y up."""
-    skinned = [thing for thing in bpy.data.objects if thing.find_armature() == armature()]
-    (body,) = skinned
+    (body,) = [thing for thing in bpy.data.objects if thing.find_armature() == armature()]
     moved = body.evaluated_get(bpy.context.evaluated_depsgraph_get())
     places = [moved.matrix_world @ vertex.co for vertex in moved.to_mesh().vertices]
-    x, y, z = np.array(places, np.float64).T
-    np.savez(path, vertices=np.stack([x, z, -y], axis=-1))
+    np.savez(path, vertices=y_up(places))
 
 
 def dress(skeleton) -> None:
@@ -78,9 +81,8 @@ def main(bvh: Path, glb: Path, folder: Path) -> None:
     bpy.ops.import_anim.bvh(filepath=str(bvh), frame_start=1)
     save_heads(folder / "imported.bvh")
     scene = bpy.context.scene
-    bpy.ops.export_anim.bvh(
-        filepath=str(folder / "exported.bvh"), frame_start=1, frame_end=scene.frame_end
-    )
+    exported = str(folder / "exported.bvh")
+    bpy.ops.export_anim.bvh(filepath=exported, frame_start=1, frame_end=scene.frame_end)
     save_heads(folder / "exported.bvh")
     for name in ("exported.glb", "dressed.glb", "dressed.gltf"):
         if name == "dressed.glb":

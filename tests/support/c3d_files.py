@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from fitting.datasets.clips import Clip
 
 WIDTHS = {"KneeWidth": 104.0, "AnkleWidth": 70.0}  # mm
+MEASURES = {letter + name: width for letter in "LR" for name, width in WIDTHS.items()}
 RADIUS = 0.007  # m, of a marker
 DEPTH = 0.15  # m, of the pelvis
 Places = dict[str, np.ndarray]
@@ -88,8 +89,3 @@ def write_c3d(
     content["data"]["meta_points"]["residuals"] = np.where(np.isnan(points[:1]), -1.0, 1.0)
     content.write(str(path))
     return path
-
-
-def both_sides(measures: Mapping[str, float]) -> dict[str, float]:
-    """Measures of both legs by their names in a file."""
-    return {f"{letter}{name}": value for letter in "LR" for name, value in measures.items()}

@@ -20,23 +20,25 @@ class Gltf:
         self.content = b""
         children = {child for node in nodes for child in node.get("children", ())}
         tops = [node for node in range(len(nodes)) if node not in children]
-        self.header: dict[str, Any] = {
-            "asset": {"version": "2.0"}, "scenes": [{"nodes": tops}], "nodes": nodes,
-            "accessors": [], "bufferViews": [], "animations": [], **more,
-        }  # fmt: skip
+        self.header: dict[str, Any] = {"asset": {"version": "2.0"}, "scenes": [{"nodes": tops}]}
+        self.header |= {
+            "nodes": nodes,
+            "accessors": [],
+            "bufferViews": [],
+            "animations": [],
+            **more,
+        }
 
     def add(self, values: Any, dtype: str = "f4", **more: Any) -> int:
         """The index of a new accessor with these values."""
         array = np.asarray(values, f"<{dtype}")
         width = array.shape[1] if array.ndim > 1 else 1
-        self.header["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(self.content), "byteLength": array.nbytes}
-        )
+        view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": array.nbytes}
+        accessor = {"bufferView": len(self.header["bufferViews"]), "count": len(array)}
+        accessor |= {"componentType": COMPONENTS[dtype], "type": TYPES[width], **more}
         self.content += array.tobytes()
-        self.header["accessors"].append(
-            {"bufferView": len(self.header["bufferViews"]) - 1, "count": len(array)}
-            | {"componentType": COMPONENTS[dtype], "type": TYPES[width]} | more
-        )  # fmt: skip
+        self.header["bufferViews"].append(view)
+        self.header["accessors"].append(accessor)
         return len(self.header["accessors"]) - 1
 
     def animate(self, name: str, keys: Keys) -> "Gltf":
@@ -45,10 +47,9 @@ class Gltf:
         for (node, path), (times, values, interpolation) in keys.items():
             output = values if isinstance(values, int) else self.add(values)
             target = {"node": node, "path": path}
+            sampler = {"input": self.add(times), "output": output, "interpolation": interpolation}
             animation["channels"].append({"sampler": len(animation["samplers"]), "target": target})
-            animation["samplers"].append(
-                {"input": self.add(times), "output": output, "interpolation": interpolation}
-            )
+            animation["samplers"].append(sampler)
         self.header["animations"].append(animation)
         return self
 
@@ -61,23 +62,18 @@ class Gltf:
 
 def walker() -> Gltf:
     """A character of two legs under a turned and scaled node, which stands and moves along."""
-    nodes: list[dict[str, Any]] = [
-        {"name": "Armature", "children": [1], "rotation": [0.5, 0.5, 0.5, 0.5], "scale": [0.01] * 3}
-    ]
-    nodes.append({"name": "mixamorig:Hips", "translation": [0, 0, 95], "children": [2, 6]})
+    armature = {"name": "Armature", "rotation": [0.5, 0.5, 0.5, 0.5], "scale": [0.01] * 3}
+    hips = {"name": "mixamorig:Hips", "translation": [0, 0, 95], "children": [2, 6]}
+    nodes: list[dict[str, Any]] = [armature | {"children": [1]}, hips]
     for side, x in (("Left", 10), ("Right", -10)):
-        first = len(nodes)
-        nodes += [
-            {"name": f"mixamorig:{side}UpLeg", "translation": [x, 0, 0], "children": [first + 1]},
-            {"name": f"mixamorig:{side}Leg", "translation": [0, 2, -45], "children": [first + 2]},
-            {"name": f"mixamorig:{side}Foot", "translation": [0, -2, -42], "children": [first + 3]},
-            {"name": f"mixamorig:{side}ToeBase", "translation": [0, 12, -5]},
-        ]
+        bones = {"UpLeg": [x, 0, 0], "Leg": [0, 2, -45], "Foot": [0, -2, -42]}
+        for bone, place in bones.items():
+            node = {"name": f"mixamorig:{side}{bone}", "translation": place}
+            nodes.append(node | {"children": [len(nodes) + 1]})
+        nodes.append({"name": f"mixamorig:{side}ToeBase", "translation": [0, 12, -5]})
     file = Gltf(nodes, skins=[{"joints": list(range(1, 10))}])
     times = np.arange(12) / 30
     travel = np.stack([0 * times, 100 * times, 95 + 0 * times], axis=-1)
     bend = np.stack([np.sin(times), 0 * times, 0 * times, np.cos(times)], axis=-1)
-    return file.animate(
-        "Walk",
-        {(1, "translation"): (times, travel, "LINEAR"), (3, "rotation"): (times, bend, "LINEAR")},
-    )
+    keys = {(1, "translation"): (times, travel, "LINEAR")}
+    return file.animate("Walk", keys | {(3, "rotation"): (times, bend, "LINEAR")})

@@ -11,50 +11,33 @@ FPS = 60.0
 STRIDE, LIFT = 0.6, 0.12  # m
 STANCE_FRAMES, SWING_FRAMES = 30, 24
 
-BVH = """HIERARCHY
+LEG = """\
+  JOINT {side}UpLeg
+  {{
+    OFFSET {x} 0 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT {side}Leg
+    {{
+      OFFSET 0 -42 0
+      CHANNELS 3 Xrotation Yrotation Zrotation
+      JOINT {side}Foot
+      {{
+        OFFSET 0 -40 0
+        CHANNELS 3 Zrotation Xrotation Yrotation
+        End Site
+        {{
+          OFFSET 0 -5 12
+        }}
+      }}
+    }}
+  }}
+"""
+BVH = f"""HIERARCHY
 ROOT Hips
-{
+{{
   OFFSET 0 90 0
   CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
-  JOINT LeftUpLeg
-  {
-    OFFSET 10 0 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    JOINT LeftLeg
-    {
-      OFFSET 0 -42 0
-      CHANNELS 3 Xrotation Yrotation Zrotation
-      JOINT LeftFoot
-      {
-        OFFSET 0 -40 0
-        CHANNELS 3 Zrotation Xrotation Yrotation
-        End Site
-        {
-          OFFSET 0 -5 12
-        }
-      }
-    }
-  }
-  JOINT RightUpLeg
-  {
-    OFFSET -10 0 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    JOINT RightLeg
-    {
-      OFFSET 0 -42 0
-      CHANNELS 3 Xrotation Yrotation Zrotation
-      JOINT RightFoot
-      {
-        OFFSET 0 -40 0
-        CHANNELS 3 Zrotation Xrotation Yrotation
-        End Site
-        {
-          OFFSET 0 -5 12
-        }
-      }
-    }
-  }
-}
+{LEG.format(side="Left", x=10)}{LEG.format(side="Right", x=-10)}}}
 MOTION
 Frames: 3
 Frame Time: 0.0083333
@@ -125,6 +108,10 @@ def stairs(points: np.ndarray) -> np.ndarray:
     return 0.08 * np.floor(np.abs(np.abs(points[:, 2]) - 2.0) / 0.3)
 
 
+def flat_floor(points: np.ndarray) -> np.ndarray:
+    return np.zeros(len(points))
+
+
 def stair_walk(height_under: HeightFunction = stairs, strides: int = 3) -> Clip:
     """A walk along +z on level treads at 60 Hz, with the balls placed exactly on the ground."""
     period = STANCE_FRAMES + SWING_FRAMES
@@ -137,13 +124,11 @@ def stair_walk(height_under: HeightFunction = stairs, strides: int = 3) -> Clip:
         own_frames = frames + leg * period // 2
         swing = np.clip((own_frames % period - STANCE_FRAMES) / SWING_FRAMES, 0.0, 1.0)
         ease = swing**3 * (10 - 15 * swing + 6 * swing**2)
-        z = STRIDE * (own_frames // period + ease) - leg * STRIDE / 2
-        start_z, end_z = (
-            STRIDE * (own_frames // period + step) - leg * STRIDE / 2 for step in (0, 1)
-        )
+        start_z = STRIDE * (own_frames // period - leg / 2)
+        z = start_z + STRIDE * ease
         start_y, end_y = (
             height_under(np.stack([0 * z, 0 * z, foothold_z], -1))
-            for foothold_z in (start_z, end_z)
+            for foothold_z in (start_z, start_z + STRIDE)
         )
         y = start_y + (end_y - start_y) * ease + LIFT * np.sin(np.pi * swing) ** 2
         balls.append(np.stack([np.full_like(z, x), y, z], axis=-1))
@@ -166,3 +151,11 @@ def stair_walk(height_under: HeightFunction = stairs, strides: int = 3) -> Clip:
         np.stack(stance, axis=-1), FPS,
     )  # fmt: skip
     return clip_from_joints(motion, "stair walk")
+
+
+# Clips of several dialects whose joints are known, in the folder of shared motion.
+AMC_FILES = [f"cmu_asfamc/{name}.amc" for name in ("01_01", "02_01", "02_03", "03_01", "03_03")]
+BVH_FILES = [
+    *("cmu_bvh_max/131_01.bvh", "cmu_bvh_max/scaled_131_01.bvh", "cmu_bvh_mb/cmu_12_01_walk.bvh"),
+    *("cmu_bvh_poser/03_01.bvh", "mit/pybvh_test1_zup.bvh", "mit/full_precision_frame_time.bvh"),
+]
