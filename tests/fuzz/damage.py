@@ -154,20 +154,28 @@ def damage_json(random: Random, content: bytes) -> bytes:
     return json.dumps(damage_value(random, json.loads(content))).encode()
 
 
+def parts_of_glb(content: bytes) -> tuple[bytes, bytes]:
+    """The JSON and the numbers of a binary glTF."""
+    length = int.from_bytes(content[12:16], "little")
+    return content[20 : 20 + length], content[28 + length :]
+
+
+def glb_of(head: bytes, numbers: bytes) -> bytes:
+    """A binary glTF with lengths that fit."""
+    head += b" " * (-len(head) % 4)
+    chunks = len(head).to_bytes(4, "little") + b"JSON" + head
+    chunks += len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers
+    return b"glTF\2\0\0\0" + (12 + len(chunks)).to_bytes(4, "little") + chunks
+
+
 def damage_glb(random: Random, content: bytes) -> bytes:
     """A binary glTF with damage to its JSON or its numbers, and often with lengths that fit."""
     if random.random() < 0.3:
         return damage_bytes(random, content)
-    length = int.from_bytes(content[12:16], "little")
-    head, numbers = content[20 : 20 + length], content[28 + length :]
+    head, numbers = parts_of_glb(content)
     if random.random() < 0.6:
-        head = damage_json(random, head)
-        head += b" " * (-len(head) % 4)
-    else:
-        numbers = damage_bytes(random, numbers)
-    chunks = len(head).to_bytes(4, "little") + b"JSON" + head
-    chunks += len(numbers).to_bytes(4, "little") + b"BIN\0" + numbers
-    return content[:8] + (12 + len(chunks)).to_bytes(4, "little") + chunks
+        return glb_of(damage_json(random, head), numbers)
+    return glb_of(head, damage_bytes(random, numbers))
 
 
 def change_value(random: Random, array: np.ndarray) -> np.ndarray:

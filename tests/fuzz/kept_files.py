@@ -28,45 +28,18 @@ from support.curves import curve_problem
 
 SETTINGS = SearchSettings(descents=2, max_rounds=1, generations=1, population=20, elite=5)
 PARAMETER = {
-    "name": "lean.gain",
-    "kind": "smooth",
-    "unit": "1",
-    "u": 0.5,
-    "start_sd": 0.1,
-    "value": 0.2,
-    "before": 0.1,
-    "low": 0.0,
-    "high": 1.0,
+    **{"name": "lean.gain", "kind": "smooth", "unit": "1", "u": 0.5, "start_sd": 0.1},
+    **{"value": 0.2, "before": 0.1, "low": 0.0, "high": 1.0, "interval": [0.1, 0.3]},
+    **{"verdict": "two-sided", "contraction": 0.9, "at_bound": "", "determined": True},
     "prior": {"shape": "normal", "centre": 0.1, "spread": 1.6, "interval": [0.05, 0.9]},
-    "interval": [0.1, 0.3],
-    "verdict": "two-sided",
     "valleys": [{"value": 0.2, "rise": 0.0, "interval": [0.1, 0.3], "values": [0.2]}],
-    "contraction": 0.9,
-    "at_bound": "",
-    "determined": True,
 }
 ENDING = {"converged": True, "message": "Converged.", "seconds": 1.5}
-REPLICATES: Mapping[str, Mapping[str, object]] = {
-    calibration.FITS: {
-        "number": 0,
-        "truth_u": [0.4],
-        "truth": [0.21],
-        "truth_levels": [0.3],
-        "truth_valley_cost": 10.0,
-        "cost": 10.5,
-        "starts": 2,
-        "agreeing": 2,
-        "parameters": [PARAMETER],
-        **ENDING,
-    },
-    calibration.CHAINS: {
-        "number": 0,
-        "ranks": {"lean.gain": DRAWS // 2, calibration.LOG_PROBABILITY: 3},
-        "intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)},
-        "draws": DRAWS,
-        **ENDING,
-    },
-}
+FIT = {"number": 0, "truth_u": [0.4], "truth": [0.21], "truth_levels": [0.3], "cost": 10.5}
+FIT |= {"truth_valley_cost": 10.0, "starts": 2, "agreeing": 2, "parameters": [PARAMETER]}
+CHAIN = {"number": 0, "ranks": {"lean.gain": DRAWS // 2, calibration.LOG_PROBABILITY: 3}}
+CHAIN |= {"intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS}
+REPLICATES = {calibration.FITS: FIT | ENDING, calibration.CHAINS: CHAIN | ENDING}
 
 
 def text_of(content: Mapping[str, object]) -> bytes:
