@@ -15,7 +15,7 @@ from jaxik.world.terrain import LegTerrains
 from support.clips import make_rig, planes, to_frames, to_rig, to_terrain, wandering
 
 RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.06, 0.04, 0.1)))
-CLIP = to_frames(wandering(make_rig(), np.random.default_rng(3), 6))
+CLIP = jax.tree.map(np.asarray, to_frames(wandering(make_rig(), np.random.default_rng(3), 6)))
 SHIPPED = sorted((Path(__file__).parents[2] / "data" / "clips").glob("*.npz"))
 WRONG = {
     **dict.fromkeys(UNIT, (1.5, "a length of 1")),
@@ -35,41 +35,38 @@ def spoilt(tree, name: str, value: float):
     """The tree with the last number, or vector, of an array replaced."""
 
     def spoil(path, leaf):
-        if jax.tree_util.keystr(path) != name:
-            return leaf
-        return leaf.at[(-1,) * leaf.ndim].set(value)
+        if jax.tree_util.keystr(path) == name:
+            leaf = np.array(leaf)
+            leaf[(-1,) * leaf.ndim] = value
+        return leaf
 
     return jax.tree_util.tree_map_with_path(spoil, tree)
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=[path.stem for path in SHIPPED])
-def test_shipped_clips_pass(path: Path):
-    clip = fitting.load_clip(path)
-    jaxik.check(fitting.frames_from_clip(clip), clip.rig, GROUND)
-
-
 def test_sound_data_pass():
+    for path in SHIPPED:
+        clip = fitting.load_clip(path)
+        jaxik.check(fitting.frames_from_clip(clip), clip.rig, GROUND)
     jaxik.check(CLIP, RIG, GROUND)
     jaxik.check(jax.tree.map(lambda x: x[0], CLIP), RIG, GROUND)
-    jaxik.check(jax.tree.map(lambda x: jnp.stack([x, x]), CLIP), RIG, GROUND)
+    jaxik.check(jax.tree.map(lambda x: np.stack([x, x]), CLIP), RIG, GROUND)
     jaxik.check(CLIP, RIG, LegTerrains(GROUND, (GROUND, GROUND)))
 
 
-@pytest.mark.parametrize("name", arrays(CLIP))
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_numbers_that_are_not_finite_are_refused(name: str, value: float):
-    with pytest.raises(ValueError, match=rf"^frame\{name}\[5.* is .*(nan|inf)"):
-        jaxik.check(spoilt(CLIP, name, value), RIG, GROUND)
+def test_numbers_that_are_not_finite_are_refused(value: float):
+    for name in arrays(CLIP):
+        with pytest.raises(ValueError, match=rf"^frame\{name}\[5.* is .*(nan|inf)"):
+            jaxik.check(spoilt(CLIP, name, value), RIG, GROUND)
 
 
 @pytest.mark.parametrize("part", ["frame", "rig"])
-@pytest.mark.parametrize("field", WRONG)
-def test_numbers_out_of_range_are_refused(part: str, field: str):
-    value, wanted = WRONG[field]
-    tree = CLIP if part == "frame" else RIG
-    for name in arrays(tree):
-        if name.endswith(f".{field}"):
-            trees = {"frame": CLIP, "rig": RIG} | {part: spoilt(tree, name, value)}
+def test_numbers_out_of_range_are_refused(part: str):
+    sound = {"frame": CLIP, "rig": RIG}
+    for name in arrays(sound[part]):
+        if (field := name.rsplit(".", 1)[1]) in WRONG:
+            value, wanted = WRONG[field]
+            trees = sound | {part: spoilt(sound[part], name, value)}
             with pytest.raises(ValueError, match=rf"^{part}\{name}\[.*\] is .*; wanted {wanted}"):
                 jaxik.check(trees["frame"], trees["rig"], GROUND)
 

@@ -24,58 +24,32 @@ from reference.terrain import Terrain as PlainTerrain
 
 FRAMES = 240
 HZ = 60.0
-ODD: dict[str, Any] = {  # all parameters away from their defaults
-    "contact.ground_height": 0.01,
-    "contact.planted_height": 0.095,
-    "contact.raised_height": 0.15,
-    "probe.ray_up": 0.4,
-    "probe.ray_down": 0.42,
-    "probe.toe_ls": [0.02, -0.05, 0.18],
-    "target.min_ankle_height": 0.05,
-    "target.max_ankle_height": 0.24,
-    "target.foot_height": 0.07,
-    "target.max_slope": 0.3,
-    "target.rise_half_life": 0.03,
-    "target.fall_half_life": 0.06,
-    "target.spring": True,
-    "target.follow_slopes": True,
-    "lean.forward_rate": 0.5,
-    "lean.side_rate": -0.4,
-    "lean.forward_rate_slide": -0.6,
-    "lean.side_rate_slide": 0.7,
-    "lean.gain": 0.3,
-    "lean.gain_slide": 0.5,
-    "lean.slide_on_gain": 0.3,
-    "lean.slide_off_gain": 0.2,
-    "lean.spring": True,
-    "lock.release_min_angle": 1.2,
-    "lock.release_max_angle": 2.9,
-    "lock.release_cone": 0.2,
-    "lock.release_distance": 0.12,
-    "lock.relock_threshold": 0.4,
-    "lock.max_speed": 0.9,
-    "lock.hold_ball": True,
-    "lock.release_heading": 0.15,
-    "lock.release_speed": 1.2,
-    "lock.return_speed": 0.3,
-    "lock.lock_half_life": 0.02,
-    "lock.unlock_half_life": 0.07,
-    "pelvis.limit": 0.05,
-    "pelvis.on_gain": 0.3,
-    "pelvis.off_gain": 0.15,
-    "pelvis.vertical_only": False,
-    "pelvis.wait_to_rise": True,
-    "leg.max_knee_angle": 2.8,
-    "leg.min_knee_angle": 1.6,
-    "leg.soften": 0.94,
-    "leg.twist": 0.1,
-    "leg.as_animated": True,
-    "leg.weight": 0.9,
-    "foot.max_pitch": 0.1,
-    "foot.min_pitch": -0.15,
-    "foot.max_roll": 0.08,
-    "foot.min_roll": -0.1,
-}
+
+
+def named(stage: str, **values: Any) -> dict[str, Any]:
+    """Values of a stage's parameters by dotted name."""
+    return {f"{stage}.{name}": value for name, value in values.items()}
+
+
+ODD: dict[str, Any] = (  # all parameters away from their defaults
+    named("contact", ground_height=0.01, planted_height=0.095, raised_height=0.15)
+    | named("probe", ray_up=0.4, ray_down=0.42, toe_ls=[0.02, -0.05, 0.18])
+    | named("target", min_ankle_height=0.05, max_ankle_height=0.24, foot_height=0.07)
+    | named("target", max_slope=0.3, rise_half_life=0.03, fall_half_life=0.06)
+    | named("target", spring=True, follow_slopes=True)
+    | named("lean", forward_rate=0.5, side_rate=-0.4, gain=0.3, spring=True)
+    | named("lean", forward_rate_slide=-0.6, side_rate_slide=0.7, gain_slide=0.5)
+    | named("lean", slide_on_gain=0.3, slide_off_gain=0.2)
+    | named("lock", release_min_angle=1.2, release_max_angle=2.9, release_cone=0.2)
+    | named("lock", release_distance=0.12, relock_threshold=0.4, max_speed=0.9, hold_ball=True)
+    | named("lock", release_heading=0.15, release_speed=1.2, return_speed=0.3)
+    | named("lock", lock_half_life=0.02, unlock_half_life=0.07)
+    | named("pelvis", limit=0.05, on_gain=0.3, off_gain=0.15)
+    | named("pelvis", vertical_only=False, wait_to_rise=True)
+    | named("leg", max_knee_angle=2.8, min_knee_angle=1.6, soften=0.94)
+    | named("leg", twist=0.1, as_animated=True, weight=0.9)
+    | named("foot", max_pitch=0.1, min_pitch=-0.15, max_roll=0.08, min_roll=-0.1)
+)
 
 
 def to_transform(t: reference.Transform) -> jaxik.Transform:
@@ -311,6 +285,7 @@ def wandering(
     rng: np.random.Generator,
     count: int = FRAMES,
     stand: tuple[float, ...] = (),
+    hz: float = HZ,
 ) -> list:
     """A clip with a bit of everything.
 
@@ -325,7 +300,7 @@ def wandering(
     frames = []
     heading, place, phase, stood = 0.3, np.array([-2.2, 0.0, -2.4]), 0.0, 0.0
     for index in range(count):
-        dt = 1 / 60 if index % 97 else 1 / 30
+        dt = 1 / hz if index % 97 else 2 / hz
         sway = np.zeros(3)
         if any(start <= index / count < end for start, end in stands):
             stood += dt
