@@ -10,18 +10,16 @@ from fitting.experiments import problems
 from fitting.experiments.experiment_files import load_experiment
 from fitting.studies import assess
 from fitting.studies.fit import search
-from support import quick
-from support.experiments import CLIP, write
-
-pytestmark = pytest.mark.slow
+from support import small_studies
+from support.experiments import write
+from support.small_studies import HALF_SECOND
 
 
 @pytest.fixture
 def solved(tmp_path, monkeypatch):
     """An experiment with residuals that compile at once, its problem and its solution."""
-    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
-    clip = "start = 1.0\nend = 1.5"
-    experiment = load_experiment(write(tmp_path, "hill.toml", clips=CLIP, clip=clip))
+    small_studies.quick_fits(monkeypatch)
+    experiment = load_experiment(write(tmp_path, clips=HALF_SECOND))
     with jax.enable_x64(True):
         problem = problems.make_problem(experiment)
         return experiment, problem, search(problem, experiment)

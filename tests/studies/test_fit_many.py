@@ -1,16 +1,9 @@
-"""Many fits: what is fitted, what is kept, and what survives failures and kills."""
+"""Many fits: what is fitted, what is kept, and what survives failures."""
 
 import csv
 import dataclasses
-import json
-import os
 import shutil
-import signal
-import subprocess
 import sys
-import threading
-import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +13,6 @@ from distributed import LocalCluster
 
 import fitting
 from fitting.cli import main
-from fitting.experiments import problems
 from fitting.experiments.experiment_files import load_experiment
 from fitting.jobs.many import task as task_of_worker
 from fitting.runtime.parallel import first_use
@@ -28,23 +20,32 @@ from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
 from fitting.studies.many import rows, table
 from fitting.studies.many.tasks import plan
-from support import quick
-from support.experiments import CLIP, ROOT, write
-
-FEW = "[fit]\nstarts = 1\n[fit.search]\nagreeing_starts = 1\n"
-TWO = f"{CLIP}start = 1.0\nend = 1.5\n{CLIP}start = 2.0\nend = 2.5\n"
+from support import small_studies
+from support.experiments import ROOT
 
 
 @pytest.fixture
 def experiment_file(tmp_path, monkeypatch) -> Path:
-    """Two clips whose fits take no time."""
-    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
-    return write(tmp_path, "walks.toml", clips=TWO, rest=FEW)
+    return small_studies.quick_many(tmp_path, monkeypatch)
 
 
 def fit_many(experiment: Path | list[Path], folder: Path, **options: Any) -> fitting.ManyFits:
     """In this process, without pictures of each run."""
     return fitting.fit_many(experiment, folder, workers=0, report=False, **options)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> fitting.ManyFits:
+    """Both clips with two seeds; tests must not change the folder."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        return fit_many(small_studies.quick_many(folder, patch), folder / "out", seeds=2)
+
+
+@pytest.fixture
+def out(finished, tmp_path, undrawn) -> Path:
+    """A copy of its folder, in which fits may be missing."""
+    return Path(shutil.copytree(finished.folder, tmp_path / "out"))
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -81,77 +82,62 @@ def test_a_fit_is_another_one_if_its_experiment_or_a_file_of_it_changes(experime
     assert task.identity() != identity
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"seeds": 0}, "seeds is 0; wanted 1 to"), ({"workers": -1}, "workers is -1; wanted 0")],
-)
-def test_numbers_that_make_no_sense_are_refused(experiment_file, tmp_path, options, words):
-    with pytest.raises(ValueError, match=words):
-        fitting.fit_many(experiment_file, tmp_path / "out", **{"workers": 0} | options)
-    with pytest.raises(ValueError, match="no experiments; wanted one or more"):
-        fit_many([], tmp_path / "out")
-
-
-def test_a_folder_with_something_else_is_refused(experiment_file, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "summary.md").write_text("of another command")
-    with pytest.raises(ValueError, match=r"there is something in it already: \['summary.md'\]"):
-        fit_many(experiment_file, tmp_path / "out")
-    assert (tmp_path / "out" / "summary.md").read_text() == "of another command"
-
-
 # What is kept
 
 
-def test_each_fit_is_a_run_and_a_row_and_is_not_repeated(experiment_file, tmp_path, monkeypatch):
-    out, lines = tmp_path / "out", []
-    fits = fit_many(experiment_file, out, seeds=2, log=lines.append)
-    assert [row["state"] for row in fits.rows] == ["finished"] * 4 and not fits.interrupted
-    for row in fits.rows:
-        experiment, summary = run_folder.load_fit(out / row["run"])
+def test_each_fit_is_a_run_and_a_row(finished):
+    assert [row["state"] for row in finished.rows] == ["finished"] * 4 and not finished.interrupted
+    for row in finished.rows:
+        experiment, summary = run_folder.load_fit(finished.folder / row["run"])
         assert len(experiment.clips) == 1 and experiment.seed == row["seed"]
         assert "outcome" in row and summary["cost"] == row["outcome"]["cost"]
-    present = read(out / table.CSV)
-    assert [row["run"] for row in present] == [row["run"] for row in fits.rows]
+    present = read(finished.folder / table.CSV)
+    assert [row["run"] for row in present] == [row["run"] for row in finished.rows]
     assert float(present[0]["pelvis.on_gain"]) == pytest.approx(0.3, abs=0.02)
-    parquet = pyarrow.parquet.read_table(out / table.PARQUET).to_pylist()
-    assert [row["cost"] for row in parquet] == [row["cost"] for row in map(table.cells, fits.rows)]
-    assert {"fits.png", "summary.md", "report.html"} <= {path.name for path in out.iterdir()}
-
-    monkeypatch.setattr(task_of_worker, "fit", None)
-    again = fit_many(experiment_file, out, seeds=2, log=lines.append)
-    assert again.rows == fits.rows and again.made == 0
-    assert "4 fits of 1 experiment, 2 seeds for each clip; 4 are there already" in lines
-
-
-def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(experiment_file, tmp_path):
-    here = fit_many(experiment_file, tmp_path / "here", seeds=2)
-    options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
-    with LocalCluster(n_workers=2, processes=False, **options) as workers:
-        address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
-        out = tmp_path / "there"
-        there = fitting.fit_many(experiment_file, out, seeds=2, scheduler=address, report=False)
-        again = fitting.fit_many(experiment_file, out, seeds=2, scheduler=address, report=False)
-    numbers = [[row[name] for name in ("run", "cost", "state")] for row in cells(here)]
-    assert [[row[name] for name in ("run", "cost", "state")] for row in cells(there)] == numbers
-    assert (there.made, again.made) == (4, 0) and again.rows == there.rows
-    for row in there.rows:
-        run_folder.load_fit(out / row["run"])
+    parquet = pyarrow.parquet.read_table(finished.folder / table.PARQUET).to_pylist()
+    assert [row["cost"] for row in parquet] == [row["cost"] for row in cells(finished)]
+    files = {path.name for path in finished.folder.iterdir()}
+    assert {"fits.png", "summary.md", "report.html"} <= files
 
 
 def cells(fits: fitting.ManyFits) -> list[dict[str, Any]]:
     return [table.cells(row) for row in fits.rows]
 
 
-def test_the_run_of_another_experiment_is_not_taken_for_ones_own(experiment_file, tmp_path):
-    fit_many(experiment_file, tmp_path / "out")
+def test_only_what_is_not_whole_is_fitted_again(finished, out, experiment_file, monkeypatch):
+    lines: list[str] = []
+    (out / finished.rows[0]["run"] / rows.ROW).unlink()
+    assert fit_many(experiment_file, out, seeds=2, log=lines.append).made == 1
+    assert "4 fits of 1 experiment, 2 seeds for each clip; 3 are there already" in lines
+    monkeypatch.setattr(task_of_worker, "fit", None)
+    again = fit_many(experiment_file, out, seeds=2)
+    assert again.rows[1:] == finished.rows[1:] and again.made == 0
+
+
+def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(
+    finished, experiment_file, tmp_path, undrawn
+):
+    options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(n_workers=2, processes=False, **options) as workers:
+        address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
+        out = tmp_path / "there"
+        there = fitting.fit_many(experiment_file, out, seeds=2, scheduler=address, report=False)
+        again = fitting.fit_many(experiment_file, out, seeds=2, scheduler=address, report=False)
+    numbers = [[row[name] for name in ("run", "cost", "state")] for row in cells(finished)]
+    assert [[row[name] for name in ("run", "cost", "state")] for row in cells(there)] == numbers
+    assert (there.made, again.made) == (4, 0) and again.rows == there.rows
+    for row in there.rows:
+        run_folder.load_fit(out / row["run"])
+
+
+def test_the_run_of_another_experiment_is_not_taken_for_ones_own(out, experiment_file):
     experiment_file.write_text(f'loss = "huber"\n{experiment_file.read_text()}')
     with pytest.raises(ValueError, match=r"seed_0: has the fit of another experiment, or of one"):
-        fit_many(experiment_file, tmp_path / "out")
+        fit_many(experiment_file, out)
 
 
 def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
-    experiment_file, tmp_path, monkeypatch
+    experiment_file, tmp_path, monkeypatch, undrawn
 ):
     out, real = tmp_path / "out", task_of_worker.fit
 
@@ -175,42 +161,18 @@ def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
     assert not trace.exists()
 
 
-def test_an_interrupt_keeps_what_is_finished(experiment_file, tmp_path, monkeypatch):
-    out, real = tmp_path / "out", task_of_worker.fit
-
-    def interrupted_second(experiment, *args, **named):
-        if experiment.clips[0].start == 2.0:
-            raise KeyboardInterrupt
-        return real(experiment, *args, **named)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(task_of_worker, "fit", interrupted_second)
-        words = ["fit-many", str(experiment_file), "-o", str(out), "--workers", "0"]
-        assert main.main([*words, "--no-reports"]) == main.INTERRUPTED
-    assert len(read(out / table.CSV)) == 1
-    fits = fit_many(experiment_file, out)
-    assert fits.made == 1 and len(fits.finished) == 2
-
-
-def test_a_run_without_its_row_is_not_whole(experiment_file, tmp_path):
-    out = tmp_path / "out"
-    fits = fit_many(experiment_file, out)
-    (out / fits.rows[0]["run"] / rows.ROW).unlink()
-    assert fit_many(experiment_file, out).made == 1
-
-
 def test_without_pyarrow_there_is_the_csv_and_a_line_that_says_so(
-    experiment_file, tmp_path, monkeypatch
+    out, experiment_file, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (out / table.PARQUET).unlink()
     lines: list[str] = []
-    fit_many(experiment_file, tmp_path / "out", log=lines.append)
+    fit_many(experiment_file, out, seeds=2, log=lines.append)
     assert "no fits.parquet, as pyarrow is not installed: pip install 'jaxik[parquet]'" in lines
-    assert (tmp_path / "out" / table.CSV).is_file()
-    assert not (tmp_path / "out" / table.PARQUET).exists()
+    assert (out / table.CSV).is_file() and not (out / table.PARQUET).exists()
 
 
-# Several processes
+# Several processes; `test_interruptions.py` kills them
 
 
 def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch):
@@ -230,139 +192,3 @@ def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch
         assert len(looks) == 3
     with claimed(tmp_path / f"first-{key}"), first_use.first_alone(key):
         assert len(looks) == 3  # they are kept by now, and nobody waits
-
-
-def workers_of(client: subprocess.Popen) -> list[int]:
-    """The processes of a command that compute."""
-    lines = subprocess.run(
-        ["ps", "-wweo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    every = [(int(pid), int(ppid), words) for pid, ppid, words in (x.split(None, 2) for x in lines)]
-    return [pid for pid, ppid, words in every if ppid == client.pid and "spawn_main" in words]
-
-
-def is_running(process: int) -> bool:
-    """Whether a process is there, and not only waits for whoever asks how it ended."""
-    try:
-        return Path(f"/proc/{process}/cmdline").read_bytes() != b""
-    except OSError:
-        return False
-
-
-def start(experiment: Path, out: Path) -> subprocess.Popen:
-    """The command with two workers, as a process."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "fitting.cli.main", "fit-many", str(experiment), "-o", str(out),
-         "--workers", "2", "--seeds", "3", "--no-reports"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
-        env=os.environ | {"PYTHONWARNINGS": "default"},
-    )  # fmt: skip
-
-
-def wait_for(condition, client: subprocess.Popen, seconds: float = 400.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert client.poll() is None, client.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads processes as Linux lists them")
-def test_killed_workers_and_a_killed_client_lose_only_what_was_being_made(tmp_path):
-    experiment, out = write(tmp_path, "walks.toml", clips=TWO, rest=FEW), tmp_path / "out"
-    tasks = plan([load_experiment(experiment)], seeds=3)
-
-    def whole() -> set[Path]:
-        return set(out.glob(f"runs/**/{rows.ROW}"))
-
-    with ExitStack() as held:
-        # As another worker does that makes these fits, so that the command cannot end meanwhile.
-        for task in tasks[2::3]:
-            held.enter_context(claimed((out / task.run).with_suffix(".lock")))
-        client = start(experiment, out)
-        workers: list[int] = []
-        try:
-            wait_for(lambda: len(whole()) >= 1, client)
-            first, *_ = workers_of(client)
-            os.kill(first, signal.SIGKILL)
-            wait_for(lambda: len(whole()) >= 2, client)
-            workers = workers_of(client)
-        finally:
-            client.send_signal(signal.SIGKILL)
-            client.communicate()
-        end = time.monotonic() + 60.0
-        while any(map(is_running, workers)):  # nobody may be left who takes the next fit
-            assert time.monotonic() < end
-            time.sleep(0.1)
-    before = {path: path.read_bytes() for path in whole()}
-    assert 2 <= len(before) <= 4
-    client = start(experiment, out)
-    output, errors = client.communicate(timeout=500)
-    assert client.returncode in (0, 3), errors
-    assert {path: path.read_bytes() for path in before} == before
-    assert len(whole()) == 6 and len(read(out / table.CSV)) == 6
-    assert "Dask's dashboard: http://127.0.0.1:" in output
-    assert f"3 seeds for each clip; {len(before)} are there already" in output
-    costs = [json.loads(path.read_text())["outcome"]["cost"] for path in sorted(whole())]
-    assert all(cost > 0 for cost in costs)
-
-
-class Terminal:
-    """The command with two workers in a terminal of its own."""
-
-    SPAWN = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))"
-
-    def __init__(self, experiment: Path, out: Path) -> None:
-        words = ["fit-many", str(experiment), "-o", str(out), "--workers", "2", "--no-reports"]
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", self.SPAWN, sys.executable, "-m", "fitting.cli.main", *words],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=ROOT,
-        )  # fmt: skip
-        self._parts: list[bytes] = []
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        while part := os.read(self.process.stdout.fileno(), 65536):
-            self._parts.append(part)
-
-    def press_ctrl_c(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(b"\x03")  # the terminal sends it to the command and its workers
-        self.process.stdin.flush()
-
-    def end(self, seconds: float) -> str:
-        """What the terminal got, of a command that ends by itself."""
-        try:
-            self.process.wait(seconds)
-        finally:
-            self.process.kill()  # and so its terminal is gone, which ends the command
-            self._reader.join(60.0)
-            for pipe in (self.process.stdin, self.process.stdout):
-                assert pipe is not None
-                pipe.close()
-        return b"".join(self._parts).decode()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="a terminal of Linux")
-def test_one_ctrl_c_in_a_terminal_ends_it_and_the_same_command_goes_on(tmp_path):
-    experiment, out = write(tmp_path, "walks.toml", clips=TWO, rest=FEW), tmp_path / "out"
-    _, second = plan([load_experiment(experiment)])
-    with claimed((out / second.run).with_suffix(".lock")):  # so that it cannot end meanwhile
-        terminal = Terminal(experiment, out)
-        try:
-            wait_for(lambda: len(list(out.glob(f"runs/**/{rows.ROW}"))) == 1, terminal.process)
-            terminal.press_ctrl_c()
-        finally:
-            shown = terminal.end(120.0)
-    assert terminal.process.returncode == main.INTERRUPTED
-    assert "Finished: 1 of 2 fits" in shown and "Traceback" not in shown
-    assert "the same command makes the fit that is missing" in shown
-    (first,) = read(out / table.CSV)
-    kept = (out / first["run"] / rows.ROW).read_bytes()
-    shown = (again := Terminal(experiment, out)).end(500.0)
-    assert again.process.returncode in (0, 3) and "1 are there already" in shown
-    assert (out / first["run"] / rows.ROW).read_bytes() == kept and len(read(out / table.CSV)) == 2

@@ -1,9 +1,12 @@
-"""Populations of clips: what is fitted, kept, left out and reported, and the command."""
+"""Populations of clips and bodies: what is fitted, left out and reported, and the command."""
 
 import dataclasses
 import json
 import re
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,94 +15,60 @@ import numpy as np
 import pytest
 
 import fitting
+import jaxik
 from fitting.cli import main
-from fitting.experiments import parameter_files, problems
+from fitting.datasets.clips import edit, load_clip, save_clip
+from fitting.experiments import parameter_files
 from fitting.experiments.experiment import ClipEntry
 from fitting.experiments.experiment_files import load_experiment
-from fitting.inference.optimisation.solution import Progress
-from fitting.jobs import populations
+from fitting.experiments.problems import make_problem
+from fitting.inference.hierarchy.grouping import Grouping
+from fitting.inference.hierarchy.population_fit import PopulationFit, fit_population
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.problem.problem import Problem
+from fitting.problem.simulation import simulate
 from fitting.report.hierarchy import population_plots, population_report, population_tables
 from fitting.studies import run_folder
-from fitting.studies.hierarchy import kept_searches, population
+from fitting.studies.hierarchy import kept_searches
+from fitting.studies.hierarchy.estimates import summarise
+from fitting.studies.hierarchy.left_out import predict
 from fitting.studies.hierarchy.population import Population, clip_names
 from jaxik.maths import parameter_tree
-from support.experiments import CLIP, write
+from support import small_studies
+from support.bodies import scaled
+from support.experiments import ROOT
 from support.pages import Page
-
-SIGMA = 0.02
-FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
-MEASURED = ((0.2, 0.41), (0.5, 0.39), (0.3, 0.4))  # of each clip, in the order of FREE
-SUBJECTS = ("ann", "ann", "ben")
-TABLE = '[hierarchy]\nper_clip = ["pelvis.on_gain"]\n'
+from support.small_studies import MEASURED, SUBJECTS, VARYING, kept, write_population
 
 
-def values_of(ik) -> jax.Array:
-    return jnp.stack([ik.pelvis.on_gain, ik.foot.max_pitch])
+class Made(NamedTuple):
+    """What was made of three walks."""
+
+    walks: Path
+    folder: Path
+    printed: str
+    fitted: Population
 
 
-def residuals_of_scenes(ik, scenes):
-    """Two parameters against the two numbers that stand in each reference."""
-    each = []
-    for scene in scenes:
-        measured, seen = scene.reference.pelvis.pos[0, :2], scene.reference.observed[0]
-        residuals = (values_of(ik) - measured) / jnp.asarray(SIGMA, measured.dtype)
-        each.append(jnp.where(seen, residuals, 0.0))
-    return jnp.concatenate(each)
-
-
-def error_at(problem: Problem, u: np.ndarray) -> float:
-    (scene,) = problem.data
-    measured = np.asarray(scene.reference.pelvis.pos[0, :2])
-    return float(np.linalg.norm(np.asarray(problem.space.values(jnp.asarray(u))) - measured))
-
-
-def with_measured(problem: Problem, measured=MEASURED) -> Problem:
-    for c, values in enumerate(measured):
-        pos = problem.data[c].reference.pelvis.pos
-        problem = eqx.tree_at(
-            lambda p, c=c: p.data[c].reference.pelvis.pos,
-            problem,
-            pos.at[0, :2].set(jnp.asarray(values)),
-        )
-    return problem
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Made:
+    """Tests must not change its folder."""
+    folder, lines = tmp_path_factory.mktemp("population"), []
+    with pytest.MonkeyPatch.context() as patch:
+        walks, out = small_studies.quick_population(folder, patch), folder / "out"
+        fitted = fitting.population(walks, out, log=lines.append)
+    return Made(walks, out, "\n".join(lines), fitted)
 
 
 @pytest.fixture
-def quick(monkeypatch) -> None:
-    """Residuals, references and errors that compile at once."""
-    make = problems.make_problem
-    monkeypatch.setattr(problems, "residuals_of_scenes", residuals_of_scenes)
-    monkeypatch.setattr(populations, "make_problem", lambda e: with_measured(make(e)))
-    monkeypatch.setattr(population, "error_at", error_at)
-
-
-def write_walks(folder: Path, rest: str = TABLE, top: str = "", free: str = FREE) -> Path:
-    """Three clips of a tenth of a second."""
-    clips = "".join(
-        f'{CLIP}start = {c}.0\nend = {c}.1\nsubject = "{subject}"\n'
-        for c, subject in enumerate(SUBJECTS)
-    )
-    return write(folder, "walks.toml", top=top, clips=clips, free=free, rest=rest)
-
-
-@pytest.fixture
-def walks(quick, tmp_path) -> Path:
-    return write_walks(tmp_path)
-
-
-def kept(folder: Path) -> dict[str, dict]:
-    """All searches on disk without how long they took, by what was fitted."""
-    paths = (folder / "searches").glob("*.json")
-    found = [json.loads(path.read_text()) | {"seconds": 0} for path in paths]
-    return {search["name"]: search for search in found}
+def fitted(made) -> Population:
+    return made.fitted
 
 
 # What is fitted
 
 
-def test_clips_are_fitted_alone_pooled_and_as_a_population(walks):
-    fitted = fitting.population(walks)
+def test_clips_are_fitted_alone_pooled_and_as_a_population(fitted):
     gain, pitch = fitted.parameters
     assert (gain["level"], pitch["level"]) == ("clip", "shared")
     alone = [estimate["value"] for estimate in gain["alone"]]
@@ -117,8 +86,7 @@ def test_clips_are_fitted_alone_pooled_and_as_a_population(walks):
     assert fitted.subjects == SUBJECTS
 
 
-def test_a_clip_that_is_left_out_is_predicted_by_the_others_alone(walks):
-    fitted = fitting.population(walks)
+def test_a_clip_that_is_left_out_is_predicted_by_the_others_alone(fitted):
     for c, row in enumerate(fitted.errors):
         others = np.delete(np.array(MEASURED), c, axis=0)
         far = float(np.linalg.norm(others.mean(axis=0) - MEASURED[c]))
@@ -127,11 +95,11 @@ def test_a_clip_that_is_left_out_is_predicted_by_the_others_alone(walks):
         assert row.left_out_population == pytest.approx(far, abs=0.06)
 
 
-def test_a_subject_that_others_show_is_expected_as_they_show_it(quick, tmp_path, monkeypatch):
-    make = problems.make_problem
-    measured = ((0.2, 0.4), (0.2, 0.4), (0.5, 0.4))
-    monkeypatch.setattr(populations, "make_problem", lambda e: with_measured(make(e), measured))
-    fitted = fitting.population(write_walks(tmp_path, TABLE.replace("per_clip", "per_subject")))
+def test_a_subject_that_others_show_is_expected_as_they_show_it(tmp_path, monkeypatch):
+    measured, table = ((0.2, 0.4), (0.2, 0.4), (0.5, 0.4)), VARYING.replace("clip", "subject")
+    fitted = fitting.population(
+        small_studies.quick_population(tmp_path, monkeypatch, measured, table)
+    )
     first, second, other = fitted.errors
     assert max(first.left_out_population, second.left_out_population) < 0.03
     assert min(first.left_out_pooled, second.left_out_pooled) > 0.08
@@ -141,20 +109,21 @@ def test_a_subject_that_others_show_is_expected_as_they_show_it(quick, tmp_path,
     assert gain["clips"][0]["value"] == gain["clips"][1]["value"] < gain["clips"][2]["value"]
 
 
-def test_noise_is_estimated_in_each_clip_alone(quick, tmp_path, monkeypatch):
+def test_noise_is_estimated_in_each_clip_alone(tmp_path, monkeypatch, undrawn):
     estimated: list[int] = []
     search = kept_searches.search_with_noise
 
     def watched(problem, experiment, progress, kept):
         estimated.append(len(problem.data) if experiment.noise.estimates_any else 0)
-        return search(problem, dataclasses.replace(experiment, noise=no_noise), progress, kept)
+        quiet = dataclasses.replace(experiment, noise=NoiseOptions())
+        return search(problem, quiet, progress, kept)
 
-    no_noise = load_experiment(write_walks(tmp_path)).noise
     monkeypatch.setattr(kept_searches, "search_with_noise", watched)
-    rest = TABLE + '[noise]\nsigmas = "estimated"\n'
-    fitted = fitting.population(write_walks(tmp_path, rest), tmp_path / "out")
+    rest, out = VARYING + '[noise]\nsigmas = "estimated"\n', tmp_path / "out"
+    path = small_studies.quick_population(tmp_path, monkeypatch, rest=rest)
+    fitted = fitting.population(path, out)
     assert estimated == [1, 1, 1, 0, 0, 0, 0]
-    searches = kept(tmp_path / "out")
+    searches = {found["name"]: found for found in kept(out / "searches").values()}
     assert all("noise" in searches[name] for name in fitted.clips)
     assert "noise" not in searches["all clips"]
 
@@ -167,100 +136,28 @@ def test_clips_of_one_file_are_told_apart():
     assert names == ("a", "b from 0 s", "b from 2.5 s", "c from 1 s (4)", "c from 1 s (5)")
 
 
-# Searches that are kept
+def test_other_settings_are_searched_anew(made, tmp_path, monkeypatch, undrawn):
+    small_studies.quick_population(tmp_path, monkeypatch)
+    out, searched = tmp_path / "out", []
+    shutil.copytree(made.folder / "searches", out / "searches")
 
+    def watched(searches, name, *_):
+        searched.append(name)
+        raise KeyboardInterrupt
 
-def test_an_interrupted_population_continues_and_repeats_nothing(walks, tmp_path, monkeypatch):
-    out, whole = tmp_path / "out", tmp_path / "whole"
-    fitting.population(walks, whole)
-
-    def stop(report: Progress) -> None:
-        if report.stage == "all clips but uneven_walk from 1 s: polish":
-            raise KeyboardInterrupt
-
+    monkeypatch.setattr(kept_searches.KeptSearches, "_search", watched)
+    fitting.population(made.walks, out)
+    assert searched == []
     with pytest.raises(KeyboardInterrupt):
-        fitting.population(walks, out, progress=stop)
-    assert len(kept(out)) == 5 and not (out / "population.json").exists()
-    (part,) = (out / "searches").glob("*.part")
-    (stages,) = json.loads(part.read_text())["searches"].values()
-    assert [stage["name"] for stage in stages[:2]] == ["descent", "descent"]
-    searched: list[str] = []
-    search = kept_searches.search_with_noise
-
-    def watched(*arguments):
-        searched.append("search")
-        return search(*arguments)
-
-    monkeypatch.setattr(kept_searches, "search_with_noise", watched)
-    fitting.population(walks, out)
-    assert len(searched) == 2 and kept(out) == kept(whole) and not part.exists()
-    for name in ("population.json", "summary.md"):
-        assert (out / name).read_text() == (whole / name).read_text()
-
-
-def test_other_settings_are_searched_anew(walks, tmp_path):
-    out = tmp_path / "out"
-    fitting.population(walks, out)
-    fitting.population(write_walks(tmp_path, top="seed = 1"), out)
-    assert len(list((out / "searches").iterdir())) == 14
-
-
-def test_a_search_that_is_damaged_is_refused(walks, tmp_path):
-    out = tmp_path / "out"
-    fitting.population(walks, out)
-    path = next((out / "searches").iterdir())
-    whole = json.loads(path.read_text())
-    damaged = [
-        ("{", "not JSON"),
-        ("[]", "wanted a table"),
-        ("{}", "it has no converged, cost"),
-        (json.dumps(whole | {"u": [0.0]}), "u has 1 numbers; wanted 2"),
-        (json.dumps(whole | {"u": [0.0, float("nan")]}), r"u\[1\] is nan; wanted a finite number"),
-        (json.dumps(whole | {"cost": "low"}), "cost is 'low'; wanted a number"),
-        (json.dumps(whole | {"noise": {"sigmas": {}}}), "noise has no correlations"),
-    ]
-    for text, message in damaged:
-        path.write_text(text)
-        with pytest.raises(
-            ValueError, match=rf"\.json: not written by `jaxik population`: .*{message}"
-        ):
-            fitting.population(walks, out)
-    path.write_text(json.dumps(whole | {"format": 9}))
-    with pytest.raises(ValueError, match=r"\.json: its format is 9"):
-        fitting.population(walks, out)
-
-
-# Mistakes
-
-
-@pytest.mark.parametrize(
-    ("rest", "free", "message"),
-    [
-        ("", FREE, "nothing varies between the clips; name free parameters in the table [hier"),
-        (
-            '[hierarchy]\nper_clip = ["contact.planted_height"]\n',
-            FREE + "contact.planted_height = {}\n",
-            "contact.planted_height is a threshold: residuals jump with it",
-        ),
-    ],
-)
-def test_a_mistake_is_one_line_before_anything_is_searched(
-    quick, tmp_path, capsys, rest, free, message
-):
-    path, out = write_walks(tmp_path, rest, free=free), tmp_path / "out"
-    assert main.main(["population", str(path), "-o", str(out)]) == main.MISTAKE
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-    assert not out.exists()
+        fitting.population(write_population(tmp_path, top="seed = 1"), out)
+    assert searched == ["uneven_walk from 0 s"]
 
 
 # Report and command
 
 
-def test_the_command_writes_a_report_and_parameters(walks, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main.main(["population", str(walks), "-o", str(out)]) == 0
-    printed = capsys.readouterr().out
+def test_the_folder_has_a_report_and_parameters(made):
+    out, printed = made.folder, made.printed
     assert "fitting 2 parameters of record to 3 clips, 1 of them varying" in printed
     assert "uneven_walk from 1 s: cost" in printed and f"read {out / 'summary.md'}" in printed
     summary = (out / "summary.md").read_text()
@@ -284,17 +181,15 @@ def test_the_command_writes_a_report_and_parameters(walks, tmp_path, capsys):
         assert preset.name == "record"
 
 
-def test_what_has_not_converged_is_said_and_ends_with_status_3(quick, tmp_path, capsys):
-    path = write_walks(tmp_path, TABLE + "[fit]\nstarts = 1\n[fit.search]\ndescents = 1\n")
+def test_what_has_not_converged_is_said_and_ends_with_status_3(
+    tmp_path, monkeypatch, undrawn, capsys
+):
+    rest = VARYING + "[fit]\nstarts = 1\n[fit.search]\ndescents = 1\n"
+    path = small_studies.quick_population(tmp_path, monkeypatch, rest=rest)
     assert main.main(["population", str(path), "-o", str(tmp_path / "out")]) == 3
     assert "**Not converged**: all clips: Not converged: stopped" in capsys.readouterr().out
     page = Page(tmp_path / "out" / run_folder.PAGE)
     assert re.search(r"walks \d not converged ◐ \d of the searches did not converge", page.text)
-
-
-@pytest.fixture
-def fitted(walks) -> Population:
-    return fitting.population(walks)
 
 
 def changed(fitted: Population, **spread: object) -> Population:
@@ -334,3 +229,119 @@ def test_the_picture_has_a_panel_for_each_parameter_that_varies(fitted):
     figure = population_plots.overview(fitted, "title")
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles == ["pelvis.on_gain", "Error"]
+
+
+# Through the pipeline: short clips of `ozz` with known parameters, of one shape and so one program
+
+STOP_AND_GO = ROOT / "data" / "clips" / "stop_and_go_base.npz"
+TERRAIN = ROOT / "data" / "terrains" / "stop_and_go.ply"
+SIZE = 1.3
+STARTS = (1.0, 4.0, 8.0)  # s, of clips of half a second
+TRUTH = {"target.foot_height": 0.10, "pelvis.on_gain": 0.2, "leg.soften": 0.95}
+HEADER = """
+preset = "ozz"
+faithful = true
+body = "adult"
+[free]
+target.foot_height = {}
+pelvis.on_gain = {}
+leg.soften = {}
+[sigmas]
+ankle = 0.002
+knee = 0.002
+pelvis = 0.002
+foot = 0.0087
+[hierarchy]
+scale_with_body = true
+"""
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory) -> list[Problem[jaxik.FootIK]]:
+    """Problems of one clip each: three of one body, and the second again of a larger one."""
+    folder, walk = tmp_path_factory.mktemp("ozz"), load_clip(STOP_AND_GO)
+    clips = [edit.trim(walk, start, start + 0.5) for start in STARTS]
+    clips.append(scaled(clips[1], SIZE, froude=True))
+    tables = []
+    for number, clip in enumerate(clips):
+        path: Path = folder / f"{number}.npz"
+        save_clip(path, clip)
+        files = f'reference = "{path}"\nbase = "{path}"\nterrain = "{TERRAIN}"\n'
+        tables.append(f'[[clips]]\n{files}root = "animation"\n')
+    (folder / "ozz.toml").write_text(HEADER + "".join(tables))
+    with jax.enable_x64(True):
+        problem = make_problem(load_experiment(folder / "ozz.toml"))
+    return [eqx.tree_at(lambda p: p.data, problem, (scene,)) for scene in problem.data]
+
+
+def moved(problem: Problem, values: Mapping[str, float], seed: int) -> Problem:
+    """The problem with motion that these values make, plus noise."""
+    return simulate(problem, jnp.asarray(problem.space.pack(values)), seed)
+
+
+def without_size(problem: Problem) -> Problem:
+    """The problem of a body that is taken for the first one."""
+    return eqx.tree_at(lambda p: p.data[0].size, problem, jnp.ones(()))
+
+
+def test_what_made_the_motion_explains_it_on_a_body_of_another_size(walks):
+    adult, larger = (moved(walks[c], TRUTH, c) for c in (1, 3))
+    assert float(larger.data[0].size / adult.data[0].size) == pytest.approx(SIZE)
+    u = adult.space.pack(TRUTH)
+    costs = [float(each.cost(u)) for each in (adult, larger, without_size(larger))]
+    assert costs[1] == pytest.approx(costs[0], rel=0.2) and costs[2] > 3 * costs[1]
+
+
+@pytest.mark.slow
+def test_a_fit_across_two_bodies_needs_their_sizes(walks):
+    both = [moved(walks[c], TRUTH, c) for c in (1, 3)]
+    unsized = [without_size(problem) for problem in both]
+    space = walks[0].space
+    start = np.tile(np.asarray(space.start), (2, 1))
+    grouping = Grouping.pooled(2, space.size)
+    with_sizes, without = (fit_population(p, grouping, [start]) for p in (both, unsized))
+    fitted, other = (np.asarray(space.values(fit.centre)) for fit in (with_sizes, without))
+    expected = np.array(list(TRUTH.values()))
+    np.testing.assert_allclose(fitted, expected, rtol=0.03)
+    assert with_sizes.converged and np.abs(other / expected - 1).max() > 0.1
+    assert without.cost > 2 * with_sizes.cost
+
+
+HEIGHT_OF_EACH = Grouping.of_labels([["a", "b", "c"], None, None])
+
+
+def fit_heights(clips: list[Problem]) -> PopulationFit:
+    """Three clips that may differ in the first parameter."""
+    starts = [np.tile(np.asarray(clips[0].space.start), (3, 1))]
+    fit = fit_population(clips, HEIGHT_OF_EACH, starts)
+    assert fit.converged
+    return fit
+
+
+@pytest.mark.slow
+def test_the_population_of_short_clips_is_recovered(walks):
+    """One body whose ankles stand at another height in each clip; all else is the same."""
+    heights = (0.07, 0.085, 0.10)
+    clips = [
+        moved(problem, TRUTH | {"target.foot_height": height}, c)
+        for c, (problem, height) in enumerate(zip(walks[:3], heights, strict=True))
+    ]
+    fit = fit_heights(clips)
+    rows = summarise(clips, fit.clips, fit.centre, fit, ("clip", "shared", "shared"))
+    for estimate, truth in zip(rows[0]["clips"], heights, strict=True):
+        assert estimate["value"] == pytest.approx(truth, abs=0.002)
+    low, high = rows[0]["centre"]["interval"]  # type: ignore[misc]
+    assert low < 0.085 < high
+    assert rows[0]["spread"]["interval"][0] > 0  # type: ignore[index]
+    assert rows[2]["centre"]["value"] == pytest.approx(0.95, abs=0.02)
+    expected = predict(clips, HEIGHT_OF_EACH, fit, fit.centre, 0, lambda rounds, cost: None)
+    assert expected[0] > fit.clips[0, 0] + 0.1, "the others' ankles are higher"
+
+
+@pytest.mark.slow
+def test_clips_that_are_alike_have_a_spread_near_0(walks):
+    clips = [moved(problem, TRUTH, 10 + c) for c, problem in enumerate(walks[:3])]
+    fit = fit_heights(clips)
+    heights = [float(np.asarray(clips[0].space.values(u))[0]) for u in fit.clips]
+    assert fit.spread[0] < 0.05
+    np.testing.assert_allclose(heights, TRUTH["target.foot_height"], atol=0.002)
