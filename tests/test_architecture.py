@@ -1,6 +1,7 @@
 """The structure of the two packages: who imports whom, and what every file must have."""
 
 import ast
+import functools
 import sys
 from pathlib import Path
 
@@ -25,61 +26,67 @@ ONLY_IMPORTED_BY = {
     "emcee": "fitting/inference/sampling/sampler.py",
 }
 
-PACKAGES = {name: house.Package(name) for name in house.PACKAGES}
-TREES = {path: tree for package in PACKAGES.values() for path, tree in package.trees.items()}
+
+@functools.cache
+def package(name: str) -> house.Package:
+    """Parsed once, and not where tests are only collected."""
+    return house.Package(name)
+
+
+def trees() -> dict[Path, ast.Module]:
+    """Of all modules of both packages."""
+    return {path: tree for name in WINGS for path, tree in package(name).trees.items()}
 
 
 def name_of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
+@functools.cache
 def imports(path: Path) -> set[str]:
     """Absolute dotted names of everything that a module imports."""
-    package = path.relative_to(ROOT).parent.parts
+    folders = path.relative_to(ROOT).parent.parts
     names = set()
-    for node in ast.walk(TREES[path]):
+    for node in ast.walk(trees()[path]):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            parents = package[: len(package) - node.level + 1] if node.level else ()
+            parents = folders[: len(folders) - node.level + 1] if node.level else ()
             base = ".".join([*parents, *([node.module] if node.module else [])])
             names |= {f"{base}.{alias.name}" for alias in node.names}
     return names
 
 
-IMPORTS = {path: imports(path) for path in TREES}
-
-
 def imported_packages(path: Path) -> set[str]:
     """Top-level packages that a module imports."""
-    return {name.partition(".")[0] for name in IMPORTS[path]}
+    return {name.partition(".")[0] for name in imports(path)}
 
 
 def package_and_wing(path: Path) -> tuple[str, str]:
     """The package of a file and its wing in it."""
-    package, *rest = path.relative_to(ROOT).with_suffix("").parts
-    return package, rest[0]
+    home, *rest = path.relative_to(ROOT).with_suffix("").parts
+    return home, rest[0]
 
 
 def imported_wings(path: Path) -> set[str]:
     """Wings of a file's own package that it imports, its own left out."""
-    package, own = package_and_wing(path)
-    parts = [name.split(".") for name in IMPORTS[path]]
-    return {names[1] for names in parts if names[0] == package and len(names) > 1} - {own}
+    home, own = package_and_wing(path)
+    parts = [name.split(".") for name in imports(path)]
+    return {names[1] for names in parts if names[0] == home and len(names) > 1} - {own}
 
 
-@pytest.mark.parametrize("package", WINGS)
-def test_every_wing_has_its_place_in_the_import_order(package):
-    wings = {package_and_wing(path)[1] for path in PACKAGES[package].files}
-    assert wings - {"__init__"} == set(WINGS[package])
+@pytest.mark.parametrize("name", WINGS)
+def test_every_wing_has_its_place_in_the_import_order(name):
+    wings = {package_and_wing(path)[1] for path in package(name).files}
+    assert wings - {"__init__"} == set(WINGS[name])
 
 
 def test_a_wing_imports_only_wings_before_it():
     offenders = {}
-    for path in TREES:
-        package, own = package_and_wing(path)
+    for path in trees():
+        home, own = package_and_wing(path)
         if own != "__init__":
-            order = WINGS[package]
+            order = WINGS[home]
             offenders[name_of(path)] = imported_wings(path) - set(order[: order.index(own)])
     assert not {path: sorted(later) for path, later in offenders.items() if later}, WINGS
 
@@ -91,11 +98,11 @@ def stage_of(path: Path) -> str:
 
 
 def test_a_stage_imports_only_stages_before_it():
-    staged = {path: stage_of(path) for path in PACKAGES["jaxik"].files if stage_of(path)}
+    staged = {path: stage_of(path) for path in package("jaxik").files if stage_of(path)}
     assert set(staged.values()) == set(STAGES)
     offenders = {}
     for path, stage in staged.items():
-        names = [name.split(".") for name in IMPORTS[path] if name.startswith("jaxik.stages.")]
+        names = [name.split(".") for name in imports(path) if name.startswith("jaxik.stages.")]
         later = {parts[2] for parts in names} - {stage, *STAGES[: STAGES.index(stage)]}
         offenders |= {name_of(path): sorted(later)} if later else {}
     assert not offenders, STAGES
@@ -103,19 +110,19 @@ def test_a_stage_imports_only_stages_before_it():
 
 def test_jaxik_imports_nothing_but_its_libraries_and_touches_no_files():
     allowed = {*LIBRARIES_OF_JAXIK, *sys.stdlib_module_names, "jaxik"} - {"os", "pathlib"}
-    foreign = {name_of(path): imported_packages(path) - allowed for path in PACKAGES["jaxik"].files}
+    foreign = {name_of(path): imported_packages(path) - allowed for path in package("jaxik").files}
     assert not {path: names for path, names in foreign.items() if names}
 
 
 @pytest.mark.parametrize(("library", "module"), ONLY_IMPORTED_BY.items())
 def test_a_heavy_library_is_imported_by_one_module_only(library, module):
-    assert {name_of(path) for path in TREES if library in imported_packages(path)} == {module}
+    assert {name_of(path) for path in trees() if library in imported_packages(path)} == {module}
 
 
 def test_everything_public_has_a_docstring():
-    bare = [name_of(path) for path, tree in TREES.items() if not ast.get_docstring(tree)]
+    bare = [name_of(path) for path, tree in trees().items() if not ast.get_docstring(tree)]
     assert bare == [], "modules without a docstring"
-    missing = {path: PACKAGES[package_and_wing(path)[0]].undocumented(path) for path in TREES}
+    missing = {path: package(package_and_wing(path)[0]).undocumented(path) for path in trees()}
     assert not {name_of(path): names for path, names in missing.items() if names}
 
 
