@@ -1,4 +1,4 @@
-"""Ground that is too high, too low or too steep: refused gradually, the same by every probe."""
+"""Ground too high, too low, too steep or too narrow: refused gradually, the same by every probe."""
 
 import dataclasses
 import functools
@@ -14,18 +14,20 @@ import jaxik
 from jaxik import HARD
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs
+from jaxik.stages.probe import foot_heading
 from jaxik.stages.probe.limits import AbstractLimitedProbe
 from jaxik.world.frame import GroundHits
 from jaxik.world.terrain import ALL_LAYERS
 from reference import maths
 from reference.characters import Parameters
-from reference.maths import Array
 from reference.stages import limits
 from reference.terrain import Terrain as PlainTerrain
-from support.cases import QUICK, RIG
-from support.clips import animate, planes, to_frames, to_rig, to_terrain
+from support.cases import RIG
+from support.clips import animate, to_frames, to_rig, to_terrain
+from support.probing import BLOCKS, ground_under, level_blocks, quad
 
 LIMITS = {"max_step_up": 0.3, "max_step_down": 0.25, "max_slope": 0.7}
+WIDTHS = {"min_support": 0.5, "support_radius": 0.04}
 PROBES = {
     "FootProbe": jaxik.presets.ozz,
     "RootProbe": jaxik.presets.unreal,
@@ -33,53 +35,46 @@ PROBES = {
     "StrideProbe": jaxik.presets.stride,
 }
 FRAME = animate(RIG, count=1)[0]
+FLOOR = (-3.0, 3.0, -0.02)  # a level block
 UP_START = 1.2  # m above the root, where rays start
+STEP = 0.005  # m, between heights
+UP, DOWN = np.arange(0.25, 0.45, STEP), -np.arange(0.20, 0.40, STEP)  # m, of too high and low steps
 
 
-def system(preset: str, **values: Any) -> jaxik.FootIK:
-    """The preset with these limits."""
+def system(preset: str, check_support: bool = False, **values: Any) -> jaxik.FootIK:
+    """The preset with these limits; it refuses narrow ground too if it checks for support."""
     named = {f"probe.{name}": value for name, value in (LIMITS | values).items()}
-    return parameter_tree.replace(PROBES[preset](), named)
+    ik = parameter_tree.replace(PROBES[preset](), named)
+    return parameter_tree.with_option(ik, "probe.check_support", check_support)
 
 
-@functools.partial(jax.jit, compiler_options=QUICK)
-def ground_under(ik: jaxik.FootIK, ground: Any, frames: jaxik.Frame) -> GroundHits:
-    """What the probe finds in each frame."""
-
-    def sense(frame: jaxik.Frame) -> GroundHits:
-        inputs = Inputs(to_rig(RIG), ground, frame, HARD)
-        contact = ik.contact.sense(inputs)
-        return ik.probe.sense(inputs, contact, ik.target.foot_height)
-
-    return jax.vmap(sense)(frames)
-
-
-def accepted_ground(ik: jaxik.FootIK, ground: Any, starts_ws: Array) -> Any:
-    """Accepted ground below the starts (rays, legs, 3), of a character that stands still."""
+def inputs_of(ground: Any) -> Inputs:
+    """A character that stands still."""
     frame = jax.tree.map(lambda x: x[0], to_frames([FRAME]))
-    inputs = Inputs(to_rig(RIG), ground, frame, HARD)
+    return Inputs(to_rig(RIG), ground, frame, HARD)
+
+
+@jax.jit
+def accepted_ground(ik: jaxik.FootIK, ground: Any, starts_ws: Any) -> Any:
+    """Accepted ground below the starts (rays, legs, 3), m."""
     assert isinstance(ik.probe, AbstractLimitedProbe)
-    starts, layers = jnp.asarray(starts_ws), jnp.asarray(ALL_LAYERS, jnp.uint32)
-    hit = ik.probe.cast(inputs, starts, jnp.asarray(2.4), layers)
+    layers = jnp.asarray(ALL_LAYERS, jnp.uint32)
+    hit = ik.probe.cast(inputs_of(ground), starts_ws, jnp.asarray(2.4), layers)
     return hit.found, hit.point, hit.normal
 
 
-read = jax.jit(accepted_ground, compiler_options=QUICK)
+def read(ik: jaxik.FootIK, ground: PlainTerrain, starts: Any) -> list[np.ndarray]:
+    return [np.asarray(x) for x in accepted_ground(ik, to_terrain(ground), jnp.asarray(starts))]
 
 
-def quad(*corners: tuple[float, float, float]) -> list:
-    """Two triangles over four corners in turn."""
-    a, b, c, d = ([*corner] for corner in corners)
-    return [[a, b, c], [a, c, d]]
+def found_on(ik: jaxik.FootIK, ground: PlainTerrain, *places: float, up: float = UP_START):
+    """How far the ground below five places, m forward, is accepted for the left leg."""
+    z = (*places, *(places[-1:] * 5))[:5]
+    starts = np.array([[[0.0, up, place]] * 2 for place in z])
+    return read(ik, ground, starts)[0][:, 0]
 
 
-def level(height: float, near: float = -0.5, far: float = 0.8) -> PlainTerrain:
-    """A level plate over the origin."""
-    corners = ((-1, near), (1, near), (1, far), (-1, far))
-    plate = quad(*((x, height, z) for x, z in corners))
-    return PlainTerrain(maths.Y, triangles=np.array(plate))
-
-
+@functools.cache
 def bumps() -> PlainTerrain:
     """Rough ground, much of it too steep or too high, over a tilted floor with a hole."""
     rng = np.random.default_rng(3)
@@ -94,68 +89,109 @@ def bumps() -> PlainTerrain:
     return PlainTerrain(maths.Y, triangles=np.array(rough + quad(*floor)))
 
 
+def starts_over_bumps(seed: int) -> np.ndarray:
+    places = np.random.default_rng(seed).uniform(-1.6, 1.6, (300, 2, 3))
+    return places * [1, 0, 1] + [0, UP_START, 0]
+
+
+def sloped(slope: float) -> list:
+    """Two triangles that rise forward by this slope."""
+    return quad(*((x, slope * z, z) for x, z in ((-3, -3), (3, -3), (3, 3), (-3, 3))))
+
+
 # The decision.
 
 
-def test_it_agrees_with_the_reference():
-    ground, rng = bumps(), np.random.default_rng(0)
-    starts = rng.uniform(-1.6, 1.6, (600, 2, 3)) * [1, 0, 1] + [0, UP_START, 0]
+@pytest.mark.parametrize("check_support", [False, True])
+def test_it_agrees_with_the_reference(check_support):
+    ground, starts = bumps(), starts_over_bumps(seed=0)
     per_leg = {"max_step_up": [0.3, 0.2], "max_slope": [0.6, 0.9]}
-    ik = system("FootProbe", **per_leg)
-    found, point, normal = map(np.asarray, read(ik, to_terrain(ground), starts))
-    values = {f"probe.{name}": np.asarray(value) for name, value in (LIMITS | per_leg).items()}
-    defaults = {f"probe.{name}": 0.0 for name in LIMITS}
-    parameters = Parameters(values, defaults)
+    if check_support:
+        per_leg |= {"min_support": [0.9, 0.7], "support_radius": [0.1, 0.06]}
+    found, point, normal = read(system("FootProbe", check_support, **per_leg), ground, starts)
+    values = {f"probe.{name}": np.asarray(x) for name, x in (LIMITS | per_leg).items()}
+    parameters = Parameters(values, dict.fromkeys(values, 0.0))
+    inputs = inputs_of(to_terrain(ground))
+    ahead = np.asarray(foot_heading(inputs, inputs.terrain.leg_up_ws)[0])
+    heading = ahead if check_support else [None, None]
     expected = [
         [
-            limits.read(parameters, ground, leg, np.zeros(3), start, 2.4)
+            limits.read(parameters, ground, leg, np.zeros(3), start, 2.4, ahead=heading[leg])
             for leg, start in enumerate(row)
         ]
         for row in starts
     ]
     accepted = np.array([[reading.found for reading in row] for row in expected])
     np.testing.assert_allclose(found, accepted, rtol=0, atol=1e-9)
-    assert ((accepted > 0.05) & (accepted < 0.95)).sum() > 30
-    assert (accepted == 0).sum() > 100 and (accepted == 1).sum() > 100
+    assert ((accepted > 0.05) & (accepted < 0.95)).sum() > 15
+    assert (accepted == 0).sum() > 50 and (accepted == 1).sum() > 50
     counts = accepted > 0
     for ours, name in ((point, "point"), (normal, "normal")):
         theirs = np.array([[getattr(reading, name) for reading in row] for row in expected])
         np.testing.assert_allclose(ours[counts], theirs[counts], rtol=0, atol=1e-9)
 
 
-def test_a_slope_is_no_step_however_far_it_goes():
-    starts = np.array([[[0.0, 2.0, z]] * 2 for z in (-0.5, 0.5, 2.0)])
-    slope = to_terrain(planes((0.5, 0, 0)))
-    found, _, _ = read(system("FootProbe", max_slope=0.6), slope, starts)
-    assert (np.asarray(found) == 1).all()
+@pytest.mark.parametrize("check_support", [False, True])
+def test_a_slope_is_no_step_however_far_it_goes_and_supports_all_of_the_sole(check_support):
+    slope = PlainTerrain(maths.Y, triangles=np.array(sloped(0.5) * BLOCKS))
+    ik = system("FootProbe", check_support, max_slope=0.6)
+    assert (found_on(ik, slope, -0.5, 0.0, 0.5, 2.0, up=2.0) == 1).all()
 
 
 def test_a_ray_from_no_higher_than_a_step_looks_no_further_than_its_first_ground():
     """Only a ray from further up may have met a table."""
-    steep = quad((-1, -1.6, -1), (1, -1.6, -1), (1, 1.6, 1), (-1, 1.6, 1))
-    floor = quad((-1, -0.9, -1), (1, -0.9, -1), (1, -0.9, 1), (-1, -0.9, 1))
-    ground = to_terrain(PlainTerrain(maths.Y, triangles=np.array(steep + floor)))
-    starts = np.array([[[0.0, height, 0.0]] * 2 for height in (0.05, 0.2, 0.5)])
+    floor = level_blocks((-1.0, 1.0, -0.9)).triangles[2:]
+    ground = PlainTerrain(maths.Y, triangles=np.concatenate([sloped(1.6), floor]))
+    starts = np.array([[[0.0, height, 0.0]] * 2 for height in (0.05, 0.1, 0.2, 0.3, 0.5)])
     found, point, _ = read(system("FootProbe", max_step_down=2.0), ground, starts)
     np.testing.assert_array_equal(found, 0.0)
     np.testing.assert_allclose(point, 0.0, rtol=0, atol=1e-12)
 
 
 def test_infinite_limits_refuse_nothing():
-    rng = np.random.default_rng(1)
-    starts = rng.uniform(-1.4, 1.4, (100, 2, 3)) * [1, 0, 1] + [0, UP_START, 0]
     wide = system("FootProbe", **dict.fromkeys(LIMITS, np.inf))
-    never = dataclasses.replace(wide, probe=dataclasses.replace(wide.probe, limited=False))
-    ground = to_terrain(bumps())
-    for ours, theirs in zip(*(read(ik, ground, starts) for ik in (wide, never)), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+    never = parameter_tree.with_option(wide, "probe.limited", False)
+    ours, theirs = (read(ik, bumps(), starts_over_bumps(seed=1)) for ik in (wide, never))
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("half_left", "half_ahead", "accepted"),
+    [(0.02, 0.02, 0), (0.02, 1.0, 0), (1.0, 0.02, 0), (0.06, 1.0, 1), (1.0, 1.0, 1)],
+    ids=["post", "beam", "beam across", "plank", "floor"],
+)
+def test_ground_narrower_than_the_sole_is_refused(half_left, half_ahead, accepted):
+    plate = (-half_ahead, half_ahead, 0.0, -half_left, half_left)
+    ground = level_blocks(plate, (-3.0, 3.0, -0.5))
+    assert found_on(system("FootProbe", check_support=True), ground, 0.0)[0] == accepted
+    assert found_on(system("FootProbe"), ground, 0.0)[0] == 1
+
+
+def test_a_foot_may_stand_on_an_edge_and_beside_a_wall():
+    edge = level_blocks((-0.2, 0.2, 0.0), (-3.0, 3.0, -0.5))
+    wall = level_blocks((-3.0, 3.0, 0.0), (0.2, 2.0, 0.9))
+    for ground in (edge, wall):
+        found = found_on(system("FootProbe", True), ground, -0.199, -0.1, 0.0, 0.1, 0.199)
+        assert (found == 1).all()
+
+
+def test_ground_fades_out_as_it_becomes_narrower():
+    widths = np.linspace(0.005, 0.06, 111)
+    middles = 0.5 * np.arange(111) - 30.0
+    plates = [
+        level_blocks((-1.0, 1.0, 0.0, x - half, x + half)).triangles[:2]
+        for x, half in zip(middles, widths, strict=True)
+    ]
+    ground = PlainTerrain(maths.Y, triangles=np.concatenate(plates))
+    starts = np.array([[[x, UP_START, 0.0]] * 2 for x in middles])
+    found = read(system("FootProbe", True, max_step_up=9.0), ground, starts)[0][:, 0]
+    assert found[0] == 0 and found[-1] == 1 and (np.diff(found) >= 0).all()
 
 
 def test_gradients_are_finite_where_ground_is_accepted_in_part_or_not_at_all():
-    ik, ground = system("FootProbe", max_step_down=0.1), to_terrain(bumps())
-    starts = np.random.default_rng(2).uniform(-1.6, 1.6, (200, 2, 3)) * [1, 0, 1]
-    starts = starts + [0, UP_START, 0]
-
+    limits = {"max_step_down": 0.1, "min_support": 0.8, "support_radius": 0.1}
+    ik, ground = system("FootProbe", True, **limits), to_terrain(bumps())
     floats, rest = eqx.partition(ik.probe, eqx.is_inexact_array)
 
     def total(floats: Any, starts: Any) -> jax.Array:
@@ -163,9 +199,9 @@ def test_gradients_are_finite_where_ground_is_accepted_in_part_or_not_at_all():
         found, point, normal = accepted_ground(dataclasses.replace(ik, probe=probe), ground, starts)
         return found.sum() + point[..., 1].sum() + normal.sum()
 
-    gradient = jax.jit(jax.grad(total, (0, 1)), compiler_options=QUICK)
-    by_limit, by_start = gradient(floats, jnp.asarray(starts))
-    slopes = [np.asarray(getattr(by_limit, name)) for name in LIMITS]
+    gradient = jax.jit(jax.grad(total, (0, 1)))
+    by_limit, by_start = gradient(floats, jnp.asarray(starts_over_bumps(seed=2)))
+    slopes = [np.asarray(getattr(by_limit, name)) for name in LIMITS | WIDTHS]
     assert np.isfinite(slopes).all() and np.abs(slopes).min() > 0
     assert np.isfinite(by_start).all()
 
@@ -173,49 +209,63 @@ def test_gradients_are_finite_where_ground_is_accepted_in_part_or_not_at_all():
 # What the probes do with it.
 
 
+@functools.cache
+def raised() -> jaxik.Frame:
+    """The character as high over level ground as it would be over steps up and down."""
+    heights = np.concatenate([[0.0], UP, DOWN])
+    frames = to_frames([FRAME] * len(heights))
+    return frames.translated(jnp.asarray(-heights[:, None] * maths.Y))
+
+
+def on_steps(ik: jaxik.FootIK) -> GroundHits:
+    ground = to_terrain(level_blocks((-3.0, 3.0, 0.0)))
+    return jax.tree.map(lambda x: np.asarray(x)[1:], ground_under(ik, ground, raised()))
+
+
+def on_blocks(ik: jaxik.FootIK, *blocks: tuple[float, ...]) -> GroundHits:
+    hits = ground_under(ik, to_terrain(level_blocks(*blocks)), raised())
+    return jax.tree.map(lambda x: np.asarray(x)[0], hits)
+
+
 @pytest.mark.parametrize("preset", PROBES)
 def test_a_foot_stands_on_the_floor_under_a_table(preset):
-    table, floor = level(0.5), level(-0.02)
-    ground = PlainTerrain(maths.Y, triangles=np.concatenate([table.triangles, floor.triangles]))
-    hits = ground_under(system(preset), to_terrain(ground), to_frames([FRAME]))
-    np.testing.assert_allclose(hits.ankle.point[0, :, 1], -0.02, rtol=0, atol=1e-12)
-    assert (np.asarray(hits.ankle.found) == 1).all()
+    hits = on_blocks(system(preset), (-3.0, 3.0, 0.5), FLOOR)
+    np.testing.assert_allclose(hits.ankle.point[:, 1], -0.02, rtol=0, atol=1e-12)
+    assert (hits.ankle.found == 1).all()
 
 
 @pytest.mark.parametrize("preset", PROBES)
-@pytest.mark.parametrize("height", [0.41, -0.36], ids=["up", "down"])
-def test_a_foot_stays_as_animated_where_nothing_is_accepted(preset, height):
-    ground = np.concatenate([level(height).triangles] * 2)
-    frames = to_frames([FRAME])
-    ik = system(preset)
-    hits = ground_under(ik, to_terrain(PlainTerrain(maths.Y, triangles=ground)), frames)
-    assert (np.asarray(hits.ankle.found) == 0).all()
-
-
-@pytest.mark.parametrize("preset", PROBES)
-def test_a_step_fades_out_as_it_becomes_too_high(preset):
+def test_a_step_fades_out_as_it_becomes_too_high_or_too_low(preset):
     """The foothold leaves the ground without a jump, and is the animated one in the end."""
-    frames = to_frames([FRAME])
-    heights = np.linspace(0.25, 0.45, 41)
-    grounds = [to_terrain(level(height)) for height in heights]
-    ik = system(preset)
-    hits = [ground_under(ik, ground, frames).ankle for ground in grounds]
-    found = np.array([hit.found[0, 0] for hit in hits])
-    assert (found[heights <= 0.3] == 1).all() and (found[heights > 0.4] == 0).all()
-    assert np.abs(np.diff(found)).max() < 1.5 * 0.005 / 0.1 + 1e-9
+    found = on_steps(system(preset)).ankle.found
+    assert (found[-1] == 0).all()
+    both = [(UP, found[: len(UP)], 0.3), (-DOWN, found[len(UP) :], 0.25)]
+    for heights, part, limit in both[:1] if preset == "CornerProbe" else both:  # its rays end there
+        assert (part[heights < limit - 1e-9] == 1).all()
+        assert (part[heights > limit + 0.1 + 1e-9] == 0).all()
+        assert np.abs(np.diff(part, axis=0)).max() < 1.5 * STEP / 0.1 + 1e-9
 
 
 def test_a_toe_on_half_accepted_ground_is_between_it_and_the_level_of_the_foot():
     """The rule of Mec looks for its toe from where it puts the sole."""
-    height, ik = 0.33, system("CornerProbe")
-    frame = jax.tree.map(lambda x: x[:1], to_frames([FRAME]))
-    ground = jax.tree.map(lambda x: x[0], ground_under(ik, to_terrain(level(height)), frame))
-    found, foot_height = np.asarray(ground.ankle.found), float(ik.target.foot_height)
-    assert ((found > 0.05) & (found < 0.95)).all()
-    foot = np.asarray(frame.pose.ankle.pos[0, :, 1] + frame.world_from_model.pos[0, 1])
-    sole = (1 - found) * (foot - foot_height) + found * height
-    weight = np.asarray(ground.toe.found)
-    np.testing.assert_allclose(weight, found**2, rtol=1e-6)
+    ik = system("CornerProbe")
+    ground, root = on_steps(ik), np.asarray(raised().world_from_model.pos[1:, 1])
+    found, weight = np.asarray(ground.ankle.found), np.asarray(ground.toe.found)
+    half = ((found > 0.05) & (found < 0.95)).all(axis=1) & (root < 0)
+    assert half.sum() > 10
+    sole = (1 - found) * (FRAME.ankle.pos[:, 1] + root[:, None] - float(ik.target.foot_height))
+    np.testing.assert_allclose(weight[half], found[half] ** 2, rtol=1e-6)
     np.testing.assert_allclose(
-        ground.toe.point[:, 1], (1 - weight) * sole + weight * height, rtol=1e-9
+        np.asarray(ground.toe.point)[half, :, 1], ((1 - weight) * sole)[half], rtol=1e-9
     )
+
+
+@pytest.mark.parametrize("preset", PROBES)
+def test_no_foot_stands_on_a_post_but_on_the_floor_below(preset):
+    feet = on_blocks(system(preset), FLOOR).ankle.point
+    below = np.concatenate([feet, FRAME.toe.pos])
+    posts = [(z - 0.02, z + 0.02, 0.2, x - 0.02, x + 0.02) for x, _, z in below]
+    on_posts = on_blocks(system(preset), *posts, FLOOR).ankle
+    assert on_posts.point[:, 1].max() > 0.1, "feet would stand there"
+    hits = on_blocks(system(preset, check_support=True), *posts, FLOOR).ankle
+    np.testing.assert_allclose(hits.found * (hits.point[:, 1] + 0.02), 0.0, rtol=0, atol=1e-9)
