@@ -1,9 +1,10 @@
 """Mutation testing: `PYTHONPATH=tests python -m mutation --count 200 --seed 1`.
 
-Changes a line of the source, in a copy of the checkout, and runs the tests until one fails; then
-the next. Prints how many changes the tests caught and lists those that survived. Results are kept
-in `build/mutation`: the same command goes on where it was interrupted. The exit status is 1 if
-less than 95 % were caught.
+Changes a line of the source, in a copy of the checkout, and runs the tests that execute it until
+one fails; then the next. Which tests do is shown by a run of the suite, the first time. Prints how
+many changes the tests caught and lists those that survived. Results are kept in `build/mutation`:
+the same command goes on where it was interrupted. The exit status is 1 if less than 95 % were
+caught.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from pathlib import Path
 from .mutants import modules_of, mutants_of, sample
 from .report import OUTCOMES, Result, score, summary
 from .run import Run
+from .survey import DIGESTS, EVERYTHING, Survey, make
 from .workplace import Workplace
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,13 +54,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="mutation", description="Changes code, and tests it.")
     parser.add_argument("--count", type=int, default=200, help="mutants, of all modules together")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--only", nargs="+", default=["jaxik", "fitting"], help="folders or modules"
-    )
+    parser.add_argument("--only", nargs="+", default=[*PACKAGES], help="folders or modules")
     parser.add_argument("--report", type=Path, help="a file for what is printed at the end")
     parser.add_argument("--retry", action="store_true", help="test survivors again")
     parser.add_argument("--budget", type=float, help="only so many CPU seconds of tests for each")
-    parser.add_argument("--default", action="store_true", help="ask no tests marked as slow")
+    parser.add_argument("--all", action="store_true", help="ask tests marked as slow, too")
+    parser.add_argument("--survey", action="store_true", help="find out anew which test runs what")
     options = parser.parse_args()
     KEPT.mkdir(parents=True, exist_ok=True)
     os.environ.update(ENVIRONMENT)
@@ -67,9 +68,12 @@ def main() -> int:
     mutants = [mutant for path in modules for mutant in mutants_of(ROOT, path)]
     chosen = sample(mutants, options.count, options.seed)
     print(f"{len(chosen)} of {len(mutants)} mutants in {len(modules)} modules", flush=True)
-    with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
-        name = f"{options.seed}-default" if options.default else str(options.seed)
-        run = Run(Workplace(ROOT, Path(folder)), KEPT, name, not options.default)
+    folder = KEPT / ("all" if options.all else "default")
+    if options.survey or not (folder / DIGESTS).exists():
+        make(ROOT, folder, EVERYTHING if options.all else "not slow")
+    with tempfile.TemporaryDirectory(prefix="mutation-") as copy:
+        workplace = Workplace(ROOT, Path(copy))
+        run = Run(workplace, Survey(ROOT, folder), folder / f"{options.seed}.jsonl")
         if options.retry:
             run.forget_survivors()
         try:

@@ -25,7 +25,6 @@ class Result:
     after: str
     outcome: str
     by: str = ""  # the test that caught it, or the reason that explains it
-    slow: bool = False  # whether that test is marked as slow
     status: int = 0  # of pytest, or minus the signal that ended it
     seconds: float = 0.0  # that it took
     complete: bool = True  # whether all tests have been asked about it

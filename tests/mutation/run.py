@@ -1,18 +1,15 @@
 """Mutants tested one after the other, first by the likeliest tests and then by all others."""
 
-import itertools
 import math
 import time
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 from .explained import reason_for
-from .ledger import Ledger
 from .mutants import Mutant, diff
-from .ranking import Group, first_part, groups_of, importers, ranked
 from .report import CAUGHT, EXPLAINED, SURVIVED, Key, Result, keep_result, load_results
-from .trial import OUTPUT, run_groups, run_test
+from .survey import Survey
+from .trial import OUTPUT, run_tests
 from .workplace import Workplace
 
 # Of the results so far, the seconds that the round will still take, and the last result.
@@ -22,19 +19,15 @@ Progress = Callable[[list[Result], float, Result], None]
 class Run:
     """Tests mutants, keeping what becomes of each as soon as that is known."""
 
-    def __init__(
-        self, workplace: Workplace, folder: Path, name: str, slow_too: bool = True
-    ) -> None:
-        """A run that goes on where an earlier one with this name stopped.
+    def __init__(self, workplace: Workplace, survey: Survey, kept: Path) -> None:
+        """A run that goes on where an earlier one stopped.
 
         Args:
             workplace: where mutants are tested.
-            folder: of what is kept: results, and which tests are known to pass.
-            name: of the file of results.
-            slow_too: whether tests marked as slow are asked, too.
+            survey: of the tests that are asked.
+            kept: the file of results.
         """
-        self.workplace, self.kept, self.slow_too = workplace, folder / f"{name}.jsonl", slow_too
-        self.ledger = Ledger(folder / "tests.json", workplace.checkout)
+        self.workplace, self.survey, self.kept = workplace, survey, kept
         self.results = {result.key: result for result in load_results(self.kept)}
 
     def forget_survivors(self) -> None:
@@ -66,44 +59,30 @@ class Run:
         key, earlier = self._key(mutant), self.results.get(self._key(mutant))
         if reason := reason_for(mutant.path, *key[2:]):
             return self._keep(Result(*key, EXPLAINED, reason))
-        seconds, checkout = self.ledger.seconds(), self.workplace.checkout
-        groups = ranked(
-            mutant.path,
-            [x for x in groups_of(checkout, mutant.path) if self.slow_too or not x.slow],
-            seconds,
-            self._catches(key),
-            importers(checkout, mutant.path),
-        )
-        near, far = first_part(groups, seconds, budget)
+        checkout = self.workplace.checkout
+        asked = self.survey.asked(self.workplace.root, mutant.path, mutant.line)
+        part = asked if earlier else self.survey.first_part(asked, budget)
+        if not part:  # no test executes the module
+            return self._keep(Result(*key, SURVIVED))
         begin = time.monotonic()
         with self.workplace.mutated(mutant):
-            outcome = run_groups(checkout, groups if earlier else near, budget)
-        last = outcome.last.partition("::")[0]
-        before = itertools.takewhile(lambda group: group.file != last, groups)
-        self.ledger.add(outcome.passed, before if last else ())
+            outcome = run_tests(checkout, part, budget)
         spent = round(time.monotonic() - begin + (earlier.seconds if earlier else 0.0), 1)
         if outcome.none_failed:
-            complete = bool(earlier) or not far
+            complete = bool(earlier) or (part == asked and not outcome.stopped)
             return self._keep(Result(*key, SURVIVED, seconds=spent, complete=complete))
-        self._confirm(outcome.last, groups if earlier else near)
-        caught = outcome.last, outcome.slow, outcome.status, spent
-        return self._keep(Result(*key, CAUGHT, *caught))
+        self._confirm(outcome.last, part)
+        return self._keep(Result(*key, CAUGHT, outcome.last, outcome.status, spent))
 
-    def _confirm(self, test: str, groups: list[Group]) -> None:
+    def _confirm(self, test: str, asked: list[str]) -> None:
         """Ends the run if a test fails without any change too, or some cannot be imported."""
-        checkout = self.workplace.checkout
-        if test in self.ledger:
+        if self.survey.passes(test):
             return
-        outcome = run_test(checkout, test) if test else run_groups(checkout, groups, budget=0.0)
-        self.ledger.add(outcome.passed)
+        checkout = self.workplace.checkout
+        outcome = run_tests(checkout, [test] if test else asked, math.inf if test else 0.0)
         if not outcome.none_failed:
             print((checkout.parent / OUTPUT).read_text())
-            raise SystemExit(f"Without any change of the source, {test or groups} fails.")
-
-    def _catches(self, key: Key) -> Counter[Group]:
-        """How many mutants of a module each group of tests has caught."""
-        own = [x for x in self.results.values() if x.outcome == CAUGHT and x.path == key[0]]
-        return Counter(Group(x.by.partition("::")[0], x.slow) for x in own)
+            raise SystemExit(f"Without any change of the source, {test or asked} fails.")
 
     def _is_known(self, key: Key, budget: float) -> bool:
         return key in self.results and (self.results[key].complete or math.isfinite(budget))

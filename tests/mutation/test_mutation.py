@@ -12,9 +12,9 @@ import pytest
 from mutation import trial
 from mutation.explained import EXPLAINED, Explained, reason_for
 from mutation.mutants import diff, modules_of, mutants_of, sample
-from mutation.ranking import NEAR, RINGS, Group, first_part, ranked, wing_of
 from mutation.report import CAUGHT, SURVIVED, Result, score, summary
 from mutation.run import Run
+from mutation.survey import EVERYTHING, Survey, make, statement
 from mutation.workplace import Workplace
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,26 +35,60 @@ class Doubling:
             raise ValueError(f"{1 + 1} is wanted")
         return 2.0 * x
 '''
-TESTS = """from jaxik.solvers.toy import Doubling
+TESTS = {
+    "tests/solvers/test_toy.py": """from jaxik.solvers.toy import Doubling
 
 def test_nothing_is_twice_nothing():
     assert Doubling().doubled(0) == 0
+
+def test_nothing_at_all():
+    pass
+""",
+    "tests/solvers/test_other.py": """import time
+
+from jaxik.solvers.toy import Doubling
+
+def test_what_fails_already():
+    assert Doubling().doubled(1) == 3
+
+def test_a_slow_sum():
+    time.sleep(0.2)
+    assert Doubling().doubled(0) + 0 == 0
+""",
+    "tests/solvers/test_else.py": "def test_something_else():\n    assert True\n",
+}
+SETTINGS = """[tool.coverage.run]
+source = ["jaxik"]
+relative_files = true
+[tool.pytest.ini_options]
+pythonpath = ["."]
 """
+CATCHER = "tests/solvers/test_toy.py::test_nothing_is_twice_nothing"
+SLOW_CATCHER = "tests/solvers/test_other.py::test_a_slow_sum"
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory):
+    """A checkout with a module and weak tests of it, and the folder of its survey."""
+    root, folder = tmp_path_factory.mktemp("root"), tmp_path_factory.mktemp("survey")
+    files = {MODULE: SOURCE, "pyproject.toml": SETTINGS, **TESTS}
+    files |= {f"{folder}/__init__.py": "" for folder in ("jaxik", "jaxik/solvers")}
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, encoding="utf-8")
+    make(root, folder, EVERYTHING)
+    return root, folder
 
 
 @pytest.fixture
-def root(tmp_path):
-    """A checkout with a module and a weak test of it."""
-    for name, text in ((MODULE, SOURCE), ("tests/solvers/test_toy.py", TESTS)):
-        (tmp_path / name).parent.mkdir(parents=True)
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    for folder in ("jaxik", "jaxik/solvers"):
-        (tmp_path / folder / "__init__.py").touch()
-    return tmp_path
+def run(surveyed, tmp_path, monkeypatch):
+    monkeypatch.setattr(trial, "PRELOADED", [])
+    root, folder = surveyed
+    return Run(Workplace(root, tmp_path / "copy"), Survey(root, folder), tmp_path / "1.jsonl")
 
 
-def test_only_what_runs_is_mutated(root):
-    changes = [diff(mutant, root) for mutant in mutants_of(root, MODULE)]
+def test_only_what_runs_is_mutated(surveyed):
+    changes = [diff(mutant, surveyed[0]) for mutant in mutants_of(surveyed[0], MODULE)]
     assert sorted(changes) == [
         ("if x is None:", "if not x is None:"),
         ("if x is None:", "if x is not None:"),
@@ -64,35 +98,54 @@ def test_only_what_runs_is_mutated(root):
     ]
 
 
-def test_a_run_tells_caught_mutants_from_survivors_and_keeps_what_it_found(
-    root, tmp_path_factory, monkeypatch
-):
-    monkeypatch.setattr(trial, "PRELOADED", [])
-    chosen = [
-        x
-        for x in mutants_of(root, MODULE)
-        if diff(x, root)[1] in ("return 2.0 / x", "return 1.0 * x")
-    ]
-    kept, seen = tmp_path_factory.mktemp("kept"), []
-    run = Run(Workplace(root, tmp_path_factory.mktemp("copy")), kept, "1")
+def test_those_are_asked_that_execute_the_line_and_pass_quick_files_first(surveyed):
+    root, folder = surveyed
+    survey = Survey(root, folder)
+    line = 1 + SOURCE.splitlines().index("        return 2.0 * x")
+    asked = survey.asked(root, MODULE, line)
+    assert asked == [CATCHER, SLOW_CATCHER, "tests/solvers/test_toy.py::test_nothing_at_all"]
+    assert survey.first_part(asked, 0.0) == asked[:1] and survey.first_part(asked, 9.0) == asked
+    assert survey.passes(CATCHER) and not survey.passes("tests/solvers/test_toy.py::test_new")
+
+
+def test_files_that_changed_since_the_survey_are_asked_whole(surveyed):
+    root, folder = surveyed
+    new = root / "tests/solvers/test_new.py"
+    new.write_text(TESTS["tests/solvers/test_else.py"], encoding="utf-8")
+    try:
+        survey = Survey(root, folder)
+    finally:
+        new.unlink()
+    assert survey.asked(root, MODULE, 12)[0] == "tests/solvers/test_new.py"
+    assert survey.passes(CATCHER)
+
+
+def test_a_change_of_a_statement_is_one_of_all_its_lines(tmp_path):
+    path = tmp_path / "a.py"
+    path.write_text("x = [\n    1,\n]\nif (\n    x\n):\n    y = 2\n", encoding="utf-8")
+    assert [list(statement(path, line)) for line in (2, 5, 7)] == [[1, 2, 3], [4, 5, 6], [7]]
+
+
+def test_a_run_tells_caught_mutants_from_survivors_and_keeps_what_it_found(run):
+    root, seen = run.workplace.root, []
+    wanted = ("return 2.0 / x", "return 1.0 * x")
+    chosen = [mutant for mutant in mutants_of(root, MODULE) if diff(mutant, root)[1] in wanted]
     run.round(chosen, math.inf, lambda results, seconds, last: seen.append(last))
     outcomes = {result.after: (result.outcome, result.by) for result in run.results_of(chosen)}
-    by = "tests/solvers/test_toy.py::test_nothing_is_twice_nothing"
-    assert outcomes == {"return 2.0 / x": (CAUGHT, by), "return 1.0 * x": (SURVIVED, "")}
+    assert outcomes == {"return 2.0 / x": (CAUGHT, CATCHER), "return 1.0 * x": (SURVIVED, "")}
     assert (root / MODULE).read_text() == SOURCE
 
-    again = Run(run.workplace, kept, "1")
+    again = Run(run.workplace, run.survey, run.kept)
     again.round(chosen, math.inf, lambda *_: pytest.fail("tested again"))
     assert again.results_of(chosen) == seen
     assert "50.0%" in summary(seen) and f"{MODULE}:15" in summary(seen)
 
 
-def test_a_run_ends_where_tests_fail_without_any_change(root, tmp_path_factory, monkeypatch):
-    monkeypatch.setattr(trial, "PRELOADED", [])
-    (root / "tests/solvers/test_toy.py").write_text("import nothing_that_exists")
-    run = Run(Workplace(root, tmp_path_factory.mktemp("copy")), root / "build", "1")
+def test_a_run_ends_where_tests_fail_without_any_change(run, monkeypatch):
+    monkeypatch.setattr(run.survey, "passes", lambda test: False)
+    monkeypatch.setattr(run.survey, "asked", lambda *_: ["tests/solvers/test_other.py"])
     with pytest.raises(SystemExit, match="Without any change"):
-        run.round(mutants_of(root, MODULE), math.inf, lambda *_: None)
+        run.round(mutants_of(run.workplace.root, MODULE), math.inf, lambda *_: None)
 
 
 def test_a_sample_takes_from_each_module_by_its_number_of_mutants():
@@ -104,30 +157,6 @@ def test_a_sample_takes_from_each_module_by_its_number_of_mutants():
     for path in modules:
         share = 50 * sum(x.path == path for x in mutants) / len(mutants)
         assert abs(sum(x.path == path for x in chosen) - share) <= 1.0
-
-
-def test_tests_run_by_likely_catches_per_second_within_their_budget():
-    quick, near, catcher = (
-        Group(f"tests/solvers/test_{x}.py", False) for x in ("aim", "pole", "x")
-    )
-    seconds = {quick: 1.0, near: 4.0, catcher: 4.0}
-    groups = ranked("jaxik/solvers/pole.py", [quick, near, catcher], seconds, {catcher: 90})
-    assert groups == [catcher, near, quick]
-    assert first_part(groups, seconds, budget=10.0) == ([catcher, near], [quick])
-
-
-def test_tests_of_a_module_run_before_those_of_its_folder():
-    names = ("stages/test_declarations", "stages/test_limits", "stages/test_stride_probe")
-    groups = [Group(f"tests/{name}.py", False) for name in names]
-    assert ranked("jaxik/stages/probe/stride.py", groups, {}, {}) == groups[::-1]
-
-
-def test_every_wing_has_tests():
-    wings = {wing_of(path) for path in modules_of(ROOT, "jaxik")}
-    assert wings <= RINGS.keys()
-    places = [place for wing in wings for place in RINGS[wing]]
-    places += [name for names in NEAR.values() for name in names]
-    assert not [place for place in places if not (ROOT / "tests" / place).exists()]
 
 
 def test_the_score_has_the_interval_of_wilson_and_leaves_out_what_is_explained():

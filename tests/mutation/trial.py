@@ -11,18 +11,18 @@ import multiprocessing
 import os
 import signal
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from .ranking import Group
+from .survey import EVERYTHING
 
 PRELOADED = ["jax", "jax.numpy", "equinox", "scipy.stats", "scipy.spatial", "trimesh"]
 SECONDS = 180.0  # of CPU for one test, beyond which it hangs
 LONGEST = 3600.0  # seconds for all tests together, waiting included
-OPTIONS = ["-x", "-q", "--hypothesis-seed=0", "-p", "no:cacheprovider", "-m", "slow or not slow"]
+OPTIONS = ["-x", "-q", "--hypothesis-seed=0", "-p", "no:cacheprovider", "-m", EVERYTHING]
 OPTIONS += ["-W", "ignore:Module already imported"]  # among what is preloaded
 OUTPUT = "output.txt"  # beside the checkout: what pytest prints
 NOTES = "notes.json"
@@ -37,10 +37,6 @@ class Outcome:
     """Of pytest, or minus the signal that ended the process."""
     last: str = ""
     """The test that failed, or the last that began; empty before the first."""
-    slow: bool = False
-    """Whether that test is marked as slow."""
-    passed: dict[str, tuple[float, bool]] = field(default_factory=dict)
-    """CPU seconds of each test that passed, and whether it is marked as slow."""
     stopped: bool = False
     """Whether there was no time for more tests."""
 
@@ -53,12 +49,11 @@ class Outcome:
 class Watch:
     """A plugin of pytest: the order of tests, an end to those that hang, notes of what happens."""
 
-    def __init__(self, groups: list[Group], notes: Path, budget: float) -> None:
-        self.places = {group: place for place, group in enumerate(groups)}
+    def __init__(self, asked: list[str], notes: Path, budget: float) -> None:
+        self.places = {name: place for place, name in enumerate(asked)}
         self.notes, self.budget = notes, budget
         self.session: pytest.Session | None = None
         self.outcome = Outcome()
-        self.begin = 0.0
         self._restart_clock()
 
     def pytest_sessionstart(self, session: pytest.Session) -> None:
@@ -67,23 +62,15 @@ class Watch:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Leaves the tests of the groups, in their order."""
-        if self.places:
-            items[:] = [item for item in items if _group(item) in self.places]
-            items.sort(key=lambda item: self.places[_group(item)])
+        """Leaves the tests that are asked, in their order."""
+        items[:] = [item for item in items if self._place(item) is not None]
+        items.sort(key=self._place)  # pyright: ignore[reportArgumentType]
 
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Starts the clock of a test."""
-        self.outcome.last, self.outcome.slow = item.nodeid, _group(item).slow
+        self.outcome.last = item.nodeid
         self._note()
         self._restart_clock()
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Notes that a test passed."""
-        if report.when == "call" and report.passed:
-            seconds = round(_cpu_seconds() - self.begin, 2)
-            self.outcome.passed[report.nodeid] = seconds, self.outcome.slow
-            self._note()
 
     def pytest_runtest_logfinish(self) -> None:
         """Ends the run where there is no time for more tests."""
@@ -92,30 +79,30 @@ class Watch:
             self.outcome.stopped = True
             self._note()
 
+    def _place(self, item: pytest.Item) -> int | None:
+        """Of a test, or of its file where that is asked whole."""
+        return self.places.get(item.nodeid, self.places.get(item.nodeid.partition("::")[0]))
+
     def _note(self) -> None:
         self.notes.write_text(json.dumps(asdict(self.outcome)), encoding="utf-8")
 
     def _restart_clock(self) -> None:
-        self.begin = _cpu_seconds()
         signal.setitimer(signal.ITIMER_PROF, SECONDS)  # its signal ends the process
 
 
-def run_groups(checkout: Path, groups: list[Group], budget: float) -> Outcome:
-    """Runs groups of tests until a test fails or hangs, or all took so many CPU seconds."""
-    return _run(checkout, list(dict.fromkeys(group.file for group in groups)), groups, budget)
+def run_tests(checkout: Path, asked: list[str], budget: float = math.inf) -> Outcome:
+    """Runs tests until one fails or hangs, or all took so many CPU seconds.
 
-
-def run_test(checkout: Path, test: str) -> Outcome:
-    """Runs a single test, named as pytest does."""
-    return _run(checkout, [test], [], math.inf)
-
-
-def _run(checkout: Path, names: list[str], groups: list[Group], budget: float) -> Outcome:
+    Args:
+        checkout: where.
+        asked: names of tests or of files of tests, in their order.
+        budget: CPU seconds.
+    """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     notes = checkout.parent / NOTES
     notes.unlink(missing_ok=True)
-    process = context.Process(target=_pytest, args=(checkout, names, groups, budget))
+    process = context.Process(target=_pytest, args=(checkout, asked, budget))
     process.start()
     try:
         process.join(LONGEST)
@@ -125,7 +112,7 @@ def _run(checkout: Path, names: list[str], groups: list[Group], budget: float) -
     return Outcome(**{**known, "status": process.exitcode or PASSED})
 
 
-def _pytest(checkout: Path, names: list[str], groups: list[Group], budget: float) -> None:
+def _pytest(checkout: Path, asked: list[str], budget: float) -> None:
     os.setsid()
     os.chdir(checkout)
     with open(checkout.parent / OUTPUT, "w") as output:
@@ -134,8 +121,9 @@ def _pytest(checkout: Path, names: list[str], groups: list[Group], budget: float
     own = [str(checkout), str(checkout / "tests")]
     os.environ["PYTHONPATH"] = os.pathsep.join(own)  # of processes that tests start
     sys.path[:] = [*own, *sys.path]
-    watch = Watch(groups, checkout.parent / NOTES, budget)
-    sys.exit(pytest.main([*OPTIONS, *names], plugins=[watch]))
+    watch = Watch(asked, checkout.parent / NOTES, budget)
+    files = dict.fromkeys(name.partition("::")[0] for name in asked)
+    sys.exit(pytest.main([*OPTIONS, *files], plugins=[watch]))
 
 
 def _end(process: Any) -> None:
@@ -143,11 +131,6 @@ def _end(process: Any) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.join()
-
-
-def _group(item: pytest.Item) -> Group:
-    file = item.nodeid.partition("::")[0]
-    return Group(file, item.get_closest_marker("slow") is not None)
 
 
 def _cpu_seconds() -> float:
