@@ -1,95 +1,94 @@
 """Every path that a command takes: what is no file to read costs one line, and writes nothing."""
 
-import argparse
 import os
+import re
 import stat
 from pathlib import Path
 
 import pytest
 
 from fitting.cli import main
-from fitting.cli.parser import make_parser
 from support import experiments
+from support.commands import commands
 from support.sample_clips import BVH
 
-BASE = experiments.ROOT / "data" / "clips" / "uneven_walk_base.npz"
-GROUND = experiments.ROOT / "data" / "terrains" / "uneven_walk.ply"
-ANIMATION = [str(BASE), "--terrain", str(GROUND)]
-FROM_TO = ["--from", "mec", "--to", "record"]
-PLACES: dict[str, tuple[list[str], str]] = {  # words with a place for a path, and its suffix
-    "init": (["init", "{}", "--terrain", str(GROUND), "-o", "out"], ".bvh"),
-    "init --terrain": (["init", str(BASE), "--terrain", "{}", "-o", "out"], ".ply"),
-    "init --base": (["init", *ANIMATION, "--base", "{}", "-o", "out"], ".npz"),
-    "fit": (["fit", "{}", "-o", "out"], ".toml"),
-    "ablate": (["ablate", "{}", "-o", "out"], ".toml"),
-    "calibrate": (["calibrate", "{}", "-o", "out"], ".toml"),
-    "population": (["population", "{}", "-o", "out"], ".toml"),
-    "fit-many": (["fit-many", "{}", "-o", "out"], ".toml"),
-    "sample": (["sample", "{}"], ""),
-    "apply": (["apply", "{}", *ANIMATION, "-o", "a.npz"], ""),
-    "run clip": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".bvh"),
-    "run clip npz": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".npz"),
-    "run clip glb": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".glb"),
-    "run clip gltf": (["run", "{}", "--terrain", str(GROUND), "-o", "a.npz"], ".gltf"),
-    "run --terrain": (["run", str(BASE), "--terrain", "{}", "-o", "a.npz"], ".ply"),
-    "run --terrain npz": (["run", str(BASE), "--terrain", "{}", "-o", "a.npz"], ".npz"),
-    "run --terrain npy": (["run", str(BASE), "--terrain", "{}", "-o", "a.npz"], ".npy"),
-    "run --joints": (
-        ["run", "walk.bvh", "--joints", "{}", "--terrain", str(GROUND), "-o", "a.npz"],
-        ".toml",
-    ),
-    "inspect --joints": (["inspect", "walk.bvh", "--joints", "{}"], ".toml"),
-    "terrain --joints": (["terrain", "walk.bvh", "--joints", "{}", "-o", "a.ply"], ".toml"),
-    "translate --asf": (
-        ["translate", *FROM_TO, "--clip", "whole.amc", "--asf", "{}", *ANIMATION[1:], "-o", "out"],
-        ".asf",
-    ),
-    "run --parameters": (["run", *ANIMATION, "--parameters", "{}", "-o", "a.npz"], ".toml"),
-    "run --tracks": (["run", *ANIMATION, "--tracks", "{}", "-o", "a.npz"], ".toml"),
-    "view run": (["view", "{}"], ""),
-    "view clip": (["view", "{}", "--terrain", str(GROUND)], ".bvh"),
-    "view --parameters": (["view", *ANIMATION, "--parameters", "{}"], ".toml"),
-    "compare --parameters": (["compare", *ANIMATION, "--parameters", "{}", "-o", "out"], ".toml"),
-    "compare --runs": (["compare", "--runs", "{}", "-o", "out"], ""),
-    "translate --from": (
-        ["translate", "--from", "{}", *FROM_TO[2:], "--clip", *ANIMATION, "-o", "out"],
-        ".toml",
-    ),
-    "translate --clip": (
-        ["translate", *FROM_TO, "--clip", "{}", "--terrain", str(GROUND), "-o", "out"],
-        ".amc",
-    ),
-    "translate --free": (
-        ["translate", *FROM_TO, "--clip", *ANIMATION, "--free", "{}", "-o", "out"],
-        ".toml",
-    ),
-    "inspect": (["inspect", "{}"], ".amc"),
-    "inspect --asf": (["inspect", "whole.amc", "--asf", "{}"], ".asf"),
-    "terrain": (["terrain", "{}", "-o", "a.ply"], ".bvh"),
-    "record show": (["record", "show", "{}"], ".bin"),
-    "record show csv": (["record", "show", "{}"], ".csv"),
-    "record show toml": (["record", "show", "{}"], ".toml"),
-    "record to-toml": (["record", "to-toml", "{}", "-o", "a.toml"], ".bin"),
-    **{
-        f"export {suffix}": (["export", "{}", "-o", "a.toml"], suffix)
-        for suffix in (".toml", ".json", ".csv", ".bin", "")
-    },
-    "record to-bytes --base": (
-        ["record", "to-bytes", "whole.toml", "--base", "{}", "-o", "a.bin"],
-        ".bin",
-    ),
+DATA = experiments.ROOT / "data"
+FILES = {
+    "BASE": str(DATA / "clips" / "uneven_walk_base.npz"),
+    "GROUND": str(DATA / "terrains" / "uneven_walk.ply"),
 }
+# The suffix of PATH is that of the files which are read or written there.
+INPUTS = """
+init PATH.bvh --terrain GROUND -o out
+init BASE --terrain PATH.ply -o out
+init BASE --terrain GROUND --base PATH.npz -o out
+fit PATH.toml -o out
+ablate PATH.toml -o out
+calibrate PATH.toml -o out
+population PATH.toml -o out
+fit-many PATH.toml -o out
+sample PATH
+apply PATH BASE --terrain GROUND -o a.npz
+run PATH.bvh --terrain GROUND -o a.npz
+run PATH.npz --terrain GROUND -o a.npz
+run PATH.glb --terrain GROUND -o a.npz
+run PATH.gltf --terrain GROUND -o a.npz
+run BASE --terrain PATH.ply -o a.npz
+run BASE --terrain PATH.npz -o a.npz
+run BASE --terrain PATH.npy -o a.npz
+run walk.bvh --joints PATH.toml --terrain GROUND -o a.npz
+run BASE --terrain GROUND --parameters PATH.toml -o a.npz
+run BASE --terrain GROUND --tracks PATH.toml -o a.npz
+view PATH
+view PATH.bvh --terrain GROUND
+view BASE --terrain GROUND --parameters PATH.toml
+compare BASE --terrain GROUND --parameters PATH.toml -o out
+compare --runs PATH,other -o out
+translate --from PATH.toml --to record --clip BASE --terrain GROUND -o out
+translate --from mec --to record --clip PATH.amc --terrain GROUND -o out
+translate --from mec --to record --clip whole.amc --asf PATH.asf --terrain GROUND -o out
+translate --from mec --to record --clip BASE --terrain GROUND --free PATH.toml -o out
+inspect PATH.amc
+inspect whole.amc --asf PATH.asf
+inspect walk.bvh --joints PATH.toml
+terrain PATH.bvh -o a.ply
+terrain walk.bvh --joints PATH.toml -o a.ply
+record show PATH.bin
+record show PATH.csv
+record show PATH.toml
+record to-toml PATH.bin -o a.toml
+record to-bytes whole.toml --base PATH.bin -o a.bin
+export PATH.toml -o a.toml
+export PATH.json -o a.toml
+export PATH.csv -o a.toml
+export PATH.bin -o a.toml
+export PATH -o a.toml
+""".strip().splitlines()
+OUTPUTS = """
+init BASE --terrain GROUND -o PATH
+fit walk.toml -o PATH
+ablate walk.toml -o PATH
+calibrate walk.toml -o PATH
+population walk.toml -o PATH
+fit-many walk.toml -o PATH
+run BASE --terrain GROUND -o PATH.npz
+run BASE --terrain GROUND -o PATH.bvh
+view BASE --terrain GROUND -o PATH
+compare BASE --terrain GROUND --presets record -o PATH
+translate --from mec --to record --clip BASE --terrain GROUND -o PATH
+terrain BASE -o PATH.ply
+record to-toml whole.bin -o PATH.toml
+export whole.bin -o PATH.toml
+export whole.bin --as mec -o PATH.csv
+bench --quick --only legs --json PATH.json
+parameters -o PATH.md
+schema -o PATH.json
+example uneven_walk -o PATH
+""".strip().splitlines()
+OF_FITS = ("fit ", "ablate ", "calibrate ", "population ", "fit-many ")
 WAYS = (
-    "missing",
-    "folder",
-    "null",
-    "long",
-    "binary",
-    "empty",
-    "pipe",
-    "unreadable",
-    "below a file",
-)
+    "missing", "folder", "null", "long", "binary", "empty", "pipe", "unreadable", "below a file",
+)  # fmt: skip
 
 
 def broken_path(way: str, suffix: str) -> str:
@@ -97,7 +96,7 @@ def broken_path(way: str, suffix: str) -> str:
     path = Path(f"broken{suffix}")
     match way:
         case "folder":
-            path.mkdir()
+            path.mkdir(exist_ok=True)
         case "null":
             return f"bro\0ken{suffix}"
         case "long":
@@ -106,9 +105,9 @@ def broken_path(way: str, suffix: str) -> str:
             path.write_bytes(bytes(range(128, 228)))
         case "empty":
             path.touch()
-        case "pipe":
+        case "pipe" if not path.exists():
             os.mkfifo(path)
-        case "unreadable":
+        case "unreadable" if not path.exists():
             path.write_text("x")
             path.chmod(0)
             if os.access(path, os.R_OK):
@@ -119,94 +118,49 @@ def broken_path(way: str, suffix: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("place", PLACES)
+def check_refusals(lines: list[str], way: str, capsys, *, named: bool = True) -> None:
+    """Checks that each of these commands, with a broken path, prints one line and does nothing."""
+    for line in lines:
+        (place,) = re.findall(r"PATH[.a-z]*", line)
+        path = broken_path(way, place.removeprefix("PATH"))
+        before = sorted(Path().rglob("*"))
+        words = [FILES.get(word, word.replace(place, path)) for word in line.split()]
+        status = main.main(words)
+        output = capsys.readouterr()
+        case = f"{line}: {output}"
+        assert (status, output.out, output.err.count("\n")) == (main.MISTAKE, "", 1), case
+        assert output.err[:-1].isprintable(), case
+        assert not named or "ken" in output.err or "x" * 300 in output.err, case
+        assert not named or way != "missing" or "no such" in output.err, case
+        assert sorted(Path().rglob("*")) == before, case
+
+
 @pytest.mark.parametrize("way", WAYS)
-def test_a_path_without_a_file_of_its_kind_costs_one_line(
-    place, way, tmp_path, monkeypatch, capsys
-):
+def test_a_path_without_a_file_of_its_kind_costs_one_line(way, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("whole.toml").write_text('preset = "record"\nfaithful = true\n')
     Path("whole.amc").write_text(":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\n")
     Path("walk.bvh").write_text(BVH)
-    words, suffix = PLACES[place]
-    if (
-        way == "empty"
-        and suffix == ".toml"
-        and place
-        not in (
-            "fit",
-            "ablate",
-            "calibrate",
-            "fit-many",
-        )
-    ):
-        pytest.skip("an empty TOML file is a whole one")
-    path = broken_path(way, suffix)
-    before = sorted(Path().rglob("*"))
-    assert main.main([path if word == "{}" else word for word in words]) == main.MISTAKE
-    output = capsys.readouterr()
-    assert output.out == "" and output.err.count("\n") == 1 and output.err[:-1].isprintable()
-    assert "ken" in output.err or "x" * 300 in output.err
-    assert sorted(Path().rglob("*")) == before
+    lines = INPUTS
+    if way == "empty":  # such a TOML file is a whole one, but no experiment
+        lines = [line for line in INPUTS if "PATH.toml" not in line or line.startswith(OF_FITS)]
+    check_refusals(lines, way, capsys)
 
 
-OUTPUTS: dict[str, tuple[list[str], str]] = {
-    "init": (["init", *ANIMATION, "-o", "{}"], ""),
-    "fit": (["fit", "{experiment}", "-o", "{}"], ""),
-    "run": (["run", *ANIMATION, "-o", "{}"], ".npz"),
-    "run bvh": (["run", *ANIMATION, "-o", "{}"], ".bvh"),
-    "view": (["view", *ANIMATION, "-o", "{}"], ""),
-    "compare": (["compare", *ANIMATION, "--presets", "record", "-o", "{}"], ""),
-    "translate": (["translate", *FROM_TO, "--clip", *ANIMATION, "-o", "{}"], ""),
-    "terrain": (["terrain", str(BASE), "-o", "{}"], ".ply"),
-    "record to-toml": (["record", "to-toml", "whole.bin", "-o", "{}"], ".toml"),
-    "export": (["export", "whole.bin", "-o", "{}"], ".toml"),
-    "export --as": (["export", "whole.bin", "--as", "mec", "-o", "{}"], ".csv"),
-    "bench --json": (["bench", "--quick", "--only", "legs", "--json", "{}"], ".json"),
-    "ablate": (["ablate", "{experiment}", "-o", "{}"], ""),
-    "calibrate": (["calibrate", "{experiment}", "-o", "{}"], ""),
-    "population": (["population", "{experiment}", "-o", "{}"], ""),
-    "fit-many": (["fit-many", "{experiment}", "-o", "{}"], ""),
-    "parameters": (["parameters", "-o", "{}"], ".md"),
-    "schema": (["schema", "-o", "{}"], ".json"),
-    "example": (["example", "uneven_walk", "-o", "{}"], ""),
-}
-
-
-@pytest.mark.parametrize("place", OUTPUTS)
 @pytest.mark.parametrize("way", ["null", "long", "below a file"])
 def test_a_path_that_cannot_be_written_costs_one_line_before_anything_runs(
-    place, way, tmp_path, monkeypatch, capsys
+    way, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     Path("whole.bin").write_bytes(bytes(128))
-    experiment = experiments.write(tmp_path)
-    words, suffix = OUTPUTS[place]
-    path = broken_path(way, suffix)
-    before = sorted(Path().rglob("*"))
-    filled = [word.replace("{experiment}", str(experiment)).replace("{}", path) for word in words]
-    assert main.main(filled) == main.MISTAKE
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and error[:-1].isprintable()
-    assert sorted(Path().rglob("*")) == before
-
-
-def paths_of(parser: argparse.ArgumentParser, command: str = "") -> set[str]:
-    """The commands that take a path."""
-    commands = set()
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name, child in action.choices.items():
-                commands |= paths_of(child, f"{command} {name}".strip())
-        elif action.type is Path:
-            commands.add(command)
-    return commands
+    experiments.write(tmp_path, "walk.toml")
+    check_refusals(OUTPUTS, way, capsys, named=False)
 
 
 def test_every_command_that_takes_a_path_is_here():
-    listed = {*PLACES, *OUTPUTS}
-    for command in paths_of(make_parser()):
-        assert any(place.startswith(command) for place in listed), command
+    for command, parser in commands().items():
+        if any(action.type is Path for action in parser._actions):
+            assert any(line.startswith(f"{command} ") for line in [*INPUTS, *OUTPUTS]), command
 
 
 def test_the_broken_paths_are_what_they_should_be(tmp_path, monkeypatch):
