@@ -1,140 +1,299 @@
-"""Whole jobs from Python: what they return, and that they write only where they are told to."""
+"""Whole jobs, from Python and the command line: what they return, announce, and where they write.
 
+One fit and its sampling are looked at by most tests here. They were made where JAX has 32 bits.
+"""
+
+import dataclasses
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, NamedTuple
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import fitting
 import jaxik
 from fitting import jobs
 from fitting.analysis import playback
+from fitting.cli import main, progress
 from fitting.experiments import problems
 from fitting.inference.identifiability import assess_identifiability
-from fitting.report import fit_report
+from fitting.inference.optimisation import search
+from fitting.inference.profiles import profiling
+from fitting.inference.sampling import posterior
+from fitting.inference.sampling.posterior import Posterior
+from fitting.report import fit_report, posterior_report
+from fitting.report.identifiability import sections
+from fitting.runtime import activity
 from fitting.runtime.precision import with_floats
 from fitting.studies import assess, run_folder
+from fitting.studies.posterior import replay
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import CLIP, ROOT, write
+from support.watching import Recorder
 
+NAME = r"../../elsewhere $\frac{$"  # no path, and no formula
+TOP = f"name = '{NAME}'"
+HALF_SECOND = f"start = 1.0\nend = 1.5\nlabel = '{NAME}'\nsubject = '{NAME}'"
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 20"
+READING, PREPARING = "Reading the clip and its ground", "Preparing what is compared"
+PLAYING = "Playing the clips with the "
+FIT_TITLES = [
+    READING,
+    PREPARING,
+    "Preparing the programs of the search",
+    "Searching from up to 6 starts",
+    "Following 2 parameters over their ranges",
+    "Writing the motions and numbers of the fit",
+    f"{PLAYING}fitted system",
+    f"{PLAYING}system before the fit",
+    "Drawing the curves of the parameters",
+    f"Drawing {NAME}",
+    "Measuring where limits are in effect",
+    "Finding what determines 2 parameters",
+    "Writing the page",
+    "Finishing the pictures",
+]
+SAMPLE_TITLES = [
+    READING,
+    PREPARING,
+    "Sampling up to 20 steps of 8 walkers",
+    "Placing 8 walkers",
+    "Summing up the chain",
+    "Playing 80 draws of the posterior",
+    "Writing the posterior",
+    "Drawing the posterior",
+]
+LONG = {  # what takes long, and how the work is called that must be going on then
+    (problems, "load_clip_data"): READING,
+    (problems, "make_scene"): PREPARING,
+    (search, "_begin"): "Preparing the programs",
+    (search, "search_from"): "Searching",
+    (profiling, "lowest"): "Following",
+    (run_folder, "save_clip"): "Writing the motions",
+    (playback, "run"): ("Playing", "Measuring", "Finding"),
+    (fit_report, "_draw_clip"): f"Drawing {NAME}",
+    (fit_report, "_draw_profiles"): "Drawing the curves",
+    (fit_report.limit_activity, "measure"): "Measuring",
+    (sections, "find_evidence"): "Finding",
+    (fit_report.fit_page, "write"): "Writing the page",
+    (posterior, "_check"): "Sampling",
+    (posterior, "_posterior"): "Summing up",
+    (replay._Clip, "add"): "Playing",
+    (posterior_report.posterior_plots, "corner"): "Drawing the posterior",
+}
+
+
+class Watcher(Recorder):
+    """Also writes down what is done, with the innermost work that is going on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.going_on: list[str] = []
+        self.done: set[tuple[str, str]] = set()
+
+    def began(self, work: activity.Work) -> None:
+        super().began(work)
+        self.going_on.append(work.title)
+
+    def ended(self, work: activity.Work) -> None:
+        super().ended(work)
+        assert self.going_on.pop() == work.title
+
+    def watch(self, patch: pytest.MonkeyPatch, place: ModuleType | type, name: str) -> None:
+        """Writes down each call of a function."""
+        function = getattr(place, name)
+
+        def called(*arguments, **named):
+            if threading.current_thread() is threading.main_thread():  # others keep nobody waiting
+                self.done.add((name, self.going_on[-1] if self.going_on else "nothing announced"))
+            return function(*arguments, **named)
+
+        patch.setattr(place, name, called)
+
+
+def watched(job: Callable[[], Any]) -> tuple[Any, Watcher]:
+    """What a job returns, and what it announced and did."""
+    watcher = Watcher()
+    with pytest.MonkeyPatch.context() as patch, activity.watched_by(watcher):
+        for place, name in LONG:
+            watcher.watch(patch, place, name)
+        return job(), watcher
+
+
+class Done(NamedTuple):
+    """A fit and its sampling."""
+
+    experiment: Path
+    fitted: fitting.Fit
+    run: Path
+    """Before the sampling."""
+    posterior: Posterior
+    sampled: Path
+    """The run after the sampling."""
+    log: list[str]
+    """Of the fit."""
+    watchers: tuple[Watcher, Watcher]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_jobs() -> Iterator[None]:
+    """Jobs fit residuals that compile at once, and draw nothing; they play the real pipeline."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
+        patch.setattr(Figure, "savefig", lambda figure, path, **look: Path(path).touch())
+        yield
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory) -> Done:
+    """Half a second of the uneven walk, fitted and sampled; tests change copies of its folders."""
+    folder, log = tmp_path_factory.mktemp("files"), []
+    experiment = write(folder, "hill.toml", top=TOP, clips=CLIP, clip=HALF_SECOND, rest=SAMPLE)
+    run, sampled = folder / "run", tmp_path_factory.mktemp("sampled") / "run"
+    jax.clear_caches()  # what other tests compiled with other options rounds differently
+    with jax.enable_x64(False):
+        fitted, of_fit = watched(lambda: fitting.fit(experiment, run, log=log.append))
+        shutil.copytree(run, sampled)
+        drawn, of_sampling = watched(lambda: fitting.sample(sampled))
+    return Done(experiment, fitted, run, drawn, sampled, log, (of_fit, of_sampling))
 
 
 @pytest.fixture
-def experiment_file(tmp_path, monkeypatch, undrawn) -> Path:
-    """Half a second of the uneven walk, with residuals that compile at once."""
-    monkeypatch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
-    monkeypatch.chdir(tmp_path)
-    clip = "start = 1.0\nend = 1.5"
-    return write(tmp_path, "hill.toml", clips=CLIP, clip=clip, rest=SAMPLE)
+def run(done, tmp_path) -> Path:
+    """A copy of the fit's folder."""
+    return Path(shutil.copytree(done.run, tmp_path / "run"))
 
 
-def test_jobs_without_an_output_write_nothing(experiment_file):
-    fitted = fitting.fit(experiment_file)
-    posterior = fitting.sample(fitted)
-    values = dict(zip(fitted.solution.names, fitted.solution.values, strict=True))
+def tree(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def numbers_of(run: Path, name: str = run_folder.FIT) -> dict[str, Any]:
+    return json.loads((run / name).read_text())
+
+
+def chain_of(run: Path) -> np.ndarray:
+    with h5py.File(run / run_folder.CHAIN) as file:
+        return np.asarray(file["mcmc/chain"])
+
+
+def interrupt(*_, **__) -> Any:
+    """Ctrl-C at this moment."""
+    signal.raise_signal(signal.SIGINT)
+
+
+# Fit and sample
+
+
+def test_a_fit_writes_numbers_tables_and_plots_and_says_where(done):
+    summary, page = done.run / run_folder.SUMMARY, done.run / run_folder.PAGE
+    assert done.fitted.run == done.run
+    assert done.log[0].startswith("fitting 2 parameters of record to 1 clip")
+    assert done.log[-1] == f"written to {done.run}; read {summary}, or open {page} in a browser"
+    names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
+    names |= {run_folder.PAGE, "base.npz", "fitted.npz", "motion.png", "cost.png"}
+    assert names <= tree(done.run)
+    numbers = numbers_of(done.run)
+    assert numbers["converged"] and numbers["experiment"] == NAME
+    values = {row["name"]: row["value"] for row in numbers["parameters"]}
     assert values == pytest.approx(quick.TARGETS, abs=0.003)
-    assert posterior.names == fitted.solution.names and len(posterior.u) == 20
-    assert list(experiment_file.parent.iterdir()) == [experiment_file]
 
 
-@pytest.mark.slow
-def test_a_fit_with_an_output_can_be_sampled_from_memory_and_from_disk(experiment_file):
-    run, lines = experiment_file.parent / "run", []
-    experiment = fitting.load_experiment(experiment_file)
-    fitted = fitting.fit(experiment, run, log=lines.append)
-    assert fitted.run == run and lines[0].startswith("fitting 2 parameters of record to 1 clip")
-    summary, page = run / run_folder.SUMMARY, run / run_folder.PAGE
-    assert lines[-1] == f"written to {run}; read {summary}, or open {page} in a browser"
-    first = fitting.sample(fitted)
-    assert (run / run_folder.CHAIN).is_file() and (run / run_folder.POSTERIOR).is_file()
-    continued = fitting.sample(run, max_steps=30)
-    assert (continued.u[:20] == first.u).all() and len(continued.u) == 30
+def test_the_names_in_an_experiment_are_no_paths(done):
+    assert {path.name for path in done.run.parent.iterdir()} == {"hill.toml", "run"}
+    assert f"# {NAME}" in (done.run / run_folder.SUMMARY).read_text()
 
 
-def worsen(run: Path) -> dict:
+def test_everything_is_announced_in_its_order(done):
+    of_fit, of_sampling = done.watchers
+    assert list(dict.fromkeys(of_fit.titles)) == FIT_TITLES
+    assert list(dict.fromkeys(of_sampling.titles)) == SAMPLE_TITLES
+    assert not of_fit.going_on and not of_sampling.going_on
+
+
+def test_what_takes_long_is_done_within_its_announcement(done):
+    found = set.union(*(watcher.done for watcher in done.watchers))
+    assert {name for name, _ in found} == {name for _, name in LONG}
+    wanted = {name: title for (_, name), title in LONG.items()}
+    assert [pair for pair in found if not pair[1].startswith(wanted[pair[0]])] == []
+
+
+def test_a_fit_in_memory_continues_the_chain_that_is_in_its_folder(done, tmp_path):
+    sampled = Path(shutil.copytree(done.sampled, tmp_path / "run"))
+    continued = fitting.sample(dataclasses.replace(done.fitted, run=sampled), max_steps=30)
+    assert (continued.u[:20] == done.posterior.u).all() and len(continued.u) == 30
+    assert len(chain_of(sampled)) == 30
+
+
+def worsen(run: Path) -> dict[str, Any]:
     """Moves the fit of a run off its optimum; what its file then holds."""
-    worse = json.loads((run / run_folder.FIT).read_text())
+    worse = numbers_of(run)
     for row in worse["parameters"]:
         row["u"] += 3 * row["start_sd"]
     (run / run_folder.FIT).write_text(json.dumps(worse))
     return worse
 
 
-@pytest.mark.slow
-def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(experiment_file):
-    run, lines = experiment_file.parent / "run", []
-    fitted = fitting.fit(experiment_file, run)
-    best = fitted.summary["parameters"]
+def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(done, run):
     worsen(run)
-    posterior = fitting.sample(run, log=lines.append)
+    lines: list[str] = []
+    sampled = fitting.sample(run, log=lines.append)
     assert any("higher than the fit's; the fit goes on from there" in line for line in lines)
     _, adopted = run_folder.load_fit(run)
-    for before, after in zip(best, adopted["parameters"], strict=True):
+    for before, after in zip(done.fitted.parameters, adopted["parameters"], strict=True):
         assert after["u"] == pytest.approx(before["u"], abs=0.1 * before["start_sd"])
-    assert posterior.improvement <= assess.MIN_IMPROVEMENT
-    numbers = json.loads((run / run_folder.POSTERIOR).read_text())
-    assert numbers["lower_point"] is None and not (run / run_folder.LOWER_POINT).exists()
+    assert sampled.improvement <= assess.MIN_IMPROVEMENT
+    assert numbers_of(run, run_folder.POSTERIOR)["lower_point"] is None
+    assert not (run / run_folder.LOWER_POINT).exists()
     text = (run / run_folder.SUMMARY).read_text()
     assert "## Posterior" in text and "The chain contradicts its fit: it met" not in text
 
 
-@pytest.mark.slow
-def test_an_interrupted_adoption_leaves_the_old_fit_and_the_lower_point(
-    experiment_file, monkeypatch
-):
-    run = experiment_file.parent / "run"
-    fitting.fit(experiment_file, run)
+def test_an_interrupted_adoption_leaves_the_old_fit_and_the_lower_point(run, monkeypatch):
     worse = worsen(run)
-
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(jobs.fits, "assess_solution", interrupt)
     fitting.sample(run)
-    assert {"format": 1, **run_folder.load_fit(run)[1]} == worse
-    assert (run / run_folder.LOWER_POINT).is_file()
+    assert numbers_of(run) == worse and (run / run_folder.LOWER_POINT).is_file()
 
 
-@pytest.mark.slow
-def test_a_replay_that_is_interrupted_leaves_the_report_of_the_chain(experiment_file, monkeypatch):
-    run = experiment_file.parent / "run"
-    fitted = fitting.fit(experiment_file, run)
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
+def test_a_replay_that_is_interrupted_leaves_the_report_of_the_chain(done, run, monkeypatch):
     monkeypatch.setattr(jobs.fits, "replay", interrupt)
-    posterior = fitting.sample(fitted)
-    assert posterior.interrupted and (run / run_folder.POSTERIOR).is_file()
+    sampled = fitting.sample(dataclasses.replace(done.fitted, run=run))
+    assert sampled.interrupted and (run / run_folder.POSTERIOR).is_file()
     assert "## Posterior" in (run / run_folder.SUMMARY).read_text()
 
 
-def test_a_solution_is_on_disk_before_anything_else_is_computed(experiment_file, monkeypatch):
-    run = experiment_file.parent / "run"
+def test_a_solution_is_on_disk_before_anything_can_fail_after_the_search(
+    done, tmp_path, monkeypatch
+):
+    def fail(*_):
+        raise ValueError("no slopes")
 
-    def interrupt(*_):
-        assert (run / run_folder.PARAMETERS).is_file()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(assess, "assess_identifiability", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        fitting.fit(experiment_file, run)
-    assert not (run / run_folder.FIT).exists()
+    monkeypatch.setattr(assess, "assess_identifiability", fail)
+    with pytest.raises(ValueError, match="no slopes"):
+        fitting.fit(done.experiment, tmp_path / "run")
+    kept = {run_folder.EXPERIMENT, run_folder.PARAMETERS, run_folder.SEARCH}
+    assert tree(tmp_path / "run") == kept
 
 
 # Precision
 
 IN_A_PROCESS_OF_32_BITS = """
 import json, sys
-import jax
 import jax.numpy as jnp
 import fitting
 from fitting.experiments import problems
@@ -148,69 +307,52 @@ print(json.dumps([fitted.solution.u.tolist(), posterior.u.tolist(), fitted.summa
 """
 
 
-def test_a_process_with_32_bits_gets_the_fit_and_posterior_of_64_and_keeps_its_setting(
-    experiment_file,
+def test_a_process_with_32_bits_gets_the_numbers_of_64_keeps_its_setting_and_writes_nothing(
+    done, tmp_path
 ):
     """In a process of its own, since the tests' has 64 bits: threads would inherit them."""
-    words = [sys.executable, "-W", "error", "-c", IN_A_PROCESS_OF_32_BITS, str(experiment_file)]
-    paths = f"{ROOT}:{ROOT / 'tests'}"
-    done = subprocess.run(words, env=os.environ | {"PYTHONPATH": paths}, capture_output=True)
-    assert not done.returncode, done.stderr.decode()
-    u, walkers, cost, new = json.loads(done.stdout)
-    jax.clear_caches()  # what other tests compiled with other options rounds differently
-    fitted = fitting.fit(experiment_file)
-    assert u == fitted.solution.u.tolist() and cost == fitted.solution.cost
-    assert walkers == fitting.sample(fitted).u.tolist()
+    words = [sys.executable, "-W", "error", "-c", IN_A_PROCESS_OF_32_BITS, str(done.experiment)]
+    variables = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    before = tree(done.experiment.parent)
+    ended = subprocess.run(words, env=variables, cwd=tmp_path, capture_output=True)
+    assert not ended.returncode, ended.stderr.decode()
+    u, walkers, cost, new = json.loads(ended.stdout)
+    assert u == done.fitted.solution.u.tolist() and cost == done.fitted.solution.cost
+    assert walkers == done.posterior.u.tolist() and len(walkers) == 20
     assert new == "float32"
+    assert not list(tmp_path.iterdir()) and tree(done.experiment.parent) == before
 
 
-def test_a_fit_can_be_used_where_jax_has_32_bits(experiment_file):
+def test_a_fit_can_be_used_where_jax_has_32_bits(done):
+    problem, solution, ik = done.fitted.problem, done.fitted.solution, done.fitted.ik
     with jax.enable_x64(False):
-        fitted = fitting.fit(experiment_file)
-        problem, solution = fitted.problem, fitted.solution
         outputs = [
             problem.residuals(solution.u),
             problem.cost(solution.u),
             problem.jacobian(solution.u),
             problem.log_probability(solution.u),
             problem.space.values(solution.u),
-            problem.space.pack(fitted.ik),
-            parameter_tree.get(fitted.ik, "pelvis.on_gain"),
-            fitted.results[0].body.pos,
+            problem.space.pack(ik),
+            parameter_tree.get(ik, "pelvis.on_gain"),
+            done.fitted.results[0].body.pos,
             assess_identifiability(problem, solution).contraction,
         ]
         assert {output.dtype for output in outputs} == {np.dtype(np.float64)}
         assert float(outputs[1]) == pytest.approx(solution.cost, rel=1e-12)
-        assert fitted.summary["parameters"][0]["value"] == solution.values[0]
-        assert with_floats(fitted.ik, np.float32).leg.weight.dtype == np.float32
+        assert done.fitted.summary["parameters"][0]["value"] == solution.values[0]
+        assert with_floats(ik, np.float32).leg.weight.dtype == np.float32
         assert jnp.ones(1).dtype == np.float32
 
 
-def test_a_fit_is_reported_where_jax_has_32_bits(experiment_file):
-    with jax.enable_x64(False):
-        fitted = fitting.fit(experiment_file)
-        fit_report.write_fit(experiment_file.parent, fitted)
-    assert (experiment_file.parent / run_folder.SUMMARY).is_file()
-
-
-def test_a_system_made_in_32_bits_runs_in_those_of_the_clip(experiment_file):
-    problem = problems.make_problem(fitting.load_experiment(experiment_file))
+def test_a_system_made_in_32_bits_runs_in_those_of_the_clip(done):
     with jax.enable_x64(False):
         single = jaxik.presets.record()
-        result = playback.run(single, problem.data[0])
+        result = playback.run(single, done.fitted.problem.data[0])
     assert single.leg.weight.dtype == np.float32 and result.body.pos.dtype == np.float64
 
 
-def test_an_error_in_a_job_leaves_32_bits(tmp_path):
-    with jax.enable_x64(False):
-        with pytest.raises(ValueError, match="no such file"):
-            fitting.fit(tmp_path / "no.toml")
-        assert jnp.ones(1).dtype == np.float32
-
-
-@pytest.mark.slow
 def test_systems_made_in_32_bits_are_compared_in_64(tmp_path):
-    short = fitting.load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz").select(slice(40))
+    short = fitting.load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz").select(slice(16))
     fitting.save_clip(tmp_path / "short.npz", short)
     ground = ROOT / "data" / "terrains" / "uneven_walk.ply"
     animation = fitting.AnimationFiles(tmp_path / "short.npz", ground)
@@ -222,3 +364,63 @@ def test_systems_made_in_32_bits_are_compared_in_64(tmp_path):
     np.testing.assert_array_equal(
         compared.motions["record"].ankle, solved.joints_ws(2), strict=True
     )
+
+
+# From the command line
+
+
+def test_an_interrupted_fit_writes_its_best_point_and_the_same_command_goes_on(
+    done, tmp_path, monkeypatch, capsys
+):
+    run = tmp_path / "run"
+    words = ["fit", str(done.experiment), "-o", str(run)]
+    with monkeypatch.context() as patch:
+        patch.setattr(progress, "fit_line", interrupt)
+        assert main.main(words) == main.INTERRUPTED == 130
+    numbers = numbers_of(run)
+    assert numbers["message"].startswith("Interrupted after 0 steps") and not numbers["converged"]
+    assert np.isfinite(numbers["cost"]) and numbers["message"] in capsys.readouterr().out
+    assert run_folder.SUMMARY in tree(run)
+    assert main.main(words) == 0
+    assert numbers_of(run)["parameters"] == numbers_of(done.run)["parameters"]
+    assert f"read {run / run_folder.SUMMARY}" in capsys.readouterr().out
+
+
+def test_an_interrupt_before_the_search_writes_nothing(done, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(jobs.fits, "load_clips", interrupt)
+    words = ["fit", str(done.experiment), "-o", str(tmp_path / "run")]
+    assert main.main(words) == main.INTERRUPTED
+    assert capsys.readouterr().err == "\njaxik fit: interrupted\n" and not tree(tmp_path)
+
+
+def test_the_exit_status_says_what_is_wrong_with_a_fit(done, tmp_path, monkeypatch):
+    for status, interrupted, converged, has_noise, fits in (
+        (0, False, True, True, True),
+        (0, False, True, False, False),  # what a translation leaves over is no failure
+        (3, False, False, True, False),
+        (4, False, True, True, False),
+        (130, True, False, True, False),
+    ):
+        found = SimpleNamespace(interrupted=interrupted, converged=converged)
+        verdict = SimpleNamespace(fits=fits)
+        fitted = SimpleNamespace(solution=found, has_noise=has_noise, verdict=verdict)
+        monkeypatch.setattr(jobs, "fit", lambda *_, fitted=fitted, **__: fitted)
+        assert main.main(["fit", str(done.experiment), "-o", str(tmp_path)]) == status
+
+
+def test_sampling_continues_its_chain(done, run, capsys):
+    assert main.main(["sample", str(run), "--max-steps", "16"]) == 0
+    assert len(chain_of(run)) == 16
+    assert main.main(["sample", str(run)]) == 0
+    np.testing.assert_array_equal(chain_of(run), chain_of(done.sampled))
+    text = capsys.readouterr().out
+    assert "8 walkers, 20 steps" in text and f"read {run / run_folder.SUMMARY}" in text
+    assert numbers_of(run, run_folder.POSTERIOR)["steps"] == 20 and "corner.png" in tree(run)
+    assert "## Posterior" in (run / run_folder.SUMMARY).read_text()
+
+
+def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "sample_line", interrupt)
+    assert main.main(["sample", str(run), "--max-steps", "300"]) == main.INTERRUPTED
+    assert "Interrupted, the chain is kept" in capsys.readouterr().out
+    assert len(chain_of(run)) == 100
