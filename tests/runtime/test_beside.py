@@ -10,14 +10,24 @@ from loky import get_reusable_executor
 
 from fitting.runtime.parallel import beside
 
+MARK = "JAXIK_TEST_MARK"
+
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(beside, "cpu_count", lambda: 2)
 
 
+def mark() -> None:
+    os.environ[MARK] = "prepared"
+
+
 def write_process(path: Path) -> None:
-    path.write_text(str(os.getpid()))
+    path.write_text(f"{os.getpid()} {os.environ.get(MARK, '')}")
+
+
+def process_of(path: Path) -> int:
+    return int(path.read_text().split()[0])
 
 
 def warn(message: str) -> None:
@@ -28,51 +38,27 @@ def fail(message: str) -> None:
     raise ValueError(message)
 
 
-def test_calls_run_elsewhere_and_have_finished_at_the_end(tmp_path):
-    paths = [tmp_path / str(number) for number in range(5)]
-    with beside.calls_beside():
-        for path in paths:
-            beside.call(write_process, path)
-    processes = {int(path.read_text()) for path in paths}
-    assert os.getpid() not in processes and len(processes) <= 2
-
-
-def mark() -> None:
-    os.environ["JAXIK_TEST_MARK"] = "prepared"
-
-
-def write_mark(path: Path) -> None:
-    path.write_text(os.environ.get("JAXIK_TEST_MARK", "") + f" {os.getpid()}")
-
-
-def test_processes_can_be_prepared(tmp_path):
+def test_calls_run_in_processes_that_can_be_prepared_and_have_finished_at_the_end(tmp_path):
     get_reusable_executor(2, timeout=beside.IDLE).shutdown(wait=True)
     beside.prepare(mark)
     paths = [tmp_path / str(number) for number in range(20)]
     with beside.calls_beside():
         for path in paths:
-            beside.call(write_mark, path)
-    marks = [path.read_text().split() for path in paths]
-    assert ["prepared"] in [mark[:-1] for mark in marks]
-    assert str(os.getpid()) not in [mark[-1] for mark in marks]
+            beside.call(write_process, path)
+    processes = {process_of(path) for path in paths}
+    assert os.getpid() not in processes and len(processes) <= 2
+    assert any(path.read_text().endswith("prepared") for path in paths)
 
 
-def test_on_one_core_nothing_is_prepared(monkeypatch):
+def test_without_it_and_on_one_core_calls_run_here_and_at_once(tmp_path, monkeypatch):
+    beside.call(write_process, tmp_path / "without")
+    assert process_of(tmp_path / "without") == os.getpid()
     monkeypatch.setattr(beside, "cpu_count", lambda: 1)
     beside.prepare(mark)
-    assert "JAXIK_TEST_MARK" not in os.environ
-
-
-def test_without_it_calls_run_here_and_at_once(tmp_path):
-    beside.call(write_process, tmp_path / "file")
-    assert int((tmp_path / "file").read_text()) == os.getpid()
-
-
-def test_on_one_core_they_run_here(tmp_path, monkeypatch):
-    monkeypatch.setattr(beside, "cpu_count", lambda: 1)
     with beside.calls_beside():
-        beside.call(write_process, tmp_path / "file")
-        assert int((tmp_path / "file").read_text()) == os.getpid()
+        beside.call(write_process, tmp_path / "alone")
+        assert process_of(tmp_path / "alone") == os.getpid()
+    assert MARK not in os.environ
 
 
 def draw_in_a_daemon(path: Path) -> None:
@@ -87,27 +73,24 @@ def test_processes_that_may_have_no_children_call_themselves(tmp_path):
     process = context.Process(target=draw_in_a_daemon, args=(tmp_path / "file",), daemon=True)
     process.start()
     process.join()
-    assert int((tmp_path / "file").read_text()) == process.pid
+    assert process_of(tmp_path / "file") == process.pid
 
 
-def test_an_error_is_raised_at_the_end():
+def test_errors_and_warnings_come_at_the_end():
     with pytest.raises(ValueError, match="no such colour"):
         with beside.calls_beside():
             beside.call(fail, "no such colour")
-
-
-def test_warnings_are_given_at_the_end():
     with pytest.warns(RuntimeWarning, match="a glyph is missing"):
         with beside.calls_beside():
             beside.call(warn, "a glyph is missing")
 
 
-def test_an_error_here_does_not_wait_for_calls(tmp_path):
+def test_an_error_here_does_not_wait_for_calls_and_spoils_nothing(tmp_path):
     with pytest.raises(KeyError, match="here"):
         with beside.calls_beside():
             for number in range(20):
                 beside.call(write_process, tmp_path / str(number))
             raise KeyError("here")
-    with beside.calls_beside():  # and spoils nothing
+    with beside.calls_beside():
         beside.call(write_process, tmp_path / "afterwards")
     assert (tmp_path / "afterwards").exists()

@@ -16,19 +16,21 @@ from fitting.runtime.cache_folder import (
     SwitchedOffError,
     setting,
 )
+from fitting.runtime.storage import compiled_programs
 
 DIGEST = "0123456789abcdef" * 4
 
 
 @pytest.fixture(autouse=True)
-def untouched(monkeypatch):
-    """JAX as it is without settings of its own, which come back after the test."""
+def caches(monkeypatch, tmp_path):
+    """Where the user has caches; JAX is without settings of its own, which come back at the end."""
     before = {name: setting(name) for name in (FOLDER, ENABLED, MIN_SECONDS)}
     jax.config.update(FOLDER, None)
     cache_folder.WARNED.clear()
-    for variable in ("XDG_CACHE_HOME", FOLDER.upper(), MIN_SECONDS.upper()):
+    for variable in (FOLDER.upper(), MIN_SECONDS.upper()):
         monkeypatch.delenv(variable, raising=False)
-    yield
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    yield tmp_path / "caches"
     for name, value in before.items():
         jax.config.update(name, value)
 
@@ -37,95 +39,95 @@ def untouched(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("platform", "expected"),
-    [("linux", "home/.cache/jaxik"), ("darwin", "home/Library/Caches/jaxik")],
+    ("platform", "variables", "expected"),
+    [
+        ("linux", {}, "home/.cache/jaxik"),
+        ("linux", {"XDG_CACHE_HOME": "relative"}, "home/.cache/jaxik"),
+        ("linux", {"XDG_CACHE_HOME": "TMP/xdg"}, "xdg/jaxik"),
+        ("darwin", {}, "home/Library/Caches/jaxik"),
+        ("win32", {"LOCALAPPDATA": "TMP/local"}, "local/jaxik/Cache"),
+    ],
 )
-def test_programs_are_kept_where_the_platform_keeps_caches(
-    platform, expected, tmp_path, monkeypatch
+def test_programs_are_kept_where_the_platform_or_the_environment_says(
+    platform, variables, expected, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.setenv(name, variables.get(name, "").replace("TMP", str(tmp_path)))
     assert cache_folder.default() == tmp_path / expected
 
 
-def test_on_windows_programs_are_kept_in_the_local_application_data(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
-    assert cache_folder.default() == tmp_path / "jaxik" / "Cache"
-
-
-def test_the_environment_may_name_another_place(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder.default() == tmp_path / "jaxik"
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert cache_folder.default() == Path.home() / ".cache" / "jaxik"
-
-
-def test_the_default_folder_is_made_and_private(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "new"))
+@pytest.mark.parametrize(("chosen", "seconds"), [(None, 0.0), ("3", 3.0)])
+def test_the_default_folder_is_made_and_private_and_its_files_are_complete(
+    chosen, seconds, caches, monkeypatch
+):
+    called = []
+    monkeypatch.setattr(compiled_programs, "write_complete_files", lambda: called.append(True))
+    if chosen is not None:
+        monkeypatch.setenv(MIN_SECONDS.upper(), chosen)
+    jax.config.update(MIN_SECONDS, 3.0)
     cache_folder.use_default()
-    folder = tmp_path / "new" / "jaxik"
-    assert setting(FOLDER) == str(folder) and setting(MIN_SECONDS) == 0
+    folder = caches / "jaxik"
+    assert setting(FOLDER) == str(folder) and setting(MIN_SECONDS) == seconds
     assert folder.stat().st_mode & 0o077 == 0
     assert cache_folder.traced() == folder / TRACED
+    assert called
 
 
 @pytest.mark.parametrize("chosen", ["elsewhere", ""])
-def test_a_choice_of_the_user_stays(chosen, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_a_choice_of_the_user_stays(chosen, caches):
     jax.config.update(FOLDER, chosen)
     jax.config.update(MIN_SECONDS, 3.0)
     cache_folder.use_default()
     assert setting(FOLDER) == chosen and setting(MIN_SECONDS) == 3.0
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_choice_of_what_is_worth_keeping_stays(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv(MIN_SECONDS.upper(), "3")
-    jax.config.update(MIN_SECONDS, 3.0)
-    cache_folder.use_default()
-    assert setting(MIN_SECONDS) == 3.0
+    assert not caches.exists()
 
 
 # Whose
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
-def test_a_default_folder_of_somebody_else_is_not_used_by_jax_either(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    (tmp_path / "jaxik").mkdir()
+def others(caches, monkeypatch):
+    (caches / "jaxik").mkdir(parents=True)
     monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
-    with pytest.warns(RuntimeWarning, match="not kept between calls: .*belongs to another user"):
-        cache_folder.use_default()
-    assert setting(FOLDER) is None
 
 
-@pytest.mark.skipif(os.name != "posix", reason="no such permissions")
-def test_a_default_folder_that_everybody_may_write_to_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    (tmp_path / "jaxik").mkdir()
-    (tmp_path / "jaxik").chmod(0o777)
-    with pytest.warns(RuntimeWarning, match=f"everybody may write to {tmp_path}"):
-        cache_folder.use_default()
-    assert setting(FOLDER) is None
+def open_to_all(caches, monkeypatch):
+    (caches / "jaxik").mkdir(parents=True)
+    (caches / "jaxik").chmod(0o777)
 
 
-def test_a_default_folder_that_cannot_be_made_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    (tmp_path / "jaxik").write_text("a file in its place")
-    with pytest.warns(RuntimeWarning, match="not kept between calls: .*: File exists"):
-        cache_folder.use_default()
-    assert setting(FOLDER) is None
+def no_folder(caches, monkeypatch):
+    caches.mkdir()
+    (caches / "jaxik").write_text("a file in its place")
 
 
-def test_without_a_home_nothing_is_kept(monkeypatch):
+def no_home(caches, monkeypatch):
     def fail():
         raise RuntimeError("Could not determine home directory.")
 
+    monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(Path, "home", fail)
-    with pytest.warns(RuntimeWarning, match="not kept between calls: Could not determine home"):
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no such permissions")
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (others, "{folder} belongs to another user"),
+        (open_to_all, "everybody may write to {folder}"),
+        (no_folder, ".*: File exists"),
+        (no_home, "Could not determine home"),
+    ],
+)
+def test_a_default_folder_that_is_not_safe_is_not_used_by_jax_either(
+    spoil, reason, caches, monkeypatch
+):
+    spoil(caches, monkeypatch)
+    message = f"programs are not kept between calls: {reason.format(folder=caches / 'jaxik')}"
+    with pytest.warns(RuntimeWarning, match=message):
         cache_folder.use_default()
+    assert setting(FOLDER) is None
 
 
 @pytest.mark.parametrize(
@@ -157,8 +159,11 @@ def test_with_several_devices_nothing_is_kept(tmp_path, monkeypatch):
 
 # What
 
+# The last two are half-written.
+TRACED_FILES = [("run", ""), ("_evaluate", ""), (".run", "x_1ab"), (".run", ".jaxik-vm-7-x_1ab")]
 
-def test_only_kept_programs_count_as_such(tmp_path):
+
+def test_only_kept_programs_of_this_user_count_as_such(tmp_path, monkeypatch):
     traced = [tmp_path / TRACED / f"{name}-{DIGEST}{end}" for name, end in TRACED_FILES]
     compiled = [tmp_path / f"jit_step-{DIGEST}-{end}" for end in ("atime", "cache")]
     compiled.append(tmp_path / f".jit_step-{DIGEST}-cache.jaxik-vm-7-x_1ab")  # half-written
@@ -176,29 +181,12 @@ def test_only_kept_programs_count_as_such(tmp_path):
     (tmp_path / TRACED / f"link-{DIGEST}").symlink_to(others[0])
     assert cache_folder.kept_programs(tmp_path) == (sorted(traced), sorted(compiled))
     assert cache_folder.kept_programs(tmp_path / "none") == ([], [])
-
-
-# The last two are half-written.
-TRACED_FILES = [("run", ""), ("_evaluate", ""), (".run", "x_1ab"), (".run", ".jaxik-vm-7-x_1ab")]
-
-
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
-def test_programs_of_others_do_not_count(tmp_path, monkeypatch):
-    (tmp_path / f"jit_step-{DIGEST}-cache").touch()
     monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
     assert cache_folder.kept_programs(tmp_path) == ([], [])
 
 
 def test_a_problem_is_said_once():
-    problems = [
-        ("nothing is kept", "no space"),
-        ("nothing is kept", "no folder"),
-        ("read anew", ""),
-    ]
     with pytest.warns(RuntimeWarning) as said:
-        for problem, reason in problems:
+        for problem, reason in (("nothing kept", "no space"), ("nothing kept", "x"), ("anew", "")):
             cache_folder.warn_once(problem, reason)
-    assert [str(warning.message) for warning in said] == [
-        "nothing is kept: no space",
-        "read anew: ",
-    ]
+    assert [str(warning.message) for warning in said] == ["nothing kept: no space", "anew: "]

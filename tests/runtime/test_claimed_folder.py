@@ -53,7 +53,7 @@ def test_a_second_process_is_told_who_is_at_work_and_a_kill_ends_it(tmp_path):
     assert not (folder / LOCK).exists()
 
 
-def test_the_same_process_claims_a_folder_once(tmp_path):
+def test_the_same_process_claims_a_folder_once_and_leaves_it_empty(tmp_path):
     with claimed(tmp_path), pytest.raises(ValueError, match=f"process {os.getpid()}"):
         with claimed(tmp_path):
             pass
@@ -110,12 +110,6 @@ def test_windows_locks_a_byte_beyond_the_text_that_others_read(tmp_path, monkeyp
             assert (tmp_path / LOCK).is_file()
         assert not list(tmp_path.iterdir())
         windows.owners.clear()
-
-
-def test_a_folder_that_was_there_stays(tmp_path):
-    with claimed(tmp_path):
-        pass
-    assert tmp_path.is_dir()
 
 
 def test_a_lock_file_with_anything_in_it_is_nobodys(tmp_path):

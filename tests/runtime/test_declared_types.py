@@ -32,9 +32,8 @@ class Table(TypedDict):
     rows: list[Row]
 
 
-ROW = {
-    "name": "x", "u": 1, "interval": [0.0, 2], "kind": "smooth", "steps": 3, "determined": True,
-}  # fmt: skip
+ROW = {"name": "x", "u": 1, "interval": [0.0, 2], "kind": "smooth", "steps": 3}
+ROW["determined"] = True
 FILE = JsonFile(Table, "a table", "make it anew", version=2, essential={"rows", "name"})
 
 

@@ -12,7 +12,6 @@ import pytest
 from fitting.runtime import files, plain_tree
 from fitting.runtime.plain_tree import NotPlainError, describe, rebuild
 from fitting.runtime.program_file import Slot
-from jaxik.presets import record
 
 
 class Pair(NamedTuple):
@@ -132,10 +131,3 @@ HOSTILE = [
 def test_a_description_reaches_nothing_but_fields_of_known_classes(description):
     with pytest.raises(ValueError):
         rebuild(["list", description])
-
-
-def test_a_system_is_described_the_same_each_time():
-    def text(ik):
-        return json.dumps(describe(eqx.filter(ik, eqx.is_array, inverse=True)))
-
-    assert text(record()) == text(record())

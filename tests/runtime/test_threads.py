@@ -15,23 +15,17 @@ def use_cores(monkeypatch, count):
 
 
 @pytest.mark.parametrize("cores", [1, 2, 5])
-@pytest.mark.parametrize("count", [0, 1, 7])
-def test_outputs_are_in_the_order_of_the_calls(monkeypatch, cores, count):
+def test_outputs_are_in_the_order_of_the_calls(monkeypatch, cores):
     use_cores(monkeypatch, cores)
-    calls = [lambda number=number: jnp.asarray(number) for number in range(count)]
-    assert [int(output) for output in threads.on_all_cores(calls)] == list(range(count))
-
-
-def test_two_calls_run_at_the_same_time(monkeypatch):
-    use_cores(monkeypatch, 2)
-    meeting = threading.Barrier(2, timeout=30)  # breaks unless two threads wait at it together
-    threads.on_all_cores([lambda: jnp.asarray(meeting.wait())] * 2)
+    for count in (0, 1, 7):
+        calls = [lambda number=number: jnp.asarray(number) for number in range(count)]
+        assert [int(output) for output in threads.on_all_cores(calls)] == list(range(count))
 
 
 @pytest.mark.parametrize("enabled", [False, True])
-def test_calls_in_all_threads_have_the_callers_types(monkeypatch, enabled):
+def test_two_calls_run_at_the_same_time_and_have_the_callers_types(monkeypatch, enabled):
     use_cores(monkeypatch, 2)
-    meeting = threading.Barrier(2, timeout=30)
+    meeting = threading.Barrier(2, timeout=30)  # breaks unless two threads wait at it together
 
     def new_floats() -> jax.Array:
         meeting.wait()
@@ -39,8 +33,7 @@ def test_calls_in_all_threads_have_the_callers_types(monkeypatch, enabled):
 
     with jax.enable_x64(enabled):
         outputs = threads.on_all_cores([new_floats] * 2)
-    expected = np.float64 if enabled else np.float32
-    assert [output.dtype for output in outputs] == [expected] * 2
+    assert [output.dtype for output in outputs] == [np.float64 if enabled else np.float32] * 2
 
 
 @pytest.mark.parametrize("cores", [1, 2])

@@ -35,60 +35,45 @@ def test_the_pinned_jaxlib_has_flags():
     assert xla.FLAGS[version]
 
 
-def test_an_untried_jaxlib_gets_no_flags_and_says_so(monkeypatch):
-    monkeypatch.setattr(xla, "jaxlib_version", lambda: "99.0.0")
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
+def flags_with(of_user: str | None, monkeypatch, version: str = "0.12.0") -> str | None:
+    """The variable with the flags after a start with what the user had set."""
+    monkeypatch.setattr(xla, "jaxlib_version", lambda: version)
+    monkeypatch.delenv(xla.VARIABLE, raising=False)
+    if of_user is not None:
+        monkeypatch.setenv(xla.VARIABLE, of_user)
     xla.configure_xla()
-    assert "XLA_FLAGS" not in os.environ
+    return os.environ.get(xla.VARIABLE)
+
+
+def test_an_untried_jaxlib_gets_no_flags_and_says_so(monkeypatch):
+    assert flags_with(None, monkeypatch, "99.0.0") is None
     assert xla.describe_flags().startswith("none; which flags jaxlib 99.0.0 knows")
 
 
-@pytest.mark.parametrize("version", xla.FLAGS)
-def test_flags_are_set_where_there_are_none(monkeypatch, version):
-    monkeypatch.setattr(xla, "jaxlib_version", lambda: version)
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    xla.configure_xla()
-    flags = os.environ["XLA_FLAGS"]
-    assert flags.split() == list(xla.FLAGS[version])
-    assert xla.describe_flags() == flags
+def test_flags_are_set_where_there_are_none(monkeypatch):
+    for version, known in xla.FLAGS.items():
+        flags = flags_with(None, monkeypatch, version)
+        assert flags == " ".join(known) == xla.describe_flags(), version
 
 
-def test_flags_of_the_user_stay_and_take_precedence(monkeypatch):
-    monkeypatch.setattr(xla, "jaxlib_version", lambda: "0.12.0")
-    monkeypatch.setenv("XLA_FLAGS", f"{OF_USER} --xla_cpu_prefer_vector_width=128")
-    xla.configure_xla()
-    first, *_, last_but_one, last = os.environ["XLA_FLAGS"].split()
-    assert first == xla.VECTORS
-    # XLA takes the later of two values for one flag.
-    assert [last_but_one, last] == [OF_USER, "--xla_cpu_prefer_vector_width=128"]
-
-
-def test_flags_are_added_once(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", OF_USER)
-    xla.configure_xla()
-    once = os.environ["XLA_FLAGS"]
-    xla.configure_xla()
-    assert os.environ["XLA_FLAGS"] == once
+def test_flags_of_the_user_stay_and_take_precedence_as_the_later_ones(monkeypatch):
+    of_user = f"{OF_USER} --xla_cpu_prefer_vector_width=128"
+    flags = flags_with(of_user, monkeypatch)
+    assert flags == " ".join([*xla.FLAGS["0.12.0"], of_user])
+    assert flags_with(flags, monkeypatch) == flags  # and are added once
 
 
 @pytest.mark.parametrize("of_user", ["", "flags.txt"])
 def test_nothing_is_added_to_an_empty_value_or_a_file(monkeypatch, of_user):
-    monkeypatch.setenv("XLA_FLAGS", of_user)
-    xla.configure_xla()
-    assert os.environ["XLA_FLAGS"] == of_user
+    assert flags_with(of_user, monkeypatch) == of_user
 
 
-@pytest.mark.parametrize("of_user", [None, OF_USER])
-def test_the_installed_jaxlib_starts_with_its_flags(of_user):
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    if of_user is not None:
-        environment["XLA_FLAGS"] = of_user
-    command = [sys.executable, "-c", START]
-    started = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-    )
-    flags = [*xla.FLAGS.get(xla.jaxlib_version(), ()), *(of_user or "").split()]
-    assert started.stdout.split() == ["3.0", *flags]
+def test_the_installed_jaxlib_starts_with_its_flags():
+    done = subprocess.run(
+        [sys.executable, "-c", START], cwd=ROOT, env=os.environ | {"XLA_FLAGS": OF_USER},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["3.0", *xla.FLAGS.get(xla.jaxlib_version(), ()), OF_USER]
 
 
 @pytest.mark.parametrize("user_setting", [None, "true"])
