@@ -10,25 +10,17 @@ import jsonschema
 import pytest
 
 from fitting.cli import main, without_jax
-from fitting.cli.parser import make_parser
+from fitting.cli.commands import COMMANDS
 from fitting.cli.parsers.guides import SHELLS
 from fitting.experiments import systems
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.schema.experiment_schema import experiment_schema
 from fitting.jobs import examples
 from jaxik.maths import parameter_tree
+from support.commands import commands
+from support.refusals import refusal
 
 shtab = pytest.importorskip("shtab")
-
-
-@pytest.mark.parametrize("columns", [60, 80, 200])
-@pytest.mark.parametrize("command", ["parameters", "schema"])
-def test_lists_fit_into_the_terminal(command, columns, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", str(columns))
-    assert main.main([command]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    too_long = [line for line in lines if len(line) > max(columns, 75)]  # the cells without prose
-    assert len(lines) > 80 and not too_long
 
 
 @pytest.mark.parametrize("preset", systems.preset_names())
@@ -38,13 +30,9 @@ def test_parameters_lists_every_one_with_its_declaration(preset, capsys):
     ik = systems.preset_system(preset)
     assert list(rows) == [*parameter_tree.docs(ik)]
     for name, declared in parameter_tree.declarations(ik).items():
-        row = rows[name]
-        assert (row["low"], row["high"], row["unit"]) == (
-            declared.low,
-            declared.high,
-            declared.unit,
-        )
-        assert row["meaning"] == declared.doc and row["kind"] == declared.kind
+        shown = {key: rows[name][key] for key in ("low", "high", "unit", "kind")}
+        assert shown == {key: getattr(declared, key) for key in shown}
+        assert rows[name]["meaning"] == declared.doc
 
 
 def test_parameters_shows_the_defaults_of_the_preset_and_of_its_original(capsys):
@@ -66,10 +54,7 @@ def test_parameters_shows_the_defaults_of_the_preset_and_of_its_original(capsys)
 )
 def test_a_mistake_costs_one_line(words, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main.main(words) == main.MISTAKE
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+    assert message in refusal(words, tmp_path, capsys)
 
 
 def test_schema_is_written_as_json_and_lists_every_key(tmp_path, capsys):
@@ -99,9 +84,8 @@ def test_a_copied_example_is_whole_and_names_its_schema(name, tmp_path, monkeypa
     assert main.main(["example", name, "-o", "copy"]) == 0
     path = tmp_path / "copy" / f"{Path(name).name}.toml"
     loaded, original = load_experiment(path), load_experiment(examples.path_of(name))
-    assert (loaded.free, loaded.prior, loaded.sigmas) == (
-        original.free, original.prior, original.sigmas,
-    )  # fmt: skip
+    for part in ("free", "prior", "sigmas"):
+        assert getattr(loaded, part) == getattr(original, part)
     for clip, source in zip(loaded.clips, original.clips, strict=True):
         assert clip.reference.is_relative_to(tmp_path)
         assert clip.reference.read_bytes() == source.reference.read_bytes()
@@ -113,44 +97,43 @@ def test_a_copied_example_is_whole_and_names_its_schema(name, tmp_path, monkeypa
     assert "is already there" in capsys.readouterr().err
 
 
-def completed(*words: str) -> list[str]:
-    """What bash offers for the last of these words."""
-    script = """
-    source <("$PYTHON" -m fitting.cli.main completion bash) || exit 1
-    COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
-    $(complete -p jaxik | sed 's/.*-F \\([^ ]*\\).*/\\1/')
-    printf '%s\\n' "${COMPREPLY[@]}"
-    """
+SCRIPT = """
+source jaxik.bash
+function=$(complete -p jaxik | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+cd "$1"
+while IFS='|' read -ra COMP_WORDS; do
+    COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMPREPLY=()
+    $function
+    echo "${COMPREPLY[@]}"
+done
+"""
+COMPLETED = {
+    "jaxik para": {"parameters"},
+    "jaxik parameters --format ": {"text", "markdown", "json"},
+    "jaxik record to-": {"to-toml", "to-bytes"},
+    "jaxik fit uneven": {"uneven_walk.toml"},
+    "jaxik completion ": set(SHELLS),
+}
+
+
+def test_bash_completes_commands_options_choices_and_files(tmp_path, capsys):
+    assert main.main(["completion", "bash"]) == 0
+    (tmp_path / "jaxik.bash").write_text(capsys.readouterr().out)
+    words = [line.replace(" ", "|") + "|\n" for line in COMPLETED]  # an empty last word counts
     done = subprocess.run(
-        ["bash", "-c", script, "bash", *words],
-        env={"PYTHON": sys.executable, "PATH": "/usr/bin:/bin"},
-        check=True,
-        capture_output=True,
-        text=True,
-        cwd=examples.REPOSITORY / "experiments",
-    )
-    return done.stdout.split()
+        ["bash", "-c", SCRIPT, "bash", str(examples.REPOSITORY / "experiments")],
+        env={"PATH": "/usr/bin:/bin"}, cwd=tmp_path, input="".join(words),
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    offered = [set(line.split()) for line in done.stdout.splitlines()]
+    assert dict(zip(COMPLETED, offered, strict=True)) == COMPLETED
 
 
-@pytest.mark.parametrize(
-    ("words", "wanted"),
-    [
-        (["jaxik", "para"], {"parameters"}),
-        (["jaxik", "parameters", "--format", ""], {"text", "markdown", "json"}),
-        (["jaxik", "record", "to-"], {"to-toml", "to-bytes"}),
-        (["jaxik", "fit", "uneven"], {"uneven_walk.toml"}),
-        (["jaxik", "completion", ""], set(SHELLS)),
-    ],
-)
-def test_bash_completes_commands_options_choices_and_files(words, wanted):
-    assert wanted == set(completed(*words))
-
-
-@pytest.mark.parametrize("shell", SHELLS)
-def test_there_is_a_script_for_each_shell(shell, capsys):
-    assert main.main(["completion", shell]) == 0
-    assert "calibrate" in capsys.readouterr().out
+def test_there_is_a_script_for_each_shell(capsys):
     assert set(SHELLS) == set(shtab.SUPPORTED_SHELLS)
+    for shell in SHELLS:
+        assert main.main(["completion", shell]) == 0
+        assert "calibrate" in capsys.readouterr().out, shell
 
 
 def test_without_shtab_completion_says_what_to_install(monkeypatch, capsys):
@@ -162,7 +145,5 @@ def test_without_shtab_completion_says_what_to_install(monkeypatch, capsys):
 
 
 def test_every_command_has_a_function():
-    from fitting.cli.commands import COMMANDS
-
-    (words,) = (action.choices for action in make_parser()._actions if action.dest == "command")
-    assert set(words or ()) == {*COMMANDS, *without_jax.COMMANDS}
+    names = {name.partition(" ")[0] for name in commands()}
+    assert names == {*COMMANDS, *without_jax.COMMANDS}

@@ -7,8 +7,7 @@ import pty
 import re
 import sys
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -54,12 +53,14 @@ class Screen:
         return b"".join(self._parts).decode().replace("\r\n", "\n")
 
 
-@contextmanager
 def on_terminal(
-    monkeypatch, columns: int = 80, environment: Mapping[str, str] = {}
-) -> Iterator[list[str]]:
-    """Gives a list, which at the end holds what came on a terminal of these columns."""
-    screen, texts = Screen(), []
+    monkeypatch,
+    act: Callable[[], object],
+    columns: int = 80,
+    environment: Mapping[str, str] = {},
+) -> str:
+    """What an act prints on a terminal of these columns."""
+    screen = Screen()
     for name in ("NO_COLOR", "FORCE_COLOR", "LINES"):
         monkeypatch.delenv(name, raising=False)
     wanted = {"TERM": "xterm-256color", "COLUMNS": str(columns)} | dict(environment)
@@ -68,8 +69,8 @@ def on_terminal(
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", screen.stream)
         patch.setattr(sys, "stderr", screen.stream)
-        yield texts
-    texts.append(screen.close())
+        act()
+    return screen.close()
 
 
 def lines_of(text: str) -> list[str]:
@@ -80,9 +81,7 @@ def lines_of(text: str) -> list[str]:
 
 
 def test_a_terminal_gets_a_drawn_table_and_a_pipe_the_same_as_plain_text(monkeypatch, capsys):
-    with on_terminal(monkeypatch) as texts:
-        assert main.main(["example"]) == 0
-    (drawn,) = texts
+    drawn = on_terminal(monkeypatch, lambda: main.main(["example"]))
     assert main.main(["example"]) == 0
     plain = capsys.readouterr()
     rows = [["name", "experiment"], *([name, title] for name, title in examples.names().items())]
@@ -91,22 +90,21 @@ def test_a_terminal_gets_a_drawn_table_and_a_pipe_the_same_as_plain_text(monkeyp
     assert all(name in drawn and title[:20] in drawn for name, title in rows)
 
 
-@pytest.mark.parametrize("columns", [50, 80, 120])
+@pytest.mark.parametrize("columns", [50, 80, 200])
 @pytest.mark.parametrize("command", [["parameters", "stride"], ["schema"]])
-def test_lists_fit_into_the_width_of_the_terminal(command, columns, monkeypatch):
-    with on_terminal(monkeypatch, columns) as texts:
-        assert main.main(command) == 0
-    lines = lines_of(texts[0])
-    assert len(lines) > 80 and max(map(len, lines)) <= columns
+def test_lists_fit_into_the_width_of_the_terminal(command, columns, monkeypatch, capsys):
+    drawn = on_terminal(monkeypatch, lambda: main.main(command), columns)
+    assert main.main(command) == 0
+    plain = capsys.readouterr().out.splitlines()  # whose cells without prose take 75
+    for lines, widest in ((lines_of(drawn), columns), (plain, max(columns, 75))):
+        assert len(lines) > 80 and max(map(len, lines)) <= widest
 
 
 def test_marks_are_red_and_without_colours_where_there_shall_be_none(monkeypatch):
-    drawn = []
-    for environment in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"}):
-        with on_terminal(monkeypatch, environment=environment) as texts:
-            show(TABLE)
-        drawn += texts
-    coloured, colourless, dumb = drawn
+    coloured, colourless, dumb = (
+        on_terminal(monkeypatch, lambda: show(TABLE), environment=environment)
+        for environment in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"})
+    )
     assert f"{ESCAPE}[31m8.2!" in coloured and f"{ESCAPE}[31m3.0" not in coloured
     assert RULE in colourless and not COLOUR.search(colourless)
     assert dumb == f"{TABLE}\n"
@@ -116,11 +114,10 @@ def test_tables_in_longer_text_are_drawn_and_paths_stay_whole(monkeypatch, capsy
     path = "/a/long/path" * 10
     text = joined(["", "a sentence", joined([TABLE, "bounds"], apart=True), f"written to {path}"])
     assert text == f"\na sentence\n{TABLE}\n\nbounds\nwritten to {path}"
-    with on_terminal(monkeypatch, 60) as texts:
-        show(text)
-    lines = lines_of(texts[0])
-    assert lines[:2] == ["", "a sentence"] and RULE in lines[3] and "-" * 10 not in texts[0]
-    assert path in texts[0].splitlines()[-1]
+    drawn = on_terminal(monkeypatch, lambda: show(text), 60)
+    lines = lines_of(drawn)
+    assert lines[:2] == ["", "a sentence"] and RULE in lines[3] and "-" * 10 not in drawn
+    assert path in drawn.splitlines()[-1]
     show(text)
     assert capsys.readouterr().out == f"{text}\n"
 
@@ -128,9 +125,7 @@ def test_tables_in_longer_text_are_drawn_and_paths_stay_whole(monkeypatch, capsy
 def test_a_table_that_is_too_wide_becomes_two_which_begin_alike(monkeypatch):
     rows = [["parameter", *(f"column {number}" for number in range(6))]]
     rows += [["leg.twist", *(f"{number} to {number + 10}.0" for number in range(6))]]
-    with on_terminal(monkeypatch, 50) as texts:
-        show(aligned(rows))
-    lines = lines_of(texts[0])
+    lines = lines_of(on_terminal(monkeypatch, lambda: show(aligned(rows)), 50))
     cells = [re.split(r"  +", line) for line in lines if line and RULE not in line]
     assert max(map(len, lines)) <= 50 and len(cells) == 4
     assert [*cells[0], *cells[2][1:]] == rows[0] and cells[2][0] == "parameter"
@@ -141,26 +136,23 @@ def test_prose_stands_beside_its_columns_or_below_them(monkeypatch):
     prose = "Largest interior angle of the knee; pi is a straight leg."
     table = wrapped([["leg: TwoBone"], ["leg.max_knee_angle", prose]], 60)
     for columns, first in ((60, "leg.max_knee_angle  Largest"), (40, "leg.max_knee_angle")):
-        with on_terminal(monkeypatch, columns) as texts:
-            show(table)
-        lines = lines_of(texts[0])
+        lines = lines_of(on_terminal(monkeypatch, lambda: show(table), columns))
         assert lines[0] == "leg: TwoBone" and lines[1].startswith(first)
         assert " ".join(" ".join(lines[1:]).split()) == f"leg.max_knee_angle {prose}"
 
 
 @pytest.mark.parametrize("words", [["--help"], ["fit", "--help"]])
 def test_help_has_colours_on_a_terminal_only(words, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "80")
-    with on_terminal(monkeypatch) as texts, pytest.raises(SystemExit, match="0"):
-        main.main(words)
-    with pytest.raises(SystemExit, match="0"):
-        main.main(words)
+    def ask() -> None:
+        with pytest.raises(SystemExit, match="0"):
+            main.main(words)
+
+    drawn = on_terminal(monkeypatch, ask)
+    ask()
     plain = capsys.readouterr().out
-    assert ESCAPE in texts[0] and ESCAPE not in plain
-    examples_of = [
-        text.rpartition("example")[2].split() for text in (CODES.sub("", texts[0]), plain)
-    ]
-    assert examples_of[0] == examples_of[1]
+    assert ESCAPE in drawn and ESCAPE not in plain
+    undrawn = CODES.sub("", drawn).rpartition("example")[2]
+    assert undrawn.split() == plain.rpartition("example")[2].split()
 
 
 # What a command is busy with
@@ -180,28 +172,21 @@ def test_a_terminal_gets_bars_and_results_above_them(monkeypatch):
     monkeypatch.setattr(plain_lines, "PATIENCE", 1.5)
     seconds = itertools.count()
     monkeypatch.setattr(activity.time, "monotonic", lambda: float(next(seconds)))
-    with on_terminal(monkeypatch, 100) as texts:
-        work_for_a_while()
-    (drawn,) = texts
+    drawn = on_terminal(monkeypatch, work_for_a_while, 100)
     text = CODES.sub("", drawn)
-    assert "━" in text and "Searching from 4 starts" in text and "2 of 4, " in text
-    assert (
-        " s each, " in text and " s left" in text and "cost 12.5" in text and "  Descending" in text
-    )
+    for part in ("━", "Searching from 4 starts", "2 of 4, ", " s each, ", " s left", "cost 12.5"):
+        assert part in text
+    assert "  Descending" in text
     assert "\na result meanwhile\n" in text.replace("\r", "\n")
     assert drawn.rfind(f"{ESCAPE}[?25h") > drawn.rfind(f"{ESCAPE}[?25l")  # the cursor is back
     assert "Searching from 4 starts: " in lines_of(drawn)[-1]
 
 
-@pytest.mark.parametrize("environment", [{"TERM": "dumb"}, {}])
-def test_a_pipe_gets_plain_lines_without_codes(environment, monkeypatch, capsys):
-    if environment:
-        with on_terminal(monkeypatch, environment=environment) as texts:
-            work_for_a_while()
-        assert texts == ["a result meanwhile\n"]
-    else:
-        work_for_a_while()
-        assert capsys.readouterr() == ("a result meanwhile\n", "")
+def test_a_dumb_terminal_and_a_pipe_get_plain_lines_without_codes(monkeypatch, capsys):
+    dumb = on_terminal(monkeypatch, work_for_a_while, environment={"TERM": "dumb"})
+    assert dumb == "a result meanwhile\n"
+    work_for_a_while()
+    assert capsys.readouterr() == ("a result meanwhile\n", "")
 
 
 def test_a_terminal_of_other_letters_and_a_closed_one_get_plain_lines(monkeypatch):
