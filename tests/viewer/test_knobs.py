@@ -2,7 +2,6 @@
 
 import threading
 
-import numpy as np
 import pytest
 
 import jaxik
@@ -33,27 +32,28 @@ def test_every_parameter_and_every_switch_has_a_knob(ik, by_name):
     declared = set(parameter_tree.declarations(ik))
     switches = {slot.name for slot in parameter_tree.slots(ik) if slot.value.dtype == bool}
     assert {knob.leaf for knob in by_name.values()} == declared | switches
-    assert [name for name in by_name if name.startswith("probe.toe_ls")] == [
-        f"probe.toe_ls[{i}]" for i in range(3)
-    ]
+    toes = [name for name in by_name if name.startswith("probe.toe_ls")]
+    assert toes == [f"probe.toe_ls[{i}]" for i in range(3)]
     for knob in by_name.values():
         assert knob.low <= knob.shown(ik) <= knob.high
         assert 0 < knob.step <= (knob.high - knob.low) / 100
 
 
-def test_a_knob_changes_its_own_number_and_no_other(ik, by_name):
-    for name in ("pelvis.limit", "probe.toe_ls[2]", "lock.enabled"):
-        knob = by_name[name]
-        value = (not knob.read(ik)) if knob.is_switch else 0.5 * (knob.low + knob.high)
-        moved = knob.write(ik, value)
-        assert knob.read(moved) == pytest.approx(value)
-        others = [other for other in by_name.values() if other is not knob]
-        assert [other.read(moved) for other in others] == [other.read(ik) for other in others]
+@pytest.mark.parametrize("name", ["pelvis.limit", "probe.toe_ls[2]", "lock.enabled"])
+def test_a_knob_changes_its_own_number_and_no_other(name, ik, by_name):
+    knob = by_name[name]
+    value = (not knob.read(ik)) if knob.is_switch else 0.5 * (knob.low + knob.high)
+    moved = knob.write(ik, value)
+    assert knob.read(moved) == pytest.approx(value)
+    others = [other for other in by_name.values() if other is not knob]
+    assert [other.read(moved) for other in others] == [other.read(ik) for other in others]
 
 
-def test_the_end_of_a_slider_is_within_the_range_however_a_page_rounds_it(ik, by_name):
-    knob = by_name["leg.max_knee_angle"]
-    assert knob.read(knob.write(ik, 3.1415927)) == knob.high < 3.1415927
+def test_a_number_is_within_its_range_however_a_page_rounds_it_or_refused(ik, by_name):
+    knee, limit = by_name["leg.max_knee_angle"], by_name["pelvis.limit"]
+    assert knee.read(knee.write(ik, 3.1415927)) == knee.high < 3.1415927
+    with pytest.raises(ValueError, match="pelvis.limit is 99; wanted from"):
+        limit.write(ik, 99.0)
 
 
 def test_the_order_of_two_parameters_is_kept(ik, by_name):
@@ -65,12 +65,6 @@ def test_the_order_of_two_parameters_is_kept(ik, by_name):
     assert low.read(low.write(ik, low.high)) == high.read(ik)
 
 
-def test_a_number_beyond_its_range_is_refused(ik, by_name):
-    knob = by_name["pelvis.limit"]
-    with pytest.raises(ValueError, match="pelvis.limit is 99; wanted from"):
-        knob.write(ik, 99.0)
-
-
 def test_fitted_parameters_have_the_range_of_their_fit(ik):
     free = [free_parameter(ik, "foot.max_pitch", low=0.1, high=0.2)]
     fitted = [knob for knob in knobs(ik, free=free) if knob.is_free]
@@ -78,8 +72,7 @@ def test_fitted_parameters_have_the_range_of_their_fit(ik):
 
 
 def test_undo_redo_and_reset(ik, by_name):
-    knob = by_name["pelvis.limit"]
-    other = by_name["foot.max_pitch"]
+    knob, other = by_name["pelvis.limit"], by_name["foot.max_pitch"]
     tuning = Tuning({"fitted": ik, "default": presets.ozz()})
     for i, now in enumerate((0.0, 0.1, 0.2)):  # one drag
         tuning.change(knob.write(ik, 0.1 + 0.01 * i), knob.name, now)
@@ -106,21 +99,17 @@ def test_a_pause_begins_a_new_step(ik, by_name):
     assert tuning.ik is first
 
 
-def test_what_is_saved_is_read_again(tmp_path):
+def test_what_is_saved_is_read_again_and_stays_when_more_is_saved(tmp_path):
     ik = presets.record(faithful=True)
     knob = next(knob for knob in knobs(ik) if knob.name == "pelvis.limit")
-    moved = knob.write(ik, 0.123)
-    said = saving.save(tmp_path, moved, FAITHFUL)
-    loaded, preset = parameter_files.load_system(tmp_path / "tuned.toml")
-    assert preset == FAITHFUL and knob.read(loaded) == pytest.approx(0.123)
-    content = (tmp_path / "tuned.bin").read_bytes()
-    assert knob.read(record.to_ik(record.from_bytes(content))) == pytest.approx(0.123)
-    assert "knee" in said[-1]  # the bytes hold more than parameters
+    said = saving.save(tmp_path, knob.write(ik, 0.123), FAITHFUL)
     saving.save(tmp_path, ik, FAITHFUL)
-    assert knob.read(parameter_files.load_system(tmp_path / "tuned.toml")[0]) == pytest.approx(
-        0.123
-    )
-    assert (tmp_path / "tuned_2.toml").exists()
+    loaded, preset = parameter_files.load_system(tmp_path / "tuned.toml")
+    content = (tmp_path / "tuned.bin").read_bytes()
+    for read in (loaded, record.to_ik(record.from_bytes(content))):
+        assert knob.read(read) == pytest.approx(0.123)
+    assert preset == FAITHFUL and (tmp_path / "tuned_2.toml").exists()
+    assert "knee" in said[-1]  # the bytes hold more than parameters
 
 
 def test_a_record_that_would_lose_something_is_not_written(tmp_path):
@@ -139,8 +128,8 @@ def test_other_rules_make_no_record(tmp_path):
 
 
 def test_only_the_newest_request_is_worked_on():
-    began, go_on, done = threading.Event(), threading.Event(), []
-    newest = [0]
+    began, go_on = threading.Event(), threading.Event()
+    newest, done = [0], []
 
     def work() -> None:
         value = newest[0]
@@ -157,4 +146,4 @@ def test_only_the_newest_request_is_worked_on():
     go_on.set()
     assert latest.wait(10)
     latest.close()
-    assert done == [0, 49] and np.all(np.diff(done) > 0)
+    assert done == [0, 49]

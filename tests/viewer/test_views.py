@@ -1,30 +1,24 @@
 """A fit is watched while it goes on, and what cannot be shown costs one line."""
 
-import builtins
 import dataclasses
 import importlib.metadata
-import importlib.util
-from pathlib import Path
+import sys
 
 import numpy as np
 import pytest
 
 from fitting import viewer
-from fitting.cli import main
 from fitting.inference.optimisation.solution import Progress, Report
 from fitting.jobs import views
 from fitting.jobs.views import Address, FitWatch
 from fitting.studies.fit import Fit
 from support import runs
 from support.experiments import ROOT
+from support.refusals import refusal
 
-needs_viser = pytest.mark.skipif(
-    importlib.util.find_spec("viser") is None, reason='needs `pip install "jaxik[view]"`'
-)
-CLIP = [
-    str(ROOT / "data" / "clips" / "uneven_walk_base.npz"), "--terrain",
-    str(ROOT / "data" / "terrains" / "uneven_walk.ply"),
-]  # fmt: skip
+pytest.importorskip("viser", reason='needs `pip install "jaxik[view]"`')
+BASE = str(ROOT / "data" / "clips" / "uneven_walk_base.npz")
+ON_GROUND = [BASE, "--terrain", str(ROOT / "data" / "terrains" / "uneven_walk.ply")]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +30,6 @@ def report(best: float, u: np.ndarray) -> Report:
     return Report("descent", 0, 1, best, best, 1.0, best_u=u)
 
 
-@needs_viser
 def test_a_fit_in_progress_shows_its_best_point(fitted, tmp_path, monkeypatch):
     monkeypatch.setattr(views, "EVERY", 0.0)
     heard: list[Progress] = []
@@ -57,46 +50,30 @@ def test_a_fit_in_progress_shows_its_best_point(fitted, tmp_path, monkeypatch):
     assert len(heard) == 4
 
 
-def test_without_viser_one_line_names_the_extra(monkeypatch, capsys):
-    imported = builtins.__import__
-
-    def without_viser(name: str, *rest, **named):
-        if name == "viser":
-            raise ImportError(name)
-        return imported(name, *rest, **named)
-
-    monkeypatch.setattr(builtins, "__import__", without_viser)
-    assert main.main(["view", *CLIP]) == main.MISTAKE
-    assert capsys.readouterr().err == 'jaxik view: needs viser: pip install "jaxik[view]"\n'
+def test_without_viser_one_line_names_the_extra(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    line = refusal(["view", *ON_GROUND], tmp_path, capsys)
+    assert line == 'jaxik view: needs viser: pip install "jaxik[view]"'
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["view", CLIP[0]], "a clip needs --terrain"),
-        (["view", "runs/walk", "--speed", "2"], "--speed is 2.0; a run has its own clips"),
-        pytest.param(
-            ["view", *CLIP, "-o", "nowhere"], "nowhere: no such folder", marks=needs_viser
-        ),
+        ([BASE], "a clip needs --terrain"),
+        (["runs/walk", "--speed", "2"], "--speed is 2.0; a run has its own clips"),
+        ([*ON_GROUND, "-o", "nowhere"], "nowhere: no such folder"),
     ],
 )
 def test_a_mistake_costs_one_line(words, sentence, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main.main(words) == main.MISTAKE
-    error = capsys.readouterr().err
-    assert sentence in error and error.count("\n") == 1
+    assert sentence in refusal(["view", *words], tmp_path, capsys)
 
 
-def subject_of_two_clips(fitted: Fit) -> viewer.Subject:
+def test_another_clip_is_shown_while_the_first_one_plays(fitted, tmp_path):
     subject = viewer.subject_of_fit(fitted.experiment, fitted.problem, fitted.clips)
     (take,) = subject.takes
-    other = dataclasses.replace(take, name="again")
-    return dataclasses.replace(subject, title="<img src=x onerror=run()>", takes=(take, other))
-
-
-@needs_viser
-def test_another_clip_is_shown_while_the_first_one_plays(fitted, tmp_path):
-    subject = subject_of_two_clips(fitted)
+    takes = (take, dataclasses.replace(take, name="again"))
+    subject = dataclasses.replace(subject, title="<img src=x onerror=run()>", takes=takes)
     with views.opened(subject, tmp_path, Address(port=0)) as shown:
         assert shown.wait(300)
         first = shown.solver
@@ -107,7 +84,6 @@ def test_another_clip_is_shown_while_the_first_one_plays(fitted, tmp_path):
         assert shown.wait(300) and shown._player._thread.is_alive()
 
 
-@needs_viser
 def test_pages_of_other_origins_cannot_connect(fitted):
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
@@ -128,16 +104,14 @@ def test_pages_of_other_origins_cannot_connect(fitted):
         stop(server)
 
 
-@needs_viser
 def test_a_title_is_no_script():
     from fitting.viewer.page.words import literal
 
     assert literal("<img src=x>") == r"\<img src=x\>" and literal("walk 2") == "walk 2"
 
 
-@needs_viser
-def test_an_address_of_another_machine_is_refused(fitted):
+def test_an_address_of_another_machine_is_refused():
     from fitting.viewer.page import open_server
 
     with pytest.raises(ValueError, match="--host 192.0.2.1: no address of this machine"):
-        open_server("192.0.2.1", 0, Path(fitted.experiment.name).name)
+        open_server("192.0.2.1", 0, "test")
