@@ -3,34 +3,24 @@
 import dataclasses
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxik
-from jaxik import HARD
-from jaxik.stages.inputs import SensedMoment
-from jaxik.stages.lock import OffsetLock, PlantLock
-from jaxik.stages.lock.offset import LockState
-from jaxik.world import terrain
-from jaxik.world.frame import Contact, Foothold, Sensed
-from jaxik.world.skeleton import Still
 from reference import maths
 from reference.systems import record as reference
 from reference.terrain import Terrain
-from support.cases import QUICK
 from support.clips import FLAT, animate, make_rig, stepping, to_frames, to_ik, to_rig, to_terrain
-from support.fragments import fragment
 
 RIG = make_rig()
-ALWAYS = {  # locked until the foot is lifted
-    "release_distance": 9.0,
-    "release_cone": 1.5,
-    "release_max_angle": np.pi,
-    "release_min_angle": 0.0,
+FIRM = {  # locked at once, and until the foot is lifted
+    "lock.lock_half_life": 0.0,
+    "lock.release_distance": 9.0,
+    "lock.release_cone": 1.5,
+    "lock.release_max_angle": np.pi,
+    "lock.release_min_angle": 0.0,
 }
-FIRM = {"lock.lock_half_life": 0.0} | {f"lock.{name}": value for name, value in ALWAYS.items()}
+HORIZONTAL = np.array([1.0, 0.0, 1.0])
 
 
 def run(values: dict, frames: list, ground: Terrain = FLAT) -> jaxik.Result:
@@ -47,12 +37,8 @@ def tracks(result: jaxik.Result) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     """Targets, footholds and unlocked targets (frames, legs, 3), m, and locked (frames, legs)."""
     advanced, sensed = result.trace.advanced, result.trace.sensed
     unlocked = advanced.foothold_ws + sensed.contact.lift[..., None] * sensed.up_ws[:, None]
-    tracks = (
-        advanced.effector.target_ws,
-        advanced.foothold_ws,
-        unlocked,
-        advanced.state.lock.locked > 0,
-    )
+    target_ws, locked = advanced.effector.target_ws, advanced.state.lock.locked > 0
+    tracks = (target_ws, advanced.foothold_ws, unlocked, locked)
     return tuple(map(np.asarray, tracks))  # type: ignore[return-value]
 
 
@@ -79,9 +65,8 @@ def test_nothing_jumps_at_lock_or_release():
 def test_a_locked_foot_slips_less_and_lifts_as_animated():
     targets, footholds, unlocked, locked = tracks(slipping())
     locked_twice = locked[1:] & locked[:-1]
-    horizontal = np.array([1.0, 0.0, 1.0])
-    slip = np.linalg.norm(np.diff(targets * horizontal, axis=0), axis=-1)[locked_twice]
-    animated = np.linalg.norm(np.diff(unlocked * horizontal, axis=0), axis=-1)[locked_twice]
+    slip = np.linalg.norm(np.diff(targets * HORIZONTAL, axis=0), axis=-1)[locked_twice]
+    animated = np.linalg.norm(np.diff(unlocked * HORIZONTAL, axis=0), axis=-1)[locked_twice]
     assert slip.mean() < 0.3 * animated.mean()
     np.testing.assert_allclose(targets[..., 1], unlocked[..., 1], atol=1e-12)
 
@@ -89,10 +74,9 @@ def test_a_locked_foot_slips_less_and_lifts_as_animated():
 def test_a_foot_locked_firmly_does_not_move_at_all():
     result = run(FIRM, stepping(RIG, drift=0.15))
     targets, _, _, locked = tracks(result)
-    horizontal = np.array([1.0, 0.0, 1.0])
     locked_twice = locked[1:] & locked[:-1]
     assert locked_twice.mean() > 0.3
-    assert np.abs(np.diff(targets * horizontal, axis=0))[locked_twice].max() < 1e-12
+    assert np.abs(np.diff(targets * HORIZONTAL, axis=0))[locked_twice].max() < 1e-12
 
 
 def carousel(time: float) -> reference.Transform:
@@ -148,47 +132,3 @@ def test_a_lock_lets_go_in_the_frame_in_which_its_knee_would_open_too_far():
     lets_go = held & ~locked[1:]
     assert lets_go.sum() > 2 and (held & locked[1:]).sum() > 20
     np.testing.assert_array_equal(angle[held] > max_angle, lets_go[held])
-
-
-# One frame by itself.
-
-
-def test_a_lock_takes_as_much_from_a_turn_as_it_holds():
-    """A lock that holds 0.4 takes half the rest of the way, to 0.7, while the foot turns."""
-    dt, turned = 1 / 60, np.array([0.1, -0.2])
-    rule = OffsetLock(**ALWAYS, hold_ball=True, lock_half_life=dt)
-    up, both, zeros = jnp.array([0.0, 1.0, 0.0]), jnp.ones(2), jnp.zeros((2, 3))
-    ankle, ball = jnp.array([[0.1, 0.08, 0.0], [-0.1, 0.08, 0.0]]), zeros + jnp.array([0, 0, 0.12])
-    sensed = fragment(
-        Sensed,
-        leg_up_ws=up,
-        carry=Still(),
-        weight=both,
-        hip_ws=ankle + 0.8 * up,
-        ankle_ws=ankle,
-        ball_ws=ball,
-        ahead_ws=jnp.stack([jnp.sin(turned), 0 * turned, jnp.cos(turned)], axis=-1),
-        rot_ws=jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (2, 4)),
-        thigh=0.45 * both,
-        shin=0.43 * both,
-        contact=fragment(Contact, planted=both, lifted=0 * both),
-        foothold=fragment(Foothold, lift=0.08 * both, found=both),
-    )
-    ground = fragment(terrain.Terrain, up_ws=up)
-    now = SensedMoment(jnp.asarray(dt), jnp.asarray(True), HARD, sensed, ground)
-    foothold, ahead = ankle - 0.08 * up, zeros + jnp.array([0, 0, 1.0])
-    before = LockState(both, 0.4 * both, zeros, jnp.array([0.02, 0.0]), foothold, ball, ahead)
-
-    def advance() -> LockState:
-        return rule.advance(now, foothold, sensed.hip_ws, before)[0]
-
-    after = jax.jit(advance, compiler_options=QUICK)()
-    np.testing.assert_array_equal(after.locked, 1.0)
-    np.testing.assert_allclose(after.factor, 0.7, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(after.turn, [0.02, 0.0] - 0.7 * turned, rtol=0, atol=1e-12)
-
-
-def test_no_foot_is_planted_or_turned_before_the_first_frame():
-    state = PlantLock().init(to_rig(RIG))
-    np.testing.assert_array_equal(state.locked, [0.0, 0.0])
-    np.testing.assert_array_equal(state.rot, [[1.0, 0.0, 0.0, 0.0]] * 2)

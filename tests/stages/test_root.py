@@ -34,13 +34,9 @@ def frames() -> jaxik.Frame:
     return fitting.frames_from_clip(walk())
 
 
-def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> np.ndarray:
-    """How far the rule moves the root in each frame, m."""
-    return np.asarray(_heights(ground, clip, rule))
-
-
 @jax.jit
-def _heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> jax.Array:
+def heights(ground: terrain.Terrain, clip: jaxik.Frame, rule: AbstractRoot) -> jax.Array:
+    """How far the rule moves the root in each frame, m."""
     rig, ik = walk().rig, dataclasses.replace(jaxik.presets.record(), root=rule)
     inputs = Inputs(rig, ground, clip, jaxik.HARD)
     return sense_first("root", ik, jaxik.init(ik, rig), inputs, faults=None, tracks={})[1]
@@ -57,14 +53,11 @@ def grounds() -> tuple[list[str], terrain.Terrain]:
         "eight steps down": flight(edges, -0.15),
         "curb": flight(edges[3:4]),
     }
-    vertices = [
-        np.asarray(mesh.vertices) + [WIDTH * number, 0.0, 0.0]
-        for number, mesh in enumerate(meshes.values())
-    ]
-    starts = np.cumsum([0, *map(len, vertices)])
-    faces = [
-        np.asarray(mesh.faces) + start for mesh, start in zip(meshes.values(), starts, strict=False)
-    ]
+    vertices, faces, count = [], [], 0
+    for number, mesh in enumerate(meshes.values()):
+        vertices.append(np.asarray(mesh.vertices) + [WIDTH * number, 0.0, 0.0])
+        faces.append(np.asarray(mesh.faces) + count)
+        count += len(mesh.vertices)
     return list(meshes), terrain.mesh(np.concatenate(vertices), np.concatenate(faces))
 
 
@@ -120,21 +113,22 @@ def glide(speed: float = 1.4, count: int = 180) -> jaxik.Frame:
 
 def step(height: float, z: float = 2.0) -> terrain.Terrain:
     """Level ground with a step at z, m."""
-    far = jnp.array([[0.0, 0.0], [0.0, 0.0], [height, height], [height, height]])
-    spacing = jnp.array([20.0, 1.0])
+    near, wide = jnp.zeros((2, 2)), (20.0, 40.0)
     fine = terrain.heightfield(
-        far[:2], spacing, (-10.0, 0.0, z - 1.0), interpolation="triangulated"
+        near, (20.0, 1.0), (-10.0, 0.0, z - 1.0), interpolation="triangulated"
     )
-    ahead = terrain.heightfield(far[2:], (20.0, 40.0), (-10.0, 0.0, z))
-    behind = terrain.heightfield(far[:2], (20.0, 40.0), (-10.0, 0.0, z - 41.0))
+    ahead = terrain.heightfield(near + height, wide, (-10.0, 0.0, z))
+    behind = terrain.heightfield(near, wide, (-10.0, 0.0, z - 41.0))
     return terrain.combine(fine, ahead, behind)
+
+
+RAMP = terrain.plane(normal=(0.0, 1.0, -0.4))
 
 
 @pytest.mark.parametrize("half_life", [0.1, 0.2, 0.4])
 def test_on_a_ramp_the_root_is_on_the_ramp(half_life):
-    ramp = terrain.plane(normal=(0.0, 1.0, -0.4))
     clip = glide()
-    lifted = heights(ramp, clip, GroundRoot(half_life=half_life))
+    lifted = heights(RAMP, clip, GroundRoot(half_life=half_life))
     ground = 0.4 * np.asarray(clip.world_from_model.pos[:, 2])
     np.testing.assert_allclose(lifted, ground, atol=1e-4)
 
@@ -156,18 +150,18 @@ def test_the_root_moves_no_faster_than_its_limit():
 
 def test_in_the_air_the_root_waits_for_the_landing():
     clip = glide()
-    flight_time = (np.arange(180) > 60) & (np.arange(180) < 120)
-    grounded = jnp.asarray(1.0 - flight_time)
+    time = np.arange(180)
+    grounded = jnp.asarray(1.0 - ((time > 60) & (time < 120)))
     lifted = heights(step(0.3), dataclasses.replace(clip, grounded=grounded), GroundRoot())
     np.testing.assert_allclose(lifted[61:120], lifted[60], atol=1e-6)
     assert np.abs(np.diff(lifted)).max() < 0.02 and lifted[-1] == pytest.approx(0.3, abs=0.02)
 
 
 def test_over_a_hole_the_root_keeps_its_height():
-    gap = terrain.combine(
-        terrain.heightfield(jnp.full((2, 2), 0.2), (20.0, 40.0), (-10.0, 0.0, -39.0)),
-        terrain.heightfield(jnp.full((2, 2), 0.2), (20.0, 40.0), (-10.0, 0.0, 2.0)),
+    behind, ahead = (
+        terrain.heightfield(jnp.full((2, 2), 0.2), (20.0, 40.0), (-10.0, 0.0, z)) for z in (-39, 2)
     )
+    gap = terrain.combine(behind, ahead)
     np.testing.assert_allclose(heights(gap, glide(), GroundRoot()), 0.2, atol=1e-6)
 
 
@@ -183,18 +177,15 @@ def test_the_first_frame_is_settled():
 
 def test_a_root_without_memory_costs_no_scan():
     for rule, scans in ((KeepRoot(), False), (GroundRoot(), True)):
-        program = jax.make_jaxpr(lambda clip: _heights(step(0.1), clip, rule))(glide())  # noqa: B023
+        program = jax.make_jaxpr(lambda clip: heights(step(0.1), clip, rule))(glide())  # noqa: B023
         assert ("scan[" in str(program)) == scans
-
-
-RAMP = terrain.plane(normal=(0.0, 1.0, -0.4))
 
 
 def last_height(half_life: jax.Array, max_speed: jax.Array, speed: jax.Array) -> jax.Array:
     """Where the rule puts a character that goes up the ramp at this speed."""
     clip = at(glide(), slice(0, 40))
     moving = dataclasses.replace(clip, velocity_ws=clip.velocity_ws * speed)
-    return _heights(RAMP, moving, GroundRoot(half_life=half_life, max_speed=max_speed))[-1:]
+    return heights(RAMP, moving, GroundRoot(half_life=half_life, max_speed=max_speed))[-1:]
 
 
 @pytest.mark.parametrize(
