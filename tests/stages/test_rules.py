@@ -9,24 +9,15 @@ import pytest
 
 import jaxik
 from fitting.cli import main
-from fitting.experiments import (
-    ablations,
-    experiment_files,
-    known_values,
-    parameter_files,
-    problems,
-    systems,
-)
-from fitting.inference.identifiability import Identifiability
-from fitting.inference.optimisation.solution import Solution
+from fitting.experiments import experiment_files, known_values, parameter_files, problems, systems
+from fitting.experiments.ablations import Ablation
 from fitting.studies import run_folder, translation
 from fitting.studies.animations import Animation, AnimationFiles
-from fitting.studies.fit import Fit
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages import contact, leg, pelvis
-from support.experiments import CLIP, ROOT, SECOND, write
-from support.profiles import parabolas
+from support.experiments import ROOT, write
+from support.runs import invented_fit, save
 
 PRESETS = ("record", "ozz", "unreal", "mec")
 RULES = 'rules = { pelvis = "CapsulePelvis", contact = "IdleContact" }'
@@ -66,8 +57,7 @@ def test_all_rules_of_the_presets_are_known_at_their_stages():
         for stage, rule in systems.rule_names(systems.preset_system(name)).items():
             assert rule in systems.STAGES[stage]
     assert systems.STAGES["leg"]["PoleLeg"] is leg.PoleLeg
-    abstract = [n for rules in systems.STAGES.values() for n in rules if n.startswith("Abstract")]
-    assert not abstract
+    assert not [n for rules in systems.STAGES.values() for n in rules if n.startswith("Abstract")]
 
 
 def test_a_new_rule_has_its_defaults_and_a_present_one_keeps_its_values():
@@ -88,8 +78,6 @@ def test_a_new_rule_has_its_defaults_and_a_present_one_keeps_its_values():
         ({"pelvs": "LowestPelvis"}, "here: unknown key 'pelvs'; nearest is 'pelvis' of"),
         ({"pelvis": "LowPelvis"}, "here: pelvis has no rule 'LowPelvis'; it has .'LowestPelvis',"),
         ({"pelvis": "TwoBone"}, "pelvis has no rule 'TwoBone'"),
-        ({"pelvis": "AbstractPelvis"}, "pelvis has no rule 'AbstractPelvis'"),
-        ({"pelvis": 3}, "pelvis has no rule 3"),
         ({"pelvis": ["LowestPelvis"]}, r"pelvis has no rule \['LowestPelvis'\]"),
     ],
 )
@@ -121,21 +109,28 @@ def test_the_rules_of_a_preset_itself_are_not_written():
         assert "rules" not in parameter_files.system_to_toml(preset.system(), preset)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("rules = 3", "parameters.toml: rules is 3; wanted a table"),
-        ("[rules]\npelvs = 'x'", r"parameters.toml \[rules\]: unknown key 'pelvs'"),
-        ("[rules]\npelvis = 'x'", r"parameters.toml \[rules\]: pelvis has no rule 'x'; it has"),
-        (
-            "[rules]\npelvis = 'CapsulePelvis'\n[pelvis]\non_gain = 0.1",
-            "unknown key 'pelvis.on_gain'",
-        ),
-    ],
-)
-def test_wrong_rules_of_a_parameter_file_are_an_error(tmp_path, text, message):
-    with pytest.raises(ValueError, match=message):
+WRONG_RULES = [
+    ("rules = 3", "rules is 3; wanted a table"),
+    ("rules = { pelvs = 'x' }", r"\[rules\]: unknown key 'pelvs'; nearest is 'pelvis'"),
+    ("rules = { pelvis = 'Low' }", r"\[rules\]: pelvis has no rule 'Low'; it has \["),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG_RULES)
+def test_wrong_rules_of_a_file_are_an_error(tmp_path, text, message):
+    with pytest.raises(ValueError, match=f"parameters.toml.*{message}"):
         parameter_files.load_system(write_parameters(tmp_path, text))
+    with pytest.raises(ValueError, match=message):
+        experiment_files.load_experiment(write(tmp_path, top=text))
+
+
+def test_parameters_of_an_exchanged_rule_are_unknown(tmp_path):
+    text = "[rules]\npelvis = 'CapsulePelvis'\n[pelvis]\non_gain = 0.1"
+    with pytest.raises(ValueError, match="unknown key 'pelvis.on_gain'"):
+        parameter_files.load_system(write_parameters(tmp_path, text))
+    read = experiment_files.load_experiment(write(tmp_path, top=RULES))
+    with pytest.raises(ValueError, match="no parameter named 'pelvis.on_gain'"):
+        problems.make_problem(read)
 
 
 def test_a_system_with_other_rules_cannot_become_a_record(tmp_path, capsys):
@@ -161,25 +156,6 @@ def test_an_experiment_can_exchange_rules_and_free_their_parameters(tmp_path):
     assert problem.space.names == ("pelvis.speed", "foot.max_pitch")
 
 
-@pytest.mark.parametrize(
-    ("top", "message"),
-    [
-        ("rules = 3", "rules is 3; wanted a table"),
-        ("rules = { pelvs = 'x' }", r"\[rules\]: unknown key 'pelvs'; nearest is 'pelvis'"),
-        ("rules = { pelvis = 'Low' }", r"\[rules\]: pelvis has no rule 'Low'; it has \["),
-    ],
-)
-def test_wrong_rules_of_an_experiment_are_an_error(tmp_path, top, message):
-    with pytest.raises(ValueError, match=message):
-        experiment_files.load_experiment(write(tmp_path, top=top))
-
-
-def test_parameters_of_an_exchanged_rule_are_unknown(tmp_path):
-    read = experiment_files.load_experiment(write(tmp_path, top=RULES))
-    with pytest.raises(ValueError, match="no parameter named 'pelvis.on_gain'"):
-        problems.make_problem(read)
-
-
 def test_the_truth_of_an_experiment_is_read_with_its_rules(tmp_path):
     (tmp_path / "truth.toml").write_text("[pelvis]\nspeed = 3.5\n")
     clip = "truth = 'truth.toml'"
@@ -187,29 +163,16 @@ def test_the_truth_of_an_experiment_is_read_with_its_rules(tmp_path):
     assert known_values.load_known_values(read) == {"pelvis.speed": 3.5}
 
 
-def test_rules_are_kept_through_a_run(tmp_path):
-    read = experiment_files.load_experiment(
-        write(tmp_path, top=RULES, free=FREE, clips=CLIP + SECOND)
-    )
-    problem = problems.make_problem(read)
-    u = np.array([0.4, -0.3])
-    values = np.asarray(problem.space.values(problem.space.start * 0 + u))
-    names = problem.space.names
-    solution = Solution(names, u, values, 9.0, 1.0, True, "Done.", np.zeros((1, 2)), (), 1, 1.0)
-    identifiability = Identifiability(
-        names, parabolas(problem.space.parameters, [(0.1, 0.2)] * 2), np.ones(2), np.ones(2),
-        ("", ""), np.ones(2), (), (), (), u, 1.0, 0.0,
-    )  # fmt: skip
-    run = tmp_path / "run"
-    run_folder.save_solution(run, read, problem, solution)
-    run_folder.save_fit(run, Fit(read, problem, solution, identifiability))
+def test_rules_are_kept_through_a_run(tmp_path, undrawn):
+    fit, run = invented_fit(tmp_path, '[rules]\ncontact = "IdleContact"\n'), tmp_path / "run"
+    save(run, fit)
     reloaded, summary = run_folder.load_fit(run)
-    assert reloaded.rules == read.rules
+    assert reloaded.rules == fit.experiment.rules == {"contact": "IdleContact"}
     assert json.loads((run / run_folder.FIT).read_text())["parameters"] == summary["parameters"]
     ik, _ = parameter_files.load_system(run / run_folder.PARAMETERS)
-    assert systems.rule_names(ik) == systems.rule_names(read.starting_system())
-    fitted = [float(parameter_tree.get(ik, name)) for name in names]
-    np.testing.assert_allclose(fitted, values, rtol=1e-12)
+    assert systems.rule_names(ik) == systems.rule_names(reloaded.starting_system())
+    fitted = [float(parameter_tree.get(ik, name)) for name in fit.solution.names]
+    np.testing.assert_allclose(fitted, fit.solution.values, rtol=1e-12)
 
 
 def test_a_translation_keeps_the_rules_of_its_target(tmp_path, monkeypatch):
@@ -249,50 +212,45 @@ parameters = { lock.enabled = false, "leg.soften" = 1.0 }
 """
 
 
-def test_variants_are_read_with_their_rules_and_parameters(tmp_path):
+def test_variants_are_read_with_their_rules_and_parameters_and_kept_by_a_run(tmp_path):
     read = experiment_files.load_experiment(write(tmp_path, rest=WITHOUT))
     assert read.without == (
-        ablations.Ablation("pelvis", {"pelvis": "CapsulePelvis"}, {}),
-        ablations.Ablation("locks", {}, {"lock.enabled": False, "leg.soften": 1.0}),
+        Ablation("pelvis", {"pelvis": "CapsulePelvis"}, {}),
+        Ablation("locks", {}, {"lock.enabled": False, "leg.soften": 1.0}),
     )
-
-
-def test_variants_are_kept_through_a_run_s_own_file(tmp_path):
-    read = experiment_files.load_experiment(write(tmp_path, rest=WITHOUT))
     (tmp_path / "again.toml").write_text(experiment_files.experiment_to_toml(read))
     assert experiment_files.load_experiment(tmp_path / "again.toml").without == read.without
 
 
 @pytest.mark.parametrize(
-    ("table", "message"),
+    ("line", "message"),
     [
-        ("without = 3", r"without is 3; wanted \[\[without\]\], one for each variant"),
-        ("without = [3]", r"\[\[without\]\] is 3; wanted a table"),
-        ("[[without]]\nrules = { pelvis = 'CapsulePelvis' }", "a variant without a name"),
-        ("[[without]]\nname = ' '\nparameters = { leg.soften = 1 }", "a variant without a name"),
-        ("[[without]]\nname = 3", "name is 3; wanted a text"),
-        ("[[without]]\nname = 'a'", "a: changes nothing"),
-        ("[[without]]\nname = 'a'\nrules = { leg = 'TwoBone' }", "a: changes nothing"),
-        ("[[without]]\nname = 'a'\nrule = 3", "unknown key 'rule'; nearest is 'rules'"),
-        ("[[without]]\nname = 'a'\nrules = 3", "rules is 3; wanted a table"),
-        ("[[without]]\nname = 'a'\nrules = { leg = 'x' }", "a: rules: leg has no rule 'x'; it has"),
-        ("[[without]]\nname = 'a'\nrules = { lg = 'x' }", "a: rules: unknown key 'lg'"),
-        (
-            "[[without]]\nname = 'a'\nparameters = { leg.softn = 1 }",
-            "a: parameters: unknown key 'leg.softn'; nearest is 'leg.soften'",
-        ),
-        (
-            "[[without]]\nname = 'a'\nparameters = { leg.soften = 'x' }",
-            "a: parameters: leg.soften is 'x'; wanted a number",
-        ),
-        (
-            "[[without]]\nname = 'all rules'\nparameters = { leg.soften = 1 }",
-            "there already is a variant named 'all rules'",
-        ),
-        (2 * "[[without]]\nname = 'a'\nparameters = { leg.soften = 1 }\n", "a variant named 'a'"),
+        ("name = 'a'", "a: changes nothing"),
+        ("name = 'a'\nrules = { leg = 'TwoBone' }", "a: changes nothing"),
+        ("rules = { pelvis = 'CapsulePelvis' }", "a variant without a name"),
+        ("name = ' '\nparameters = { leg.soften = 1 }", "a variant without a name"),
+        ("name = 3", "name is 3; wanted a text"),
+        ("name = 'a'\nrule = 3", "unknown key 'rule'; nearest is 'rules'"),
+        ("name = 'a'\nrules = 3", "rules is 3; wanted a table"),
+        ("name = 'a'\nrules = { leg = 'x' }", "a: rules: leg has no rule 'x'; it has"),
+        ("name = 'a'\nrules = { lg = 'x' }", "a: rules: unknown key 'lg'"),
+        ("name = 'a'\nparameters = { leg.softn = 1 }", "a: parameters: unknown key 'leg.softn'"),
+        ("name = 'a'\nparameters = { leg.soften = 'x' }", "leg.soften is 'x'; wanted a number"),
+        ("name = 'all rules'\nparameters = { leg.soften = 1 }", "already is a variant named 'all"),
     ],
 )
-def test_a_wrong_variant_is_refused(tmp_path, table, message):
-    place = "top" if table.startswith("without") else "rest"
+def test_a_wrong_variant_is_refused(tmp_path, line, message):
     with pytest.raises(ValueError, match=f"experiment.toml.*{message}"):
-        experiment_files.load_experiment(write(tmp_path, **{place: table}))
+        experiment_files.load_experiment(write(tmp_path, rest=f"[[without]]\n{line}"))
+
+
+def test_variants_that_are_no_tables_or_have_one_name_are_refused(tmp_path):
+    for top, message in (
+        ("without = 3", r"without is 3; wanted \[\[without\]\], one for each variant"),
+        ("without = [3]", r"\[\[without\]\] is 3; wanted a table"),
+    ):
+        with pytest.raises(ValueError, match=f"experiment.toml.*{message}"):
+            experiment_files.load_experiment(write(tmp_path, top=top))
+    table = "[[without]]\nname = 'a'\nparameters = { leg.soften = 1 }\n"
+    with pytest.raises(ValueError, match="experiment.toml.*a variant named 'a'"):
+        experiment_files.load_experiment(write(tmp_path, rest=2 * table))
