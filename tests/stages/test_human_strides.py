@@ -1,9 +1,5 @@
 """The preset `stride` on captured people, on uneven blocks and on flat floors."""
 
-import importlib.util
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
 
@@ -15,6 +11,7 @@ from fitting.datasets.terrain import mesh_files
 from fitting.studies.animations import Animation
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support.benchmark import scoring_program
 
 pytestmark = pytest.mark.slow
 
@@ -30,26 +27,10 @@ BOUNDS = {  # required by the benchmark
     "pop_max_cm_per_frame": 2.0,
     "bone_length_error_max_mm": 1e-3,
 }
-WALK_BOUNDS = (
-    BOUNDS
-    | {  # where the animation knows nothing of the ground: just above what is reached
-        "knee_cm": 4.05,
-        "knee_angle_deg": 11.0,
-        "pop_max_cm_per_frame": 3.0,
-    }
-)
+# Where the animation knows nothing of the ground: just above what is reached.
+WALK_BOUNDS = BOUNDS | {"knee_cm": 4.05, "knee_angle_deg": 11.0, "pop_max_cm_per_frame": 3.0}
 FRAMES = 400
 CALIBRATION = 1.26  # cm, error of the terrain itself under the stances of 03_03
-
-
-@pytest.fixture(scope="module")
-def scoring(mocap: Path) -> ModuleType:
-    """The benchmark's own scoring program."""
-    spec = importlib.util.spec_from_file_location("score", mocap / "blocks" / "score.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def solved(clip: Clip, ground: terrain.Terrain, as_animated: bool = False) -> Clip:
@@ -66,7 +47,7 @@ def solved(clip: Clip, ground: terrain.Terrain, as_animated: bool = False) -> Cl
     ids=["swings of the capture", "swings of a flat floor"],
 )
 def test_the_preset_meets_the_benchmark_on_the_clip_it_was_developed_on(
-    mocap, scoring, file, as_animated, bounds
+    mocap, file, as_animated, bounds
 ):
     path = mocap / "blocks" / file
     after = solved(
@@ -75,7 +56,7 @@ def test_the_preset_meets_the_benchmark_on_the_clip_it_was_developed_on(
         as_animated,
     )
     clip = dict(np.load(path))
-    score = scoring.score(clip, clip_frames.positions_by_role(after))
+    score = scoring_program(mocap).score(clip, clip_frames.positions_by_role(after))
     assert not {name: score[name] for name, bound in bounds.items() if score[name] > bound}
     assert score["ankle_stance_cm"] <= CALIBRATION + 0.5
     # The flat animation slides as captured; foot IK adds less than 0.1 mm per frame.
@@ -93,21 +74,25 @@ def flat_floor(clip: Clip) -> np.ndarray:
     return plane - [0.0, 0.0, BALL_HEIGHT]
 
 
+def levelled(clip: Clip, plane: np.ndarray) -> Clip:
+    """The clip as an animation for a flat floor."""
+    return flat_animation.flatten_clip(
+        clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2]
+    )
+
+
 @pytest.mark.parametrize("name", FLAT)
 def test_no_joint_moves_on_the_floor_the_clip_was_animated_for(mocap, name):
     clip = load_clip(mocap / "clips" / name)
-    plane = flat_floor(clip)
-    level = flat_animation.flatten_clip(
-        clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2]
-    )
-    level = resample(
-        level, (FRAMES - 1) / level.seconds
-    )  # all clips share one shape, and so one program
+    level = levelled(clip, flat_floor(clip))
+    # All clips share one shape, and so one program.
+    level = resample(level, (FRAMES - 1) / level.seconds)
     after = solved(level, terrain.plane())
     for joint in (1, 2, 3):
         np.testing.assert_allclose(after.joints_ws(joint), level.joints_ws(joint), atol=1e-9)
+    pelvis = level.rig.pelvis
     np.testing.assert_allclose(
-        after.positions_ws[:, after.rig.pelvis], level.positions_ws[:, level.rig.pelvis], atol=1e-9
+        after.positions_ws[:, pelvis], level.positions_ws[:, pelvis], atol=1e-9
     )
 
 
@@ -115,9 +100,7 @@ def test_on_a_tilted_floor_standing_feet_rise_by_the_tilt_only(mocap):
     """The floor of 02_01 is tilted in the capture; here only the animation is levelled."""
     clip = load_clip(mocap / "clips" / "cmu_asfamc" / "02_01.amc")
     plane = flat_floor(clip)
-    level = flat_animation.flatten_clip(
-        clip, lambda points: points[:, [0, 2]] @ plane[:2] + plane[2]
-    )
+    level = levelled(clip, plane)
     tilted = terrain.plane((0.0, float(plane[2]), 0.0), (-plane[0], 1.0, -plane[1]))
     after = solved(level, tilted)
     balls, stance = level.joints_ws(3), level.stance_labels()
