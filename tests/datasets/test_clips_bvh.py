@@ -201,7 +201,7 @@ def test_what_no_body_or_argument_can_be_is_refused_but_bounds_give_way_to_argum
         ("", "", {"variant": "base"}, "variant 'base'"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
-            load_clip(write_bvh(BVH.replace(old, new, 1)), **arguments)
+            load_clip(write_bvh(BVH.replace(old, new, 1)), **arguments)  # pyright: ignore[reportArgumentType]
     far = write_bvh(BVH.replace("0 87 1 0 0 5", "0 1e9 1 0 0 5", 1))
     assert load_clip(far, scale=1e-4).positions_ws.max() == pytest.approx(1e5, rel=1e-3)
     slow = write_bvh(BVH.replace("Frame Time: 0.0083333", "Frame Time: 1e21", 1))

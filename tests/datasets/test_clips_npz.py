@@ -90,7 +90,7 @@ def test_archives_that_are_not_clips_are_refused(content, path):
         ({"fps": 30.0}, r"\['fps'\] do not apply"),
     ):
         with pytest.raises(ValueError, match=message):
-            load_clip(path, **options)
+            load_clip(path, **options)  # pyright: ignore[reportArgumentType]
     nowhere = content["positions_ws"] * np.nan
     for arrays, message in (
         ({"a": np.zeros(3)}, r"wanted a clip saved by save_clip.*\['a'\]"),

@@ -48,8 +48,9 @@ def test_the_knee_axis_is_found_from_motion_or_for_a_stiff_knee_from_geometry():
             shin = thigh * Rotation.from_rotvec(flexion[:, None] * left)
             knee = thigh.apply([0.0, -0.4, 0.0])
             ankle = knee + shin.apply([0.0, -0.4, 0.0])
-            rotations = (rot.as_quat(scalar_first=True) for rot in (thigh, shin * skew, shin))
-            leg = LegMotion(np.zeros((40, 3)), knee, ankle, ankle, *rotations, thigh.apply(left))
+            rotations = [rot.as_quat(scalar_first=True) for rot in (thigh, shin * skew, shin)]
+            places = np.zeros((40, 3)), knee, ankle, ankle
+            leg = LegMotion(*places, *rotations, left_ws=thigh.apply(left))
             assert np.allclose(knee_axis(leg), skew.inv().apply(-left), atol=1e-6)
 
 

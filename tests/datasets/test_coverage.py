@@ -54,19 +54,19 @@ def z_up(vertices: np.ndarray) -> np.ndarray:
 
 def test_the_other_axis_and_other_units_are_named(walk, tmp_path):
     for change, options, words in (
-        (z_up, {}, "--file-up z"),
-        (lambda v: v, {"file_up": "z"}, "--file-up y"),
-        (lambda v: v / 100, {}, "--terrain-scale 100"),
-        (lambda v: 100 * v, {"scale": 0.0001}, "--terrain-scale 0.01"),
-        (lambda v: (v * [1, 1, 0.3] + [0, 0, 1]) / 0.0254, {}, "--terrain-scale 0.0254"),
-        (lambda v: (v + [0, 0, 2.1]) * 100, {}, "--terrain-scale 0.01"),
+        (z_up, AS_IS, "--file-up z"),
+        (lambda v: v, TerrainOptions(file_up="z"), "--file-up y"),
+        (lambda v: v / 100, AS_IS, "--terrain-scale 100"),
+        (lambda v: 100 * v, TerrainOptions(scale=0.0001), "--terrain-scale 0.01"),
+        (lambda v: (v * [1, 1, 0.3] + [0, 0, 1]) / 0.0254, AS_IS, "--terrain-scale 0.0254"),
+        (lambda v: (v + [0, 0, 2.1]) * 100, AS_IS, "--terrain-scale 0.01"),
         (
             lambda v: z_up(v * [1, 0.01, 1] + [0, 0, 2.1]) * 100,
-            {},
+            AS_IS,
             "--file-up z --terrain-scale 0.01",
         ),
     ):
-        measured = covered(walk, tmp_path, change(hill().vertices), TerrainOptions(**options))
+        measured = covered(walk, tmp_path, change(hill().vertices), options)
         assert measured.share < 0.5
         assert measured.text().endswith(f"; likely remedy: {words}")
 

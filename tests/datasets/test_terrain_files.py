@@ -68,17 +68,14 @@ def test_a_mesh_with_z_up_is_turned_and_scaled_before_it_is_moved(tmp_path):
 @pytest.mark.parametrize("suffix", ["ply", "npz"])
 def test_up_layer_and_dtype_reach_the_terrain_and_so_does_all_of_an_archive(tmp_path, suffix):
     path = tmp_path / f"ramp.{suffix}"
-    levels = np.array([[0, 50]] * 3, np.uint16)
     if suffix == "ply":
         ramp().apply_translation([2.0, 0.1, 0.0]).apply_scale(100.0).export(path)
-        options = {"slack": 0.1}
     else:
-        origin, kind = [200.0, 10.0, 0.0], "triangulated"
+        levels, kind = np.array([[0, 50]] * 3, np.uint16), "triangulated"
+        origin = [200.0, 10.0, 0.0]
         save_ramp(path, heights=levels, spacing=100, origin=origin, interpolation=kind)
-        options = {}
-    ground = load_terrain(
-        path, up=(0.0, 2.0, 0.0), layer=4, scale=0.01, dtype=jnp.float32, **options
-    )
+    up, dtype = (0.0, 2.0, 0.0), jnp.float32
+    ground = load_terrain(path, up=up, layer=4, scale=0.01, slack=0.1, dtype=dtype)
     (surface,) = ground.surfaces
     np.testing.assert_array_equal(ground.up_ws, [0.0, 1.0, 0.0])
     assert ground.up_ws.dtype == jnp.float32
@@ -214,7 +211,7 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
         (ROOT / "data" / "clips" / "uneven_walk_base.npz", {}, "the file has .*joint_names"),
     ):
         with pytest.raises(ValueError, match=f"(?s){message}"):
-            load_terrain(tmp_path / file, **options)
+            load_terrain(tmp_path / file, **options)  # pyright: ignore[reportArgumentType]
 
 
 def png_that_says(columns: int, rows: int) -> bytes:

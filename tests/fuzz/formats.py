@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -198,7 +199,7 @@ def heights_picture() -> bytes:
     return file.getvalue()
 
 
-def load_ground(path: Path, **options: float) -> None:
+def load_ground(path: Path, **options: Any) -> None:
     soundness.check_terrain(load_terrain(path, **options))
 
 
