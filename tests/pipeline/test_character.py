@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,24 +13,36 @@ import jaxik
 from jaxik.pipeline import character, packing
 from support.clips import make_rig, planes, to_frames, to_rig, to_terrain, wandering
 
-RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.06, 0.04, 0.1)))
-IK = jaxik.presets.record()
 COUNT = 6
+
+
+IK, RIG = jaxik.presets.record(), to_rig(make_rig())
+GROUND = to_terrain(planes((0.06, 0.04, 0.1)))
+
+
+def floats_as(dtype: Any, tree: Any) -> Any:
+    return jax.tree.map(
+        lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+    )
 
 
 @functools.cache
 def frames() -> list[jaxik.Frame]:
+    """With floats of 32 bits, while characters compute with the 64 of their rig."""
     clip = to_frames(wandering(make_rig(), np.random.default_rng(3), COUNT))
-    return [jax.tree.map(lambda x: np.asarray(x[n]), clip) for n in range(COUNT)]  # noqa: B023
+    clip = floats_as(np.float32, jax.tree.map(np.asarray, clip))
+    return [jax.tree.map(lambda x: x[n], clip) for n in range(COUNT)]  # noqa: B023
 
 
 @functools.cache
-def stepped() -> tuple[jaxik.State, list[jaxik.Result]]:
-    state, results = jaxik.init(IK, RIG), []
+def stepped() -> tuple[list[jaxik.State], list[jaxik.Result]]:
+    """Memory before each frame and after the last, and the results."""
+    states, results = [jaxik.init(IK, RIG)], []
     for frame in frames():
-        state, result = jaxik.step(IK, RIG, GROUND, state, frame)
+        state, result = jaxik.step(IK, RIG, GROUND, states[-1], floats_as(np.float64, frame))
+        states.append(state)
         results.append(result)
-    return state, results
+    return states, results
 
 
 def assert_same(ours, theirs) -> None:
@@ -39,21 +52,19 @@ def assert_same(ours, theirs) -> None:
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
 
 
-def test_a_character_moves_as_steps_do_and_keeps_their_memory():
-    walker = jaxik.Character(IK, RIG, GROUND)
-    state, results = stepped()
-    for frame, expected in zip(frames(), results, strict=True):
+@pytest.mark.parametrize("start", [None, 3])
+def test_a_character_moves_as_steps_do_and_keeps_their_memory(start):
+    states, results = stepped()
+    memory = None if start is None else states[start]
+    walker = jaxik.Character(IK, RIG, GROUND, state=memory)
+    for frame, expected in list(zip(frames(), results, strict=True))[start:]:
         assert_same(walker.step(frame), expected)
-    assert_same(walker.state, state)
+    assert_same(walker.state, states[-1])
 
 
-def test_a_character_goes_on_from_a_memory_and_takes_arrays_of_jax():
-    state = jaxik.init(IK, RIG)
-    for frame in frames()[:3]:
-        state, _ = jaxik.step(IK, RIG, GROUND, state, frame)
-    walker = jaxik.Character(IK, RIG, GROUND, state=state)
-    for frame, expected in zip(frames()[3:], stepped()[1][3:], strict=True):
-        assert_same(walker.step(jax.tree.map(jnp.asarray, frame)), expected)
+def test_a_character_takes_arrays_of_jax():
+    walker = jaxik.Character(IK, RIG, GROUND)
+    assert_same(walker.step(jax.tree.map(jnp.asarray, frames()[0])), stepped()[1][0])
 
 
 def test_results_are_numpy_arrays_that_later_steps_leave_alone():
@@ -74,19 +85,6 @@ def test_characters_with_other_numbers_share_a_program():
     other = jaxik.Character(IK, RIG, steep).step(frames()[0])
     assert character._step._cache_size() == compiled  # pyright: ignore[reportAttributeAccessIssue]
     assert np.abs(one.pose.ankle.pos - other.pose.ankle.pos).max() > 0.01
-
-
-def test_a_frame_of_other_floats_is_computed_with_those_of_the_rig():
-    rig = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, RIG)
-    ik, ground = (
-        jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, tree)
-        for tree in (IK, GROUND)
-    )
-    result = jaxik.Character(ik, rig, ground).step(frames()[0])
-    assert result.pose.ankle.pos.dtype == np.float32
-    np.testing.assert_allclose(
-        result.pose.ankle.pos, stepped()[1][0].pose.ankle.pos, rtol=0, atol=1e-4
-    )
 
 
 def test_a_frame_of_another_shape_is_refused_by_name():

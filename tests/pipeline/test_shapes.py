@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import operator
 import re
 from typing import Any
 
@@ -29,11 +30,15 @@ def crowd(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.stack([leaf] * CHARACTERS), tree)
 
 
-def shapes_of(ik: jaxik.FootIK) -> list[tuple[int, ...]]:
-    """Shapes of everything that a game reads from the result."""
+def assert_right_shapes(ik: jaxik.FootIK) -> None:
+    """Asserts that all a game reads from the result is as large as it should be."""
     result = jax.eval_shape(jaxik.run, ik, RIG, GROUND, CLIP)
-    outputs = result.pose, result.body, result.corrections, result.reached, result.aimed
-    return [leaf.shape for leaf in jax.tree.leaves(outputs)]
+    places = [leaf.shape for leaf in jax.tree.leaves((result.pose, result.body))]
+    assert places == [(FRAMES, LEGS, 3), (FRAMES, LEGS, 4)] * 4 + [(FRAMES, 3), (FRAMES, 4)]
+    turns = [(FRAMES, LEGS, 4)] * 3 + [(FRAMES, 4)] * 2
+    corrections = [leaf.shape for leaf in jax.tree.leaves(result.corrections)]
+    assert corrections == turns[: len(corrections)]
+    assert result.reached.shape == result.aimed.shape == (FRAMES, LEGS)
 
 
 def with_one_a_leg(ik: jaxik.FootIK, *names: str) -> jaxik.FootIK:
@@ -59,10 +64,9 @@ def test_each_parameter_is_refused_per_leg_or_gives_results_of_the_right_shapes(
                 jaxik.init(with_one_a_leg(ik, name), RIG)
         else:
             per_leg.append(name)
-    assert shapes_of(with_one_a_leg(ik, *per_leg)) == shapes_of(ik)
+    assert_right_shapes(with_one_a_leg(ik, *per_leg))
 
 
-@pytest.mark.parametrize("call", ["init", "step", "resume", "run"])
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
@@ -72,17 +76,16 @@ def test_each_parameter_is_refused_per_leg_or_gives_results_of_the_right_shapes(
         ("lean.tick_hz", [30.0], "shape (1,), wanted (), the same for all legs;"),
     ],
 )
-def test_every_way_in_names_the_parameter_and_what_it_may_be(call, name, value, message):
-    ik = to_ik({name: value})
-    state = jaxik.init(to_ik({}), RIG)
-    calls = {
-        "init": lambda: jaxik.init(ik, RIG),
-        "step": lambda: jaxik.step(ik, RIG, GROUND, state, FRAME),
-        "resume": lambda: jaxik.resume(ik, RIG, GROUND, state, CLIP),
-        "run": lambda: jaxik.run(ik, RIG, GROUND, CLIP),
-    }
-    with pytest.raises(ValueError, match=f"^{name} has {re.escape(message)}"):
-        calls[call]()
+def test_every_way_in_names_the_parameter_and_what_it_may_be(name, value, message):
+    ik, state = to_ik({name: value}), jaxik.init(to_ik({}), RIG)
+    for call in (
+        lambda: jaxik.init(ik, RIG),
+        lambda: jaxik.step(ik, RIG, GROUND, state, FRAME),
+        lambda: jaxik.resume(ik, RIG, GROUND, state, CLIP),
+        lambda: jaxik.run(ik, RIG, GROUND, CLIP),
+    ):
+        with pytest.raises(ValueError, match=f"^{name} has {re.escape(message)}"):
+            call()
 
 
 class Sinking(AbstractPelvis):
@@ -96,33 +99,30 @@ class Sinking(AbstractPelvis):
 
 def test_a_rule_of_ones_own_is_checked_too():
     ik = dataclasses.replace(to_ik({}), pelvis=Sinking())
-    assert shapes_of(ik) == shapes_of(to_ik({}))
+    assert_right_shapes(ik)
     with pytest.raises(ValueError, match=r"^pelvis.depth has shape \(2,\)"):
-        shapes_of(with_one_a_leg(ik, "pelvis.depth"))
+        jaxik.init(with_one_a_leg(ik, "pelvis.depth"), RIG)
 
 
 INPUTS = {"ik": to_ik({}), "rig": RIG, "terrain": GROUND, "frames": CLIP}
 
 
-@pytest.mark.parametrize(
-    ("argument", "message"),
-    [
-        ("ik", r"^contact.ground_height has shape \(4,\), wanted \(\)"),
-        ("rig", r"^rig.side has shape \(4, 2\), wanted \(legs,\)"),
-        ("terrain", r"^terrain.up_ws has shape \(4, 3\), wanted \(3,\)"),
-        ("frames", r"^frames.dt has shape \(4, 3\), wanted \(frames,\)"),
-    ],
-)
-def test_several_characters_without_vmap_are_told_of_it_and_pass_with_it(argument, message):
-    inputs = INPUTS | {argument: crowd(INPUTS[argument])}
-    with pytest.raises(ValueError, match=f"{message}.*; many .* need jax.vmap or jaxik.lanes"):
-        jax.eval_shape(lambda inputs: jaxik.run(**inputs), inputs)
-    axes = {name: 0 if name == argument else None for name in INPUTS}
-    # Tracing with lanes takes long, and which argument is batched is all the same to it.
-    ways = [jax.vmap, *([functools.partial(jaxik.lanes, block=2)] if argument == "ik" else [])]
-    for batched in ways:
-        many = batched(lambda inputs: jaxik.run(**inputs).reached, in_axes=(axes,))
-        assert jax.eval_shape(many, inputs).shape == (CHARACTERS, FRAMES, LEGS)
+MANY = {
+    "ik": r"^contact.ground_height has shape \(4,\), wanted \(\)",
+    "rig": r"^rig.side has shape \(4, 2\), wanted \(legs,\)",
+    "terrain": r"^terrain.up_ws has shape \(4, 3\), wanted \(3,\)",
+    "frames": r"^frames.dt has shape \(4, 3\), wanted \(frames,\)",
+}
+
+
+def test_several_characters_without_vmap_are_told_of_it_and_pass_with_it():
+    for argument, message in MANY.items():
+        inputs = INPUTS | {argument: crowd(INPUTS[argument])}
+        with pytest.raises(ValueError, match=f"{message}.*; many .* need jax.vmap or jaxik.lanes"):
+            jaxik.run(**inputs)
+    for batched in (jax.vmap, functools.partial(jaxik.lanes, block=2)):
+        many = batched(lambda inputs: jaxik.run(**inputs).reached)
+        assert jax.eval_shape(many, crowd(INPUTS)).shape == (CHARACTERS, FRAMES, LEGS)
 
 
 def test_a_frame_goes_to_step_and_a_clip_to_run():
@@ -134,44 +134,45 @@ def test_a_frame_goes_to_step_and_a_clip_to_run():
 
 
 @pytest.mark.parametrize(
-    ("where", "value", "message"),
+    ("argument", "name", "value", "message"),
     [
+        ("frames", "weight", jnp.ones((3, 4)), r"weight .*\(3, 4\), .*\(3, 2\): 2 legs"),
+        ("frames", "slide", jnp.ones(2), r"slide .*\(2,\), wanted \(3,\): 2 legs"),
+        ("frames", "pose.toe.rot", jnp.ones((3, 2, 3)), r"pose.toe.rot .*\(3, 2, 4\)"),
+        ("frames", "stride.known", jnp.ones((3, 1)), r"stride.known .*\(3, 1\)"),
+        ("rig", "side", jnp.ones(4), r"knee_axis_ls .*\(2, 3\), wanted \(4, 3\)"),
+        ("rig", "present", jnp.ones(3, bool), r"present .*\(3,\), wanted \(2,\): 2"),
         (
-            lambda i: i["frames"].weight,
-            jnp.ones((3, 4)),
-            r"frames.weight .*\(3, 4\), .*\(3, 2\): 2 legs",
+            "frames",
+            "platforms_before",
+            Transform.none(jnp.zeros((3, 2))),
+            r"platforms_before.pos .*\(3, 2, 0, 3\), wanted \(3, 0, 3\): .* as many platf",
         ),
-        (lambda i: i["frames"].slide, jnp.ones(2), r"frames.slide .*\(2,\), wanted \(3,\): 2 legs"),
-        (lambda i: i["frames"].pose.toe.rot, jnp.ones((3, 2, 3)), r"pose.toe.rot .*\(3, 2, 4\)"),
-        (lambda i: i["frames"].stride.known, jnp.ones((3, 1)), r"frames.stride.known .*\(3, 1\)"),
-        (lambda i: i["rig"].side, jnp.ones(4), r"rig.knee_axis_ls .*\(2, 3\), wanted \(4, 3\)"),
-        (lambda i: i["rig"].present, jnp.ones(3, bool), r"rig.present .*\(3,\), wanted \(2,\): 2"),
+    ],
+)
+def test_arrays_that_disagree_on_legs_or_frames_are_named(argument, name, value, message):
+    part = eqx.tree_at(operator.attrgetter(name), INPUTS[argument], value)
+    with pytest.raises(ValueError, match=rf"{argument}\.{message}"):
+        jaxik.run(**INPUTS | {argument: part})
+
+
+@pytest.mark.parametrize(
+    ("ground", "message"),
+    [
+        (LegTerrains(GROUND, (GROUND,) * 3), "terrain.legs has 3 terrains, the rig 2 legs"),
         (
-            lambda i: i["terrain"],
-            LegTerrains(GROUND, (GROUND,) * 3),
-            r"terrain.legs has 3 terrains, the rig 2 legs",
-        ),
-        (
-            lambda i: i["terrain"],
             LegTerrains(GROUND, (GROUND, crowd(GROUND))),
             r"terrain.legs\[1\].up_ws has shape \(4, 3\)",
         ),
         (
-            lambda i: i["frames"].platforms_before,
-            Transform.none(jnp.zeros((3, 2))),
-            r"frames.platforms_before.pos .*\(3, 2, 0, 3\), wanted \(3, 0, 3\): .* as many platf",
-        ),
-        (
-            lambda i: i["terrain"],
             moving(GROUND, 1),
             "^the terrain moves with platform 1, but platforms has 0 platforms, numbered from 0",
         ),
     ],
 )
-def test_arrays_that_disagree_on_legs_or_frames_are_named(where, value, message):
-    wrong = eqx.tree_at(where, INPUTS, value)
+def test_a_terrain_that_does_not_fit_is_refused(ground, message):
     with pytest.raises(ValueError, match=message):
-        jaxik.run(**wrong)
+        jaxik.run(**INPUTS | {"terrain": ground})
 
 
 @pytest.mark.parametrize(
