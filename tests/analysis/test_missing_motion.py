@@ -28,16 +28,16 @@ from fitting.problem.free_parameters import free_parameter, from_fractions, pres
 from fitting.problem.loss import rho
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
-from fitting.problem.scene import Scene
-from fitting.problem.simulation import _motions
+from fitting.problem.scene import Scene, legs_ws, pelvis_ws
+from fitting.problem.shared_world import run_scenes
 from fitting.problem.space import make_space
-from fitting.runtime.precision import in_float64, with_floats
+from fitting.runtime.precision import with_floats
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.probe import FootProbe
 from jaxik.world import terrain
-
-pytestmark = pytest.mark.slow
+from jaxik.world.skeleton import Transform
+from support.clips import at
 
 SECONDS, FPS = 3.0, 30.0
 FRAMES = round(SECONDS * FPS)
@@ -61,7 +61,7 @@ TRUTH = {  # limits that people reach
 
 @functools.cache
 def clip_of(name: str) -> Clip:
-    """A walk, one whose feet slip, a body that stands, a jump or a crouch."""
+    """A walk, one whose feet slip, a body that stands, a run or a crouch."""
     style = WalkStyle(bend=0.0, knees=1.0)
     walk = walker.walk(SECONDS, FPS, 0, (), style)
     match name:
@@ -71,41 +71,28 @@ def clip_of(name: str) -> Clip:
             return walker.walk(SECONDS, FPS, 0, (Slip(0.2, 2.8, 0.25),), style)
         case "stands":
             return walk.select(np.full(FRAMES, 6))
-        case "jumps" | "runs" | "crouches":
-            action = {"jumps": actions.jump, "runs": actions.run, "crouches": actions.crouch}[name]
-            return action(SECONDS, FPS).select(slice(0, FRAMES))
-        case _:
-            raise ValueError(name)
+    action = {"runs": actions.run, "crouches": actions.crouch}[name]
+    return action(SECONDS, FPS).select(slice(0, FRAMES))
 
 
-def ramp(degrees: float) -> Callable:
-    return lambda x, z: np.tan(np.radians(degrees)) * (np.clip(z, 0.7, 2.5) - 0.7)
-
-
-def across(degrees: float) -> Callable:
-    return lambda x, z: np.tan(np.radians(degrees)) * x + 0 * z
-
-
-def step(height: float) -> Callable:
-    return lambda x, z: height * (z > 1.5) + 0 * x
-
-
-def level(height: float) -> Callable:
-    return lambda x, z: height + 0 * x + 0 * z
+SHAPES: dict[str, Callable] = {  # heights by degrees or metres, and by x and z
+    "ramp": lambda degrees, x, z: np.tan(np.radians(degrees)) * (np.clip(z, 0.7, 2.5) - 0.7),
+    "across": lambda degrees, x, z: np.tan(np.radians(degrees)) * x,
+    "step": lambda height, x, z: height * (z > 1.5),
+    "level": lambda height, x, z: height,
+}
 
 
 @functools.cache
 def ground_of(name: str) -> terrain.Terrain:
     """The ground of a name such as `ramp 20`."""
     shape, _, figure = name.partition(" ")
-    height = {"ramp": ramp, "across": across, "step": step, "level": level}[shape](float(figure))
     x = np.arange(-HALF_WIDTH, HALF_WIDTH + SPACING / 2, SPACING)
     z = np.arange(-BEHIND, AHEAD + SPACING / 2, SPACING)
-    heights = np.broadcast_to(height(x, z[:, None]), (len(z), len(x)))
+    heights = np.broadcast_to(SHAPES[shape](float(figure), x, z[:, None]), (len(z), len(x)))
     return terrain.heightfield(heights, SPACING, origin=(-HALF_WIDTH, 0.0, -BEHIND))
 
 
-@in_float64
 def system_of(name: str) -> jaxik.FootIK:
     """An original system, for the record with the limits of its probe."""
     ik = presets.mec(faithful=True)
@@ -115,37 +102,47 @@ def system_of(name: str) -> jaxik.FootIK:
 
 
 @functools.cache
-@in_float64
 def scene_of(clip: str, ground: str) -> Scene:
     """A clip on a ground, with itself as its reference."""
     return make_scene(ClipData(clip_of(clip), clip_of(clip), ground_of(ground)), SIGMAS)
 
 
-@in_float64
-def motion(ik: jaxik.FootIK, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (frames, n, 3) and rotations (frames, n, 4) of pelvis, knees and ankles, sigmas."""
-    ((pelvis, knee_ws, ankle, _),) = _motions(ik, (scene,))
-    positions = [pelvis.pos[:, None], knee_ws, ankle.pos]
-    rotations = np.concatenate([pelvis.rot[:, None], ankle.rot], axis=1)
-    return np.concatenate(positions, axis=1) / POSITION, rotations / (0.5 * ROTATION)
+@jax.jit
+def motions(iks: jaxik.FootIK, scene: Scene) -> tuple[Transform, jax.Array, Transform]:
+    """Pelvis, knees and ankles in the world, by each system of a batch."""
+
+    def motion(ik: jaxik.FootIK) -> tuple[Transform, jax.Array, Transform]:
+        (result,) = run_scenes(ik, (scene,))
+        legs = legs_ws(scene, result)
+        return pelvis_ws(scene, result), legs.knee.pos, legs.ankle
+
+    return jax.vmap(motion)(iks)
 
 
-def cost(motion: tuple[np.ndarray, ...], truth: tuple[np.ndarray, ...]) -> float:
-    """Half the squared distance; a small angle is twice that of its quaternions."""
-    (position, rotation), (true_position, true_rotation) = motion, truth
-    apart = [np.sum((rotation - sign * true_rotation) ** 2, axis=-1) for sign in (1, -1)]
-    return 0.5 * float(np.sum((position - true_position) ** 2) + np.minimum(*apart).sum())
+def squares(moved: np.ndarray) -> np.ndarray:
+    """Squared distances from the last, whose values are true."""
+    return (moved - moved[-1]) ** 2
+
+
+def cost(pelvis: Transform, knee: np.ndarray, ankle: Transform) -> np.ndarray:
+    """Half the squared distance from the last; a small angle is twice that of its quaternions."""
+    rotations = np.concatenate([pelvis.rot[:, :, None], ankle.rot], axis=2)
+    apart = [((rotations - sign * rotations[-1]) ** 2).sum(axis=-1) for sign in (1, -1)]
+    positions = sum(squares(x).reshape(len(x), -1).sum(1) for x in (pelvis.pos, knee, ankle.pos))
+    angles = 4.0 * np.minimum(*apart).sum(axis=(1, 2))
+    return 0.5 * (positions / POSITION**2 + angles / ROTATION**2)
 
 
 def profile_of(
-    system: str, name: str, clip: str, ground: str, cost: Callable[..., float] = cost
+    system: str, name: str, clip: str, ground: str, cost: Callable[..., np.ndarray] = cost
 ) -> Profile:
     """The profile of a parameter with all others at their truth, and without a prior."""
-    ik, scene = system_of(system), scene_of(clip, ground)
-    parameter, truth = free_parameter(ik, name), motion(ik, scene)
+    ik = system_of(system)
+    parameter = free_parameter(ik, name)
     own = np.append(from_fractions(parameter, PLACES), present_value(ik, name))
-    moved = [with_floats(parameter_tree.replace(ik, {name: x}), np.float64) for x in own]
-    costs = np.array([cost(motion(each, scene), truth) for each in moved])
+    iks = [parameter_tree.replace(ik, {name: x}) for x in own]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *iks)
+    costs = cost(*jax.tree.map(np.asarray, motions(stacked, scene_of(clip, ground))))
     return make_profile(parameter, own[:, None], own, costs, np.zeros_like(costs))
 
 
@@ -210,19 +207,22 @@ def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
     """A step up 1.5 m ahead; the rises are those of the loss, with the tails of the fit."""
     clip, ground, tails = "walks", "step 0.25", 2.0
 
-    def student(motion: tuple[np.ndarray, ...], truth: tuple[np.ndarray, ...]) -> float:
-        return 0.5 * float(rho((motion[0] - truth[0]) ** 2, "student", tails, np).sum())
+    def student(pelvis: Transform, knee: np.ndarray, ankle: Transform) -> np.ndarray:
+        losses = (
+            rho(squares(x) / POSITION**2, "student", tails, np).reshape(len(x), -1)
+            for x in (pelvis.pos, knee, ankle.pos)
+        )
+        return 0.5 * sum(loss.sum(axis=1) for loss in losses)
 
     profile = profile_of("record", "pelvis.limit", clip, ground, student)
     ik, scene = system_of("record"), scene_of(clip, ground)
-    with jax.enable_x64(True):
-        ((pelvis, knee_ws, ankle, _),) = _motions(ik, (scene,))
-        exact = dataclasses.replace(scene.reference, pelvis=pelvis, knee_ws=knee_ws, ankle=ankle)
-        none = jnp.asarray(jnp.inf)
-        sigmas = dataclasses.replace(scene.sigmas, foot=none, body=none)
-        scene = dataclasses.replace(scene, reference=exact, sigmas=sigmas)
-        space = make_space(ik, [free_parameter(ik, "pelvis.limit")])
-        problem = Problem(space, (scene,), residuals_of_scenes, "student", tails=jnp.asarray(tails))
+    pelvis, knee_ws, ankle = at(motions(jax.tree.map(lambda x: x[None], ik), scene), 0)
+    exact = dataclasses.replace(scene.reference, pelvis=pelvis, knee_ws=knee_ws, ankle=ankle)
+    none = jnp.asarray(jnp.inf)
+    sigmas = dataclasses.replace(scene.sigmas, foot=none, body=none)
+    scene = dataclasses.replace(scene, reference=exact, sigmas=sigmas)
+    space = make_space(ik, [free_parameter(ik, "pelvis.limit")])
+    problem = Problem(space, (scene,), residuals_of_scenes, "student", tails=jnp.asarray(tails))
     below, above = find_evidence(problem, play_all(ik, problem.data), profile)
     assert (below.side, above.side) == ("below", "above")
     assert below.value < profile.interval[0] and above.value > profile.interval[1]
