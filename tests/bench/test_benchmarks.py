@@ -3,7 +3,9 @@
 import dataclasses
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,7 @@ from fitting.bench.benchmarks import (
     crowd,
     inference,
     kernels,
+    live,
     many,
     scaling,
 )
@@ -33,13 +36,32 @@ from jaxik import presets
 from support.clips import assert_close
 from support.quick import TARGETS, residuals_of_scenes
 
-pytestmark = pytest.mark.slow
-
 SMALL = Sizes(
-    repeats=2, legs=12, feet=12, characters=5, derived=3, frames=24, chunk=2,
+    repeats=2, legs=12, feet=12, characters=5, derived=3, frames=12, chunk=2,
     crowd_repeats=1, cells=8, rays=40, read=1 << 12, side=8, fits=1, walkers=40, steps=2,
     batches=(2, 8), lengths=(10, 20), grids=(3, 6), parameters=(2, 3), legs_each=(2, 3),
 )  # fmt: skip
+CALLS = "", ", program", ", Character"  # of a step
+
+
+@pytest.fixture(autouse=True)
+def short_samples(monkeypatch):
+    """A sample is one call."""
+    monkeypatch.setattr(measurement, "SAMPLE", 0.0)
+
+
+@pytest.fixture(scope="module")
+def legs():
+    """Batches of legs are parts of this one, so that its pipeline is compiled once."""
+    every = workloads.leg_batch(200)
+    parts = every.rig, every.frame, every.sensed, every.target_ms
+
+    def first(count: int) -> workloads.LegBatch:
+        return workloads.LegBatch(every.ik, *jax.tree.map(lambda leaf: leaf[:count], parts))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workloads, "leg_batch", first)
+        yield every
 
 
 def run_suite(name: str, sizes: Sizes = SMALL) -> runner.Report:
@@ -72,7 +94,6 @@ def test_the_ceilings_of_the_machine_are_its_best_runs():
 
 def test_import_times_do_not_include_that_of_jax(monkeypatch):
     commands = []
-    monkeypatch.setattr(measurement, "SAMPLE", 0.0)
     monkeypatch.setattr(ceilings.subprocess, "run", lambda command, check: commands.append(command))
     timings = measure("start", repeats=1)
     seconds = {name: samples[0] for name, samples in timings.samples.items()}
@@ -83,7 +104,7 @@ def test_import_times_do_not_include_that_of_jax(monkeypatch):
     }  # fmt: skip
 
 
-def test_legs_and_feet_have_their_targets(monkeypatch):
+def test_legs_and_feet_have_their_targets(legs, monkeypatch):
     monkeypatch.setattr(xla, "vector_bits", lambda: 256)
     timings = measure("legs")
     assert figures(timings)["a leg and core"].at_most == 45.0
@@ -92,12 +113,10 @@ def test_legs_and_feet_have_their_targets(monkeypatch):
     assert figures(measure("feet"))["a leg and core"].at_most == 110.0
 
 
-def test_the_leg_in_numpy_is_the_same_as_ours():
-    with jax.enable_x64(True):
-        batch = workloads.leg_batch(200)
-        corrections = kernels.leg_corrections(batch.ik, batch.lanes)
-        ours = [np.asarray(rotations)[0].T for rotations in corrections]
-        theirs = baselines.two_bone(*kernels.numpy_arguments(batch))
+def test_the_leg_in_numpy_is_the_same_as_ours(legs):
+    corrections = kernels.leg_corrections(legs.ik, legs.lanes)
+    ours = [np.asarray(rotations)[0].T for rotations in corrections]
+    theirs = baselines.two_bone(*kernels.numpy_arguments(legs))
     for our_rot, their_rot in zip(ours, theirs, strict=True):
         assert_close(np.abs(np.sum(our_rot * their_rot, axis=-1)), np.ones(200), 1e-4)
         assert np.ptp(our_rot[:, 0]) > 1e-3  # the legs differ
@@ -132,37 +151,35 @@ def test_a_crowd_in_chunks_is_the_whole_crowd():
     assert timings.work["plane"].operations >= 3 * 2 * 24 * 3  # of all three chunks
 
 
-@pytest.fixture
-def flat(monkeypatch):
-    """A plane in place of the mesh, so that there is one program only."""
-    monkeypatch.setattr(workloads, "ground", lambda mesh: workloads.single(kernels.plane()))
+def test_the_whole_pipeline_is_measured_for_a_crowd_in_reverse_and_by_frames(monkeypatch):
+    """With something else in its place, as its programs take long to compile."""
 
+    def outputs(ik, crowd, ground, frames):
+        return (ik.leg.soften * frames.pose.ankle.pos + ground.up_ws,)
 
-def test_the_crowd_is_measured_on_a_plane_and_on_a_mesh(flat):
+    monkeypatch.setattr(crowd, "_outputs", outputs)
     of_crowd = figures(measure("crowd"))
     wider = 1.0 / host.time_in_width()
     assert of_crowd["plane, leg-frames a second"].at_least == pytest.approx(9.0 * wider)
     assert of_crowd["mesh, leg-frames a second"].at_least == pytest.approx(5.0 * wider)
     assert of_crowd["peak of memory"].value > 50.0
-
-
-def test_the_gradient_is_measured_in_forward_runs(monkeypatch):
-    def outputs(ik, crowd, ground, frames):
-        """In place of the pipeline, whose gradient takes a minute to compile."""
-        return (ik.leg.soften * frames.pose.ankle.pos,)
-
-    monkeypatch.setattr(crowd, "_outputs", outputs)
     timings = measure("gradient")
     ratio = timings.samples["reverse"][0] / timings.samples["forward"][0]
     assert figures(timings)["reverse in forward runs"].value == pytest.approx(ratio)
 
-
-def test_a_step_is_measured_with_its_dispatch(flat):
+    character = SimpleNamespace(step=lambda frame: None)
+    monkeypatch.setattr(kernels.jaxik, "step", lambda ik, rig, ground, state, frame: frame.weight)
+    monkeypatch.setattr(kernels.jaxik, "Character", lambda ik, rig, ground: character)
     timings = measure("step")
     assert figures(timings)["Character on a plane"].at_most == 150.0
-    assert set(timings.work) == set(timings.samples) == {
-        "plane", "mesh", "plane, program", "mesh, program", "plane, Character", "mesh, Character",
-    }  # fmt: skip
+    calls = {f"{ground}{call}" for ground in ("plane", "mesh") for call in CALLS}
+    assert set(timings.work) == set(timings.samples) == calls
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["crowd", "step", "view"])
+def test_a_benchmark_runs_with_the_whole_pipeline(name):
+    assert measure(name).figures
 
 
 def test_the_jacobian_is_measured_in_evaluations(small_problem):
@@ -174,8 +191,12 @@ def test_the_jacobian_is_measured_in_evaluations(small_problem):
         assert figures(timings)[f"in evaluations, {floats}"].value == pytest.approx(slopes / rows)
 
 
-def test_the_fit_has_twenty_smooth_parameters():
-    problem = workloads.problem(24)
+def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
+    subject = live.subject(12)
+    (take,), (system,) = subject.takes, subject.starts.values()
+    assert take.base.fps == live.RATE and take.base.frame_count == 6
+    assert system.leg is not None and subject.cost is not None
+    problem = workloads.problem(12)
     assert problem.space.size == 20 and all(problem.space.smooth)
     count = max(bench_sizes.FULL.parameters)
     names = workloads.parameter_names(count)
@@ -184,7 +205,7 @@ def test_the_fit_has_twenty_smooth_parameters():
 
 @pytest.fixture
 def small_problem(monkeypatch):
-    """A problem of two parameters, whose residuals compile small_problem."""
+    """A problem of two parameters, whose residuals compile at once."""
 
     def problem(frame_count: int, names: tuple[str, ...] = ()) -> Problem:
         ik = presets.record()
@@ -205,7 +226,7 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own(small_problem, monke
         return cold_fit.subprocess.CompletedProcess(command, 0, "1.00\n")
 
     monkeypatch.setattr(cold_fit.subprocess, "run", run)
-    timings = measure("fit", frames=12)
+    timings = measure("fit")
     of_fit = figures(timings)
     assert of_fit["warm"].at_most == 2.0
     assert of_fit["cold, empty cache"].at_most == 20.0
@@ -224,15 +245,24 @@ def test_a_posterior_is_sampled_for_all_its_steps(small_problem):
     assert figure.value == timings.samples["chain"][0]
 
 
-def test_a_drag_is_measured_without_its_compilation():
+def test_a_drag_is_measured_without_its_compilation(monkeypatch):
+    systems = []
+    ik, clip = presets.record(), workloads.walk(12)
+    subject = SimpleNamespace(starts={live.DEFAULT: ik}, rig=clip.rig)
+    solver = SimpleNamespace(solve=systems.append, take=SimpleNamespace(base=clip))
+    monkeypatch.setattr(live, "subject", lambda frame_count: subject)
+    monkeypatch.setattr(live, "Solver", lambda subject: solver)
     timings = measure("view")
     (figure,) = timings.figures
     assert figure.at_most == 100.0 and figure.unit == "ms"
     assert figure.value == pytest.approx(1e3 * np.median(timings.samples["drag"]))
     assert timings.compile_s["solve"] > 0
+    first, *dragged = systems
+    assert first is ik and len(dragged) == 2 + SMALL.repeats
+    assert not any(eqx.tree_equal(ik, other) for other in dragged)
 
 
-def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, tmp_path, monkeypatch):
+def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, legs, tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "run", lambda ik, rig, ground, motion: 2 * motion.weight)
     measured = run_suite("scaling")
     timings = measured.measurements[-1]
@@ -258,34 +288,27 @@ def test_an_interrupted_fit_adds_no_figure(small_problem, monkeypatch):
     assert measured.interrupted and measured.measurements[-1].figures == []
 
 
-def point(seconds: float) -> dict[str, float]:
-    return {"seconds": seconds, "cpu_seconds": 2.0 * seconds, "peak_mb": 300.0}
+def measured(what: str, count: int) -> dict[str, float]:
+    """In place of a process of its own."""
+    if (what, count) == ("clips", 20):
+        raise subprocess.CalledProcessError(1, "many", stderr="Trace\nMemoryError: full")
+    if (what, count) == ("clips", 40):
+        raise KeyboardInterrupt
+    return {"seconds": float(count), "cpu_seconds": 2.0 * count, "peak_mb": 300.0}
 
 
 def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch):
-    calls = []
-
-    def measured(what: str, count: int) -> dict[str, float]:
-        calls.append((what, count))
-        if (what, count) == ("clips", 20):
-            raise subprocess.CalledProcessError(1, "many", stderr="Trace\nMemoryError: full")
-        return point(count)
-
     monkeypatch.setattr(many, "_measured", measured)
     monkeypatch.setattr(many, "usable_cores", lambda: 2)
     sizes = dataclasses.replace(SMALL, devices=(1, 4, 5, 8), clips=(10, 20, 30), workers=(1, 2))
-    measurement = Measurement("many", "", 1)
-    many.many(measurement, sizes)
-    assert calls == [("devices", 1), ("devices", 4), ("clips", 10), ("clips", 20)] + [
-        ("workers", 1), ("workers", 2)
-    ]  # fmt: skip
-    assert measurement.notes[:2] == [
+    many.many(timings := Measurement("many", "", 1), sizes)
+    assert timings.notes[:2] == [
         "left out: 5, 8 devices, as two share each core already",
         "left out: 30 clips, as 20 failed",
     ]
-    assert measurement.failures == ["20 clips: MemoryError: full"]
-    assert [series.sizes for series in measurement.series] == [[1, 4], [10], [1, 2]]
-    assert figures(measurement)["8 fits, 2 workers: CPU time"].value == 4.0
+    assert timings.failures == ["20 clips: MemoryError: full"]
+    assert [series.sizes for series in timings.series] == [[1, 4], [10], [1, 2]]
+    assert figures(timings)["8 fits, 2 workers: CPU time"].value == 4.0
 
     monkeypatch.setattr(many, "LONGEST", -1.0)
     many.many(slow := Measurement("many", "", 1), sizes)
@@ -294,14 +317,9 @@ def test_many_leaves_out_what_takes_long_and_what_only_shares_cores(monkeypatch)
 
 
 def test_many_keeps_what_was_measured_before_an_interrupt(monkeypatch, tmp_path):
-    def measured(what: str, count: int) -> dict[str, float]:
-        if what == "clips":
-            raise KeyboardInterrupt
-        return point(count)
-
     monkeypatch.setattr(many, "_measured", measured)
     monkeypatch.setattr(many, "usable_cores", lambda: 2)
-    timings = run_suite("many", dataclasses.replace(SMALL, devices=(1, 2)))
+    timings = run_suite("many", dataclasses.replace(SMALL, devices=(1, 2), clips=(40,)))
     assert timings.interrupted
     numbers, curves = tmp_path / "bench.json", tmp_path / "bench.png"
     assert report.write(timings, numbers, curves) == [numbers, curves]

@@ -13,25 +13,18 @@ from jaxik.world import places, terrain
 from jaxik.world.skeleton import Still, Transform
 from jaxik.world.sweep import sweep, sweepable
 from jaxik.world.terrain import LegTerrains, Terrain
+from support.clips import assert_close
+from support.meshes import UP, cast, lattice
 
-UP = np.array([0.0, 1.0, 0.0], np.float32)
 FAR = np.array([1e5, 2e3, -7e4])  # m, a multiple of the lattice: exact in 32 bits
 FAR -= FAR % places.LATTICE
 ROUNDING = 4e-6  # m, of 32 bits at 8 m
 
-rng = np.random.default_rng(3)
-X, Z = np.meshgrid(np.arange(-4.0, 4.5, 0.5), np.arange(-4.0, 4.5, 0.5), indexing="ij")
+RNG = np.random.default_rng(3)
 # Multiples of 1/64 m, which stay exact far away.
-VERTICES = np.stack([X, np.round(rng.uniform(0, 64, X.shape)) / 64, Z], axis=-1).reshape(-1, 3)
-FIRST = (17 * np.arange(16)[:, None] + np.arange(16)).reshape(-1)
-TRIANGLES = np.concatenate(
-    [
-        np.stack([FIRST, FIRST + 1, FIRST + 17], -1),
-        np.stack([FIRST + 1, FIRST + 18, FIRST + 17], -1),
-    ]
-)
-HEIGHTS = VERTICES[:, 1].reshape(17, 17).astype(np.float32)
-STARTS = jnp.asarray(rng.uniform((-3.9, 1.5, -3.9), (3.9, 2.5, 3.9), (200, 3)), jnp.float32)
+HEIGHTS = np.round(RNG.uniform(0, 64, (17, 17))).astype(np.float32) / 64
+VERTICES, TRIANGLES = lattice(HEIGHTS, 0.5, (-4.0, 0.0, -4.0))
+STARTS = jnp.asarray(RNG.uniform((-3.9, 1.5, -3.9), (3.9, 2.5, 3.9), (200, 3)), jnp.float32)
 
 GROUNDS: dict[str, Callable[[np.ndarray], Terrain]] = {
     "level plane": lambda by: terrain.plane(by, dtype=np.float32),
@@ -46,13 +39,16 @@ def about(ground: Any, by: np.ndarray) -> Any:
 
 
 @pytest.mark.parametrize("kind", GROUNDS)
-def test_rays_hit_ground_far_away_as_exactly_as_near(kind):
-    near = terrain.cast(GROUNDS[kind](np.zeros(3)), STARTS, 20.0)
-    far = terrain.cast(about(GROUNDS[kind](FAR), FAR), STARTS, 20.0)
-    assert np.asarray(near.found).all()
-    np.testing.assert_array_equal(far.found, near.found)
-    np.testing.assert_allclose(far.point, near.point, rtol=0, atol=ROUNDING)
-    np.testing.assert_allclose(far.normal, near.normal, rtol=0, atol=ROUNDING)
+def test_rays_and_capsules_meet_ground_far_away_as_exactly_as_near(kind):
+    near, far = GROUNDS[kind](np.zeros(3)), about(GROUNDS[kind](FAR), FAR)
+    ray, far_ray = (cast(ground, STARTS) for ground in (near, far))
+    assert np.asarray(ray.found).all()
+    assert_close(far_ray, ray, ROUNDING)
+    half = jnp.asarray((0.05, 0.0, 0.1), jnp.float32)
+    near, far = sweepable(near, 0.3), about(sweepable(GROUNDS[kind](FAR), 0.3), FAR)
+    rest, far_rest = (sweep(ground, STARTS[:50], 0.1, 20.0, half_ws=half) for ground in (near, far))
+    assert np.asarray(rest.found).all()
+    np.testing.assert_allclose(far_rest.point, rest.point, rtol=0, atol=10 * ROUNDING)
 
 
 def test_a_slanted_plane_whose_point_is_far_away_is_rounded_in_the_same_way_for_all_rays():
@@ -67,46 +63,34 @@ def test_a_slanted_plane_whose_point_is_far_away_is_rounded_in_the_same_way_for_
     assert np.ptp(errors) < 2 * ROUNDING
 
 
-@pytest.mark.parametrize("kind", GROUNDS)
-def test_capsules_rest_on_ground_far_away_as_exactly_as_near(kind):
-    half = jnp.asarray((0.05, 0.0, 0.1), jnp.float32)
-    grounds = [sweepable(GROUNDS[kind](by), 0.3) for by in (np.zeros(3), FAR)]
-    near, far = (
-        sweep(ground, STARTS[:50], 0.1, 20.0, half_ws=half)
-        for ground in (grounds[0], about(grounds[1], FAR))
-    )
-    assert np.asarray(near.found).all()
-    np.testing.assert_allclose(far.point, near.point, rtol=0, atol=10 * ROUNDING)
-
-
 def test_a_function_is_asked_where_it_is_in_the_world():
     ground = terrain.function(lambda x, z: 0.1 * x - 0.2 * z, dtype=np.float32)
     by = jnp.asarray((16.0, 32.0, -48.0), jnp.float32)
-    here = terrain.cast(ground, STARTS + np.asarray(by), 100.0)
-    moved = terrain.cast(ground.moved(-by), STARTS, 100.0)
+    here, moved = cast(ground, STARTS + by), cast(ground.moved(-by), STARTS)
     np.testing.assert_allclose(moved.point, here.point - by, rtol=0, atol=2e-5)
 
 
 def test_a_moved_mesh_with_moved_vertices_stays_moved():
-    ground = GROUNDS["mesh"](np.zeros(3)).moved(jnp.asarray(UP, jnp.float32))
+    ground = GROUNDS["mesh"](np.zeros(3)).moved(jnp.float32(UP))
     raised = ground.with_vertices(jnp.asarray(VERTICES + UP, jnp.float32))
-    low, high = (terrain.cast(x, STARTS + 2 * UP, 20.0).point for x in (ground, raised))
+    low, high = (cast(x, STARTS + 2 * jnp.float32(UP)).point for x in (ground, raised))
     np.testing.assert_allclose(high, low + UP, rtol=0, atol=ROUNDING)
 
 
 def test_platforms_and_grounds_of_legs_are_moved_where_they_are():
-    ground = GROUNDS["mesh"](np.zeros(3))
+    moving = terrain.moving(GROUNDS["mesh"](np.zeros(3)), 0)
     turned = jnp.asarray([[0.8, 0.0, 0.6, 0.0]], jnp.float32)
-    pose = Transform(jnp.asarray(FAR[None], jnp.float32), turned)
-    ship = terrain.moving(ground, 0).at(pose)
-    at_origin = terrain.moving(ground, 0).at(Transform(jnp.zeros((1, 3), jnp.float32), turned))
-    starts = 0.7 * STARTS + UP
-    near, far = (terrain.cast(x, starts, 20.0) for x in (at_origin, about(ship, FAR)))
+    at_origin, ship = (
+        moving.at(Transform(jnp.asarray(by[None], jnp.float32), turned)) for by in (0 * FAR, FAR)
+    )
+    starts = 0.7 * STARTS + jnp.float32(UP)
+    near, far = (cast(x, starts) for x in (at_origin, about(ship, FAR)))
     np.testing.assert_allclose(far.point, near.point, rtol=0, atol=ROUNDING)
-    legs = LegTerrains(ship, (ship, ship))
+    legs = about(LegTerrains(ship, (ship, ship)), FAR)
+    far = terrain.cast(legs, jnp.stack([starts, starts], axis=1), jnp.inf)
     for leg in range(2):
-        far = terrain.cast(about(legs, FAR), jnp.stack([starts, starts], axis=1), 20.0)
         np.testing.assert_allclose(far.point[:, leg], near.point, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(cast(legs.body, starts).point, near.point, rtol=0, atol=ROUNDING)
 
 
 def test_the_grid_of_a_mesh_far_away_is_the_one_at_the_origin():
@@ -117,7 +101,7 @@ def test_the_grid_of_a_mesh_far_away_is_the_one_at_the_origin():
 
 
 def test_the_centre_is_on_a_lattice_near_the_character_and_absent_with_64_bits():
-    pos = rng.uniform(-1e5, 1e5, (100, 3)).astype(np.float32)
+    pos = RNG.uniform(-1e5, 1e5, (100, 3)).astype(np.float32)
     centre = np.asarray(places.centre_about(jnp.asarray(pos)))
     assert (np.abs(pos - centre) <= places.LATTICE / 2).all()
     np.testing.assert_array_equal(centre % places.LATTICE, 0.0)

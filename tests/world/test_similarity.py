@@ -33,21 +33,15 @@ class Step(Rule):
     on: Leaf = switch(True, doc="Whether it does anything.")
 
 
-@pytest.mark.parametrize(
-    ("unit", "power"),
-    [
-        ("m", 1.0), ("m/s", 0.5), ("s", 0.5), ("1/s", -0.5), ("Hz", -0.5), ("m/s²", 0.0),
-        ("m²", 2.0), ("1/m", -1.0), ("rad/s", -0.5), ("rad", 0.0), ("1", 0.0), ("1/tick", 0.0),
-    ],
-)  # fmt: skip
-def test_the_power_of_the_ratio_follows_from_the_unit(unit, power):
-    assert exponent(unit) == power
-
-
-@pytest.mark.parametrize("unit", ["kg", "m/kg", "m s", ""])
-def test_an_unknown_unit_is_an_error_that_lists_the_known_ones(unit):
-    with pytest.raises(ValueError, match=r"is not made of \['m', 's', 'Hz'"):
-        exponent(unit)
+def test_the_power_of_the_ratio_follows_from_the_unit():
+    powers = {
+        "m": 1.0, "m/s": 0.5, "s": 0.5, "1/s": -0.5, "Hz": -0.5, "m/s²": 0.0, "m²": 2.0,
+        "1/m": -1.0, "rad/s": -0.5, "rad": 0.0, "1": 0.0, "1/tick": 0.0,
+    }  # fmt: skip
+    assert {unit: exponent(unit) for unit in powers} == powers
+    for unit in ("kg", "m/kg", "m s", ""):
+        with pytest.raises(ValueError, match=r"is not made of \['m', 's', 'Hz'"):
+            exponent(unit)
 
 
 def test_every_number_of_every_preset_has_a_known_unit():
