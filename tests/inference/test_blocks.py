@@ -10,7 +10,7 @@ from scipy import stats
 from fitting.inference.sampling import blocks
 from fitting.inference.sampling.blocks import BlockLogLikelihood
 
-pytest.importorskip("arviz_stats")
+pytestmark = pytest.mark.skipif(not blocks.is_available(), reason="needs ArviZ")
 OBSERVED = np.random.default_rng(1).normal(0.4, 1.0, 40)
 SPREAD = 3.0  # of the prior of the mean
 

@@ -1,6 +1,6 @@
 """Posteriors under other priors, by weighting draws, against the answers in closed form."""
 
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,30 +8,17 @@ import pytest
 from scipy import stats
 
 from fitting.inference.sampling import prior_sensitivity
-from fitting.inference.sampling.posterior import Posterior
 from fitting.problem.prior import Prior
+from support.problems import posterior_of
 
 DRAWS = (4000, 10)
 
 
-def posterior_of(u: np.ndarray) -> Posterior:
-    """A posterior of independent draws, (steps, walkers, free), whose values are `u`."""
-    free = u.shape[-1]
-    return Posterior(
-        names=tuple(f"p{i}" for i in range(free)),
-        u=u,
-        log_probability=np.zeros(u.shape[:2]),
-        values=u,
-        thin_by=1,
-        burn_in=0,
-        autocorrelation_time=np.ones(free),
-        acceptance=np.full(u.shape[1], 0.3),
-        isolated=[],
-        stuck=[],
-        converged=True,
-        message="Converged.",
-        seconds=1.0,
-    )
+def sensitivity(u: np.ndarray, prior: Prior) -> list[list[dict[str, Any]]]:
+    """Of each parameter, for independent draws, (steps, walkers, free), whose values are `u`."""
+    names = tuple(f"p{i}" for i in range(u.shape[-1]))
+    rows = prior_sensitivity.prior_sensitivity(posterior_of(names, u, u), prior)
+    return [cast(Any, rows[name]) for name in names]
 
 
 def normal_prior(centre: float, spread: float) -> Prior:
@@ -49,7 +36,7 @@ def test_weighted_draws_have_the_posterior_of_the_other_prior():
     centre, spread, observed, error = 0.5, 1.6, 1.8, 1.0
     random = np.random.default_rng(0)
     u = product(centre, spread, observed, error).rvs((*DRAWS, 1), random_state=random)
-    rows = prior_sensitivity.prior_sensitivity(posterior_of(u), normal_prior(centre, spread))["p0"]
+    (rows,) = sensitivity(u, normal_prior(centre, spread))
     assert [row["factor"] for row in rows] == [0.5, 2.0]
     for row in rows:
         exact = product(centre, row["factor"] * spread, observed, error)
@@ -64,9 +51,9 @@ def test_a_parameter_that_the_clips_determine_is_not_sensitive_and_one_without_e
     random = np.random.default_rng(1)
     u = np.stack([random.normal(0.3, 0.1, DRAWS), random.logistic(size=DRAWS)], axis=-1)
     prior = Prior(jnp.zeros(2), jnp.asarray([1.6, 1.0]), jnp.asarray([False, True]))
-    rows = prior_sensitivity.prior_sensitivity(posterior_of(u), prior)
-    assert [row["sensitive"] for row in rows["p0"]] == [False, False]
-    for row in rows["p1"]:  # the posterior is the prior, a logistic of the scale that it is given
+    determined, idle = sensitivity(u, prior)
+    assert [row["sensitive"] for row in determined] == [False, False]
+    for row in idle:  # the posterior is the prior, a logistic of the scale that it is given
         assert row["interval"] is not None
         expected = stats.logistic(scale=row["factor"]).ppf([0.025, 0.975])
         np.testing.assert_allclose(row["interval"], expected, rtol=0.1)
@@ -76,7 +63,7 @@ def test_a_parameter_that_the_clips_determine_is_not_sensitive_and_one_without_e
 def test_a_prior_that_a_few_draws_would_decide_gets_no_figures():
     random = np.random.default_rng(2)
     u = random.normal(8.0, 1.0, (*DRAWS, 1))
-    half, twice = prior_sensitivity.prior_sensitivity(posterior_of(u), normal_prior(0.0, 1.0))["p0"]
+    ((half, twice),) = sensitivity(u, normal_prior(0.0, 1.0))
     assert half["pareto_k"] > prior_sensitivity.MAX_K
     assert half["median"] is half["interval"] is half["sensitive"] is None
     assert twice["factor"] == 2.0

@@ -1,11 +1,13 @@
 """Heights of intervals: chi-square's, or higher beside a plateau that noise undercuts."""
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.stats
 
 from fitting.inference.profiles.heights import RISE_OF_SMOOTH, level_of, max_rise
-from fitting.problem.free_parameters import FreeParameter, from_fractions
+from fitting.problem.free_parameters import FreeParameter, free_parameter, from_fractions
 from support import toy
 
 U = np.concatenate([np.linspace(-6, 6, 241), np.linspace(-0.02, 0.02, 21)])
@@ -14,22 +16,18 @@ U = np.unique(U)
 
 @pytest.fixture
 def parameter() -> FreeParameter:
-    return toy.make_problem(5, names=("body.gain",)).space.parameters[0]
+    return free_parameter(toy.Toy(), "body.gain")
 
 
 def values_of(parameter: FreeParameter, u: np.ndarray) -> np.ndarray:
     return from_fractions(parameter, 1 / (1 + np.exp(-u)))
 
 
-@pytest.mark.parametrize("sd", [0.05, 0.3, 1.6])
-@pytest.mark.parametrize("step", [0.3, 1.0])
-def test_a_parabola_has_the_height_of_chi_square(parameter, sd, step):
-    u = 0.4 + sd * np.arange(-5, 5.1, step)  # few points suffice
-    height = max_rise(parameter, values_of(parameter, u), 0.5 * ((u - 0.4) / sd) ** 2)
-    assert RISE_OF_SMOOTH <= height < 1.1 * RISE_OF_SMOOTH
-
-
-def test_levels_of_a_parabola_are_those_of_chi_square(parameter):
+def test_heights_and_levels_of_a_parabola_are_those_of_chi_square(parameter):
+    for sd, step in itertools.product((0.05, 0.3, 1.6), (0.3, 1.0)):
+        u = 0.4 + sd * np.arange(-5, 5.1, step)  # few points suffice
+        height = max_rise(parameter, values_of(parameter, u), 0.5 * ((u - 0.4) / sd) ** 2)
+        assert RISE_OF_SMOOTH <= height < 1.1 * RISE_OF_SMOOTH, (sd, step)
     u = np.linspace(-3, 3, 31)
     for rise in (0.1, 0.5, 1.92, 4.0):
         level = level_of(parameter, values_of(parameter, u), 0.5 * (u / 0.5) ** 2, rise)

@@ -9,10 +9,8 @@ import pytest
 from fitting.inference.optimisation.search import find_best_fit
 from fitting.inference.profiles.conditional import Conditional, Targets
 from fitting.inference.profiles.secants import slopes_of_thresholds
-from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
-from jaxik.maths import parameter_tree
+from support.problems import parameter, problem_of
 
 HEIGHT = jnp.linspace(0.0, 0.3, 300)  # m
 NOISE = 0.02
@@ -21,18 +19,10 @@ NOISE = 0.02
 class Fade(eqx.Module):
     """A weight that fades between two heights, and a jump."""
 
-    low: jax.Array = parameter_tree.parameter(
-        0.1, unit="m", low=0.05, high=0.15, kind="threshold", doc="Full weight below."
-    )
-    high: jax.Array = parameter_tree.parameter(
-        0.2, unit="m", low=0.15, high=0.25, kind="threshold", doc="No weight above."
-    )
-    jump: jax.Array = parameter_tree.parameter(
-        0.15, unit="m", low=0.0, high=0.3, kind="threshold", doc="Where something flips."
-    )
-    gain: jax.Array = parameter_tree.parameter(
-        1.0, unit="1", low=0.5, high=1.5, doc="Of the test rule."
-    )
+    low: jax.Array = parameter(0.1, "m", 0.05, 0.15, kind="threshold")  # full weight below
+    high: jax.Array = parameter(0.2, "m", 0.15, 0.25, kind="threshold")  # no weight above
+    jump: jax.Array = parameter(0.15, "m", 0.0, 0.3, kind="threshold")
+    gain: jax.Array = parameter(1.0, "1", 0.5, 1.5)
 
 
 def residuals(ik: Fade, data: jax.Array) -> jax.Array:
@@ -44,12 +34,9 @@ def residuals(ik: Fade, data: jax.Array) -> jax.Array:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     base = Fade()
-    names = ("low", "high", "jump", "gain")
     clean = NOISE * residuals(base, jnp.zeros((2, 300))).reshape(2, -1)
     data = clean + NOISE * np.random.default_rng(0).normal(size=clean.shape)
-    return Problem(
-        make_space(base, [free_parameter(base, name) for name in names]), data, residuals
-    )
+    return problem_of(base, ("low", "high", "jump", "gain"), data, residuals)
 
 
 def test_a_gradual_effect_has_its_derivative_and_a_sudden_one_none(problem):

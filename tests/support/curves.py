@@ -5,23 +5,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.problem import free_parameters, space
 from fitting.problem.problem import Problem
-from jaxik.maths import parameter_tree
+
+from .problems import parameter, problem_of
 
 
 class Curve(eqx.Module):
     """A decay with a jump where a hard decision changes."""
 
-    height: jax.Array = parameter_tree.parameter(
-        0.8, unit="1", low=0.0, high=4.0, doc="Height of the test rule."
-    )
-    rate: jax.Array = parameter_tree.parameter(
-        1.0, unit="1/s", low=0.1, high=10.0, scale="log", doc="Rate of the test rule."
-    )
-    turn: jax.Array = parameter_tree.parameter(
-        0.7, unit="s", low=0.0, high=1.0, kind="threshold", doc="Turn of the test rule."
-    )
+    height: jax.Array = parameter(0.8, "1", 0.0, 4.0)
+    rate: jax.Array = parameter(1.0, "1/s", 0.1, 10.0, scale="log")
+    turn: jax.Array = parameter(0.7, "s", 0.0, 1.0, kind="threshold")
 
 
 TIME = jnp.linspace(0, 1, 200)
@@ -52,7 +46,4 @@ def curve_problem(
     clean = curve(Curve(**{name: jnp.asarray(value) for name, value in CURVE_TRUTH.items()}))
     outlier = (random.random(TIME.size) < outliers) * random.uniform(1, 3, TIME.size)
     data = clean + random.normal(0, 0.02, TIME.size) + outlier
-    parameters = [free_parameters.free_parameter(base, name) for name in names]
-    return Problem(
-        space.make_space(base, parameters), (data, jnp.asarray(walls)), curve_residuals, **options
-    )
+    return problem_of(base, names, (data, jnp.asarray(walls)), curve_residuals, **options)

@@ -4,7 +4,9 @@ A foot is locked while it is near the ground and slow. Its anchor follows it whi
 freezes when it locks. Offsets, pelvis and pitch are smoothed and clamped. Metres, seconds, radians.
 """
 
+import dataclasses
 import functools
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -13,76 +15,39 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.inference.optimisation import search
-from fitting.problem import space
-from fitting.problem.free_parameters import free_parameter
-from fitting.problem.loss import Loss
+from fitting.inference.optimisation.solution import Solution
 from fitting.problem.problem import Problem
 from jaxik.maths import parameter_tree, smoothing
 from jaxik.maths.gate import HARD
 
-SIGMA_POS = 0.002  # m
-SIGMA_PITCH = 0.02  # rad
+from .problems import parameter, problem_of
+
+SIGMAS = (0.002, 0.002, 0.02)  # m of positions and pelvis, rad of pitches
+SEED = 5  # of a clip that determines every threshold
+FRAMES = 400
 
 
 class Lock(eqx.Module):
-    height_on: Array = parameter_tree.parameter(
-        0.06, unit="m", low=0.01, high=0.12, kind="threshold", doc="Height on of the test rule."
-    )
-    height_off: Array = parameter_tree.parameter(
-        0.10,
-        unit="m",
-        low=0.02,
-        high=0.2,
-        kind="threshold",
-        above="height_on",
-        doc="Height off of the test rule.",
-    )
-    speed_on: Array = parameter_tree.parameter(
-        0.6, unit="m/s", low=0.1, high=1.5, kind="threshold", doc="Speed on of the test rule."
-    )
-    speed_off: Array = parameter_tree.parameter(
-        1.2,
-        unit="m/s",
-        low=0.2,
-        high=2.5,
-        kind="threshold",
-        above="speed_on",
-        doc="Speed off of the test rule.",
-    )
-    half_life: Array = parameter_tree.parameter(
-        0.06, unit="s", low=0.01, high=0.3, scale="log", doc="Half life of the test rule."
-    )
-    release: Array = parameter_tree.parameter(
-        0.1, unit="s", low=0.01, high=0.5, scale="log", doc="Release of the test rule."
-    )
+    height_on: Array = parameter(0.06, "m", 0.01, 0.12, kind="threshold")
+    height_off: Array = parameter(0.10, "m", 0.02, 0.2, kind="threshold", above="height_on")
+    speed_on: Array = parameter(0.6, "m/s", 0.1, 1.5, kind="threshold")
+    speed_off: Array = parameter(1.2, "m/s", 0.2, 2.5, kind="threshold", above="speed_on")
+    half_life: Array = parameter(0.06, "s", 0.01, 0.3, scale="log")
+    release: Array = parameter(0.1, "s", 0.01, 0.5, scale="log")
 
 
 class Body(eqx.Module):
-    gain: Array = parameter_tree.parameter(
-        0.3, unit="1/tick", low=0.02, high=0.9, scale="gain", doc="Gain of the test rule."
-    )
+    gain: Array = parameter(0.3, "1/tick", 0.02, 0.9, scale="gain")
     tick_hz: Array = eqx.field(default=30.0, converter=parameter_tree.as_float_array)
-    drop: Array = parameter_tree.parameter(
-        0.15, unit="m", low=0.0, high=0.4, doc="Drop of the test rule."
-    )
-    rise: Array = parameter_tree.parameter(
-        0.05, unit="m", low=0.0, high=0.2, doc="Rise of the test rule."
-    )
+    drop: Array = parameter(0.15, "m", 0.0, 0.4)
+    rise: Array = parameter(0.05, "m", 0.0, 0.2)
 
 
 class Foot(eqx.Module):
-    share: Array = parameter_tree.parameter(
-        0.6, unit="1", low=0.0, high=1.2, doc="Share of the test rule."
-    )
-    limit: Array = parameter_tree.parameter(
-        (0.4, 0.4), unit="rad", low=0.1, high=0.8, doc="Limit of the test rule."
-    )
-    half_life: Array = parameter_tree.parameter(
-        0.08, unit="s", low=0.01, high=0.4, scale="log", doc="Half life of the test rule."
-    )
-    idle: Array = parameter_tree.parameter(
-        0.5, unit="1", low=0.0, high=1.0, doc="Idle of the test rule."
-    )  # does nothing
+    share: Array = parameter(0.6, "1", 0.0, 1.2)
+    limit: Array = parameter((0.4, 0.4), "rad", 0.1, 0.8)
+    half_life: Array = parameter(0.08, "s", 0.01, 0.4, scale="log")
+    idle: Array = parameter(0.5, "1", 0.0, 1.0)  # does nothing
 
 
 class Toy(eqx.Module):
@@ -91,33 +56,17 @@ class Toy(eqx.Module):
     foot: Foot = eqx.field(default_factory=Foot)
 
 
-class Inputs(eqx.Module):
-    """Animation and ground, per frame and leg."""
+class Data(eqx.Module):
+    """Animation and ground, per frame and leg, and the motion that was observed."""
 
     pos: Float[Array, "frames legs"]  # m, along the way
     height: Float[Array, "frames legs"]  # m, above the ground
     ground: Float[Array, "frames legs"]  # m
     slope: Float[Array, "frames legs"]  # rad
     dt: Float[Array, ""]  # s
+    observed: tuple[Array, ...] = ()  # pos, pelvis, pitch
 
 
-class Data(eqx.Module):
-    inputs: Inputs
-    observed: tuple[Array, Array, Array]  # pos, pelvis, pitch
-
-
-THRESHOLDS = ("lock.height_on", "lock.height_off", "lock.speed_on", "lock.speed_off")
-SMOOTH = (
-    "lock.half_life",
-    "lock.release",
-    "body.gain",
-    "body.drop",
-    "body.rise",
-    "foot.share",
-    "foot.limit[0]",
-    "foot.limit[1]",
-    "foot.half_life",
-)
 TRUTH = {
     "lock.height_on": 0.042,
     "lock.height_off": 0.078,
@@ -133,11 +82,12 @@ TRUTH = {
     "foot.limit[1]": 0.36,
     "foot.half_life": 0.05,
 }
+NAMES = (*TRUTH, "foot.idle")
 
 
-def run(ik: Toy, inputs: Inputs) -> tuple[Array, Array, Array]:
+def run(ik: Toy, data: Data) -> tuple[Array, Array, Array]:
     """Foot positions, pelvis height and foot pitches over the frames."""
-    lock, body, foot, dt = ik.lock, ik.body, ik.foot, inputs.dt
+    lock, body, foot, dt = ik.lock, ik.body, ik.foot, data.dt
 
     def step(state: tuple[Array, ...], frame: tuple[Array, ...]):
         before, anchor, offset, locked, pelvis, pitch = state
@@ -158,44 +108,41 @@ def run(ik: Toy, inputs: Inputs) -> tuple[Array, Array, Array]:
         pitch = smoothing.lerp(pitch, tilt, smoothing.fraction_of_half_life(foot.half_life, dt))
         return (pos, anchor, offset, locked, pelvis, pitch), (pos + offset, pelvis, pitch)
 
-    first = inputs.pos[0]
+    first = data.pos[0]
     zero = jnp.zeros_like(first)
     start = (first, first, zero, zero, zero[0], zero)
-    frames = (inputs.pos, inputs.height, inputs.ground, inputs.slope)
+    frames = (data.pos, data.height, data.ground, data.slope)
     return jax.lax.scan(step, start, frames)[1]
 
 
 def residuals(ik: Toy, data: Data) -> Array:
     """Residuals in sigmas."""
-    sigmas = (SIGMA_POS, SIGMA_POS, SIGMA_PITCH)
-    parts = [
-        ((modelled - observed) / sigma).ravel()
-        for modelled, observed, sigma in zip(
-            run(ik, data.inputs), data.observed, sigmas, strict=True
-        )
-    ]
-    return jnp.concatenate(parts)
+    parts = zip(run(ik, data), data.observed, SIGMAS, strict=True)
+    return jnp.concatenate(
+        [((modelled - observed) / sigma).ravel() for modelled, observed, sigma in parts]
+    )
 
 
-def make_inputs(seed: int = 0, frames: int = 400, fps: float = 60.0) -> Inputs:
+def make_clip(seed: int) -> Data:
     """A walk of changing stride, speed and lift over rough ground."""
     random = np.random.default_rng(seed)
-    time = np.arange(frames) / fps
+    fps = 60.0
+    time = np.arange(FRAMES) / fps
     phase = 2 * np.pi * np.cumsum(1.0 + 0.3 * np.sin(0.9 * time + random.uniform(0, 6))) / fps
     legs = np.stack([phase, phase + np.pi], axis=1)
     wander = np.sin(0.7 * time + random.uniform(0, 6))[:, None]
     drift = 0.25 * (1.2 + wander) * (1.0 + 0.5 * np.sin(5.3 * time + random.uniform(0, 6)))[:, None]
     swing = np.clip(np.sin(legs), 0, None)
-    speed = drift + 2.2 * swing**2 + random.normal(0, 0.12, (frames, 2))
+    speed = drift + 2.2 * swing**2 + random.normal(0, 0.12, (FRAMES, 2))
     height = (
-        0.03 * (1 + 0.6 * np.sin(3.1 * legs)) + 0.16 * swing + random.normal(0, 0.008, (frames, 2))
+        0.03 * (1 + 0.6 * np.sin(3.1 * legs)) + 0.16 * swing + random.normal(0, 0.008, (FRAMES, 2))
     )
     waves = [
         random.uniform(0.04, 0.1) * np.sin(rate * time[:, None] + random.uniform(0, 6, 2))
         for rate in (0.8, 1.7, 3.1)
     ]
     slopes = [0.3 * np.sin(rate * time[:, None] + random.uniform(0, 6, 2)) for rate in (1.1, 2.9)]
-    return Inputs(
+    return Data(
         pos=jnp.asarray(np.cumsum(speed, axis=0) / fps),
         height=jnp.asarray(height),
         ground=jnp.asarray(sum(waves)),
@@ -204,38 +151,19 @@ def make_inputs(seed: int = 0, frames: int = 400, fps: float = 60.0) -> Inputs:
     )
 
 
-def make_data(truth: Toy, seed: int = 0, frames: int = 400, outliers: float = 0.0) -> Data:
-    """Motion of the true system, with noise of one sigma and a fraction of gross outliers."""
-    inputs = make_inputs(seed, frames)
-    random = np.random.default_rng(seed + 1000)
-    observed = []
-    for clean, sigma in zip(run(truth, inputs), (SIGMA_POS, SIGMA_POS, SIGMA_PITCH), strict=True):
-        noise = random.normal(0, sigma, clean.shape)
-        gross = random.random(clean.shape) < outliers
-        observed.append(clean + noise + gross * 30 * sigma * random.random(clean.shape))
-    return Data(inputs, tuple(observed))  # type: ignore[arg-type]
-
-
-NAMES = (*THRESHOLDS, *SMOOTH, "foot.idle")
+def make_problem(
+    seed: int = SEED, names: tuple[str, ...] = NAMES, truth: Mapping[str, float] = TRUTH
+) -> Problem:
+    """A problem that starts at the defaults; its motion is that of the truth, with noise."""
+    clip, random = make_clip(seed), np.random.default_rng(seed + 1000)
+    known = problem_of(Toy(), tuple(TRUTH), None, residuals).space
+    motion = zip(run(known.unpack(known.pack(truth)), clip), SIGMAS, strict=True)
+    observed = tuple(clean + random.normal(0, sigma, clean.shape) for clean, sigma in motion)
+    return problem_of(Toy(), names, dataclasses.replace(clip, observed=observed), residuals)
 
 
 @functools.cache
-def solved(seed: int) -> tuple[Problem, search.Solution]:
+def solved() -> tuple[Problem, Solution]:
     """A problem and its solution, computed once for all tests."""
-    problem = make_problem(seed)
+    problem = make_problem()
     return problem, search.find_best_fit(problem)
-
-
-def make_problem(
-    seed: int = 0,
-    frames: int = 400,
-    names: tuple[str, ...] = NAMES,
-    truth: dict[str, float] = TRUTH,
-    outliers: float = 0.0,
-    loss: Loss = "squares",
-) -> Problem:
-    """A problem that starts at the defaults, with data made from the truth."""
-    free = [free_parameter(Toy(), name) for name in names]
-    known = space.make_space(Toy(), [free_parameter(Toy(), name) for name in TRUTH])
-    data = make_data(known.unpack(known.pack(truth)), seed, frames, outliers)
-    return Problem(space.make_space(Toy(), free), data, residuals, loss)
