@@ -1,6 +1,7 @@
-"""A search that was killed goes on, and finds to the last bit what it would have found."""
+"""Searches and profiles that were killed go on, and end to the last bit as they would have."""
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,23 +13,58 @@ from fitting.inference.optimisation import descent, evolution, kept_stages, sear
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.solution import Solution
+from fitting.inference.profiles import profiling
+from fitting.inference.profiles.curves import Curves
+from fitting.problem.problem import Problem
 from support.curves import curve_problem
 
 # Two ends are too few to agree, so that each start takes all stages.
 SETTINGS = SearchSettings(
     descents=2, agreeing_starts=3, max_rounds=3, generations=2, population=20, elite=5
 )
+SHORT = dataclasses.replace(SETTINGS, max_rounds=1)
 
 
-@pytest.fixture
-def problem(monkeypatch):
-    monkeypatch.setattr(kept_stages, "SECONDS_BETWEEN_WRITES", 0.0)
+@functools.cache
+def problem() -> Problem:
     return curve_problem(("height", "rate", "turn"))
 
 
-def solve(problem, path: Path | None, settings: SearchSettings = SETTINGS, **options) -> Solution:
-    kept = None if path is None else KeptStages(path, "a fit", **options)
-    return search.find_best_fit(problem, settings, starts=2, kept=kept)
+@pytest.fixture
+def path(tmp_path, monkeypatch) -> Path:
+    """Where stages are kept, each at once."""
+    monkeypatch.setattr(kept_stages, "SECONDS_BETWEEN_WRITES", 0.0)
+    return tmp_path / "search.json"
+
+
+def kept(path: Path, **options) -> KeptStages:
+    return KeptStages(path, "a fit", **options)
+
+
+def change_file(path: Path, change: Callable[[dict], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def assert_warned(lines: list[str], message: str) -> None:
+    """Once, of the file, in one line."""
+    (line,) = lines
+    assert "search.json" in line and message in line and "\n" not in line
+
+
+# Searches
+
+
+def solve(path: Path | None, settings: SearchSettings = SETTINGS, seed: int = 0, **options):
+    stages = None if path is None else kept(path, **options)
+    return search.find_best_fit(problem(), settings, starts=2, seed=seed, kept=stages)
+
+
+@functools.cache
+def whole(settings: SearchSettings = SETTINGS) -> Solution:
+    """Found in one go."""
+    return solve(None, settings)
 
 
 def assert_same(solution: Solution, other: Solution) -> None:
@@ -44,29 +80,33 @@ def assert_same(solution: Solution, other: Solution) -> None:
             np.testing.assert_array_equal(mine, theirs, err_msg=field.name)
 
 
+def stages_in(content: dict) -> list[dict]:
+    """Of the only search."""
+    (stages,) = content["searches"].values()
+    return stages
+
+
 def stages(path: Path) -> list[dict]:
-    (searches,) = json.loads(path.read_text())["searches"].values()
-    return searches
+    return stages_in(json.loads(path.read_text()))
 
 
 def keep_only(path: Path, count: int) -> None:
     """What a kill after so many stages leaves."""
-    content = json.loads(path.read_text())
-    (searches,) = content["searches"].values()
-    del searches[count:]
-    path.write_text(json.dumps(content))
+
+    def cut(content: dict) -> None:
+        del stages_in(content)[count:]
+
+    change_file(path, cut)
 
 
-def test_a_search_goes_on_after_each_of_its_stages_to_the_same_end(problem, tmp_path, monkeypatch):
-    path = tmp_path / "search.json"
-    whole = solve(problem, None)
-    assert_same(solve(problem, path), whole)
+def test_a_search_goes_on_after_each_of_its_stages_to_the_same_end(path, monkeypatch):
+    assert_same(solve(path), whole())
     names = [stage["name"] for stage in stages(path)]
     assert names[:4] == ["descent", "descent", "evolution", "evolution"]
     assert names.count("polish") == 2
     for count in range(len(names)):
         keep_only(path, count)
-        assert_same(solve(problem, path), whole)
+        assert_same(solve(path), whole())
         assert [stage["name"] for stage in stages(path)] == names
 
     def fail(*_: object) -> None:
@@ -74,62 +114,47 @@ def test_a_search_goes_on_after_each_of_its_stages_to_the_same_end(problem, tmp_
 
     for module in (descent, search, evolution):
         monkeypatch.setattr(module, "descend", fail)
-    assert_same(solve(problem, path), whole)
+    assert_same(solve(path), whole())
 
 
-def test_a_search_that_runs_out_of_steps_is_recalled_as_such(problem, tmp_path):
-    path = tmp_path / "search.json"
-    short = dataclasses.replace(SETTINGS, max_steps=5)
-    whole = solve(problem, path, short)
-    assert "5 steps allowed for a start were used up" in whole.message
-    assert_same(solve(problem, path, short), whole)
+def test_a_search_that_runs_out_of_steps_is_recalled_as_such(path):
+    few = dataclasses.replace(SETTINGS, max_steps=5)
+    first = solve(path, few)
+    assert "5 steps allowed for a start were used up" in first.message
+    assert_same(solve(path, few), first)
 
 
-def test_an_interrupted_search_goes_on(problem, tmp_path):
-    path, reports = tmp_path / "search.json", []
+def test_an_interrupted_search_goes_on(path):
+    reports = []
 
     def interrupt(report: search.Progress) -> None:
         reports.append(report)
         if len(reports) == 30:
             raise KeyboardInterrupt
 
-    kept = KeptStages(path, "a fit")
-    first = search.find_best_fit(problem, SETTINGS, starts=2, kept=kept, progress=interrupt)
+    first = search.find_best_fit(problem(), SETTINGS, starts=2, kept=kept(path), progress=interrupt)
     assert first.interrupted and len(stages(path)) >= 2
-    assert_same(solve(problem, path), solve(problem, None))
+    assert_same(solve(path), whole())
 
 
-def test_time_adds_up_over_the_calls(problem, tmp_path):
-    path = tmp_path / "search.json"
-    solve(problem, path)
-    content = json.loads(path.read_text())
-    (searches,) = content["searches"].values()
-    searches[-1]["history"][-1]["seconds"] = 500.0
-    path.write_text(json.dumps(content))
-    assert 500.0 < solve(problem, path).seconds < 520.0
+def test_time_adds_up_over_the_calls_and_another_search_does_not_use_the_stages(path):
+    solve(path, SHORT)
+    change_file(path, lambda content: stages_in(content)[-1]["history"][-1].update(seconds=500.0))
+    assert 500.0 < solve(path, SHORT).seconds < 520.0
+    assert_same(solve(path, SHORT, seed=1), solve(None, SHORT, seed=1))
+    assert len(json.loads(path.read_text())["searches"]) == 2
 
 
-def damaged(change: Callable[[dict], object]) -> Callable[[Path], object]:
-    def damage(path: Path) -> None:
-        content = json.loads(path.read_text())
-        change(content)
-        path.write_text(json.dumps(content))
-
-    return damage
-
-
-def in_stage(**changes: object) -> Callable[[Path], object]:
-    return damaged(lambda content: next(iter(content["searches"].values()))[1].update(changes))
+def in_stage(**changes: object) -> Callable[[dict], object]:
+    return lambda content: stages_in(content)[1].update(changes)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: path.write_text(path.read_text()[:200]), "not the state of a search"),
-        (lambda path: path.write_bytes(b"\xff\x00"), "not the state of a search"),
-        (damaged(lambda content: content.update(format=9)), "its format is 9"),
-        (damaged(lambda content: content.update(identity="x")), "the state of another fit"),
-        (damaged(lambda content: content.pop("searches")), "it has no searches"),
+        (lambda content: content.update(format=9), "its format is 9"),
+        (lambda content: content.update(identity="x"), "the state of another fit"),
+        (lambda content: content.pop("searches"), "it has no searches"),
         (in_stage(best=3), "best is 3; wanted a table"),
         (in_stage(point={"u": [0.0], "cost": 1.0}), "a point has not 3 numbers"),
         (in_stage(point={"u": [0.0, 1.0, float("nan")], "cost": 1.0}), "wanted a finite number"),
@@ -138,24 +163,98 @@ def in_stage(**changes: object) -> Callable[[Path], object]:
         (in_stage(history=[{"stage": "start"}]), "has no best, cost"),
     ],
 )
-def test_a_state_that_cannot_be_used_is_named_and_the_search_begins_anew(
-    problem, tmp_path, damage, message
-):
-    path, lines = tmp_path / "search.json", []
-    short = dataclasses.replace(SETTINGS, max_rounds=1)
-    whole = solve(problem, path, short)
-    damage(path)
-    assert_same(solve(problem, path, short, warn=lines.append), whole)
-    (line,) = lines
-    assert "search.json" in line and message in line and "\n" not in line
+def test_a_state_that_cannot_be_used_is_named_and_the_search_begins_anew(path, damage, message):
+    lines = []
+    solve(path, SHORT)
+    change_file(path, damage)
+    assert_same(solve(path, SHORT, warn=lines.append), whole(SHORT))
+    assert_warned(lines, message)
     assert len(stages(path)) == 8
 
 
-def test_another_search_does_not_use_the_stages(problem, tmp_path):
-    path = tmp_path / "search.json"
-    solve(problem, path)
-    other = search.find_best_fit(
-        problem, SETTINGS, starts=2, seed=1, kept=KeptStages(path, "a fit")
-    )
-    assert_same(other, search.find_best_fit(problem, SETTINGS, starts=2, seed=1))
-    assert len(json.loads(path.read_text())["searches"]) == 2
+@pytest.mark.parametrize("content", [b'{"format": 1, "ident', b"\xff\x00"])
+def test_a_file_that_is_no_state_is_named(path, content):
+    path.write_bytes(content)
+    lines = []
+    kept(path, warn=lines.append)
+    assert_warned(lines, "not the state of a search")
+
+
+# Profiles
+
+
+@functools.cache
+def solution() -> Solution:
+    return search.find_best_fit(problem(), starts=1)
+
+
+def find_curves(path: Path | None = None, **options) -> Curves:
+    return profiling.find_curves(problem(), solution(), path and kept(path, **options))
+
+
+def assert_same_curves(curves: Curves, others: Curves) -> None:
+    for mine, theirs in zip(curves.curves, others.curves, strict=True):
+        for name in ("u", "values", "cost"):
+            np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), err_msg=name)
+
+
+class Stop(Exception):
+    """In place of a kill."""
+
+
+def stop(*_: object) -> None:
+    raise Stop
+
+
+def kill_at(number: int, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+    """Finds profiles until this stage begins."""
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(profiling, "STAGES", [*profiling.STAGES[:number], stop])
+        find_curves(path)
+
+
+def test_profiles_go_on_after_each_of_their_stages_to_the_same_end(path, monkeypatch):
+    found, called = find_curves(), []
+    for number in range(1, 9):
+        kill_at(number, monkeypatch, path)
+        assert kept(path).profile_count == number
+    stages = [lambda state: called.append(state.stages), *profiling.STAGES[1:]]
+    monkeypatch.setattr(profiling, "STAGES", stages)
+    assert_same_curves(find_curves(path), found)
+    monkeypatch.setattr(profiling, "STAGES", [stop] * len(stages))
+    assert_same_curves(find_curves(path), found)
+    assert called == []
+
+
+def test_the_profiles_of_another_solution_are_not_used(path, monkeypatch):
+    kill_at(1, monkeypatch, path)
+    u, stored = solution().u, kept(path)
+    stored.recall_profiles(problem(), u + 1e-9, stop)
+    stored.recall_profiles(curve_problem(problem().space.names, loss="huber"), u, stop)
+    with pytest.raises(Stop):
+        stored.recall_profiles(problem(), u, stop)
+
+
+NOT_FINITE = {"cost": [float("nan")], "u": [[0.0] * 3], "values": [[0.0] * 3]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda stored: stored.update(stages=-1), "wanted a number from 0"),
+        (lambda stored: stored["curves"].pop(), "there are 2 profiles of 3 parameters"),
+        (lambda stored: stored["curves"][0]["cost"].pop(), "cannot reshape"),
+        (lambda stored: stored["curves"][1]["u"][0].pop(), "damaged"),
+        (lambda stored: stored["curves"][1].update(NOT_FINITE), "a point without a cost"),
+        (lambda stored: stored["curves"][1].update(cost=[], u=[], values=[]), "or no point"),
+        (lambda stored: stored.update(random={}), "damaged"),
+        (lambda stored: stored.update(cliffs=[[1]]), "wanted a list of 2"),
+    ],
+)
+def test_profiles_that_cannot_be_used_are_named_and_begin_anew(path, monkeypatch, change, message):
+    lines = []
+    kill_at(1, monkeypatch, path)
+    change_file(path, lambda content: change(next(iter(content["profiles"].values()))))
+    monkeypatch.setattr(profiling, "STAGES", [])
+    find_curves(path, warn=lines.append)
+    assert_warned(lines, message)
