@@ -205,21 +205,24 @@ def test_a_miss_has_the_end_of_the_way_as_point_and_up_as_normal():
     np.testing.assert_array_equal(hit.normal, [UP] * 2)
 
 
-def two_kinds() -> terrain.Terrain:
-    return terrain.combine(mesh()[0], field(HEIGHTS[::-1], "bilinear"))
+def bilinear() -> terrain.Terrain:
+    return field(HEIGHTS[::-1], "bilinear")
 
 
 def all_kinds() -> terrain.Terrain:
     return sweep.sweepable(every_kind(), 1.0)
 
 
-each_ground = pytest.mark.parametrize(
-    "make", [two_kinds, pytest.param(all_kinds, marks=pytest.mark.slow)]
+@pytest.mark.parametrize(
+    ("make", "half"),
+    [
+        (lambda: mesh()[0], HALF),
+        (bilinear, None),
+        pytest.param(all_kinds, HALF, marks=pytest.mark.slow),
+        pytest.param(all_kinds, None, marks=pytest.mark.slow),
+    ],
+    ids=["capsule, mesh", "sphere, bilinear", "capsule, all kinds", "sphere, all kinds"],
 )
-
-
-@each_ground
-@each_shape
 def test_gradients_are_those_of_differences(make, half):
     ground, step = make(), 1e-6
 
@@ -256,7 +259,7 @@ def test_gradients_are_finite_everywhere_in_both_precisions(dtype):
     assert gradients[0].dtype == dtype
 
 
-@each_ground
+@pytest.mark.parametrize("make", [bilinear, pytest.param(all_kinds, marks=pytest.mark.slow)])
 def test_batches_of_any_kind_give_the_same(make):
     ground, starts = make(), jnp.asarray(centres(12).reshape(3, 4, 3))
 
