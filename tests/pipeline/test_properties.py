@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import re
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.synthetic import walker
 from jaxik import Smooth, Transform
 from jaxik.maths import parameter_tree, quat
+from jaxik.maths.gate import AbstractGate
 from jaxik.world.skeleton import bone_lengths
 from reference import maths, sample_poses
 from reference.systems import record as reference
@@ -57,11 +59,25 @@ def wander(legs: int = 2, seed: int = 1, joints: int = 0) -> jaxik.Frame:
     return frames.with_platforms(Transform(jnp.asarray(pos)[:, None], jnp.asarray(rot)[:, None]))
 
 
+def run_on(
+    ground: PlainTerrain,
+    frames: jaxik.Frame,
+    values: dict[str, Any],
+    rig: jaxik.Rig | None = None,
+    gate: AbstractGate = jaxik.HARD,
+) -> jaxik.Result:
+    """The result of a clip of two legs on ground that rides on a platform: all share a program."""
+    if not frames.platforms.pos.size:
+        still = Transform(jnp.zeros((FRAMES, 1, 3)), jnp.tile(quat.identity(), (FRAMES, 1, 1)))
+        frames = frames.with_platforms(still)
+    ground = dataclasses.replace(ground, platform=0)
+    rig = to_rig(make_rig()) if rig is None else rig
+    return jaxik.run(to_ik(values), rig, to_terrain(ground), frames, gate)
+
+
 @functools.cache
-def wandered(name: str, legs: int = 2) -> jaxik.Result:
-    return jaxik.run(
-        to_ik(PARAMETERS[name]), to_rig(make_rig(legs=legs)), to_terrain(DRIFTING), wander(legs)
-    )
+def wandered(name: str) -> jaxik.Result:
+    return run_on(DRIFTING, wander(), PARAMETERS[name])
 
 
 def offset_of(result: jaxik.Result) -> np.ndarray:
@@ -92,55 +108,31 @@ def assert_same_pose(actual, expected, tolerance: float = EXACT) -> None:
 # Flat ground.
 
 
-def limits_kept(ik: jaxik.FootIK, frames: jaxik.Frame, result: jaxik.Result) -> np.ndarray:
+def limits_kept(values: dict, frames: jaxik.Frame, result: jaxik.Result) -> np.ndarray:
     """Frames where no lock holds a foot and no leg is beyond `soften` times its reach."""
     held = np.linalg.norm(offset_of(result), axis=-1).max(axis=-1) > 1e-6
     a, b = (np.asarray(bone) for bone in bone_lengths(frames.pose))
-    free = parameter_tree.get(ik, "leg.soften") * np.sqrt(
-        a * a + b * b - 2 * a * b * np.cos(parameter_tree.get(ik, "leg.max_knee_angle"))
-    )
+    leg = to_ik(values).leg
+    free = leg.soften * np.sqrt(a * a + b * b - 2 * a * b * np.cos(leg.max_knee_angle))
     reach = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
     return ~held & (reach <= np.asarray(free)).all(axis=-1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre(seed):
-    rig = make_rig(seed)
-    ik, frames = to_ik({}), to_frames(stepping(rig, heading=0.3 * seed, foot=0.05 * seed))
-    frames = dataclasses.replace(frames, world_from_model=along_heading(frames))
-    result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
-    kept = limits_kept(ik, frames, result)
-    assert kept.all(), (
-        "standing feet do not slip and no leg is too straight, so that all frames count"
-    )
-    locks = np.diff(result.trace.advanced.state.lock.locked, axis=0)
-    assert (locks == 1).any() and (locks == -1).any()
-    assert_same_pose(result.pose, frames.pose, 1e-4)
-    assert np.abs(result.body.pos).max() < 1e-4
-    assert_same_rot(result.body.rot, quat.identity(), 1e-4)
-
-
-def along_heading(frames: jaxik.Frame) -> Transform:
-    """The root, moved so that it walks in the direction it faces."""
-    root = frames.world_from_model
-    return Transform(quat.rotate(root.rot, root.pos), root.rot)
-
-
-def test_flat_ground_changes_slipping_feet_only_by_their_locks():
-    rig = make_rig()
-    slipping = lambda time: [0.1 * max(time - 2.0, 0.0), 0.0, 0.6 * time]  # noqa: E731
-    ik, frames = to_ik({}), to_frames(stepping(rig, place=slipping))
-    result = jaxik.run(ik, to_rig(rig), to_terrain(FLAT), frames)
-    kept = limits_kept(ik, frames, result)
-    assert 0.4 < kept.mean() < 0.6, "locks act, but only in the second half"
-    assert_same_pose(at(result.pose, kept), at(frames.pose, kept), 1e-4)
-    offset = offset_of(result)
-    assert np.abs(offset).max() > 0.01
-    for leg in range(2):
-        moved = np.asarray(result.pose.ankle.pos - frames.pose.ankle.pos)[:, leg]
-        reached = np.asarray(result.reached)[:, leg] > 0
-        np.testing.assert_allclose(moved[reached], offset[reached, leg], rtol=0, atol=1e-4)
+def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre():
+    for seed in range(3):
+        rig = make_rig(seed)
+        frames = to_frames(stepping(rig, heading=0.3 * seed, foot=0.05 * seed))
+        root = frames.world_from_model  # so that it walks in the direction it faces
+        root = Transform(quat.rotate(root.rot, root.pos), root.rot)
+        frames = dataclasses.replace(frames, world_from_model=root)
+        result = run_on(FLAT, frames, {}, to_rig(rig))
+        # Standing feet do not slip and no leg is too straight, so that all frames count.
+        assert limits_kept({}, frames, result).all()
+        locks = np.diff(result.trace.advanced.state.lock.locked, axis=0)
+        assert (locks == 1).any() and (locks == -1).any()
+        assert_same_pose(result.pose, frames.pose, 1e-4)
+        assert np.abs(result.body.pos).max() < 1e-4
+        assert_same_rot(result.body.rot, quat.identity(), 1e-4)
 
 
 def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
@@ -150,18 +142,18 @@ def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
     move by the lock's offset and no more.
     """
     clip = walker.walk(FRAMES / HZ, HZ, seed=3)
-    rig, frames = clip.rig, frames_from_clip(clip)
+    frames = frames_from_clip(clip)
     # Names and joints are static: keeping ours avoids compiling another program.
     names = {name: getattr(to_rig(make_rig()), name) for name in ("names", "joints", "pelvis")}
-    rig = dataclasses.replace(rig, **names)
+    rig = dataclasses.replace(clip.rig, **names)
 
     unlocked = {"lock.enabled": False}
-    result = jaxik.run(to_ik(unlocked), rig, to_terrain(FLAT), frames)
-    kept = limits_kept(to_ik(unlocked), frames, result)
+    result = run_on(FLAT, frames, unlocked, rig)
+    kept = limits_kept(unlocked, frames, result)
     assert kept.mean() > 0.5
     assert_same_pose(at(result.pose, kept), at(frames.pose, kept), 1e-4)
 
-    result = jaxik.run(to_ik({}), rig, to_terrain(FLAT), frames)
+    result = run_on(FLAT, frames, {}, rig)
     offset, reached = offset_of(result), np.asarray(result.reached) > 0
     assert reached.mean() > 0.5 and np.abs(offset[reached]).max() > 0.01
     moved = jax.vmap(lambda root, a, b: quat.rotate(root.rot, a - b))(
@@ -203,34 +195,25 @@ def moved_frames(frames: jaxik.Frame, by: Transform) -> jaxik.Frame:
 def some_move(kind: str) -> reference.Transform:
     rng = np.random.default_rng(len(kind))
     pos = rng.uniform(-3.0, 3.0, 3)
-    if kind == "moved":
-        return reference.Transform(pos, maths.IDENTITY)
     if kind == "turned about up":
         return reference.Transform(np.zeros(3), maths.from_axis_angle(maths.Y, 2.1))
     return reference.Transform(pos, sample_poses.random_rot(rng))
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-@pytest.mark.parametrize("kind", ["moved", "turned about up", "turned anyhow", "turned, up too"])
+@pytest.mark.parametrize("kind", ["turned about up", "turned, up too"])
 def test_moving_the_world_moves_the_result(kind, name):
-    by = some_move(kind)
-    ground = moved_ground(DRIFTING, by)
-    before = wandered(name)
-    after = jaxik.run(
-        to_ik(PARAMETERS[name]),
-        to_rig(make_rig()),
-        to_terrain(ground),
-        moved_frames(wander(), to_transform(by)),
-    )
+    by, before = some_move(kind), wandered(name)
+    frames = moved_frames(wander(), to_transform(by))
+    after = run_on(moved_ground(DRIFTING, by), frames, PARAMETERS[name])
     assert_same_pose(after.pose, before.pose)
     assert_same_transform(after.body, before.body)
     np.testing.assert_array_equal(after.reached, before.reached)
     target_ws = to_transform(by).apply(before.trace.advanced.effector.target_ws)
     np.testing.assert_allclose(after.trace.advanced.effector.target_ws, target_ws, atol=EXACT)
     for joint in ("hip", "knee", "ankle"):
-        assert_same_rot(
-            getattr(after.corrections, joint), getattr(before.corrections, joint), EXACT
-        )
+        actual, expected = (getattr(r.corrections, joint) for r in (after, before))
+        assert_same_rot(actual, expected, EXACT)
 
 
 def mirrored(tree):
@@ -246,31 +229,28 @@ def mirrored(tree):
 
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_mirroring_the_world_mirrors_the_result(name):
-    ik = to_ik(PARAMETERS[name])
-    rig = to_rig(make_rig())
+    rig, flip = to_rig(make_rig()), np.array([-1.0, 1.0, 1.0])
     other = dataclasses.replace(
         rig,
         side=-rig.side,
         knee_axis_ls=rig.knee_axis_ls * jnp.array([1.0, -1, -1]),  # a rotation axis
         ankle_from_foot=rig.ankle_from_foot * jnp.array([1.0, 1, -1, -1]),
     )
-    flip = np.array([-1.0, 1.0, 1.0])
     planes = [(point * flip, normal * flip) for point, normal in DRIFTING.planes]
-    ground = dataclasses.replace(DRIFTING, planes=planes)
-    ik = parameter_tree.replace(ik, {"leg.twist": -parameter_tree.get(ik, "leg.twist")})
-    after = jaxik.run(ik, other, to_terrain(ground), mirrored(wander()))
-    before = wandered(name)
+    ground, values = dataclasses.replace(DRIFTING, planes=planes), PARAMETERS[name]
+    values = values | {"leg.twist": -parameter_tree.get(to_ik(values), "leg.twist")}
+    after, before = run_on(ground, mirrored(wander()), values, other), wandered(name)
     assert_same_pose(after.pose, mirrored(before.pose))
     assert_same_transform(after.body, mirrored(before.body))
     np.testing.assert_allclose(offset_of(after), offset_of(before) * flip, atol=EXACT)
 
 
 def test_swapping_the_legs_swaps_their_results():
-    rig, frames = to_rig(make_rig()), wander()
     swap = lambda tree: at(tree, jnp.array([1, 0]))  # noqa: E731
     rows = lambda tree: at(tree, (slice(None), jnp.array([1, 0])))  # noqa: E731
+    frames, rig = wander(), swap(to_rig(make_rig()))
     swapped = dataclasses.replace(frames, pose=rows(frames.pose), weight=rows(frames.weight))
-    after = jaxik.run(to_ik(ODD), swap(rig), to_terrain(DRIFTING), swapped)
+    after = run_on(DRIFTING, swapped, ODD, rig)
     assert_same_pose(after.pose, rows(wandered("odd").pose))
     assert_same_transform(after.body, wandered("odd").body)
 
@@ -282,14 +262,12 @@ def test_swapping_the_legs_swaps_their_results():
 def test_bones_keep_their_lengths(name):
     def lengths(pose):
         chain = [np.asarray(getattr(pose, joint).pos) for joint in JOINTS]
-        return np.stack(
-            [np.linalg.norm(b - a, axis=-1) for a, b in zip(chain, chain[1:], strict=False)]
-        )
+        return np.linalg.norm(np.diff(chain, axis=0), axis=-1)
 
-    solved, animated = lengths(wandered(name).pose), lengths(wander().pose)
-    np.testing.assert_allclose(solved, animated, rtol=0, atol=1e-6)
+    solved = wandered(name).pose
+    np.testing.assert_allclose(lengths(solved), lengths(wander().pose), rtol=0, atol=1e-6)
     for joint in JOINTS:
-        size = np.linalg.norm(getattr(wandered(name).pose, joint).rot, axis=-1)
+        size = np.linalg.norm(getattr(solved, joint).rot, axis=-1)
         np.testing.assert_allclose(size, 1.0, atol=1e-12)
 
 
@@ -297,12 +275,8 @@ def test_bones_keep_their_lengths(name):
 def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     result, frames = wandered(name), wander()
     carried = jax.vmap(lambda pose, body: pose.transformed(body))(frames.pose, result.body)
-    for joint in ("hip", "knee"):
-        parent_turn = (
-            quat.identity()
-            if joint == "hip"
-            else quat.multiply(result.pose.hip.rot, quat.conjugate(carried.hip.rot))
-        )
+    hip_turn = quat.multiply(result.pose.hip.rot, quat.conjugate(carried.hip.rot))
+    for joint, parent_turn in (("hip", quat.identity()), ("knee", hip_turn)):
         turned = quat.multiply(
             quat.multiply(parent_turn, getattr(carried, joint).rot),
             getattr(result.corrections, joint),
@@ -313,42 +287,12 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     )
     gap = np.linalg.norm(result.pose.ankle.pos - target, axis=-1)
     reached = np.asarray(result.reached) > 0.5
-    assert reached.any() == (name == "adult"), (
-        "a leg of weight 0.9 never reaches its target exactly"
-    )
-    assert gap[reached].max(initial=0.0) < EXACT
+    # A leg of weight 0.9 never reaches its target exactly.
+    assert reached.any() == (name == "adult") and not reached.all()
+    assert gap[reached].max(initial=0.0) < EXACT < gap[~reached].min()
 
 
-# Memory.
-
-
-@pytest.mark.slow
-def test_steps_equal_the_scan():
-    ik, rig, ground, frames = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING), wander()
-    state, whole = jaxik.init(ik, rig), wandered("odd")
-    for index in range(0, FRAMES):
-        state, result = jaxik.step(ik, rig, ground, state, at(frames, index), trace=True)
-        if index % 20 == 0 or index == FRAMES - 1:
-            assert_close(result, at(whole, index), EXACT)
-            assert_close(state, at(whole.trace.advanced.state, index), EXACT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_a_clip_cut_in_two_and_resumed_equals_the_whole(name):
-    ik, rig, ground, frames = (
-        to_ik(PARAMETERS[name]),
-        to_rig(make_rig()),
-        to_terrain(DRIFTING),
-        wander(),
-    )
-    half = FRAMES // 2
-    state, first = jaxik.resume(ik, rig, ground, jaxik.init(ik, rig), at(frames, slice(half)))
-    assert np.asarray(state.lock.locked).any() and np.linalg.norm(state.lock.offset) > 0
-    end, second = jaxik.resume(ik, rig, ground, state, at(frames, slice(half, None)))
-    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
-    assert_close(joined, wandered(name), EXACT)
-    assert_close(end, at(wandered(name).trace.advanced.state, -1), EXACT)
+# Frame rates.
 
 
 def walk_at(hz: float) -> jaxik.Frame:
@@ -357,33 +301,21 @@ def walk_at(hz: float) -> jaxik.Frame:
 
 
 def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz():
-    ground = to_terrain(planes((0.1, 0.05, 0.0), (-0.1, 0.0, 0.1)))
-    runs = {
-        hz: jaxik.run(to_ik({}), to_rig(make_rig()), ground, walk_at(hz)) for hz in (30, 60, 120)
-    }
+    ground = planes((0.1, 0.05, 0.0), (-0.1, 0.0, 0.1))
+    runs = {hz: run_on(ground, walk_at(hz), {}) for hz in (30, 60, 120)}
     fine = at(runs[120], slice(0, FRAMES, 4))
     for hz, most, mean in ((30, 3e-3, 1e-3), (60, 1.2e-3, 5e-4)):  # m; measured: 2.3 and 0.8 mm
         coarse = at(runs[hz], slice(0, 2 * hz, hz // 30))
-        apart = np.stack(
-            [
-                np.linalg.norm(getattr(coarse.pose, j).pos - getattr(fine.pose, j).pos, axis=-1)
-                for j in JOINTS
-            ]
-        )
+        places = [(getattr(coarse.pose, j).pos, getattr(fine.pose, j).pos) for j in JOINTS]
+        apart = np.stack([np.linalg.norm(a - b, axis=-1) for a, b in places])
         assert apart.max() < most and apart.mean() < mean
 
 
 # Batches.
 
 
-CROWD_GROUNDS = [
-    dataclasses.replace(ground, platform=0)
-    for ground in (
-        BROKEN,
-        planes((0.1, 0.2, 0.05)),
-        planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2)),
-    )
-]
+CROWD_GROUNDS = [BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2))]
+crowd_run = jax.jit(jax.vmap(jaxik.run))
 
 
 @functools.cache
@@ -394,7 +326,7 @@ def crowd() -> tuple[jaxik.FootIK, jaxik.Rig, object, jaxik.Frame]:
     pairs.append((to_rig(make_rig(legs=3)), wander(3)))
     rigs, frames = zip(*pairs, strict=True)
     stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
-    grounds = [to_terrain(ground) for ground in CROWD_GROUNDS]
+    grounds = [to_terrain(dataclasses.replace(ground, platform=0)) for ground in CROWD_GROUNDS]
     return tuple(jax.tree.map(stack, *each) for each in (iks, rigs, grounds, frames))  # type: ignore[return-value]
 
 
@@ -403,20 +335,14 @@ def wander_of(seed: int) -> jaxik.Frame:
 
 
 @functools.cache
-def crowd_run():
-    return jax.jit(jax.vmap(jaxik.run))
-
-
-@functools.cache
 def crowd_result() -> jaxik.Result:
-    return crowd_run()(*crowd())
+    return crowd_run(*crowd())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("member", range(2))
 def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
-    ik, _, ground, _ = at(crowd(), member)
-    alone = jaxik.run(ik, to_rig(make_rig(member)), ground, wander_of(member))
+    values = list(PARAMETERS.values())[member]
+    alone = run_on(CROWD_GROUNDS[member], wander_of(member), values, to_rig(make_rig(member)))
     together = at(crowd_result(), member)
     legs = at(together.pose, (slice(None), slice(2)))
     assert_same_pose(legs, alone.pose)
@@ -425,24 +351,13 @@ def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
     np.testing.assert_allclose(offset_of(together)[:, :2], offset_of(alone), atol=EXACT)
 
 
-@pytest.mark.slow
-def test_a_three_legged_character_in_a_batch_equals_itself_alone():
-    ik, rig, ground, frames = at(crowd(), 2)
-    assert_close(at(crowd_result(), 2), jaxik.run(ik, rig, ground, frames), EXACT)
-
-
-@pytest.mark.slow
-def test_padded_legs_give_finite_numbers():
+def test_a_bad_member_does_not_affect_the_others_of_a_batch():
     for leaf in jax.tree.leaves(crowd_result()):
         assert np.isfinite(leaf).all()
-
-
-def test_a_bad_member_does_not_affect_the_others_of_a_batch():
     ik, rig, ground, frames = crowd()
-    spoiled = eqx.tree_at(
-        lambda f: f.pose.ankle.pos, frames, frames.pose.ankle.pos.at[1, 40:50, 0].set(jnp.nan)
-    )
-    result = crowd_run()(ik, rig, ground, spoiled)
+    bad = frames.pose.ankle.pos.at[1, 40:50, 0].set(jnp.nan)
+    spoiled = eqx.tree_at(lambda f: f.pose.ankle.pos, frames, bad)
+    result = crowd_run(ik, rig, ground, spoiled)
     assert result.faulty[1].sum() == 10 and np.isfinite(result.pose.ankle.pos).all()
     for member in (0, 2):
         assert_close(at(result, member), at(crowd_result(), member), 0.0)
@@ -457,17 +372,23 @@ def single(tree):
     )
 
 
-def single_inputs(ik: jaxik.FootIK):
-    return single((ik, to_rig(make_rig()), to_terrain(DRIFTING), wander()))
+def single_inputs():
+    return single((to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING), wander()))
 
 
-@pytest.mark.parametrize("gate", [jaxik.HARD, Smooth(1.0)])
-def test_a_single_precision_program_contains_no_doubles(gate):
-    inputs = (*single_inputs(to_ik(ODD)), single(gate))
+@functools.cache
+def traced(smooth: bool):
+    """The program of a clip in single precision."""
+    gate = single(Smooth(1.0)) if smooth else jaxik.HARD
     with jax.numpy_dtype_promotion("strict"):
-        program = jax.make_jaxpr(jaxik.run)(*inputs)
-    assert not list(doubles(program.jaxpr))
-    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(inputs[3].dt)
+        return jax.make_jaxpr(jaxik.run)(*single_inputs(), gate)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_single_precision_program_contains_no_doubles(smooth):
+    assert not list(doubles(traced(smooth).jaxpr))
+    times = single_inputs()[-1].dt
+    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(times)
     assert list(doubles(leak.jaxpr)), "the check notices doubles"
 
 
@@ -477,23 +398,19 @@ def doubles(program):
         for variable in equation.outvars:
             if variable.aval.dtype == jnp.float64 and not variable.aval.weak_type:
                 yield equation
-        for inner in jax.tree.leaves(
-            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
-        ):
+        params = list(equation.params.values())
+        for inner in jax.tree.leaves(params, is_leaf=lambda x: hasattr(x, "eqns")):
             if hasattr(inner, "eqns"):
                 yield from doubles(getattr(inner, "jaxpr", inner))
 
 
-@pytest.mark.slow
 def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
-    result = jaxik.run(*single_inputs(to_ik(ODD)))
+    result, double = jaxik.run(*single_inputs()), wandered("odd")
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
         floating = jnp.issubdtype(leaf.dtype, jnp.floating)
         assert not floating or leaf.dtype == jnp.float32, jax.tree_util.keystr(path)
-    double = wandered("odd")
-    np.testing.assert_array_equal(
-        result.trace.advanced.state.lock.locked, double.trace.advanced.state.lock.locked
-    )
+    locked, expected = (r.trace.advanced.state.lock.locked for r in (result, double))
+    np.testing.assert_array_equal(locked, expected)
     for joint in JOINTS:
         actual, expected = getattr(result.pose, joint), getattr(double.pose, joint)
         np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=1e-5)
@@ -505,85 +422,27 @@ def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
 # Programs.
 
 
-@pytest.fixture
-def compilations():
-    """A list that grows by one with each program that XLA compiles."""
-    events: list[str] = []
+def test_other_values_need_no_new_program():
+    def programs(ground: PlainTerrain, values: dict, seed: int, softness: float) -> int:
+        rig = to_rig(make_rig(seed))
+        for gate in (jaxik.HARD, Smooth(softness)):
+            run_on(ground, wander_of(seed), values, rig, gate)
+        return jaxik.run._cache_size()  # pyright: ignore[reportFunctionMemberAccess]
 
-    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        del duration_secs, kwargs
-        if event.endswith("backend_compile_duration"):
-            events.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield events
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
-@pytest.mark.slow
-def test_nothing_compiles_at_a_second_call_with_other_values(compilations):
-    iks = [to_ik({}), to_ik(ODD)]
-    rigs = [to_rig(make_rig(seed)) for seed in range(2)]
-    level = dataclasses.replace(planes((0.1, 0.0, 0.0)), platform=0)
-    grounds = [to_terrain(DRIFTING), to_terrain(level)]
-    clips = [wander_of(0), wander_of(1)]
-    gates = [Smooth(0.5), Smooth(0.1)]
-    frames = [at(clip, 3) for clip in clips]
-
-    def calls(i: int) -> None:
-        jaxik.run(iks[i], rigs[i], grounds[i], clips[i])
-        jaxik.run(iks[i], rigs[i], grounds[i], clips[i], gates[i])
-        state = jaxik.init(iks[i], rigs[i])
-        state, _ = jaxik.step(iks[i], rigs[i], grounds[i], state, frames[i])
-        jaxik.resume(iks[i], rigs[i], grounds[i], state, clips[i])
-
-    jax.block_until_ready(jnp.tanh(jnp.ones((2, 3, 5, 7))))
-    assert compilations, "the check notices new programs"
-    calls(0)
-    compilations.clear()
-    calls(1)
-    assert not compilations
+    level = planes((0.1, 0.0, 0.0))
+    assert programs(DRIFTING, {}, 0, 0.5) == programs(level, ODD, 1, 0.1)
 
 
 def test_only_the_smooth_program_contains_a_sigmoid():
-    inputs = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING), wander()
-    hard = str(jax.make_jaxpr(jaxik.run)(*inputs))
-    smooth = str(jax.make_jaxpr(jaxik.run)(*inputs, Smooth(1.0)))
-    assert not {"logistic", "tanh", "erf"} & set(re.findall(r"= (\w+)", hard))
-    assert "logistic" in re.findall(r"= (\w+)", smooth)
-
-
-@pytest.mark.slow
-def test_steps_and_clips_run_inside_jit_vmap_and_scan():
-    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING)
-    frames = wander()
-
-    @jax.jit
-    def scanned(ik, gains):
-        def one(gain):
-            changed = parameter_tree.replace(ik, {"pelvis.on_gain": gain})
-            return jax.lax.scan(
-                lambda state, frame: jaxik.step(changed, rig, ground, state, frame),
-                jaxik.init(changed, rig),
-                frames,
-            )[1].body
-
-        return jax.vmap(one)(gains)
-
-    bodies = scanned(ik, jnp.array([0.3, 0.6]))
-    assert_same_transform(at(bodies, 0), wandered("odd").body)
-    assert np.abs(bodies.pos[1] - bodies.pos[0]).max() > 1e-3
+    hard, smooth = (set(re.findall(r"= (\w+)", str(traced(smooth)))) for smooth in (False, True))
+    assert not {"logistic", "tanh", "erf"} & hard and "logistic" in smooth
 
 
 def test_smooth_tends_to_hard_as_softness_falls():
-    ik, rig, ground = to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING)
-    apart = []
+    apart, hard = [], wandered("odd").pose
     for softness in (1.0, 0.1, 1e-2, 1e-4, 1e-6):
-        soft = jaxik.run(ik, rig, ground, wander(), Smooth(softness))
-        gaps = [
-            np.abs(getattr(soft.pose, j).pos - getattr(wandered("odd").pose, j).pos).mean()
-            for j in JOINTS
-        ]
+        soft = run_on(DRIFTING, wander(), ODD, gate=Smooth(softness)).pose
+        gaps = [np.abs(getattr(soft, j).pos - getattr(hard, j).pos).mean() for j in JOINTS]
         apart.append(max(gaps))
     assert apart == sorted(apart, reverse=True)
     assert apart[0] > 1e-3 and apart[-1] < 1e-7
