@@ -1,7 +1,9 @@
-"""Defaults on bodies for which nobody chose them: a child, a giant, short shins, unlike legs."""
+"""Defaults on bodies for which nobody chose them, and on ground that no animation knows of.
+
+The bodies are a child, a giant, a robot with short shins, and one whose legs are unlike.
+"""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,18 +14,22 @@ import jaxik
 from fitting.analysis import measures, placement
 from fitting.datasets.clip_frames import clip_from_result, frames_from_clip
 from fitting.datasets.clips import Clip, edit, load_clip, save_clip
-from fitting.datasets.ground_path import place_root
+from fitting.datasets.ground_path import AS_ANIMATED, place_root
+from fitting.datasets.synthetic import walker
 from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
+from fitting.studies.animations import Animation
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world import body, terrain
 from support.bodies import scaled, with_shins
+from support.experiments import ROOT
+from support.grounds import edges_between_footfalls, flight, hill, terrain_of
 
-ROOT = Path(__file__).resolve().parents[2]
+CLIPS = ROOT / "data" / "clips"
 CAPTURED = ROOT.parent / "shared" / "mocap" / "clips" / "cmu_bvh_mb" / "cmu_12_01_walk.bvh"
 PRESETS = ["record", "ozz", "unreal", "mec", "stride"]
 BODIES = {
@@ -38,7 +44,7 @@ run = jax.jit(jaxik.run)
 
 @pytest.fixture(scope="module")
 def walk() -> Clip:
-    return edit.trim(load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz"), 0.0, 3.0)
+    return edit.trim(load_clip(CLIPS / "uneven_walk_base.npz"), 0.0, 3.0)
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +75,13 @@ def contact_share(clip: Clip, preset: str) -> float:
 
 
 @pytest.mark.parametrize("source", ["walk", "captured"])
-@pytest.mark.parametrize("name", BODIES)
-def test_feet_stand_as_long_as_an_adults_whatever_the_body(source, name, request):
+def test_feet_stand_as_long_as_an_adults_whatever_the_body(source, request):
     clip = request.getfixturevalue(source)
-    other = BODIES[name](clip)
+    bodies = {name: make(clip) for name, make in BODIES.items()}
     for preset in PRESETS:
         share = contact_share(clip, preset)
-        assert contact_share(other, preset) == pytest.approx(share, abs=0.02), preset
+        for name, other in bodies.items():
+            assert contact_share(other, preset) == pytest.approx(share, abs=0.02), (preset, name)
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -98,7 +104,7 @@ def test_stances_are_detected_alike_at_the_same_and_at_an_equal_froude_speed(cap
 
 def test_a_root_follows_ground_that_is_as_large_as_its_body():
     steps = np.repeat(0.15 * np.arange(8.0), 4)[:, None] * np.ones(40)  # m, a tread is 1 m long
-    clip = edit.trim(load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz"), 0.0, 6.0)
+    clip = edit.trim(load_clip(CLIPS / "uneven_walk_base.npz"), 0.0, 6.0)
     rises = []
     for size in (1.0, 0.5, 3.0):
         stairs = terrain.heightfield(size * steps, size * 0.25, origin=(-5.0 * size, 0.0, 0.0))
@@ -121,34 +127,32 @@ def test_what_is_visible_of_a_foot_is_as_large_as_its_body(walk):
 
 
 def test_an_experiment_is_for_the_body_of_its_clip_unless_it_says_adult(tmp_path):
-    clips, ground = ROOT / "data" / "clips", tmp_path / "floor.ply"
+    path, giant, ground = (tmp_path / name for name in ("e.toml", "giant.npz", "floor.ply"))
     corners = np.array([[-100.0, 0.0, -100.0], [-100, 0, 100], [100, 0, 100], [100, 0, -100]])
     save_mesh(ground, corners, np.array([[0, 1, 2], [0, 2, 3]]))  # wide enough for a giant
+    save_clip(giant, scaled(load_clip(CLIPS / "uneven_walk_base.npz"), 2.5))
     text = f"""
         preset = "record"
         [[clips]]
-        reference = "{clips / "uneven_walk.npz"}"
-        base = "{tmp_path / "giant.npz"}"
+        reference = "{CLIPS / "uneven_walk.npz"}"
+        base = "{giant}"
         terrain = "{ground}"
         root = "animation"
         [free]
         pelvis.limit = {{}}
         lean.gain = {{}}
     """
-    base = load_clip(clips / "uneven_walk_base.npz")
-    save_clip(tmp_path / "giant.npz", scaled(base, 2.5))
-    highest = {}
-    for line in ("", 'body = "adult"'):
-        (tmp_path / "e.toml").write_text(line + text, encoding="utf-8")
-        space = make_problem(load_experiment(tmp_path / "e.toml")).space
-        limit = parameter_tree.get(space.system, "pelvis.limit")
-        highest[line] = space.parameters[0].high, float(limit)
+
+    def limits(line: str) -> tuple[float, float]:
+        path.write_text(line + text, encoding="utf-8")
+        space = make_problem(load_experiment(path)).space
         assert space.parameters[1].high == 0.95
-    assert highest[""] == pytest.approx((1.5, 0.75), rel=0.01)
-    assert highest['body = "adult"'] == (0.6, pytest.approx(0.3))
-    (tmp_path / "e.toml").write_text('body = "child"' + text, encoding="utf-8")
+        return space.parameters[0].high, float(parameter_tree.get(space.system, "pelvis.limit"))
+
+    assert limits("") == pytest.approx((1.5, 0.75), rel=0.01)
+    assert limits('body = "adult"') == pytest.approx((0.6, 0.3))
     with pytest.raises(ValueError, match="body is 'child'; wanted one of"):
-        load_experiment(tmp_path / "e.toml")
+        limits('body = "child"')
 
 
 def test_a_parameter_file_is_for_the_body_of_the_clip_unless_it_says_adult(walk, tmp_path):
@@ -159,22 +163,19 @@ def test_a_parameter_file_is_for_the_body_of_the_clip_unless_it_says_adult(walk,
     assert float(parameter_tree.get(ik, "probe.ray_up")) == pytest.approx(1.25, rel=0.01)
     assert float(parameter_tree.get(ik, "pelvis.softness")) == pytest.approx(0.0625, rel=0.01)
     path.write_text('body = "adult"\n')
-    for name, value in zip(
-        systems.leaf_names(ik := presets.record()),
-        jax.tree.leaves(parameter_files.load_system(path, rig)[0]),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(parameter_tree.get(ik, name), value)
+    adult, _ = parameter_files.load_system(path, rig)
+    for name in systems.leaf_names(ik := presets.record()):
+        value, expected = (parameter_tree.get(each, name) for each in (adult, ik))
+        np.testing.assert_array_equal(value, expected)
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_system_with_a_number_for_each_leg_is_read_as_it_was_written(name, walk, tmp_path):
-    rig = walk.rig
-    unlike = replace(rig, thigh=rig.thigh * jnp.array([1.0, 0.5]))
+    unlike = replace(walk.rig, thigh=walk.rig.thigh * jnp.array([1.0, 0.5]))
     ik = getattr(presets, name)(unlike)
     path = tmp_path / "written.toml"
     path.write_text(parameter_files.system_to_toml(ik, systems.Preset(name)), encoding="utf-8")
-    for reader in (None, rig, unlike):
+    for reader in (None, walk.rig, unlike):
         again, _ = parameter_files.load_system(path, reader)
         assert jax.tree.structure(again) == jax.tree.structure(ik)
         for value, expected in zip(jax.tree.leaves(again), jax.tree.leaves(ik), strict=True):
@@ -182,10 +183,71 @@ def test_a_system_with_a_number_for_each_leg_is_read_as_it_was_written(name, wal
 
 
 def test_a_quadruped_has_numbers_of_its_own_and_stands_as_long_when_it_is_larger():
-    clip = load_clip(ROOT / "data" / "clips" / "quadruped_base.npz").select(slice(0, 60))
+    clip = load_clip(CLIPS / "quadruped_base.npz").select(slice(0, 60))
     larger = scaled(clip, 3.0)
     assert body.ratio(larger.rig) == pytest.approx(3.0 * body.ratio(clip.rig), rel=1e-6)
     for preset in PRESETS:
         share = contact_share(clip, preset)
         assert contact_share(larger, preset) == pytest.approx(share, abs=0.02)
     assert contact_share(clip, "record") > 0.3
+
+
+# Ground
+
+
+@pytest.fixture(scope="module")
+def on_a_floor() -> Clip:
+    return walker.walk(10.0, 60.0, style=walker.WalkStyle(bend=0.0))
+
+
+@pytest.fixture(scope="module")
+def grounds(on_a_floor) -> dict[str, terrain.Terrain]:
+    edges = edges_between_footfalls(on_a_floor, 8)
+    meshes = {"hill": hill(), "four steps": flight(edges[:4]), "eight steps": flight(edges)}
+    return {name: terrain_of(mesh) for name, mesh in meshes.items()}
+
+
+def placed(clip: Clip, ground: terrain.Terrain) -> Animation:
+    """The walk with its root on the ground."""
+    clip, root = place_root(clip, ground)
+    assert root.root == "ground"
+    return Animation(clip, ground, root=root)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ground", ["hill", "eight steps"])
+@pytest.mark.parametrize("preset", ["record", "stride"])
+def test_standing_feet_are_on_the_ground(on_a_floor, grounds, preset, ground):
+    animation = placed(on_a_floor, grounds[ground])
+    _, solved = animation.solve(systems.preset_system(preset))
+    found, cause = animation.assess(solved)
+    assert found.groundless == 0.0 and cause is None
+    assert found.sunk <= 0.01 and found.floating < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ground", ["four steps", "eight steps"])
+def test_neither_root_nor_pelvis_pops_on_stairs(on_a_floor, grounds, ground):
+    animation = placed(on_a_floor, grounds[ground])
+    _, solved = animation.solve(systems.preset_system("record"))
+    rise, pelvis = animation.root.rise, solved.positions_ws[:, solved.rig.pelvis, 1]
+    assert rise is not None and np.abs(np.diff(rise)).max() < 0.02
+    assert np.abs(np.diff(pelvis)).max() < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("preset", "ground"), [("record", "hill"), ("record", "four steps"), ("stride", "hill")]
+)
+def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor, grounds, preset, ground):
+    animation = Animation(on_a_floor, grounds[ground], root=AS_ANIMATED)
+    found, cause = animation.assess(animation.solve(systems.preset_system(preset))[1])
+    assert found.misplaced and found.sunk > 0.5
+    assert cause is not None and cause.kind == "root"
+
+
+@pytest.mark.slow
+def test_a_system_with_a_root_rule_of_its_own_is_raised_once(on_a_floor, grounds):
+    _, solved = placed(on_a_floor, grounds["hill"]).solve(systems.preset_system("ozz"))
+    feet = solved.joints_ws(2)[..., 1]
+    assert feet.max() < 2.4 and feet.max() > 2.0
