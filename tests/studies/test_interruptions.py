@@ -213,11 +213,12 @@ def test_the_search_of_another_experiment_is_not_used(killed, experiment_file, c
 def start(*words: object, program: str = "fitting.cli.main", **streams: Any) -> subprocess.Popen:
     """A command as a process; `program` is the module that runs it."""
     paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     return subprocess.Popen(
         [sys.executable, "-m", program, *map(str, words)],
         env=os.environ | {"PYTHONPATH": paths, "PYTHONWARNINGS": "default"},
         cwd=ROOT,
-        **({"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | streams),
+        **(quiet | streams),
     )
 
 
