@@ -23,6 +23,7 @@ from reference.characters import Parameters
 from reference.stages import separation
 from support.fragments import fragment
 from support.gradients import assert_gradients_match, finite_jacobian
+from support.rule_checks import assert_lanes_agree, assert_single_precision_agrees
 
 SIDES = np.array([1.0, -1.0, 1.0, -1.0, 0.0])
 LEGS, FRAMES, DT = len(SIDES), 60, 1.0 / 30.0
@@ -149,20 +150,12 @@ def test_the_swinging_foot_gives_way_and_two_swinging_feet_share(pull, locked, m
 
 def test_single_precision_and_lanes_give_the_same():
     clip = stroll(3)
-    exact = np.asarray(moves_of(RULE, *clip))
-    rule = FootSeparation(
-        **{name: jnp.asarray(value, jnp.float32) for name, value in VALUES.items()}
-    )
-    rounded = moves_of(rule, *(jnp.asarray(values, jnp.float32) for values in clip))
-    assert rounded.dtype == jnp.float32
-    np.testing.assert_allclose(rounded, exact, rtol=0, atol=2e-6)
+    assert_single_precision_agrees(moves_of, RULE, *clip)
 
     def of_distance(distance):
         return moves(dataclasses.replace(RULE, distance=distance), *clip)
 
-    distances = jnp.asarray([0.05, 0.15, 0.25])
-    side_by_side = jax.jit(jaxik.lanes(of_distance))(distances)
-    np.testing.assert_allclose(side_by_side, jax.vmap(of_distance)(distances), rtol=0, atol=1e-12)
+    assert_lanes_agree(of_distance, jnp.asarray([0.05, 0.15, 0.25]))
 
 
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
@@ -189,11 +182,9 @@ def test_locked_feet_of_a_walk_that_drifts_sideways_do_not_cross():
     clip = walker.walk(4.0, 30.0)
     # The character glides to its right and back, so that swinging feet pass over locked ones.
     glide = 0.16 * np.sin(np.arange(clip.frame_count) * (2 * np.pi / 25))
-    gliding = dataclasses.replace(
-        clip,
-        positions_ws=clip.positions_ws + glide[:, None, None] * [1.0, 0.0, 0.0],
-        stance=clip.stance_labels(),
-    )
+    aside = glide[:, None, None] * [1.0, 0.0, 0.0]
+    gliding = clip.with_motion(clip.positions_ws + aside, clip.rotations_ws)
+    gliding = dataclasses.replace(gliding, stance=clip.stance_labels())
     ik = parameter_tree.replace(jaxik.presets.stride(clip.rig), {"lock.enabled": True})
     frames, ground = frames_from_clip(gliding), terrain.plane()
     crossing = dataclasses.replace(ik, separation=NoSeparation())

@@ -25,14 +25,11 @@ from reference.stages import warp
 from support.clips import make_rig, to_frames, wandering
 from support.fragments import fragment
 from support.gradients import assert_gradients_match, finite_jacobian
+from support.rule_checks import assert_lanes_agree, assert_single_precision_agrees
 
 LEGS = 3
 VALUES = {"min_scale": 0.6, "max_scale": 1.4, "width": 0.3}
-PER_LEG = {
-    "min_scale": [0.6, 0.9, 0.0],
-    "max_scale": [1.4, 1.0, 2.0],
-    "width": [0.0, 0.3, 1.0],
-}
+PER_LEG = {"min_scale": [0.6, 0.9, 0], "max_scale": [1.4, 1, 2], "width": [0, 0.3, 1]}
 
 
 def offsets(rule, root, toes_ms, velocity_ws, scale, gate=HARD):
@@ -86,13 +83,8 @@ def test_a_place_on_the_ground_stays_one_whatever_the_way(animation):
 
 def test_single_precision_and_lanes_give_the_same(animation):
     few = jax.tree.map(lambda leaf: leaf[:4], animation[1])
-    exact = offsets_of_all(StrideWarp(**VALUES), *few)
-    lanes = jaxik.lanes(lambda *frame: offsets(StrideWarp(**VALUES), *frame))
-    np.testing.assert_allclose(jax.jit(lanes)(*few), exact, rtol=0, atol=1e-12)
-    half = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (VALUES, few))
-    single = offsets_of_all(StrideWarp(**half[0]), *half[1])
-    assert single.dtype == jnp.float32
-    np.testing.assert_allclose(single, exact, rtol=0, atol=2e-6)
+    assert_single_precision_agrees(offsets_of_all, StrideWarp(**VALUES), *few)
+    assert_lanes_agree(lambda *frame: offsets(StrideWarp(**VALUES), *frame), *few)
 
 
 @pytest.mark.parametrize("gate", [HARD, Smooth(1.0)], ids=["hard", "smooth"])
@@ -122,15 +114,12 @@ def test_ankles_before_strides_are_scaled_are_where_the_animation_has_them():
 
 def slides(clip, stance):
     """Horizontal way of the ball in each stance, m."""
-    balls = clip.joints_ws(3)[..., [0, 2]]
-    steps = np.linalg.norm(np.diff(balls, axis=0), axis=-1)
-    return np.array(
-        [
-            steps[first:last, leg].sum()
-            for leg in range(stance.shape[1])
-            for first, last in contacts.runs(stance[:, leg])
-        ]
-    )
+    steps = np.linalg.norm(np.diff(clip.joints_ws(3)[..., [0, 2]], axis=0), axis=-1)
+    return [
+        steps[first:last, leg].sum()
+        for leg in range(stance.shape[1])
+        for first, last in contacts.runs(stance[:, leg])
+    ]
 
 
 @pytest.mark.slow
@@ -142,12 +131,11 @@ def test_feet_of_a_faster_or_slower_walk_do_not_skate(speed):
     unscaled = dataclasses.replace(frames, stride_scale=jnp.ones_like(frames.dt))
     ik, ground = jaxik.presets.stride(), terrain.plane()
     results = [jaxik.run(ik, clip.rig, ground, each) for each in (frames, unscaled)]
-    scaled, skating = (
-        slides(clip_from_result(played, result), clip.stance_labels()) for result in results
-    )
+    stance = clip.stance_labels()
+    scaled, skating = (slides(clip_from_result(played, result), stance) for result in results)
     assert np.median(skating) > 0.10 and np.median(scaled) < 0.005
     reached = np.asarray(results[0].reached) > 0
-    assert reached[clip.stance_labels()].mean() > 0.95
+    assert reached[stance].mean() > 0.95
     # Before it lands, a foot ahead of a leg that is too short for the stride may lag behind.
     assert reached.mean() > 0.85
     # Longer strides need a lower pelvis; shorter ones do not.
