@@ -129,21 +129,28 @@ def test_a_grid_rotated_by_quarter_turns_has_one_canonical_form():
         np.testing.assert_array_equal(grid.cells(points), TILTED.cells(points))
 
 
-def test_an_unknown_grid_is_found_wherever_it_lies(narrow_search):
-    for known, angle, shift in ((WIDE, 0.0, [0.0, 0.0]), (TILTED, np.radians(-13.0), [4.0, -7.0])):
-        feet, rot = block_footprints(known), block_grids._uv_from_xz(angle).T
-        heights, heading = block_heights(known, feet.balls) + 1.0, known.heading - angle
-        balls, ankles = (points @ rot + shift for points in (feet.balls, feet.ankles))
-        feet = Footprints(balls, feet.heights + 1.0, ankles)
-        ranked = block_grids.search(feet)
-        surface = surfaces.fit_blocks(ranked, feet)
-        assert surface.grid.pitch == pytest.approx(known.pitch, rel=0.02)
-        assert surface.grid.heading == pytest.approx(heading, abs=np.radians(2.0))
-        assert ranked.pitches[0] <= known.pitch <= ranked.pitches[1]
-        step = np.radians(1.0)  # about that of the lattice from which the range is taken
-        assert ranked.headings[0] - step <= heading <= ranked.headings[1] + step
-        error = np.abs(surface.heights(feet.balls) - heights)[3:]
-        assert np.median(error) < 0.003 and np.mean(error < 0.01) > 0.9
+@pytest.mark.parametrize(
+    ("known", "angle", "shift"),
+    [
+        pytest.param(WIDE, 0.0, [0.0, 0.0], marks=pytest.mark.slow),
+        (TILTED, np.radians(-13.0), [4.0, -7.0]),
+    ],
+    ids=["80 cm", "45 cm, turned and shifted"],
+)
+def test_an_unknown_grid_is_found(known, angle, shift, narrow_search):
+    feet, rot = block_footprints(known), block_grids._uv_from_xz(angle).T
+    heights, heading = block_heights(known, feet.balls) + 1.0, known.heading - angle
+    balls, ankles = (points @ rot + shift for points in (feet.balls, feet.ankles))
+    feet = Footprints(balls, feet.heights + 1.0, ankles)
+    ranked = block_grids.search(feet)
+    surface = surfaces.fit_blocks(ranked, feet)
+    assert surface.grid.pitch == pytest.approx(known.pitch, rel=0.02)
+    assert surface.grid.heading == pytest.approx(heading, abs=np.radians(2.0))
+    assert ranked.pitches[0] <= known.pitch <= ranked.pitches[1]
+    step = np.radians(1.0)  # about that of the lattice from which the range is taken
+    assert ranked.headings[0] - step <= heading <= ranked.headings[1] + step
+    error = np.abs(surface.heights(feet.balls) - heights)[3:]
+    assert np.median(error) < 0.003 and np.mean(error < 0.01) > 0.9
 
 
 # Surfaces
@@ -285,7 +292,6 @@ def test_the_terrain_of_the_uneven_walk_is_reconstructed_as_smooth(coarse_search
 # Captured clips
 
 
-@pytest.mark.slow
 def test_the_blocks_of_subject_03_are_reconstructed_within_a_centimetre(mocap):
     """Compares heights in the middle of each cell of `terrain_subject03.json`.
 
