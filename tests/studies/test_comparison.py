@@ -1,5 +1,6 @@
-"""Comparisons: which systems, what is measured, what is written, what is rejected."""
+"""Comparisons: which systems, what is measured, at which frame rates, and what is written."""
 
+import dataclasses
 import json
 import struct
 from pathlib import Path
@@ -15,22 +16,31 @@ from fitting.cli.parser import make_parser
 from fitting.datasets import clips
 from fitting.datasets.clips import edit
 from fitting.datasets.flat_animation import load_flat_animation
+from fitting.datasets.synthetic import walker
+from fitting.datasets.synthetic.walker import WalkStyle
+from fitting.datasets.terrain import mesh_files
+from fitting.experiments.systems import preset_system
 from fitting.report import comparison_report
 from fitting.report.labels import MEASURES
 from fitting.report.plots import comparison_plots, style
 from fitting.runtime import program_cache
-from fitting.studies import comparison, run_folder
-from fitting.studies.animations import Animation
+from fitting.runtime.precision import in_float64, with_floats
+from fitting.studies import comparison, frame_rates, run_folder
+from fitting.studies.animations import Animation, AnimationFiles, load_animation
+from fitting.studies.frame_rates import every_frame, measure
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support.experiments import ROOT
 from support.pages import Page
+from support.refusals import refusal
 
 SHOWN = "always::fitting.report.placement_report.PlacementWarning"
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings(SHOWN)]
+pytestmark = pytest.mark.filterwarnings(SHOWN)
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
+TERRACES = ROOT / "data" / "terrains" / "terraces.ply"
+CAPTURED = ROOT.parent / "shared" / "mocap" / "blocks"
 STILL = "lock.enabled = false\n[leg]\nweight = 0.0\n"  # changes nothing in the animation
 
 
@@ -43,13 +53,17 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
+def compare(folder: Path, out: Path, *more: object) -> int:
+    """The command's exit status, for the preset `record` and more."""
+    words = ["compare", folder / "walk.npz", "--terrain", GROUND, "-o", out, *more]
+    return main.main([*map(str, words), "--presets", "record"])
+
+
 @pytest.fixture(scope="module")
 def compared(folder) -> Path:
     """The folder that the command writes; tests must not change it."""
     out = folder / "new" / "compared"
-    words = ["compare", folder / "walk.npz", "--terrain", GROUND, "-o", out]
-    words += ["--parameters", folder / "still.toml", "--presets", "record"]
-    assert main.main([str(word) for word in words]) == 0
+    assert compare(folder, out, "--parameters", folder / "still.toml") == 0
     return out
 
 
@@ -62,52 +76,23 @@ def numbers(folder: Path) -> dict[str, dict]:
 
 
 def test_systems_are_in_the_order_of_the_options(tmp_path):
-    for name in ("b", "a"):
-        (tmp_path / f"{name}.toml").write_text(STILL)
-    files = f"{tmp_path / 'b.toml'}, {tmp_path / 'a.toml'}"
-    options = make_parser().parse_args(
-        ["compare", "c", "--terrain", "t", "-o", "d", "--parameters", files, "--presets", "record"]
-    )
+    files = [tmp_path / "b.toml", tmp_path / "a.toml"]
+    for file in files:
+        file.write_text(STILL)
+    words = ["compare", "c", "--parameters", "{}, {}".format(*files), "--presets", "record"]
+    options = make_parser().parse_args(words)
     systems = comparison.named_systems(options.systems)
     assert list(systems) == ["b", "a", "record"]
     assert float(systems["a"].leg.weight) == 0.0 and float(systems["record"].leg.weight) == 1.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ([], "nothing to compare; wanted --presets or --parameters"),
-        ([("--presets", "")], "--presets '': wanted names with commas between them"),
-        ([("--presets", "record,")], "--presets 'record,': wanted names"),
-        ([("--presets", "recrod")], "no preset named 'recrod'; there are"),
-        ([("--presets", "record,record")], "already is a system named 'record'"),
-        ([("--presets", "record"), ("--parameters", "record.toml")], "system named 'record'"),
-        ([("--parameters", "as animated.toml")], "system named 'as animated'"),
-        ([("--parameters", "no.toml")], "no.toml: no such file, wanted a parameter file"),
-        ([("--parameters", "odd.toml")], "odd.toml: unknown key 'lok'"),
-    ],
-)
-def test_wrong_systems_are_rejected(options, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("record", "as animated"):
-        Path(f"{name}.toml").write_text(STILL)
-    Path("odd.toml").write_text("[lok]\nx = 1")
-    with pytest.raises(ValueError, match=message):
-        comparison.named_systems(options)
-
-
 def test_runs_are_named_by_their_folders_and_files_by_as_many_as_tell_them_apart(tmp_path):
-    places = (
-        "walk/parameters.toml",
-        "stairs/parameters.toml",
-        "a/own.toml",
-        "b/own.toml",
-        "c.toml",
-    )
-    for place in places:
+    runs = ["walk/parameters.toml", "stairs/parameters.toml"]
+    others = ["a/own.toml", "b/own.toml", "c.toml"]
+    for place in runs + others:
         (tmp_path / place).parent.mkdir(exist_ok=True)
         (tmp_path / place).write_text('preset = "ozz"\n')
-    files = [str(tmp_path / place) for place in ("walk", *places[1:])]
+    files = [str(tmp_path / place) for place in ("walk", runs[1], *others)]
     systems = comparison.named_systems([("--parameters", ",".join(files)), ("--presets", "ozz")])
     assert list(systems) == ["walk", "stairs", "a/own", "b/own", "c", "ozz"]
     with pytest.raises(ValueError, match="already is a system named 'walk'"):
@@ -214,8 +199,7 @@ def size_of_png(path: Path) -> tuple[int, int]:
 
 
 def test_the_terminal_shows_the_table_and_warnings(folder, compared, capsys):
-    words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
-    assert main.main([*map(str, words), "-o", str(folder / "again")]) == 0
+    assert compare(folder, folder / "again") == 0
     output = capsys.readouterr()
     assert output.out.splitlines()[0].split() == ["system", "as", "animated", "record"]
     assert f"read {folder / 'again' / comparison_report.TABLE}" in output.out
@@ -229,8 +213,7 @@ def test_an_interrupt_writes_nothing(folder, tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(program_cache, "run", interrupt)
-    words = ["compare", folder / "walk.npz", "--terrain", GROUND, "--presets", "record"]
-    assert main.main([*map(str, words), "-o", str(tmp_path / "out")]) == main.INTERRUPTED
+    assert compare(folder, tmp_path / "out") == main.INTERRUPTED
     assert capsys.readouterr().err == "\njaxik compare: interrupted\n"
     assert not list(tmp_path.iterdir())
 
@@ -264,45 +247,104 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
     assert [text.get_text() for text in legend.texts] == ["as animated", "other", "ground"]
 
 
-# What is refused
-
-
-@pytest.mark.parametrize(
-    ("clip", "ground", "out", "more", "message"),
-    [
-        ("no.npz", GROUND, "d", ["--presets", "record"], "no.npz: no such file"),
-        (BASE, "no.ply", "d", ["--presets", "record"], "no.ply: no such file"),
-        (BASE, GROUND, "file", ["--presets", "record"], "file: no folder can be made here"),
-        (BASE, GROUND, "file/d", ["--presets", "record"], "/file is a file"),
-        (BASE, GROUND, "d", [], "nothing to compare"),
-        (BASE, GROUND, "d", ["--presets", "record,none"], "no preset named 'none'; there are"),
-        (BASE, GROUND, "d", ["--presets", "record,record"], "already is a system named 'record'"),
-        (BASE, GROUND, "d", ["--parameters", "legs.toml"], "legs: foot.max_roll has shape (3,)"),
-    ],
-)
-def test_wrong_input_is_reported_in_one_line_and_nothing_written(
-    clip, ground, out, more, message, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    Path("file").write_text("kept")
-    Path("legs.toml").write_text("foot.max_roll = [1, 2, 3]")
-    words = ["compare", clip, "--terrain", ground, "-o", out, *more]
-    assert main.main([str(word) for word in words]) == main.MISTAKE
-    output = capsys.readouterr()
-    assert output.out == "" and output.err.count("\n") == 1 and message in output.err
-    assert {path.name for path in tmp_path.iterdir()} == {"file", "legs.toml"}
-
-
 def test_poses_that_are_not_finite_name_their_system_and_are_not_written(folder, tmp_path, capsys):
     (tmp_path / "mad.toml").write_text("pelvis.tick_hz = -inf\nleg.soften = inf\n")
     words = ["compare", folder / "walk.npz", "--terrain", GROUND, "-o", tmp_path / "out"]
-    words += ["--parameters", tmp_path / "mad.toml"]
-    assert main.main([str(word) for word in words]) == main.MISTAKE
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("jaxik compare: mad: these parameters give poses that are not finite")
-    assert not (tmp_path / "out").exists()
+    line = refusal([*words, "--parameters", tmp_path / "mad.toml"], tmp_path, capsys)
+    assert line.startswith("jaxik compare: mad: these parameters give poses that are not finite")
 
 
 def test_presets_that_leave_heights_to_their_game_stand_on_the_ground_by_default():
     systems = comparison.named_systems([("--presets", "mec,ozz,unreal")])
     assert all(parameter_tree.get(ik, "root.enabled") for ik in systems.values())
+
+
+# Frame rates
+
+
+@pytest.fixture(scope="module")
+def fast() -> Animation:
+    """A walk at 120 Hz over the first terraces."""
+    clip = walker.walk(3.0, 120.0, 6, (), WalkStyle(knees=1.0))
+    return Animation(clip, mesh_files.load_terrain(TERRACES))
+
+
+def raised_by_frame_time(animation, ik):
+    """A result that needs no pipeline: everything is raised by ten times the frame time, m."""
+    clip = animation.clip
+    return None, clip.with_motion(
+        clip.positions_ws + [0.0, 10.0 / clip.fps, 0.0], clip.rotations_ws
+    )
+
+
+def test_every_fourth_frame_is_played_with_the_strides_and_speeds_of_the_clip(fast):
+    played = every_frame(fast, 4)
+    own, frames = fast.frames, played.frames
+    assert played.clip.fps == 30.0 and len(frames.dt) == 90
+    np.testing.assert_allclose(frames.dt, 1 / 30, rtol=1e-6)
+    np.testing.assert_array_equal(frames.stride.fraction, own.stride.fraction[::4])
+    np.testing.assert_array_equal(frames.toe_speed, own.toe_speed[::4])
+    np.testing.assert_array_equal(frames.pose.ankle.pos, own.pose.ankle.pos[::4])
+
+
+def test_a_restart_between_two_frames_that_are_played_is_at_the_next_one(fast):
+    restart = np.isin(np.arange(fast.clip.frame_count), [5, 8])
+    frames = dataclasses.replace(fast.frames, restart=restart)
+    cut = dataclasses.replace(fast, given_frames=frames)
+    restart = every_frame(cut, 4).frames.restart
+    assert restart is not None
+    np.testing.assert_array_equal(np.flatnonzero(restart), [2])
+
+
+def test_differences_are_those_at_the_frames_of_both(fast, monkeypatch):
+    monkeypatch.setattr(Animation, "solve", raised_by_frame_time)
+    half, quarter = measure({"still": preset_system("ozz")}, fast, [60.0, 30.0])
+    assert (half.system, half.fps, quarter.fps) == ("still", 60.0, 30.0)
+    for joint in frame_rates.JOINTS:
+        assert half.rms[joint] == pytest.approx(10 / 60 - 10 / 120)
+        assert half.largest[joint] == pytest.approx(10 / 60 - 10 / 120)
+        assert quarter.rms[joint] == pytest.approx(10 / 30 - 10 / 120)
+
+
+@pytest.mark.parametrize("fps", [50.0, 240.0, 119.0])
+def test_a_rate_of_which_the_clips_is_no_multiple_is_refused(fast, fps):
+    with pytest.raises(ValueError, match=f"{fps:g} Hz; wanted a part .*: 120, 60, 40, 30, ... Hz"):
+        measure({"ozz": preset_system("ozz")}, fast, [fps])
+
+
+def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(Animation, "solve", raised_by_frame_time)
+    monkeypatch.setattr(Animation, "reached", lambda *_: np.ones((360, 2)))
+    clips.save_clip(tmp_path / "walk.npz", fast.clip)
+    words = ["compare", tmp_path / "walk.npz", "--terrain", TERRACES, "--presets", "ozz"]
+    words += ["--rates", "60,30", "-o", tmp_path / "out"]
+    assert main.main([str(word) for word in words]) == 0
+    row = "ozz 60 Hz 83.3 83.3 83.3 83.3 83.3"
+    assert row in " ".join(capsys.readouterr().out.split())
+    text = (tmp_path / "out" / comparison_report.TABLE).read_text()
+    assert "## At other frame rates" in text
+    assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text
+    entries = json.loads((tmp_path / "out" / comparison_report.NUMBERS).read_text())["rates"]
+    assert [entry["fps"] for entry in entries] == [60.0, 30.0]
+
+
+@in_float64
+def differences(animation: Animation, rates: list[float], *presets: str) -> dict:
+    """The largest rms of any joint, mm, by preset and rate."""
+    systems = {name: with_floats(preset_system(name), np.float64) for name in presets}
+    rows = measure(systems, animation, rates)
+    return {(row.system, row.fps): 1000 * max(row.rms.values()) for row in rows}
+
+
+@pytest.mark.slow
+def test_stride_hardly_depends_on_the_frame_rate(fast):
+    found = differences(fast, [60.0], "stride")
+    assert found["stride", 60.0] < 2.5
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CAPTURED.exists(), reason="needs captured clips")
+def test_stride_hardly_depends_on_the_frame_rate_on_real_ground():
+    files = AnimationFiles(CAPTURED / "03_03.npz", CAPTURED / "terrain.ply")
+    found = differences(load_animation(files), [60.0, 30.0], "stride")
+    assert found["stride", 60.0] < 2.0 and found["stride", 30.0] < 4.0
