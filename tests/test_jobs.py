@@ -351,19 +351,23 @@ def test_a_system_made_in_32_bits_runs_in_those_of_the_clip(done):
     assert single.leg.weight.dtype == np.float32 and result.body.pos.dtype == np.float64
 
 
-def test_systems_made_in_32_bits_are_compared_in_64(tmp_path):
-    short = fitting.load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz").select(slice(16))
-    fitting.save_clip(tmp_path / "short.npz", short)
+@pytest.fixture
+def animation(tmp_path) -> fitting.AnimationFiles:
+    """Half a second of the flat walk."""
+    whole = fitting.load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz")
+    fitting.save_clip(tmp_path / "short.npz", whole.select(slice(30, 46)))
     ground = ROOT / "data" / "terrains" / "uneven_walk.ply"
-    animation = fitting.AnimationFiles(tmp_path / "short.npz", ground)
+    return fitting.AnimationFiles(tmp_path / "short.npz", ground)
+
+
+def test_systems_made_in_32_bits_are_compared_in_64(animation):
     with jax.enable_x64(False):
         compared = fitting.compare({"record": jaxik.presets.record()}, animation)
         solved = jobs.solve(jaxik.presets.record(), animation)
     exact = jobs.solve(jaxik.presets.record(), animation)
     np.testing.assert_allclose(solved.positions_ws, exact.positions_ws, atol=1e-5)
-    np.testing.assert_array_equal(
-        compared.motions["record"].ankle, solved.joints_ws(2), strict=True
-    )
+    ankles = compared.motions["record"].ankle
+    np.testing.assert_array_equal(ankles, solved.joints_ws(2), strict=True)
 
 
 # From the command line
@@ -424,3 +428,18 @@ def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
     assert main.main(["sample", str(run), "--max-steps", "300"]) == main.INTERRUPTED
     assert "Interrupted, the chain is kept" in capsys.readouterr().out
     assert len(chain_of(run)) == 100
+
+
+@pytest.mark.filterwarnings("ignore::fitting.report.placement_report.PlacementWarning")
+def test_apply_runs_the_fitted_system_on_another_clip(done, animation, tmp_path, capsys):
+    out = tmp_path / "out.npz"
+    words = [done.run, animation.clip, "--terrain", animation.terrain, "-o", out]
+    assert main.main(["apply", *map(str, words)]) == 0
+    text = capsys.readouterr().out
+    assert "16 frames in" in text and f"written to {out}" in text
+    applied = fitting.load_clip(out).positions_ws
+    fitted, preset = (
+        jobs.solve(ik, animation).positions_ws for ik in (done.fitted.ik, jaxik.presets.record())
+    )
+    np.testing.assert_allclose(applied, fitted, atol=1e-9)
+    assert np.abs(applied - preset).max() > 0.001

@@ -1,4 +1,4 @@
-"""The command line, as its user sees it; fits and samplings are in `tests/test_jobs.py`."""
+"""The command line, as its user sees it; what needs a fit is in `tests/test_jobs.py`."""
 
 import json
 import os
@@ -23,7 +23,6 @@ from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
 from fitting.datasets.terrain.meshes import mesh_of
 from fitting.inference.optimisation.solution import Progress
 from fitting.runtime import activity
-from fitting.studies import run_folder
 from support import gltf_files, grounds, runs
 from support.commands import commands
 from support.experiments import CLIP, ROOT, write
@@ -295,18 +294,6 @@ def test_run_names_the_other_up_axis(on_hill, tmp_path, capsys):
     assert output.err.splitlines()[0].endswith("; likely remedy: --file-up y")
     words = [*on_hill, tmp_path / "other.npz", "--file-up", "z", "--root", "ground"]
     assert refusal(words, tmp_path, capsys).endswith("m; likely remedy: --file-up y")
-
-
-def test_apply_runs_the_parameters_of_a_run(on_hill, tmp_path):
-    runs.save(tmp_path / "run", runs.invented_fit(tmp_path))
-    parameters = tmp_path / "run" / run_folder.PARAMETERS
-    outputs = [tmp_path / f"{name}.npz" for name in ("applied", "run", "as preset")]
-    run("apply", tmp_path / "run", *on_hill[1:], outputs[0])
-    run(*on_hill, outputs[1], "--parameters", parameters)
-    run(*on_hill, outputs[2])
-    applied, same, other = (load_clip(path).positions_ws for path in outputs)
-    np.testing.assert_allclose(applied, same, atol=1e-9)
-    assert np.abs(applied - other).max() > 0.001
 
 
 # Inspect

@@ -78,7 +78,7 @@ def test_example_lists_experiments_by_title(capsys):
     assert len(examples.names().keys() - elsewhere) == 11
 
 
-@pytest.mark.parametrize("name", ["uneven_walk", "calibration/ozz_noise", "mec"])
+@pytest.mark.parametrize("name", ["uneven_walk", "calibration/ozz_noise"])
 def test_a_copied_example_is_whole_and_names_its_schema(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main.main(["example", name, "-o", "copy"]) == 0
