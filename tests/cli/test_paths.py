@@ -3,6 +3,7 @@
 import os
 import re
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -118,7 +119,7 @@ def broken_path(way: str, suffix: str) -> str:
     return str(path)
 
 
-def check_refusals(lines: list[str], way: str, capsys, *, named: bool = True) -> None:
+def check_refusals(lines: Sequence[str], way: str, capsys, *, named: bool = True) -> None:
     """Checks that each of these commands, with a broken path, prints one line and does nothing."""
     for line in lines:
         (place,) = re.findall(r"PATH[.a-z]*", line)
