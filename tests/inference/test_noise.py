@@ -14,6 +14,7 @@ from scipy import linalg, optimize, stats
 import fitting
 import jaxik
 from fitting.experiments import problems
+from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise import marginal, model, series
@@ -21,12 +22,13 @@ from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.problem.loss import apply_loss
 from fitting.problem.problem import Problem
-from fitting.problem.simulation import autoregression, simulate
+from fitting.problem.residuals import residuals_by_kind
+from fitting.problem.scene import Scene
+from fitting.problem.simulation import autoregression
 from fitting.studies import run_folder
 from fitting.studies.fit import search_with_noise
 from support.experiments import ROOT
 
-RHO = 0.95
 BOTH = NoiseOptions("estimated", "whitened")
 OZZ = ROOT / "data" / "experiments" / "ozz.toml"
 KINDS = ("ankle", "knee", "pelvis", "foot", "body")
@@ -94,49 +96,99 @@ def test_students_slopes_tell_less_than_they_say(nu):
     assert series.information_of_slopes("squares", nu) == 1.0
 
 
-# A problem
+# A problem without a pipeline: two parameters shift the errors of each frame
+
+FootProblem = Problem[jaxik.FootIK]
+
+
+def errors_by_kind(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[dict[str, jax.Array]]:
+    """What the parameters add to the noise, which is in the place of the tracks."""
+    (scene,) = scenes
+    time = jnp.arange(scene.reference.observed.size, dtype=ik.foot.weight.dtype) / 20
+    shift = ik.target.foot_height * jnp.sin(time) + 0.1 * ik.foot.weight * jnp.cos(2 * time)
+    tracks = scene.tracks.items()
+    return [{kind: x + shift.reshape(-1, *[1] * (x.ndim - 1)) for kind, x in tracks}]
+
+
+def residuals(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> jax.Array:
+    (errors,), (scene,) = errors_by_kind(ik, scenes), scenes
+    contact, smooth = jnp.zeros_like(scene.reference.contact), jnp.zeros_like(errors["ankle"][2:])
+    by_kind = residuals_by_kind(scene, errors | {"contact": contact, "smooth": smooth})
+    return jnp.concatenate([of_kind.ravel() for of_kind in by_kind.values()])
+
+
+def simulated(
+    problem: FootProblem, u: np.ndarray | jax.Array, rho: float, seed: int, outliers: float = 0.0
+) -> FootProblem:
+    """Whose errors at `u` are the noise, correlated, this fraction of it ten sigmas off."""
+    random = np.random.default_rng(seed)
+    (scene,), frames = problem.data, problem.data[0].reference.observed.size
+
+    def noise(kind: str) -> np.ndarray:
+        shape = (frames, 3) if kind in ("pelvis", "body") else (frames, 2, 3)
+        far = 10 * random.normal(size=shape) * (random.random(shape) < outliers)
+        errors = autoregression(random.normal(size=shape), rho) + far
+        return noise_of(problem).sigmas[kind] * errors
+
+    def with_tracks(tracks: dict[str, jax.Array]) -> Scene:
+        return dataclasses.replace(scene, tracks=tracks)
+
+    wanted = {kind: jnp.asarray(noise(kind)) for kind in KINDS}
+    (found,) = errors_by_kind(problem.space.unpack(jnp.asarray(u)), (with_tracks(wanted),))
+    tracks = {kind: 2 * wanted[kind] - found[kind] for kind in KINDS}
+    return dataclasses.replace(problem, data=(with_tracks(tracks),))
+
+
+def walk(options: NoiseOptions, loss: str = "squares") -> tuple[Experiment, FootProblem]:
+    """Six seconds of the walk of `ozz`, with two free parameters."""
+    experiment = load_experiment(OZZ)
+    clip = dataclasses.replace(experiment.clips[0], start=2.0, end=8.0)
+    free = {name: {} for name in ("target.foot_height", "foot.weight")}
+    changed = {"clips": (clip,), "free": free, "noise": options, "loss": loss}
+    experiment = dataclasses.replace(experiment, **changed)
+    problem = problems.make_problem(experiment)
+    return experiment, dataclasses.replace(problem, residual_function=residuals)
+
+
+@pytest.fixture
+def no_pipeline(monkeypatch) -> None:
+    """The errors are those of the problem's own residuals."""
+    monkeypatch.setattr(model, "_errors_by_kind", errors_by_kind)
 
 
 @pytest.fixture(scope="module")
-def short() -> Problem[jaxik.FootIK]:
-    """A second of the walk of `ozz`, with two free parameters and simulated correlated noise."""
-    experiment = load_experiment(OZZ)
-    clip = dataclasses.replace(experiment.clips[0], start=2.0, end=3.0)
-    free = {name: {} for name in ("target.foot_height", "foot.weight")}
-    short = dataclasses.replace(experiment, clips=(clip,), free=free)
-    problem = problems.make_problem(short)
-    noise = noise_of(problem)
-    correlated = dataclasses.replace(noise, correlations=dict.fromkeys(KINDS, 0.6))
-    return simulate(with_noise(problem, correlated), problem.space.start, seed=3)
+def correlated() -> FootProblem:
+    _, problem = walk(BOTH)
+    return simulated(problem, problem.space.start, 0.6, seed=3)
 
 
-def test_noise_is_replaced_without_a_new_program(short):
+def test_noise_is_replaced_without_a_new_program(correlated):
     noise = NoiseModel(dict.fromkeys(KINDS, 0.1), dict.fromkeys(KINDS, 0.3), 7.0, 0.5)
-    changed = with_noise(short, noise)
+    changed = with_noise(correlated, noise)
     assert noise_of(changed) == noise
     before, after = (
-        jax.tree.map(jax.typeof, eqx.filter(p, eqx.is_array)) for p in (short, changed)
+        jax.tree.map(jax.typeof, eqx.filter(p, eqx.is_array)) for p in (correlated, changed)
     )
     assert jax.tree.structure(before) == jax.tree.structure(after)
     assert jax.tree.leaves(before) == jax.tree.leaves(after)
-    assert changed.data[0].sigmas.contact == short.data[0].sigmas.contact
+    assert changed.data[0].sigmas.contact == correlated.data[0].sigmas.contact
 
 
-@pytest.mark.slow
-def test_the_fit_with_noise_is_the_joint_optimum(short):
+def test_the_fit_with_noise_is_the_joint_optimum(correlated, no_pipeline):
     """Against a quasi-Newton search over parameters, log-sigmas and correlations together."""
-    experiment = dataclasses.replace(load_experiment(OZZ), noise=BOTH)
-    problem, solution = search_with_noise(short, experiment)
+    space = correlated.space
+    problem, solution = search_with_noise(correlated, walk(BOTH)[0])
     found = noise_of(problem)
-    before = float(problem.cost(problem.space.pack({})))  # with the noise that was estimated
+    before = float(problem.cost(space.pack({})))  # with the noise that was estimated
     assert solution.cost_before == pytest.approx(before) and solution.cost < before
+    unpack = jax.jit(lambda u: (space.unpack(u), space.prior_residuals(u)))
 
     def objective(x: np.ndarray) -> float:
-        u, sigmas, rhos = x[:2], np.exp(x[2:7]), np.tanh(x[7:])
-        ik = short.space.unpack(jnp.asarray(u))
-        (by_kind,) = model._errors_by_kind(ik, short.data)
-        errors = model._counted(short.data[0], by_kind)
-        total = 0.5 * float(np.sum(np.asarray(short.space.prior_residuals(jnp.asarray(u))) ** 2))
+        sigmas, rhos = np.exp(x[2:7]), np.tanh(x[7:])
+        ik, of_prior = unpack(jnp.asarray(x[:2]))
+        (by_kind,) = errors_by_kind(ik, correlated.data)
+        errors = model._counted(correlated.data[0], by_kind)
+        total = 0.5 * float(np.sum(np.asarray(of_prior) ** 2))
         for kind, sigma, rho in zip(KINDS, sigmas, rhos, strict=True):
             values = errors[kind].values
             innovations = values[1:] - rho * values[:-1]
@@ -145,26 +197,62 @@ def test_the_fit_with_noise_is_the_joint_optimum(short):
             total -= stats.norm.logpdf(innovations, scale=math.sqrt(variance)).sum()
         return total
 
-    ours = np.concatenate(
-        [solution.u, [math.log(s) for s in found.sigmas.values()],
-         [math.atanh(rho) for rho in found.correlations.values()]]
-    )  # fmt: skip
+    logs, atanhs = np.log([*found.sigmas.values()]), np.arctanh([*found.correlations.values()])
+    ours = np.concatenate([solution.u, logs, atanhs])
     start = ours + np.random.default_rng(0).normal(0, 0.05, ours.size)
     best = optimize.minimize(objective, start, method="BFGS")
     assert objective(ours) < best.fun + 1e-3
     np.testing.assert_allclose(ours, best.x, atol=0.01)
 
 
-def test_open_sigmas_are_integrated_out(short):
+@pytest.mark.parametrize(
+    ("rho", "outliers", "loss", "options"),
+    [(0.95, 0.0, "squares", BOTH), (0.0, 0.03, "student", NoiseOptions("estimated"))],
+)
+def test_intervals_with_estimated_noise_cover_the_truth(no_pipeline, rho, outliers, loss, options):
+    """Of four truths and two parameters, assumed with twice their sigmas; 6 of 8 or more have a
+    probability of 99.4 %."""
+    experiment, problem = walk(options, loss)
+    space, true = problem.space, noise_of(problem)
+    assumed = {kind: 2 * sigma for kind, sigma in true.sigmas.items()}
+    covered = 0
+    for seed in range(4):
+        draw = np.random.default_rng(seed).normal(size=space.size)
+        u = space.start + 0.5 * space.prior.sd * jnp.asarray(draw)
+        captured = simulated(problem, u, rho, seed, outliers)
+        captured = with_noise(captured, dataclasses.replace(true, sigmas=assumed))
+        fitted, solution = search_with_noise(captured, experiment)
+        found = noise_of(fitted)
+        if loss == "squares":
+            ratios = [found.sigmas[kind] / true.sigmas[kind] for kind in KINDS]
+            np.testing.assert_allclose(ratios, 1.0, atol=0.45)
+            np.testing.assert_allclose(list(found.correlations.values()), rho, atol=0.05)
+        else:
+            assert found.tails < 10
+        low, high = assess_identifiability(fitted, solution).interval.T
+        values = np.asarray(space.values(u))
+        covered += int(np.sum((low <= values) & (values <= high)))
+    assert covered >= 6
+
+
+def test_correlation_is_counted_as_fewer_residuals(correlated, no_pipeline):
+    options = NoiseOptions("given", "counted")
+    noise = model.likeliest_noise(correlated, correlated.space.start, options)
+    assert noise.independent_fraction == pytest.approx(0.4 / 1.6, rel=0.1)
+    assert noise.sigmas == noise_of(correlated).sigmas
+    assert noise.correlations == noise_of(correlated).correlations
+
+
+def test_open_sigmas_are_integrated_out(correlated):
     """Against a sum over a grid of log-sigmas, of which one is open."""
     only_ankles = dataclasses.replace(
-        short.data[0].sigmas, **{kind: jnp.asarray(jnp.inf) for kind in KINDS[1:]}
+        correlated.data[0].sigmas, **{kind: jnp.asarray(jnp.inf) for kind in KINDS[1:]}
     )
-    scene = dataclasses.replace(short.data[0], sigmas=only_ankles)
-    problem = dataclasses.replace(short, data=(scene,), independent_fraction=jnp.asarray(0.5))
+    scene = dataclasses.replace(correlated.data[0], sigmas=only_ankles)
+    problem = dataclasses.replace(correlated, data=(scene,), independent_fraction=jnp.asarray(0.5))
     opened = marginal.with_unknown_sigmas(problem)
     assert opened.unknown_sigmas is not None and opened.unknown_sigmas.shape[0] == 1
-    points = np.asarray(short.space.start) + np.array([[0.0, 0.0], [0.2, -0.1]])
+    points = np.asarray(problem.space.start) + np.array([[0.0, 0.0], [0.2, -0.1]])
     log_sigmas = np.linspace(-4, 4, 4001)
     expected = []
     for u in points:
@@ -177,26 +265,26 @@ def test_open_sigmas_are_integrated_out(short):
     assert ours[1] - ours[0] == pytest.approx(expected[1] - expected[0], rel=1e-6)
 
 
-def test_open_sigmas_are_drawn_around_the_residuals_own(short):
-    opened = marginal.with_unknown_sigmas(short)
-    u = np.tile(np.asarray(short.space.start), (50, 30, 1))
+def test_open_sigmas_are_drawn_around_the_residuals_own(correlated):
+    opened = marginal.with_unknown_sigmas(correlated)
+    u = np.tile(np.asarray(correlated.space.start), (50, 30, 1))
     draws = marginal.draw_sigmas(opened, u, seed=0)
-    residuals = np.asarray(short.residuals(short.space.start))[:-2]
+    residuals = np.asarray(correlated.residuals(correlated.space.start))[:-2]
     assert tuple(draws) == KINDS
     for kind, row in zip(KINDS, np.asarray(opened.unknown_sigmas), strict=True):
         squares, count = row @ residuals**2, row.sum()
-        sigma = getattr(short.data[0].sigmas, kind) * np.sqrt(squares / count)
+        sigma = getattr(correlated.data[0].sigmas, kind) * np.sqrt(squares / count)
         assert np.median(draws[kind]) == pytest.approx(float(sigma), rel=0.02)
         assert np.std(draws[kind]) / sigma == pytest.approx(1 / np.sqrt(2 * count), rel=0.15)
 
 
-def test_a_robust_loss_leaves_no_sigma_open(short):
-    robust = dataclasses.replace(short, loss="student")
+def test_a_robust_loss_leaves_no_sigma_open(correlated):
+    robust = dataclasses.replace(correlated, loss="student")
     with pytest.raises(ValueError, match="loss is 'student'; only with squares"):
         marginal.with_unknown_sigmas(robust)
 
 
-# Whole fits
+# A whole fit
 
 
 @pytest.mark.slow
@@ -221,61 +309,3 @@ def test_a_run_is_sampled_with_the_noise_that_its_fit_found(undrawn, tmp_path):
     text = (Path(tmp_path) / "run" / run_folder.SUMMARY).read_text()
     assert "### Noise, estimated with the parameters" in text
     assert "Sigmas of the noise, which were sampled along:" in text
-
-
-def with_outliers(problem: Problem[jaxik.FootIK], seed: int) -> Problem[jaxik.FootIK]:
-    """The problem with three per cent of its reference's positions ten sigmas off."""
-    random = np.random.default_rng(seed)
-
-    def gross(x: jax.Array) -> jax.Array:
-        far = random.random(x.shape) < 0.03
-        return x + jnp.asarray(0.02 * random.normal(size=x.shape) * far)
-
-    return eqx.tree_at(
-        lambda p: [
-            p.data[0].reference.knee_ws,
-            p.data[0].reference.ankle.pos,
-            p.data[0].reference.pelvis.pos,
-        ],
-        problem,
-        replace_fn=gross,
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize(
-    ("rho", "loss", "options"),
-    [(RHO, "squares", BOTH), (0.0, "student", NoiseOptions("estimated"))],
-)
-def test_intervals_with_estimated_noise_cover_the_truth(rho, loss, options):
-    """Of three truths and six parameters, assumed with twice their sigmas; 14 of 18 or more have
-    a probability of 99.8 %."""
-    experiment = load_experiment(OZZ)
-    clip = dataclasses.replace(experiment.clips[0], start=2.0, end=8.0)
-    experiment = dataclasses.replace(experiment, clips=(clip,), noise=options, loss=loss)
-    problem = problems.make_problem(experiment)
-    space, true = problem.space, noise_of(problem)
-    made = with_noise(problem, dataclasses.replace(true, correlations=dict.fromkeys(KINDS, rho)))
-    assumed = dataclasses.replace(
-        true, sigmas={kind: 2 * sigma for kind, sigma in true.sigmas.items()}
-    )
-    covered = 0
-    for seed in range(3):
-        draw = np.random.default_rng(seed).normal(size=space.size)
-        u = space.start + 0.5 * space.prior.sd * jnp.asarray(draw)
-        captured = simulate(made, u, seed)
-        if loss == "student":
-            captured = with_outliers(captured, seed)
-        fitted, solution = search_with_noise(with_noise(captured, assumed), experiment)
-        found = noise_of(fitted)
-        if loss == "squares":
-            ratios = [found.sigmas[kind] / true.sigmas[kind] for kind in KINDS]
-            np.testing.assert_allclose(ratios, 1.0, atol=0.45)
-            np.testing.assert_allclose(list(found.correlations.values()), rho, atol=0.05)
-        else:
-            assert found.tails < 10
-        low, high = assess_identifiability(fitted, solution).interval.T
-        values = np.asarray(space.values(u))
-        covered += int(np.sum((low <= values) & (values <= high)))
-    assert covered >= 14
