@@ -1,4 +1,4 @@
-"""Long clips: computed in blocks, in bounded memory, and accurate in single precision."""
+"""Long clips: computed in bounded memory, and accurate in single precision."""
 
 import functools
 
@@ -13,7 +13,6 @@ from fitting.datasets.synthetic import walker
 from jaxik import presets
 from jaxik.world import terrain
 from support.cases import QUICK
-from support.clips import assert_close
 
 pytestmark = pytest.mark.slow
 
@@ -30,24 +29,6 @@ def walk() -> tuple[jaxik.Rig, jaxik.Frame]:
 def repeated(count: int) -> jaxik.Frame:
     """The walk repeated to `count` frames; it jumps at each repetition."""
     return jax.tree.map(lambda leaf: leaf[jnp.arange(count) % leaf.shape[0]], walk()[1])
-
-
-def ground() -> terrain.Terrain:
-    return terrain.plane(normal=(0.1, 1.0, 0.05))
-
-
-@pytest.mark.parametrize("block", [16, 80])
-def test_a_clip_in_blocks_equals_the_clip_as_a_whole(block):
-    rig, frames = walk()[0], repeated(50)
-    ik = presets.record(faithful=True)
-    whole = jaxik.run(ik, rig, ground(), frames)
-    assert_close(jaxik.run(ik, rig, ground(), frames, block=block), whole, 1e-12)
-
-
-@pytest.mark.parametrize("block", [0, -3])
-def test_a_block_without_frames_is_an_error(block):
-    with pytest.raises(ValueError, match=f"at least 1 frame.*got {block}"):
-        jaxik.run(presets.ozz(), walk()[0], ground(), repeated(5), block=block)
 
 
 def summed(height: jax.Array, frames: jaxik.Frame, block: int | None = None) -> jax.Array:
@@ -75,8 +56,8 @@ def test_reverse_mode_works_through_blocks_and_keeps_one_in_memory():
 
 def test_a_hundred_thousand_frames_in_single_precision_stay_accurate():
     count = 100_000
-    rig, frames = walk()[0], repeated(count)
-    given = (presets.record(), rig, ground(), frames)
+    ground = terrain.plane(normal=(0.1, 1.0, 0.05))
+    given = (presets.record(), walk()[0], ground, repeated(count))
     wide = jaxik.run(*given, block=5000)
     narrow = jaxik.run(*jax.tree.map(_single, given), block=5000)
     for name in ("hip", "knee", "ankle", "toe"):
