@@ -1,15 +1,14 @@
-"""Calibration: replicates, resuming, what is judged, the report and the command."""
+"""Calibration: replicates, what is judged, the report and the command."""
 
 import dataclasses
 import json
 import os
-import signal
+import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,118 +30,21 @@ from fitting.studies import run_folder
 from fitting.studies.calibration import calibration, replicates
 from fitting.studies.calibration.assessment import Assessment, assess, summarise
 from fitting.studies.calibration.calibration import Calibration, CalibrationProgress, Observers
-from support.experiments import CLIP, ROOT, write
+from support import small_studies
+from support.experiments import ROOT
 from support.pages import Page
+from support.small_studies import SAMPLE, kept, write_calibration
 
-SIGMA = 0.02
-FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
-SAMPLE = "[sample]\nwalkers = 8\nstop_at = 25.0\nmax_steps = 400\n"
 NUMBERS = "replicates", "level", "inside", "outside", "fit_coverage", "ranks", "chain_coverage"
-
-
-def values_of(ik) -> jax.Array:
-    return jnp.stack([ik.pelvis.on_gain, ik.foot.max_pitch])
-
-
-def residuals_of_scenes(ik, scenes):
-    """Two parameters against two numbers that stand in the reference."""
-    measured = scenes[0].reference.pelvis.pos[0, :2]
-    return (values_of(ik) - measured) / jnp.asarray(SIGMA, measured.dtype)
-
-
-def simulation(noise: float = 1.0, shift: float = 0.0):
-    """Writes the truth, plus noise in standard deviations, into the reference."""
-
-    def simulate(problem, u, seed):
-        errors = SIGMA * (shift + noise * np.random.default_rng(seed).normal(size=2))
-        measured = values_of(problem.space.unpack(u)) + errors
-        pos = problem.data[0].reference.pelvis.pos
-        return eqx.tree_at(
-            lambda p: p.data[0].reference.pelvis.pos, problem, pos.at[0, :2].set(measured)
-        )
-
-    return simulate
 
 
 @pytest.fixture
 def experiment_file(tmp_path, monkeypatch) -> Path:
-    """Half a second of the uneven walk, with residuals and a simulation that compile at once."""
-    monkeypatch.setattr(problems, "residuals_of_scenes", residuals_of_scenes)
-    monkeypatch.setattr(replicates, "simulate", simulation())
-    return write_half_second(tmp_path)
-
-
-def write_half_second(folder: Path, top: str = "", rest: str = SAMPLE) -> Path:
-    clip = "start = 1.0\nend = 1.5"
-    return write(folder, "hill.toml", top=top, clips=CLIP, clip=clip, free=FREE, rest=rest)
+    return small_studies.quick_calibration(tmp_path, monkeypatch)
 
 
 def calibrate(path: Path, folder: Path | None, count: int, **options) -> Assessment:
     return fitting.calibrate(path, folder, replicates=count, **options)
-
-
-def kept(folder: Path) -> dict[str, dict]:
-    """All replicates on disk without how long they took."""
-    return {
-        f"{path.parent.name}/{path.name}": json.loads(path.read_text()) | {"seconds": 0}
-        for path in sorted(folder.glob("*/*.json"))
-    }
-
-
-# What is judged
-
-
-def test_a_right_program_is_inside_all_bounds(experiment_file):
-    assessment = calibrate(experiment_file, None, 24, chains=True)
-    assert assessment.inside and assessment.outside == []
-    assert assessment.fit_coverage.total == 48 and assessment.fit_coverage.fraction > 0.85
-    assert list(assessment.profile_coverage) == [0.5, 0.8]
-    assert list(assessment.ranks) == ["pelvis.on_gain", "foot.max_pitch", "log-probability"]
-    assert {len(test.ranks) for test in assessment.ranks.values()} == {24}
-    assert assessment.valley.hits == 24 and assessment.wrong == ()
-    assert list(assessment.chain_coverage) == [0.5, 0.8, 0.95]
-
-
-@pytest.mark.parametrize(
-    ("noise", "shift", "count"),
-    [(3.0, 0.0, 24), (1.0, 2.0, 12)],
-    ids=["three times the noise", "a shift"],
-)
-def test_a_wrong_noise_is_found_by_intervals_and_ranks(
-    experiment_file, monkeypatch, noise, shift, count
-):
-    monkeypatch.setattr(replicates, "simulate", simulation(noise, shift))
-    assessment = calibrate(experiment_file, None, count, chains=True)
-    assert not assessment.inside
-    assert "the fit's 95 % intervals" in assessment.outside
-    assert {"the ranks of pelvis.on_gain", "the ranks of foot.max_pitch"} <= {*assessment.outside}
-    assert "the posterior's 95 % intervals" in assessment.outside
-    assert "the 80 % intervals of profiles" in assessment.outside
-    assert assessment.valley.inside, "the search is not to blame"
-
-
-def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(experiment_file, tmp_path):
-    made = calibrate_study(experiment_file, tmp_path / "out", 4)
-    fits = [{**fitted} for fitted in made.fits]
-    fits[1]["cost"] += 3.5
-    fits[2] |= {"cost": fits[2]["cost"] + 90.0, "converged": False}
-    fits[3]["cost"] += 2.5
-    assessment = assess(Calibration(fits, []))  # type: ignore[arg-type]
-    assert (assessment.wrong, assessment.wrong_but_converged) == ((2, 3), (2,))
-    assert assessment.unconverged == (3,) and assessment.valley.hits == 2
-    text = calibration_report.calibration_text(assessment)
-    assert "Replicates in another valley: 2, 3 (2 in all)." in text
-    assert "In another valley, but said to have converged: 2 (1 in all)." in text
-    assert "a valley 3.5 above the truth's" in calibration_report.fit_line(fits[1])  # type: ignore[arg-type]
-
-
-def test_only_the_intervals_of_thresholds_may_cover_more_than_they_promise(experiment_file):
-    """Whose ends lie on plateaus of the cost: 95 % is what they promise at least."""
-    fitted = calibrate_study(experiment_file, None, 1).fits[0]
-    rows = [{**row, "interval": [row["low"], row["high"]]} for row in fitted["parameters"]]
-    always: Any = {**fitted, "parameters": [{**rows[0], "kind": "threshold"}, rows[1]]}
-    covered = assess(Calibration([always] * 400, [])).fit_coverage_of
-    assert covered["pelvis.on_gain"].inside and not covered["foot.max_pitch"].inside
 
 
 def calibrate_study(path: Path, folder: Path | None, count: int, **options) -> Calibration:
@@ -152,16 +54,91 @@ def calibrate_study(path: Path, folder: Path | None, count: int, **options) -> C
         return calibration.calibrate(experiment, problem, folder, count, **options)
 
 
-def test_recovery_counts_determined_parameters_within_5_percent_of_their_range(
-    experiment_file, tmp_path
-):
-    made = calibrate_study(experiment_file, tmp_path / "out", 2)
-    for i, (shift, determined) in enumerate([(0.06, True), (0.04, True)]):
-        row = made.fits[i]["parameters"][0]
-        width = row["high"] - row["low"]
-        row |= {"value": made.fits[i]["truth"][0] + shift * width, "determined": determined}
-        made.fits[i]["parameters"][1]["determined"] = False
-    assessment = assess(made)
+class Made(NamedTuple):
+    """What was made of four replicates."""
+
+    folder: Path
+    printed: str
+    found: Calibration
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Made:
+    folder, lines = tmp_path_factory.mktemp("calibration"), []
+    with pytest.MonkeyPatch.context() as patch:
+        path, out = small_studies.quick_calibration(folder, patch), folder / "out"
+        calibrate(path, out, 4, chains=True, log=lines.append)
+        return Made(out, "\n".join(lines), calibrate_study(path, out, 4, chains=True))
+
+
+@pytest.fixture
+def made(finished, tmp_path) -> Made:
+    """The same, to be changed."""
+    folder = Path(shutil.copytree(finished.folder, tmp_path / "out"))
+    fits = json.loads(json.dumps(finished.found.fits))
+    return finished._replace(folder=folder, found=Calibration(fits, finished.found.chains))
+
+
+# What is judged
+
+
+def test_a_right_program_is_inside_all_bounds(experiment_file):
+    assessment = calibrate(experiment_file, None, 8, chains=True)
+    assert assessment.inside and assessment.outside == []
+    assert assessment.fit_coverage.total == 16 and assessment.fit_coverage.fraction > 0.85
+    assert list(assessment.profile_coverage) == [0.5, 0.8]
+    assert list(assessment.ranks) == ["pelvis.on_gain", "foot.max_pitch", "log-probability"]
+    assert {len(test.ranks) for test in assessment.ranks.values()} == {8}
+    assert assessment.valley.hits == 8 and assessment.wrong == ()
+    assert list(assessment.chain_coverage) == [0.5, 0.8, 0.95]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "count"),
+    [pytest.param({"noise": 3.0}, 24, marks=pytest.mark.slow), ({"shift": 3.0}, 8)],
+)
+def test_a_wrong_noise_is_found_by_intervals_and_ranks(tmp_path, monkeypatch, wrong, count):
+    path = small_studies.quick_calibration(tmp_path, monkeypatch, **wrong)
+    assessment = calibrate(path, None, count, chains=True)
+    assert not assessment.inside
+    assert "the fit's 95 % intervals" in assessment.outside
+    assert {"the ranks of pelvis.on_gain", "the ranks of foot.max_pitch"} <= {*assessment.outside}
+    assert "the posterior's 95 % intervals" in assessment.outside
+    assert "the 80 % intervals of profiles" in assessment.outside
+    assert assessment.valley.inside, "the search is not to blame"
+
+
+def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made):
+    fits: list[Any] = made.found.fits
+    fits[1]["cost"] += 3.5
+    fits[2] |= {"cost": fits[2]["cost"] + 90.0, "converged": False}
+    fits[3]["cost"] += 2.5
+    assessment = assess(Calibration(fits, []))
+    assert (assessment.wrong, assessment.wrong_but_converged) == ((2, 3), (2,))
+    assert assessment.unconverged == (3,) and assessment.valley.hits == 2
+    text = calibration_report.calibration_text(assessment)
+    assert "Replicates in another valley: 2, 3 (2 in all)." in text
+    assert "In another valley, but said to have converged: 2 (1 in all)." in text
+    assert "a valley 3.5 above the truth's" in calibration_report.fit_line(fits[1])
+
+
+def test_only_the_intervals_of_thresholds_may_cover_more_than_they_promise(made):
+    """Whose ends lie on plateaus of the cost: 95 % is what they promise at least."""
+    fitted = made.found.fits[0]
+    rows = [{**row, "interval": [row["low"], row["high"]]} for row in fitted["parameters"]]
+    always: Any = {**fitted, "parameters": [{**rows[0], "kind": "threshold"}, rows[1]]}
+    covered = assess(Calibration([always] * 400, [])).fit_coverage_of
+    assert covered["pelvis.on_gain"].inside and not covered["foot.max_pitch"].inside
+
+
+def test_recovery_counts_determined_parameters_within_5_percent_of_their_range(made):
+    fits = made.found.fits[:2]
+    for fitted, shift in zip(fits, (0.06, 0.04), strict=True):
+        first, second = fitted["parameters"]
+        value = fitted["truth"][0] + shift * (first["high"] - first["low"])
+        first |= {"value": value, "determined": True}
+        second["determined"] = False
+    assessment = assess(Calibration(fits, []))
     assert (assessment.recovery.hits, assessment.recovery.total) == (1, 2)
     assert assessment.recovery_of["foot.max_pitch"].total == 0
     assert "0 of 0" in str(calibration_tables.parameter_table(assessment))
@@ -192,7 +169,7 @@ def test_the_level_at_a_truth_is_that_of_a_parabola_between_points(experiment_fi
         assert level == pytest.approx(expected, abs=0.03)
 
 
-# Replicates and resuming
+# Replicates
 
 
 def test_truths_come_from_the_prior_and_differ(experiment_file):
@@ -208,60 +185,32 @@ def test_truths_come_from_the_prior_and_differ(experiment_file):
     assert len({truth.noise_seed for truth in truths} | {t.seed for t in truths}) == 800
 
 
-def test_a_cluster_makes_the_same_replicates(experiment_file, tmp_path):
-    here, there = tmp_path / "here", tmp_path / "there"
-    expected = calibrate(experiment_file, here, 2)
+def test_a_cluster_makes_the_same_replicates(made, experiment_file, tmp_path):
+    there = tmp_path / "there"
     reports: list[CalibrationProgress] = []
     options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}
     with LocalCluster(n_workers=1, processes=False, **options) as workers:
         address: str = workers.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
-        assessment = calibrate(
-            experiment_file, there, 2, scheduler=address, progress=reports.append
-        )
-    assert summarise(assessment) == summarise(expected)
-    assert kept(there) == kept(here)
+        found = calibrate(experiment_file, there, 2, scheduler=address, progress=reports.append)
+    assert summarise(found) == summarise(assess(Calibration(made.found.fits[:2], [])))
+    here = kept(made.folder)
+    assert all(here[name] == fit for name, fit in kept(there).items() if name.startswith("fits/"))
     assert {report.replicate for report in reports} == {1, 2}
     assert reports[-1].stage == "2 of 2 fits done" and reports[-1].remaining == 0.0
 
 
-def test_an_interrupted_calibration_continues_bit_by_bit(experiment_file, tmp_path):
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    expected = calibrate(experiment_file, whole, 3, chains=True)
-
-    def stop_in(stage: str):
-        def stop(report: CalibrationProgress) -> None:
-            if report.replicate == 2 and report.stage.startswith(stage):
-                raise KeyboardInterrupt
-
-        return stop
-
-    for stage, unfinished in (("polish", "fits/0001.json"), ("chain", "chains/0001.json")):
-        with pytest.raises(KeyboardInterrupt):
-            calibrate(experiment_file, out, 3, chains=True, progress=stop_in(stage))
-        assert unfinished not in kept(out)
-        assert unfinished.replace("1", "0") in kept(out)
-    assessment = calibrate(experiment_file, out, 3, chains=True)
-    assert kept(out) == kept(whole) and len(kept(out)) == 6
-    for name in ("calibration.json", "summary.md"):
-        assert (out / name).read_text() == (whole / name).read_text()
-    assert assessment.fit_coverage == expected.fit_coverage
-
-
-def test_finished_replicates_are_not_repeated_and_more_may_follow(experiment_file, tmp_path):
+def test_finished_replicates_are_not_repeated_and_more_may_follow(made, experiment_file):
+    for name in ("fits/0003.json", "chains/0003.json", "chains/0002.json"):
+        (made.folder / name).unlink()
     new: list[str] = []
     observers = Observers(
         on_fit=lambda fitted: new.append(f"fit {fitted['number']}"),
         on_chain=lambda chain: new.append(f"chain {chain['number']}"),
     )
-    out = tmp_path / "out"
-    first = calibrate_study(experiment_file, out, 1, observers=observers)
-    more = calibrate_study(experiment_file, out, 2, chains=True, observers=observers)
-    assert new == ["fit 0", "fit 1", "chain 0", "chain 1"]
-    assert more.fits[:1] == first.fits
-    assert calibrate_study(experiment_file, out, 2, observers=observers) == Calibration(
-        more.fits, []
-    )
-    assert len(new) == 4
+    first = calibrate_study(experiment_file, made.folder, 3, observers=observers)
+    assert not new and first == Calibration(made.found.fits[:3], [])
+    calibrate_study(experiment_file, made.folder, 4, chains=True, observers=observers)
+    assert new == ["fit 3", "chain 2", "chain 3"]
 
 
 def test_nothing_compiles_between_replicates(experiment_file):
@@ -290,32 +239,23 @@ def test_nothing_compiles_between_replicates(experiment_file):
         ("", SAMPLE + "[start]\npelvis.on_gain = 0.5\n", "in: start; name"),
     ],
 )
-def test_the_folder_of_another_calibration_is_refused(experiment_file, tmp_path, top, rest, words):
-    out = tmp_path / "out"
-    calibrate_study(experiment_file, out, 1)
-    before = kept(out)
-    other = write_half_second(tmp_path, top, rest)
+def test_the_folder_of_another_calibration_is_refused(
+    made, experiment_file, tmp_path, top, rest, words
+):
+    before = kept(made.folder)
     with pytest.raises(ValueError, match=words):
-        calibrate_study(other, out, 1)
-    assert kept(out) == before
+        calibrate_study(write_calibration(tmp_path, top, rest), made.folder, 1)
+    assert kept(made.folder) == before
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"number": 3}', '{"number": 0}', "[" * 10**5])
-@pytest.mark.parametrize("name", ["identity.json", "fits/0000.json"])
-def test_a_file_of_something_else_is_refused(experiment_file, tmp_path, name, text):
-    out = tmp_path / "out"
-    calibrate_study(experiment_file, out, 1)
-    (out / name).write_text(text)
-    with pytest.raises(ValueError, match=f"{name}: not written by `jaxik calibrate`"):
-        calibrate_study(experiment_file, out, 1)
-    assert (out / name).read_text() == text
-
-
-def test_replicates_without_an_identity_are_refused(experiment_file, tmp_path):
-    calibrate_study(experiment_file, tmp_path / "out", 1)
-    (tmp_path / "out" / "identity.json").unlink()
+def test_replicates_of_an_unknown_experiment_are_refused(made, experiment_file):
+    identity = made.folder / "identity.json"
+    identity.write_text('{"seed": 0}')
+    with pytest.raises(ValueError, match="identity.json: not written by `jaxik calibrate`"):
+        calibrate_study(experiment_file, made.folder, 1)
+    identity.unlink()
     with pytest.raises(ValueError, match=r"out: has replicates but no identity.json"):
-        calibrate_study(experiment_file, tmp_path / "out", 1)
+        calibrate_study(experiment_file, made.folder, 1)
 
 
 def test_a_mistake_in_a_replicate_says_in_which(experiment_file, monkeypatch):
@@ -330,41 +270,46 @@ def test_a_mistake_in_a_replicate_says_in_which(experiment_file, monkeypatch):
 # Report and command
 
 
-def test_the_command_writes_a_report_and_ends_with_status_0(experiment_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    words = ["calibrate", str(experiment_file), "-n", "3", "--chains", "-o", str(out)]
-    assert main.main(words) == 0
-    printed = capsys.readouterr().out
-    assert "3 truths of 2 parameters of record" in printed
+def test_the_folder_has_a_report(finished):
+    out, printed, _ = finished
+    assert "4 truths of 2 parameters of record" in printed
     assert "replicate 3: the truth's valley, 2 of 2 starts agree" in printed
-    assert "Calibrated: on 3 simulated motions everything is inside its bounds." in printed
+    assert "Calibrated: on 4 simulated motions everything is inside its bounds." in printed
     assert f"read {out / 'summary.md'}" in printed
     summary = (out / "summary.md").read_text()
-    assert summary.startswith("# hill: calibration\n\nCalibrated: on 3 simulated motions")
+    assert summary.startswith("# hill: calibration\n\nCalibrated: on 4 simulated motions")
     for picture in ("ranks.png", "recovery.png"):
         assert f"({picture})" in summary and (out / picture).stat().st_size > 10_000
     page = Page(out / run_folder.PAGE)
-    assert "but 3 simulated motions prove little, as these bounds are wide" in page.text
+    assert "but 4 simulated motions prove little, as these bounds are wide" in page.text
     assert page.elements.count("img") == 2 and "h2 Ranks" in page.headings
     numbers = json.loads((out / "calibration.json").read_text())
     assert set(NUMBERS) <= numbers.keys() and numbers["experiment"] == "hill"
-    assert numbers["inside"] is True and len(numbers["ranks"]["pelvis.on_gain"]["ranks"]) == 3
+    assert numbers["inside"] is True and len(numbers["ranks"]["pelvis.on_gain"]["ranks"]) == 4
     assert set(numbers["chain_coverage"]) == {"0.5", "0.8", "0.95"}
 
 
-def test_what_is_outside_is_named_and_ends_with_status_5(
-    experiment_file, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr(replicates, "simulate", simulation(shift=6.0))
-    words = ["calibrate", str(experiment_file), "-n", "8", "-o", str(tmp_path / "out")]
-    assert main.main(words) == 5
+def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, capsys, undrawn):
+    path = small_studies.quick_calibration(tmp_path, monkeypatch, shift=6.0)
+    out = tmp_path / "out"
+    assert main.main(["calibrate", str(path), "-n", "8", "-o", str(out)]) == 5
     printed = capsys.readouterr().out
     assert "Not calibrated: on 8 simulated motions, outside their bounds: the fit's 95 %" in printed
     assert "**no**, too few" in printed
-    assert not (tmp_path / "out" / "ranks.png").exists(), "there are no chains"
-    page = Page(tmp_path / "out" / run_folder.PAGE)
+    assert not (out / "ranks.png").exists(), "there are no chains"
+    page = Page(out / run_folder.PAGE)
     assert "hill Not calibrated ◐ Of 8 simulated motions, outside their bounds: the" in page.text
     assert "No posterior was sampled" in page.text and "no, too few" in page.text
+
+
+def test_the_picture_marks_ranks_that_leave_their_band(made):
+    ranks = assess(made.found).ranks
+    wrong = dataclasses.replace(ranks["pelvis.on_gain"], ranks=np.zeros(40, int))
+    figure = calibration_plots.ranks({**ranks, "foot.max_pitch": wrong}, "title")
+    titles = [axes.get_title("left") for axes in figure.axes]
+    assert titles[:6] == [
+        "pelvis.on_gain", "", "foot.max_pitch", "outside its band", "log-probability", ""
+    ]  # fmt: skip
 
 
 def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(
@@ -383,47 +328,6 @@ def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(
         residuals = np.asarray(simulated.residuals(jnp.asarray(truth.u)))[:-2]
         rms.append(np.sqrt(np.mean(residuals[residuals != 0] ** 2)))
     assert rms == pytest.approx([1.0, 2.0], rel=0.1)
-
-
-@pytest.mark.parametrize("factor", [0.0, -1.0])
-def test_noise_that_is_not_positive_is_a_mistake(experiment_file, tmp_path, factor):
-    with pytest.raises(ValueError, match=f"noise_factor is {factor:g}; wanted a positive number"):
-        fitting.calibrate(experiment_file, tmp_path / "out", noise_factor=factor)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("count", [0, -2])
-def test_fewer_than_one_replicate_is_a_mistake(experiment_file, tmp_path, count):
-    with pytest.raises(ValueError, match=f"replicates is {count}; wanted 1 or more"):
-        fitting.calibrate(experiment_file, tmp_path / "out", replicates=count)
-    assert not (tmp_path / "out").exists()
-
-
-def test_ctrl_c_ends_with_status_130_and_keeps_what_is_finished(
-    experiment_file, tmp_path, monkeypatch
-):
-    make = calibration.fit_replicate
-
-    def interrupted(problem, experiment, number, progress, **options):
-        if number == 1:
-            signal.raise_signal(signal.SIGINT)
-        return make(problem, experiment, number, progress, **options)
-
-    monkeypatch.setattr(calibration, "fit_replicate", interrupted)
-    out = tmp_path / "out"
-    assert main.main(["calibrate", str(experiment_file), "-n", "3", "-o", str(out)]) == 130
-    assert kept(out).keys() == {"fits/0000.json"}
-
-
-def test_the_picture_marks_ranks_that_leave_their_band(experiment_file):
-    assessment = calibrate(experiment_file, None, 3, chains=True)
-    wrong = dataclasses.replace(assessment.ranks["pelvis.on_gain"], ranks=np.zeros(40, int))
-    ranks = {**assessment.ranks, "foot.max_pitch": wrong}
-    figure = calibration_plots.ranks(ranks, "title")
-    titles = [axes.get_title("left") for axes in figure.axes]
-    assert titles[:6] == [
-        "pelvis.on_gain", "", "foot.max_pitch", "outside its band", "log-probability", ""
-    ]  # fmt: skip
 
 
 @pytest.mark.slow
