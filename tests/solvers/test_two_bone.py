@@ -78,11 +78,11 @@ def test_gradients_are_finite_where_a_swing_or_a_knee_has_no_single_answer():
 
 
 def test_a_limb_straight_to_within_rounding_has_no_gradient_in_its_reach():
-    limb = limbs(RNG, RNG.uniform(0.1, 3.0, ROWS))
-    full = reaches(*limb[:2], 1.0)
+    to_hip, to_ankle, hinge = limbs(RNG, RNG.uniform(0.1, 3.0, ROWS))
+    full = reaches(to_hip, to_ankle, 1.0)
     slopes = jax.jit(jax.vmap(jax.jacfwd(hinge_half_angle, argnums=3)))
     for reach in (full, np.nextafter(full, 0.0), np.nextafter(full, 9.0)):
-        np.testing.assert_array_equal(slopes(*limb, reach), 0.0)
+        np.testing.assert_array_equal(slopes(to_hip, to_ankle, hinge, reach), 0.0)
 
 
 @pytest.mark.parametrize("hinge", [X, Z, (X + 2.0 * Z) / np.sqrt(5.0)], ids=["x", "z", "between"])

@@ -1,5 +1,7 @@
 """Heightfields and height functions: agreement with meshes, SciPy and formulas; gradients."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,7 +50,7 @@ def rays(count: int, up=UPS["y"], beside: float = 0.5) -> np.ndarray:
     return local @ axes_about(up) + ORIGIN
 
 
-def field(heights, interpolation="bilinear", origin=ORIGIN, **named) -> terrain.Terrain:
+def field(heights, interpolation="bilinear", origin: Any = ORIGIN, **named) -> terrain.Terrain:
     return terrain.heightfield(heights, SPACING, origin, interpolation=interpolation, **named)
 
 
