@@ -1,13 +1,15 @@
-"""Residuals of the real pipeline, and their Jacobian."""
+"""Residuals of the real pipeline and their Jacobian, and references that are simulated."""
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import jaxik
@@ -16,14 +18,16 @@ from fitting.experiments.known_values import load_known_values
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
-from fitting.problem.shared_world import share_world
+from fitting.problem.simulation import autoregression, simulate
+from fitting.runtime.program_cache import committed
 from support.experiments import CLIP, UNEVEN_WALK, write
-
-pytestmark = pytest.mark.slow
+from support.problems import compilations
 
 BESIDE = 0.1  # in u, away from where the clip was made
 STEP = 1e-6  # of u, to either side
 TOLERANCE = 1e-5  # of a column's largest derivative
+SEEDS = 8
+MASKED = 9  # a frame that was not observed
 EVERY_KIND = """[sigmas]
 ankle = 0.02
 knee = 0.03
@@ -36,56 +40,69 @@ correlation = { ankle = 0.4, knee = 0.3, pelvis = 0.9, foot = 0.2, body = 0.1 }
 """
 
 
-@pytest.fixture(scope="module")
-def embedded() -> Problem:
-    """The embedded experiment."""
-    return problems.make_problem(experiment_files.load_experiment(UNEVEN_WALK))
+class Evaluated(NamedTuple):
+    """One program for all tests: what a problem of one clip says at a point."""
+
+    residuals: np.ndarray
+    """Of the data."""
+    jacobian: np.ndarray
+    """Of them."""
+    result: jaxik.Result
+
+    def by_kind(self) -> dict[str, np.ndarray]:
+        """Residuals, frame by frame."""
+        frames = len(self.result.body.pos)
+        widths = {"ankle": 6, "knee": 6, "pelvis": 3, "foot": 6, "body": 3, "contact": 2}
+        ends = np.cumsum([frames * width for width in widths.values()])
+        *parts, smooth = np.split(self.residuals, ends)
+        whole = {kind: x.reshape(frames, -1) for kind, x in zip(widths, parts, strict=True)}
+        return whole | {"smooth": smooth.reshape(frames - 2, 6)}
+
+
+# Compiled without optimisation, also where other tests are not.
+@functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+def evaluation(problem: Problem, u: jax.Array):
+    of_all, jacobian = problem.residuals_and_jacobian(u)
+    (scene,), ik, prior = problem.data, problem.space.unpack(u), problem.space.size
+    result = jaxik.run(ik, scene.rig, scene.terrain, scene.frames)
+    return of_all[:-prior], jacobian[:-prior], result
+
+
+def evaluate(problem: Problem, u: np.ndarray | jax.Array) -> Evaluated:
+    of_data, jacobian, result = evaluation(*committed((problem, jnp.asarray(u))))
+    return Evaluated(np.asarray(of_data), np.asarray(jacobian), result)
+
+
+def changed(
+    problem: Problem, sigmas: dict[str, float] | None = None, reference: dict | None = None, **other
+) -> Problem:
+    """The problem with other parts of its scene, of the same types, so that nothing recompiles."""
+    (scene,) = problem.data
+    alike = {k: jnp.full_like(getattr(scene.sigmas, k), x) for k, x in (sigmas or {}).items()}
+    other["sigmas"] = dataclasses.replace(scene.sigmas, **alike)
+    other["reference"] = dataclasses.replace(scene.reference, **(reference or {}))
+    return dataclasses.replace(problem, data=(dataclasses.replace(scene, **other),))
 
 
 @pytest.fixture(scope="module")
-def truth(embedded) -> jax.Array:
-    """`u` of the parameters that made its clip; what their file leaves out is the preset's."""
-    known = load_known_values(experiment_files.load_experiment(UNEVEN_WALK))
-    assert known is not None
-    names = embedded.space.names
-    return embedded.space.pack({name: known[name] for name in names if name in known})
-
-
-# Compiled without optimisation, for what is not the Jacobian that a fit uses.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
-
-@quick_jit
-def residuals_and_result(ik, scene):
-    return residuals.residuals_of_scenes(ik, (scene,)), jaxik.run(
-        ik, scene.rig, scene.terrain, scene.frames
-    )
-
-
-def compute_residuals(scene) -> np.ndarray:
-    return np.asarray(residuals_and_result(jaxik.presets.record(), scene)[0])
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Scene:
+def problem(tmp_path_factory) -> Problem:
     """Two thirds of a second with every kind of residual and an unobserved frame."""
     path = write(
         tmp_path_factory.mktemp("scene"), clips=CLIP, clip="start = 2.0\nend = 2.67",
         rest=EVERY_KIND,
     )  # fmt: skip
-    (scene,) = problems.make_problem(experiment_files.load_experiment(path)).data
-    observed = jnp.ones_like(scene.reference.observed).at[9].set(False)
-    return eqx.tree_at(lambda scene: scene.reference.observed, scene, observed)
+    problem = problems.make_problem(experiment_files.load_experiment(path))
+    observed = jnp.ones_like(problem.data[0].reference.observed).at[MASKED].set(False)
+    return changed(problem, reference={"observed": observed})
 
 
 @pytest.fixture(scope="module")
-def scene_residuals(scene) -> np.ndarray:
-    return compute_residuals(scene)
+def start(problem) -> Evaluated:
+    return evaluate(problem, problem.space.start)
 
 
-def expected_residuals(scene) -> dict[str, np.ndarray]:
+def expected_residuals(result: jaxik.Result, scene: Scene) -> dict[str, np.ndarray]:
     """Computed with NumPy and SciPy from the poses of the pipeline."""
-    result = residuals_and_result(jaxik.presets.record(), scene)[1]
     result, scene = jax.tree.map(np.array, (result, scene))  # copies, which SciPy may write to
     world, reference, sigmas = scene.frames.world_from_model, scene.reference, scene.sigmas
     heading = rotation(world.rot)
@@ -145,62 +162,33 @@ def rotation_vector(a: Rotation, b: Rotation) -> np.ndarray:
     return vector * np.sinc(angle / 2 / np.pi)
 
 
-def test_residuals_agree_with_numpy(scene, scene_residuals):
-    expected = expected_residuals(scene)
+def test_residuals_agree_with_numpy(problem, start):
+    expected = expected_residuals(start.result, problem.data[0])
     flat = np.concatenate([part.ravel() for part in expected.values()])
-    np.testing.assert_allclose(scene_residuals, flat, rtol=0, atol=1e-7 * np.abs(flat).max())
+    np.testing.assert_allclose(start.residuals, flat, rtol=0, atol=1e-7 * np.abs(flat).max())
     for kind, part in expected.items():
         assert np.abs(part).max() > 0.01, kind
 
 
-def test_an_unobserved_frame_has_zero_residuals_and_affects_no_other(scene, scene_residuals):
-    frames = scene.reference.observed.size
-    ankle = scene_residuals[: frames * 6].reshape(frames, 6)
-    assert not ankle[9].any() and ankle[[8, 10]].all()
-    smooth = scene_residuals[-(frames - 2) * 6 :].reshape(frames - 2, 6)
-    np.testing.assert_array_equal(np.flatnonzero(~smooth.any(axis=1)), [7, 8, 9])
-    knee = scene.reference.knee_ws
-    with_nan = eqx.tree_at(
-        lambda scene: scene.reference.knee_ws,
-        scene,
-        knee.at[9].set(jnp.full_like(knee[9], jnp.nan)),
-    )
-    np.testing.assert_array_equal(compute_residuals(with_nan), scene_residuals)
+def test_an_unobserved_frame_has_zero_residuals_and_affects_no_other(problem, start):
+    masked = {kind: np.flatnonzero(~x.any(axis=1)).tolist() for kind, x in start.by_kind().items()}
+    assert masked["ankle"] == [MASKED]
+    assert masked["smooth"] == [MASKED - 2, MASKED - 1, MASKED]
+    knee_ws = problem.data[0].reference.knee_ws.at[MASKED].set(jnp.nan)
+    again = evaluate(changed(problem, reference={"knee_ws": knee_ws}), problem.space.start)
+    np.testing.assert_array_equal(again.residuals, start.residuals)
 
 
-def test_an_infinite_sigma_switches_a_kind_off(scene, scene_residuals):
-    sigmas = dataclasses.replace(scene.sigmas, ankle=jnp.full_like(scene.sigmas.ankle, jnp.inf))
-    without = eqx.tree_at(lambda scene: scene.sigmas, scene, sigmas)
-    without_ankle = compute_residuals(without)
-    count = scene.reference.ankle.pos.size
-    assert not without_ankle[:count].any() and without_ankle.size == scene_residuals.size
-    np.testing.assert_array_equal(without_ankle[count:], scene_residuals[count:])
-
-
-def test_an_absent_leg_has_zero_residuals(scene):
-    present = jnp.array([True, False])
-    one_legged = eqx.tree_at(lambda scene: scene.rig.present, scene, present)
-    ankles = compute_residuals(one_legged)[: scene.reference.ankle.pos.size].reshape(-1, 2, 3)
-    assert ankles[:, 0].any() and not ankles[:, 1].any()
-
-
-def test_several_clips_follow_one_another(scene, scene_residuals):
-    """Other clips change nothing: neither the first residuals of a clip nor its accelerations."""
-    motion = (scene.frames, scene.pelvis, scene.reference)
-    start = jax.tree.map(lambda x: x[:12], motion)
-    frames, pelvis, reference = start
-    short = dataclasses.replace(scene, frames=frames, pelvis=pelvis, reference=reference)
-    parts = [short, scene]
-    sigmas = dataclasses.replace(scene.sigmas, ankle=jnp.asarray(0.05), smooth=jnp.asarray(3.0))
-    parts[0] = dataclasses.replace(parts[0], sigmas=sigmas)
-    assert np.isfinite(scene.sigmas.smooth)
-    shared = tuple(share_world(parts, jaxik.presets.record().probe))
-    assert all(part.place is not None for part in shared)
-    ik = jaxik.presets.record()
-    together = quick_jit(residuals.residuals_of_scenes)(ik, shared)
-    apart = [compute_residuals(part) for part in parts]
-    np.testing.assert_allclose(together, np.concatenate(apart), atol=1e-6)
-    assert apart[1].size == scene_residuals.size
+def test_an_infinite_sigma_switches_a_kind_off_and_an_absent_leg_has_no_residuals(problem, start):
+    off = changed(problem, sigmas={"ankle": np.inf})
+    without = evaluate(off, problem.space.start).by_kind()
+    for kind, expected in start.by_kind().items():
+        np.testing.assert_array_equal(without[kind], 0 if kind == "ankle" else expected)
+    rig = dataclasses.replace(problem.data[0].rig, present=jnp.array([True, False]))
+    of = evaluate(changed(problem, rig=rig), problem.space.start).by_kind()
+    for kind in ("ankle", "knee", "foot", "contact", "smooth"):
+        first, second = np.split(of[kind], 2, axis=1)
+        assert first.any() and not second.any(), kind
 
 
 def test_whitening_recovers_the_innovations_of_autoregressive_noise():
@@ -231,77 +219,109 @@ def test_the_rotation_between_two_quaternions_does_not_depend_on_their_signs():
         np.testing.assert_allclose(residuals.rotation_between(start, sign * end), step, atol=1e-5)
 
 
-@jax.jit
-def residuals_and_jacobian(problem, u):
-    return problem.residuals_and_jacobian(u)
-
-
-@quick_jit
-def residuals_at(problem, points):
-    return jax.vmap(problem.residuals)(points)
-
-
-@pytest.fixture(scope="module")
-def jacobian(embedded, truth) -> np.ndarray:
-    """The Jacobian beside the truth."""
-    return np.asarray(residuals_and_jacobian(embedded, truth + BESIDE)[1])
-
-
-@pytest.fixture(scope="module")
-def around(embedded, truth) -> np.ndarray:
-    """Residuals at the truth, then a step ahead of and behind the point beside it, by column."""
-    moves = STEP * jnp.eye(truth.size)
-    beside = truth + BESIDE
-    return np.asarray(
-        residuals_at(embedded, jnp.stack([truth, *(beside + moves), *(beside - moves)]))
-    )
-
-
-def test_at_the_truth_residuals_are_one_standard_deviation(embedded, around):
-    at_truth = around[0, : -embedded.space.size]
+def test_at_the_truth_residuals_are_one_standard_deviation():
+    """In a part of the embedded experiment; what its truth leaves out is as in the preset."""
+    experiment = experiment_files.load_experiment(UNEVEN_WALK)
+    known = load_known_values(experiment)
+    assert known is not None
+    clip = dataclasses.replace(experiment.clips[0], start=0.0, end=1.0)
+    embedded = problems.make_problem(dataclasses.replace(experiment, clips=(clip,)))
+    names = [name for name in embedded.space.names if name in known]
+    truth = embedded.space.pack({name: known[name] for name in names})
+    at_truth = np.asarray(embedded.residuals(truth))[: -embedded.space.size]
     active = at_truth[at_truth != 0.0]
-    assert active.size > 8_000
-    assert np.mean(active**2) == pytest.approx(1.0, rel=0.05)
-    assert abs(np.mean(active)) < 0.05
+    assert active.size > 500
+    assert np.mean(active**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / active.size))
+    assert abs(np.mean(active)) < 4 / np.sqrt(active.size)
 
 
-def test_the_jacobian_agrees_with_finite_differences_column_by_column(embedded, jacobian, around):
-    space = embedded.space
-    ahead, behind = around[1:].reshape(2, space.size, -1)
-    above_prior = 0
-    for i, (name, smooth) in enumerate(zip(space.names, space.smooth, strict=True)):
-        if smooth:
-            expected = (ahead[i] - behind[i]) / (2 * STEP)
-            scale = np.abs(expected).max()
-            atol = TOLERANCE * max(1.0, scale)
-            np.testing.assert_allclose(jacobian[:, i], expected, rtol=0, atol=atol, err_msg=name)
-            above_prior += scale > 1.0
-    assert above_prior >= 0.8 * sum(space.smooth), "the clip outweighs the prior in most columns"
+def test_the_jacobian_agrees_with_finite_differences_column_by_column(problem):
+    u = np.asarray(problem.space.start) + BESIDE
+    jacobian, scales = evaluate(problem, u).jacobian, []
+    for i, move in enumerate(STEP * np.eye(u.size)):
+        ahead, behind = (evaluate(problem, u + sign * move).residuals for sign in (1, -1))
+        expected = (ahead - behind) / (2 * STEP)
+        scales.append(np.abs(expected).max())
+        atol = TOLERANCE * max(1.0, scales[i])
+        np.testing.assert_allclose(
+            jacobian[:, i], expected, rtol=0, atol=atol, err_msg=problem.space.names[i]
+        )
+    assert max(scales) > 1.0  # a limit that is not reached has no effect
 
 
-def test_another_clip_of_the_same_shape_compiles_nothing(embedded, truth, jacobian):
-    (scene,) = embedded.data
-    pelvis, ankle = (
-        eqx.tree_at(lambda part: part.pos, part, part.pos + 0.01)
-        for part in (scene.reference.pelvis, scene.reference.ankle)
+def test_another_clip_of_the_same_shape_compiles_nothing(problem, start):
+    other = eqx.tree_at(
+        lambda p: (p.data[0].reference.pelvis.pos, p.data[0].frames.slide),
+        problem,
+        replace_fn=lambda x: 1.01 - x,
     )
-    reference = dataclasses.replace(scene.reference, pelvis=pelvis, ankle=ankle)
-    frames = eqx.tree_at(lambda frames: frames.slide, scene.frames, 1 - scene.frames.slide)
-    other = dataclasses.replace(scene, reference=reference, frames=frames)
-    again = problems.make_problem(experiment_files.load_experiment(UNEVEN_WALK))
-    again = dataclasses.replace(again, data=(other,))
-    compiled = []
-
-    def listen(event: str, duration_secs: float, **_) -> None:
-        if "backend_compile" in event:
-            compiled.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        shifted = np.asarray(residuals_and_jacobian(again, truth)[1])
+    u = problem.space.start + BESIDE
+    with compilations() as compiled:
+        shifted = evaluate(other, u).residuals
         assert not compiled
-        assert np.isfinite(shifted).all() and np.abs(shifted - jacobian).max() > 1.0
-        jax.jit(lambda x: x + 2)(1.0)  # the listener does hear a compilation
-        assert compiled
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
+    assert np.isfinite(shifted).all() and np.abs(shifted - start.residuals).max() > 1.0
+
+
+# Simulated references
+
+
+@pytest.fixture(scope="module")
+def measured(problem) -> Problem:
+    """With independent residuals of every kind that can be simulated, in all frames."""
+    observed = jnp.ones_like(problem.data[0].reference.observed)
+    return changed(problem, {"smooth": np.inf, "correlation": 0.0}, {"observed": observed})
+
+
+def simulated(problem: Problem, u: np.ndarray, seed: int) -> Problem:
+    """With the label of the others, for which there is a program."""
+    label = problem.data[0].reference.label
+    return changed(simulate(problem, u, seed), reference={"label": label})
+
+
+@pytest.mark.parametrize(("correlation", "fraction"), [(0.0, 1.0), (0.9, 1.0), (0.0, 0.1)])
+def test_residuals_at_the_truth_are_the_noise_that_is_assumed(measured, correlation, fraction):
+    """Standard normal, and as correlated as the fraction of independent ones says."""
+    noisy = dataclasses.replace(
+        changed(measured, {"correlation": correlation}),
+        independent_fraction=jnp.full_like(measured.independent_fraction, fraction),
+    )
+    u = np.asarray([0.7, -1.2])
+    drawn = [evaluate(simulated(noisy, u, seed), u).by_kind() for seed in range(SEEDS)]
+    rho = (1 - fraction) / (1 + fraction)
+    for kind in drawn[0].keys() - {"smooth"}:
+        series = np.concatenate([draw[kind] for draw in drawn], axis=1) / np.sqrt(fraction)
+        count = series.size * (1 - rho) / (1 + rho)
+        assert abs(series.mean()) < 4 / np.sqrt(count), kind
+        assert abs(series.var() - 1) < 6 / np.sqrt(count), kind
+        lag = np.sum(series[1:] * series[:-1]) / np.sum(series**2)
+        assert abs(lag - rho) < 5 / np.sqrt(count), kind
+        if rho == 0:
+            assert stats.kstest(series.ravel(), "norm").pvalue > 1e-4, kind
+
+
+def test_seeds_give_noise_but_for_kinds_that_are_off_and_masked_frames_stay(problem, measured):
+    u = np.zeros(2)
+    first, again, other = (simulate(measured, u, seed) for seed in (3, 3, 4))
+    knees = [p.data[0].reference.knee_ws for p in (first, again, other)]
+    assert np.array_equal(knees[0], knees[1])
+    assert not np.array_equal(knees[0], knees[2])
+    observed = problem.data[0].reference.observed
+    masked = changed(measured, {"ankle": np.inf}, {"observed": observed})
+    (scene,) = simulate(masked, u).data
+    assert np.flatnonzero(~scene.reference.observed).tolist() == [MASKED]
+    errors = residuals.errors_by_kind(scene, evaluate(masked, u).result)
+    assert np.max(np.abs(errors["ankle"])) < 1e-12
+
+
+def test_accelerations_cannot_be_simulated(problem):
+    with pytest.raises(ValueError, match=r"sigmas.smooth is 20: .*wanted inf"):
+        simulate(problem, np.zeros(2))
+
+
+def test_an_autoregression_is_stationary():
+    """Its variance and its correlation after one and two steps, against their formulas."""
+    series = autoregression(np.random.default_rng(0).normal(size=(100, 20_000)), 0.8)
+    assert np.allclose(series.var(axis=1), 1, atol=0.06)
+    for lag in (1, 2):
+        covariance = np.mean(series[lag:] * series[:-lag])
+        assert covariance == pytest.approx(0.8**lag, abs=0.01)
