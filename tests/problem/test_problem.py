@@ -1,16 +1,16 @@
 """How much information correlated residuals carry."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import ParameterPrior, Priors
-from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
 from support import toy
+from support.problems import problem_of
 
 RESIDUALS, CLIPS = 400, 400
 CORRELATION = 0.9
@@ -33,15 +33,12 @@ def coverage(independent_fraction: float) -> float:
     The residuals are linear in the parameter's value, so that estimate and width follow from the
     Jacobian.
     """
-    ik = toy.Toy()
-    space = make_space(ik, [free_parameter(ik, "foot.share")])
-    space = space.with_prior(Priors(ParameterPrior(spread=50.0)))
-    problem = Problem(
-        space,
-        jnp.zeros(RESIDUALS),
-        residuals,
-        independent_fraction=jnp.asarray(independent_fraction),
+    fraction = jnp.asarray(independent_fraction)
+    problem = problem_of(
+        toy.Toy(), ["foot.share"], jnp.zeros(RESIDUALS), residuals, independent_fraction=fraction
     )
+    space = problem.space.with_prior(Priors(ParameterPrior(spread=50.0)))
+    problem = dataclasses.replace(problem, space=space)
     u = jnp.zeros(1)
     value_by_u = jax.jacfwd(lambda u: space.values(u)[0])(u)[0]
     by_value = np.asarray(problem.jacobian(u))[:-1, 0] / float(value_by_u)

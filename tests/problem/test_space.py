@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.loss import Loss, rho
@@ -23,60 +21,49 @@ NAMES = ("lock.height_off", "lock.height_on", "body.gain", "foot.limit[1]", "loc
 TOLERANCE = 1e-9
 
 
-@eqx.filter_jit
-def unpack_and_pack(space: Space, u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Values, and `u` again from the system and from the values."""
-    values = space.values(u)
-    named = dict(zip(space.names, values, strict=True))
-    return values, space.pack(space.unpack(u)), space.pack(named)
-
-
 def make(*names: str, **overrides) -> Space:
     return make_space(toy.Toy(), [free_parameter(toy.Toy(), n, **overrides) for n in names])
 
 
-SPACE = make(*NAMES)
+def test_values_stay_in_their_bounds_and_order_and_packing_gives_u_again():
+    space = make(*NAMES)
+
+    @jax.jit
+    @jax.vmap
+    def unpack_and_pack(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Values, and `u` again from the system and from the values."""
+        values = space.values(u)
+        named = dict(zip(space.names, values, strict=True))
+        return values, space.pack(space.unpack(u)), space.pack(named)
+
+    u = np.random.default_rng(0).uniform(-12, 12, (2000, len(NAMES)))
+    u[:1000] /= 2
+    u[0] = 0.0
+    values, *again = map(np.asarray, unpack_and_pack(jnp.asarray(u)))
+    assert (values >= np.asarray(space.low) - 1e-12).all()
+    assert (values <= np.asarray(space.high) + 1e-12).all()
+    assert (values[:, 0] >= values[:, 1]).all()
+    for packed in again:
+        np.testing.assert_allclose(packed[:1000], u[:1000], atol=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(-12, 12), min_size=len(NAMES), max_size=len(NAMES)))
-def test_values_stay_in_their_bounds_and_in_their_order_for_every_u(u):
-    values = np.asarray(unpack_and_pack(SPACE, jnp.asarray(u))[0])
-    assert (values >= np.asarray(SPACE.low) - 1e-12).all()
-    assert (values <= np.asarray(SPACE.high) + 1e-12).all()
-    assert values[0] >= values[1]
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(-6, 6), min_size=len(NAMES), max_size=len(NAMES)))
-def test_packing_an_unpacked_system_gives_u_again(u):
-    _, from_system, from_values = unpack_and_pack(SPACE, jnp.asarray(u))
-    np.testing.assert_allclose(from_system, u, atol=1e-6)
-    np.testing.assert_allclose(from_values, u, atol=1e-6)
-
-
-def test_the_middle_of_a_gain_is_the_geometric_middle_of_its_half_lives():
+def test_the_middle_of_a_gain_or_a_logarithmic_range_is_a_geometric_one():
     space = make("body.gain")
     gain = space.values(jnp.zeros(1))[0]
     ends = smoothing.half_life_of_gain(jnp.asarray([0.02, 0.9]), jnp.asarray(30.0))
     middle = smoothing.half_life_of_gain(gain, jnp.asarray(30.0))
     np.testing.assert_allclose(middle, jnp.sqrt(ends[0] * ends[1]), rtol=TOLERANCE)
-
-
-def test_the_middle_of_a_logarithmic_range_is_its_geometric_middle():
     value = make("lock.release").values(jnp.zeros(1))[0]
     np.testing.assert_allclose(value, np.sqrt(0.01 * 0.5), rtol=TOLERANCE)
 
 
-def test_one_leg_can_be_free_while_the_other_keeps_its_value():
-    space = make("foot.limit[1]")
-    np.testing.assert_allclose(space.unpack(jnp.zeros(1)).foot.limit, [0.4, 0.45], rtol=TOLERANCE)
-
-
-def test_a_bare_name_frees_one_value_for_all_legs():
-    space = make("foot.limit")
+@pytest.mark.parametrize(
+    ("name", "limits"), [("foot.limit[1]", [0.4, 0.45]), ("foot.limit", [0.45, 0.45])]
+)
+def test_one_leg_can_be_free_while_the_other_keeps_its_value_or_one_value_is_of_all(name, limits):
+    space = make(name)
     assert space.size == 1
-    np.testing.assert_allclose(space.unpack(jnp.zeros(1)).foot.limit, [0.45, 0.45], rtol=TOLERANCE)
+    np.testing.assert_allclose(space.unpack(jnp.zeros(1)).foot.limit, limits, rtol=TOLERANCE)
 
 
 def test_a_value_stays_above_one_that_is_fixed():
@@ -162,25 +149,22 @@ def test_a_space_without_parameters_or_with_duplicates_is_refused(names, message
         make(*names)
 
 
-def test_a_parameter_without_room_above_another_is_refused():
+@pytest.mark.parametrize(
+    ("on", "off", "message"),
+    [
+        ({}, {"high": 0.11}, "stays above lock.height_on, which reaches 0.12"),
+        ({"above": "lock.height_off", "high": 0.3}, {"high": 0.4}, "above"),
+    ],
+    ids=["no room above", "above each other"],
+)
+def test_parameters_without_room_above_each_other_are_refused(on, off, message):
+    ik = toy.Toy()
     parameters = [
-        free_parameter(toy.Toy(), "lock.height_on"),
-        free_parameter(toy.Toy(), "lock.height_off"),
+        dataclasses.replace(free_parameter(ik, name), **changes)
+        for name, changes in (("lock.height_on", on), ("lock.height_off", off))
     ]
-    parameters[1] = dataclasses.replace(parameters[1], high=0.11)
-    with pytest.raises(ValueError, match="stays above lock.height_on, which reaches 0.12"):
-        make_space(toy.Toy(), parameters)
-
-
-def test_two_parameters_above_each_other_are_refused():
-    parameters = [
-        free_parameter(toy.Toy(), "lock.height_on"),
-        free_parameter(toy.Toy(), "lock.height_off"),
-    ]
-    parameters[0] = dataclasses.replace(parameters[0], above="lock.height_off", high=0.3)
-    parameters[1] = dataclasses.replace(parameters[1], high=0.4)
-    with pytest.raises(ValueError, match="above"):
-        make_space(toy.Toy(), parameters)
+    with pytest.raises(ValueError, match=message):
+        make_space(ik, parameters)
 
 
 def test_packing_a_name_that_is_not_free_is_refused():
