@@ -63,17 +63,18 @@ def test_no_chunk_and_no_second_call_compiles_anew(problem, ik):
     assert found[COST].shape == (7, 3)
 
 
-def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik):
-    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, 1000)})
+def calls_of(ik, scenes, systems: int, chunk: int | None, memory: float) -> evaluation._Calls:
+    """What evaluates so many systems on clips of one length."""
+    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
     mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
-    (stack,) = evaluation.stacking.stack(problem.data)
+    (stack,) = evaluation.stacking.stack(scenes)
+    arrays, measure = jax.tree.map(np.asarray, batch), evaluation.errors_and_cost
+    return evaluation._Calls(arrays, systems, stack, measure, mesh, chunk, memory)
 
+
+def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik):
     def size(chunk: int | None, memory: float) -> int:
-        calls = evaluation._Calls(
-            jax.tree.map(np.asarray, batch), 1000, stack, evaluation.errors_and_cost, mesh, chunk,
-            memory,
-        )  # fmt: skip
-        return calls._size()
+        return calls_of(ik, problem.data, 1000, chunk, memory)._size()
 
     assert size(None, 0.0) == 1 and size(None, 1e15) == evaluation.CACHED
     assert 1 < size(None, 1e7) < size(None, 5e7) <= evaluation.CACHED
@@ -82,26 +83,13 @@ def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("along_clips", [False, True])
-def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, along_clips):
-    count = 16
-    systems = 1 if along_clips else count
-    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
-    mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
-    (stack,) = evaluation.stacking.stack(problem.data * (count if along_clips else 1))
-    calls = evaluation._Calls(
-        jax.tree.map(np.asarray, batch),
-        systems,
-        stack,
-        evaluation.errors_and_cost,
-        mesh,
-        count,
-        1.0,
-    )
-    memory = evaluation._along.lower(*calls.arguments(0, 0, count)).compile().memory_analysis()
+@pytest.mark.parametrize(("systems", "clips"), [(16, 1), (1, 16)])
+def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, systems, clips):
+    calls = calls_of(ik, problem.data * clips, systems, 16, 1.0)
+    memory = evaluation._along.lower(*calls.arguments(0, 0, 16)).compile().memory_analysis()
     assert memory is not None
     taken = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
-    assert 0.1 * count * calls._bytes_each() < taken < count * calls._bytes_each()
+    assert 0.1 * 16 * calls._bytes_each() < taken < 16 * calls._bytes_each()
 
 
 def test_mistakes_are_told(problem, ik):

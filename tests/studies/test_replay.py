@@ -88,10 +88,10 @@ def replayed(problem: Problem) -> Replay:
     return replay(problem, posterior_of(problem), seed=0)
 
 
-def surprises(problem: Problem, **changes) -> dict[str, list[str]]:
-    """What of the problem's capture is unlike replicates with another noise, by kind."""
-    noise = dataclasses.replace(noise_of(problem), **changes)
-    checks = replay(with_noise(problem, noise), posterior_of(problem), seed=0).checks
+def surprises(problem: Problem, **noise) -> dict[str, list[str]]:
+    """What of the problem's capture is unlike replicates, perhaps with another noise, by kind."""
+    problem = with_noise(problem, dataclasses.replace(noise_of(problem), **noise))
+    checks = replay(problem, posterior_of(problem), seed=0).checks
     return {check.kind: check.surprises for check in checks}
 
 
@@ -121,8 +121,7 @@ def test_an_outlier_is_found_out(problem):
     text = predictive.sentence(checks)
     assert text.startswith("The captured motion is unlike") and "knee position" in text
     heavy = dataclasses.replace(spoilt, loss="student", tails=jnp.asarray(4.0))
-    checks = replay(heavy, posterior_of(problem), seed=0).checks
-    assert "largest residual" not in {check.kind: check for check in checks}["knee"].surprises
+    assert "largest residual" not in surprises(heavy)["knee"]
 
 
 @pytest.mark.parametrize("loss", ["squares", "student"])
@@ -190,11 +189,8 @@ def test_the_digest_is_that_of_the_captured_motion(problem):
 
 
 def test_bands_hold_the_capture_and_are_drawn(replayed):
-    assert [band.channel for band in replayed.bands[:3]] == [
-        "left, upwards",
-        "left, upwards",
-        "upwards",
-    ]
+    channels = ["left, upwards", "left, upwards", "upwards"]
+    assert [band.channel for band in replayed.bands[:3]] == channels
     assert all(band.outside < 0.15 for band in replayed.bands)
     figure = band_plots.bands(replayed.bands, "bands")
     titles = [axes.get_title(loc="left") for axes in figure.axes]
@@ -202,15 +198,8 @@ def test_bands_hold_the_capture_and_are_drawn(replayed):
 
 
 def test_the_summary_is_plain_json(replayed):
-    left_out = LeaveOneOut(
-        elpd=-3.0,
-        error=0.5,
-        parameters=1.2,
-        elpd_of_block=np.array([-1.0, -2.0]),
-        pareto_k=np.array([0.1, np.inf]),
-        max_k=0.6,
-        neighbours=np.nan,
-    )
+    of_blocks = {"elpd_of_block": np.array([-1.0, -2.0]), "pareto_k": np.array([0.1, np.inf])}
+    left_out = LeaveOneOut(-3.0, 0.5, 1.2, max_k=0.6, neighbours=np.nan, **of_blocks)
     text = json.dumps(summarise_replay(replayed, left_out), allow_nan=False)
     numbers = json.loads(text)
     assert [row["pareto_k"] for row in numbers["leave_one_out"]["blocks"]] == [0.1, None]
