@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
@@ -18,9 +17,8 @@ FLAT = to_terrain(planes((0.0, 0.0, 0.0)))
 def run(ik, ground, scale=1.0) -> jaxik.Result:
     """The standing character, its mesh scaled."""
     frames = to_frames(STANDING)
-    resized = jax.tree_util.tree_map_with_path(
-        lambda path, leaf: leaf * scale if jax.tree_util.keystr(path[-1:]) == ".pos" else leaf,
-        frames.pose,
+    resized = jaxik.LegPose(
+        *(jaxik.Transform(scale * joint.pos, joint.rot) for joint in vars(frames.pose).values())
     )
     return jaxik.run(ik, to_rig(RIG), ground, dataclasses.replace(frames, pose=resized))
 
@@ -41,26 +39,31 @@ def leg_lengths(result: jaxik.Result) -> np.ndarray:
     return np.linalg.norm(result.pose.ankle.pos - result.pose.hip.pos, axis=-1)[-1]
 
 
+def stretched(max_length: float | np.ndarray, min_length: float = 0.5) -> jaxik.Result:
+    """Mec on level ground with these lengths of its legs, m; one a leg, to share a program."""
+    lengths = {"pelvis.max_length": max_length, "pelvis.min_length": min_length}
+    per_leg = {name: np.broadcast_to(length, 2) for name, length in lengths.items()}
+    values = {"target.foot_height": sample_poses.ANKLE, "pelvis.damp": False}
+    return run(to_ik(values | per_leg, "mec"), FLAT)
+
+
 def test_mec_measures_legs_from_hip_to_ankle_so_that_nothing_moves_on_flat_ground():
     """A foot is `foot_height` above its contact: measured to that, standing legs were too long."""
     standing = STANDING[0]
     animated = np.linalg.norm(standing.ankle.pos - standing.hip.pos, axis=-1)
-    values = {"target.foot_height": sample_poses.ANKLE, "pelvis.damp": False}
     longest = animated.max() + 1e-9
-    result = run(to_ik(values | {"pelvis.max_length": longest}, "mec"), FLAT)
+    result = stretched(longest)
     np.testing.assert_allclose(result.body.pos, 0.0, atol=1e-9)
     np.testing.assert_allclose(leg_lengths(result), animated, atol=1e-9)
-    result = run(to_ik(values | {"pelvis.max_length": longest - 0.05}, "mec"), FLAT)
+    result = stretched(longest - 0.05)
     assert result.body.pos[-1, 1] < -0.03
     assert leg_lengths(result).max() == pytest.approx(longest - 0.05, abs=1e-6)
-    result = run(to_ik(values | {"pelvis.min_length": longest + 0.02}, "mec"), FLAT)
+    result = stretched(0.88, min_length=longest + 0.02)
     assert leg_lengths(result).min() == pytest.approx(longest + 0.02, abs=1e-6)
 
 
 def test_mec_keeps_the_length_of_each_leg():
-    values = {"target.foot_height": sample_poses.ANKLE, "pelvis.damp": False}
     for leg in range(2):
         lengths = np.full(2, 0.88)
         lengths[leg] = 0.7
-        result = run(to_ik(values | {"pelvis.max_length": lengths}, "mec"), FLAT)
-        assert leg_lengths(result)[leg] == pytest.approx(0.7, abs=1e-6)
+        assert leg_lengths(stretched(lengths))[leg] == pytest.approx(0.7, abs=1e-6)
