@@ -27,7 +27,7 @@ def autoregression(random: np.random.Generator, shape: tuple[int, ...], rho: flo
     """Noise of unit variance, correlated from frame to frame."""
     values = random.normal(size=shape)
     values[1:] *= np.sqrt(1 - rho**2)
-    return signal.lfilter([1.0], [1.0, -rho], values, axis=0)
+    return np.asarray(signal.lfilter([1.0], [1.0, -rho], values, axis=0))
 
 
 def simulate(seed: int, *, rho: float = 0.0, scale: float = 1.0, outliers: float = 0.0) -> Playback:
@@ -169,7 +169,7 @@ def test_only_tolerances_count_without_noise():
 def test_p_values_are_uniform_where_the_noise_is_as_assumed():
     for rho, given in ((0.0, 0.0), (RHO, RHO), (RHO, 0.0)):
         plays = [whiten(simulate(seed, rho=rho), given) for seed in range(150)]
-        given_of = [dict.fromkeys(KINDS, given)]
+        given_of: list[dict[str, float]] = [{kind: given for kind in KINDS}]
         left = [g.left for play in plays for g in measure_groups([play], given_of, Assumed())]
         assert stats.kstest([noise.p for noise in left], "uniform").pvalue > 1e-3, (rho, given)
         if rho == given:

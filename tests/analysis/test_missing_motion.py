@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -119,18 +120,19 @@ def motions(iks: jaxik.FootIK, scene: Scene) -> tuple[Transform, jax.Array, Tran
     return jax.vmap(motion)(iks)
 
 
-def squares(moved: np.ndarray) -> np.ndarray:
+def squares(moved: Any) -> np.ndarray:
     """Squared distances from the last, whose values are true."""
     return (moved - moved[-1]) ** 2
 
 
-def cost(pelvis: Transform, knee: np.ndarray, ankle: Transform) -> np.ndarray:
+def cost(pelvis: Any, knee: np.ndarray, ankle: Any) -> np.ndarray:
     """Half the squared distance from the last; a small angle is twice that of its quaternions."""
     rotations = np.concatenate([pelvis.rot[:, :, None], ankle.rot], axis=2)
     apart = [((rotations - sign * rotations[-1]) ** 2).sum(axis=-1) for sign in (1, -1)]
-    positions = sum(squares(x).reshape(len(x), -1).sum(1) for x in (pelvis.pos, knee, ankle.pos))
+    positions = np.concatenate([pelvis.pos[:, :, None], knee, ankle.pos], axis=2)
+    distances = squares(positions).sum(axis=(1, 2, 3))
     angles = 4.0 * np.minimum(*apart).sum(axis=(1, 2))
-    return 0.5 * (positions / POSITION**2 + angles / ROTATION**2)
+    return 0.5 * (distances / POSITION**2 + angles / ROTATION**2)
 
 
 def profile_of(
@@ -207,12 +209,10 @@ def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
     """A step up 1.5 m ahead; the rises are those of the loss, with the tails of the fit."""
     clip, ground, tails = "walks", "step 0.25", 2.0
 
-    def student(pelvis: Transform, knee: np.ndarray, ankle: Transform) -> np.ndarray:
-        losses = (
-            rho(squares(x) / POSITION**2, "student", tails, np).reshape(len(x), -1)
-            for x in (pelvis.pos, knee, ankle.pos)
-        )
-        return 0.5 * sum(loss.sum(axis=1) for loss in losses)
+    def student(pelvis: Any, knee: np.ndarray, ankle: Any) -> np.ndarray:
+        positions = np.concatenate([pelvis.pos[:, :, None], knee, ankle.pos], axis=2)
+        losses = np.asarray(rho(squares(positions) / POSITION**2, "student", tails, np))
+        return 0.5 * losses.sum(axis=(1, 2, 3))
 
     profile = profile_of("record", "pelvis.limit", clip, ground, student)
     ik, scene = system_of("record"), scene_of(clip, ground)
