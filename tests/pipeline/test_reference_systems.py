@@ -74,7 +74,8 @@ def of_leg(leg: int) -> Array:
 NOT_RAISED = {"root.enabled": False}
 FAR = -1.12 + math.sqrt(0.88**2 - 0.05**2)  # m, where the pelvis is that is 0.3 m too high
 NEAR = -0.37 + math.sqrt(0.5**2 - 0.05**2)  # m, and that is 0.45 m too low
-LEFT, RIGHT = ({"world_from_model": at(x, 0.0, 0.0)} for x in (0.01, -0.01))  # of the border
+LEFT: dict[str, Any] = {"world_from_model": at(0.01, 0.0, 0.0)}  # of the border
+RIGHT: dict[str, Any] = {"world_from_model": at(-0.01, 0.0, 0.0)}
 FACTS: dict[ModuleType, list[tuple[Ground, Frame, dict[str, Any], dict[str, Any]]]] = {
     ozz: [  # ground, frame, changes of parameters, outputs; heights are those of ankles and goals
         # The root is raised onto the ground, or else the pelvis.
