@@ -30,8 +30,8 @@ def base() -> Clip:
 
 
 def instead_of(name: str, other: str) -> str:
-    """A second of the walk, one of whose files is another."""
-    return CLIP.replace(f"{ROOT}/data/clips/{name}.npz", other) + SECOND
+    """The uneven walk with another file."""
+    return CLIP.replace(f"{ROOT}/data/clips/{name}.npz", other)
 
 
 def load(folder: Path, **parts: str) -> Experiment:
@@ -72,10 +72,7 @@ def test_missing_keys_have_defaults_which_are_not_written(tmp_path):
     ("parts", "message"),
     [
         ({"free": "pelvis.on_gian = {}"}, r"\[free\]: no parameter named 'pelvis.on_gian'"),
-        (
-            {"rest": "[parameters]\nlean.gain = [0.1, 0.2]"},
-            r"gain has shape \(2,\), wa.* \(\)",
-        ),
+        ({"rest": "[parameters]\nlean.gain = [0.1, 0.2]"}, r"gain has shape \(2,\), wanted \(\)"),
         (
             {"rest": "[parameters]\nfoot.max_roll = [1, 2, 3]"},
             r"max_roll has shape \(3,\), .* \(2,\), one per leg",
@@ -154,7 +151,7 @@ def test_a_frame_with_a_marker_pop_is_not_observed(tmp_path, reference):
     positions = reference.positions_ws.copy()
     positions[45, reference.rig.joints[0][2]] += 0.2
     save_clip(tmp_path / "popped.npz", dataclasses.replace(reference, positions_ws=positions))
-    loaded = load(tmp_path, clips=instead_of("uneven_walk", "popped.npz"))
+    loaded = load(tmp_path, clips=instead_of("uneven_walk", "popped.npz") + SECOND)
     (scene,) = problems.make_problem(loaded).data
     observed = np.asarray(scene.reference.observed)
     assert not observed[15] and observed[[0, 12, 18, 30]].all()
@@ -164,10 +161,9 @@ def test_a_frame_with_a_marker_pop_is_not_observed(tmp_path, reference):
 
 def test_contacts_count_only_where_the_clip_has_labels(tmp_path, reference):
     save_clip(tmp_path / "bare.npz", dataclasses.replace(reference, stance=None))
-    for clip, sigma in (("uneven_walk.npz", 0.5), ("bare.npz", np.inf)):
-        clips = instead_of("uneven_walk", clip) if clip == "bare.npz" else CLIP + SECOND
-        loaded = load(tmp_path, rest="[sigmas]\ncontact = 0.5", clips=clips)
-        assert float(problems.make_problem(loaded).data[0].sigmas.contact) == sigma, clip
+    for clips, sigma in ((CLIP, 0.5), (instead_of("uneven_walk", "bare.npz"), np.inf)):
+        loaded = load(tmp_path, rest="[sigmas]\ncontact = 0.5", clips=clips + SECOND)
+        assert float(problems.make_problem(loaded).data[0].sigmas.contact) == sigma, clips
 
 
 def test_a_missing_flat_animation_is_made_from_the_reference(tmp_path):
