@@ -160,7 +160,7 @@ def test_after_a_restart_nothing_is_remembered():
 @pytest.mark.slow
 def test_gradients_stay_finite_through_faults_and_stop_at_a_restart():
     weights = np.arange(COUNT) >= HALF
-    _, (of_system, of_root, _) = gradients(jnp.full(COUNT, 0.3), weights)
+    _, (of_system, of_root, _) = gradients(jnp.asarray(np.full(COUNT, 0.3)), weights)
     numbers = [np.asarray(leaf) for leaf in jax.tree.leaves(of_system)]
     assert all(np.isfinite(leaf).all() for leaf in numbers) and any(x.any() for x in numbers)
     of_root = np.asarray(of_root)

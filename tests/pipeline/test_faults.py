@@ -16,7 +16,8 @@ import jaxik
 from support.cases import QUICK
 from support.clips import at, make_rig, planes, to_frames, to_rig, to_terrain, wandering
 
-PRESETS = ("record", "ozz", "unreal", "mec", "stride")
+SLOW = (pytest.param(preset, marks=pytest.mark.slow) for preset in ("ozz", "unreal", "stride"))
+PRESETS = ["record", "mec", *SLOW]  # the first two remember most
 COUNT, BAD = 16, 8
 RIG, GROUND = to_rig(make_rig()), to_terrain(planes((0.06, 0.04, 0.1)))
 LEG_FIELDS = ("pose", "weight", "foot_speed", "toe_speed", "stride")
