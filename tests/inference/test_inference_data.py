@@ -35,8 +35,7 @@ def posterior(space) -> Posterior:
 
 
 def test_the_summary_of_arviz_has_our_figures(posterior, space):
-    import arviz_stats
-
+    arviz_stats = pytest.importorskip("arviz_stats")
     tree = posterior.to_inference_data(space)
     tables = {
         level: arviz_stats.summary(
@@ -90,8 +89,7 @@ def test_a_file_holds_what_was_written(posterior, space, tmp_path):
 
 
 def test_the_log_likelihood_of_blocks_is_one_that_arviz_takes(posterior, space, tmp_path):
-    import arviz_stats
-
+    arviz_stats = pytest.importorskip("arviz_stats")
     random = np.random.default_rng(0)
     given = BlockLogLikelihood(
         values=0.1 * random.normal(size=(200, 4)),

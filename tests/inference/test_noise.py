@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -101,7 +102,7 @@ def test_students_slopes_tell_less_than_they_say(nu):
 FootProblem = Problem[jaxik.FootIK]
 
 
-def errors_by_kind(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[dict[str, jax.Array]]:
+def errors_by_kind(ik: Any, scenes: tuple[Scene, ...]) -> list[dict[str, jax.Array]]:
     """What the parameters add to the noise, which is in the place of the tracks."""
     (scene,) = scenes
     time = jnp.arange(scene.reference.observed.size, dtype=ik.foot.weight.dtype) / 20

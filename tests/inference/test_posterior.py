@@ -312,8 +312,9 @@ def test_a_kill_loses_no_finished_step_wherever_it_tears_the_journal(tmp_path):
 
 def identity_of(problem: Problem, /, **other: Any) -> Identity:
     """Of a run of two parameters, unless it is said otherwise."""
-    own = {"parameters": problem.space.names, "walkers": 8, "seed": 0, "thin_by": 1}
-    return Identity(**own | {"problem": posterior.digest(problem)} | other)
+    own: dict[str, Any] = {"parameters": problem.space.names, "walkers": 8, "seed": 0, "thin_by": 1}
+    own["problem"] = posterior.digest(problem)
+    return Identity(**own | other)
 
 
 def test_the_chain_of_another_run_is_refused(tmp_path):

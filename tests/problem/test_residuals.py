@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,6 @@ from fitting.experiments import experiment_files, problems
 from fitting.experiments.known_values import load_known_values
 from fitting.problem import residuals
 from fitting.problem.problem import Problem
-from fitting.problem.scene import Scene
 from fitting.problem.simulation import autoregression, simulate
 from fitting.runtime.program_cache import committed
 from support.experiments import CLIP, UNEVEN_WALK, write
@@ -101,7 +100,7 @@ def start(problem) -> Evaluated:
     return evaluate(problem, problem.space.start)
 
 
-def expected_residuals(result: jaxik.Result, scene: Scene) -> dict[str, np.ndarray]:
+def expected_residuals(result: Any, scene: Any) -> dict[str, np.ndarray]:
     """Computed with NumPy and SciPy from the poses of the pipeline."""
     result, scene = jax.tree.map(np.array, (result, scene))  # copies, which SciPy may write to
     world, reference, sigmas = scene.frames.world_from_model, scene.reference, scene.sigmas

@@ -17,6 +17,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
 from fitting.problem.shared_world import MARGIN, run_scenes, share_world
 from fitting.runtime.program_cache import committed
+from jaxik.maths import parameter_tree
 from jaxik.pipeline import Result
 from jaxik.world.terrain import plane
 from support.experiments import ROOT, write
@@ -100,7 +101,7 @@ def alone(scene: Scene, ik: jaxik.FootIK, names: tuple[str, ...]) -> Scene:
         scene,
         place=None,
         frames=dataclasses.replace(scene.frames, stride_scale=ones if scale is None else scale),
-        tracks={TRACKED: scene.tracks.get(TRACKED, ones * ik.leg.soften)},
+        tracks={TRACKED: scene.tracks.get(TRACKED, ones * parameter_tree.get(ik, TRACKED))},
         size=jnp.asarray(1.0) if size is None else size,
         rig=dataclasses.replace(scene.rig, names=names),
     )
