@@ -4,6 +4,7 @@ Arguments: the file for the numbers, the number of simulated devices and, for se
 address of the first one, their number, and which of them this is.
 """
 
+import dataclasses
 import os
 import sys
 
@@ -27,13 +28,25 @@ def main() -> None:
     np.savez(path, allow_pickle=False, **found)
 
 
+def make_problem():
+    """Of three clips on a plane, for which programs compile sooner than for their ground."""
+    from fitting.experiments import problems
+    from fitting.problem.shared_world import share_world
+    from jaxik.world.terrain import plane
+    from support.scenes import experiment
+
+    problem = problems.make_problem(experiment())
+    ground = plane()
+    scenes = [dataclasses.replace(scene, terrain=ground, place=None) for scene in problem.data]
+    placed = tuple(share_world(scenes, problem.space.system.probe))
+    return dataclasses.replace(problem, data=placed)
+
+
 def evaluations(*kinds: str) -> dict[str, np.ndarray]:
     """Errors of many `systems` on clips, and of one system on all `clips` at once."""
     import fitting
-    from fitting.experiments.problems import make_problem
-    from support.scenes import experiment
 
-    problem = make_problem(experiment())
+    problem = make_problem()
     ik = problem.space.unpack(problem.space.start)
     found = {}
     for kind in kinds or ("systems", "clips"):
@@ -46,23 +59,23 @@ def evaluations(*kinds: str) -> dict[str, np.ndarray]:
 
 
 def log_probabilities() -> dict[str, np.ndarray]:
-    """Log-probabilities of a few points, with the sigmas that are given and with open ones."""
+    """Log-probabilities of two points, with the sigmas that are given and with open ones."""
     import jax
     import jax.numpy as jnp
 
-    from fitting.experiments.problems import make_problem
     from fitting.inference.noise.marginal import with_unknown_sigmas
     from fitting.inference.sharding import over_devices
-    from support.scenes import experiment
 
-    problem = make_problem(experiment())
-    u = jnp.asarray(np.random.default_rng(0).normal(0.0, 0.3, (4, problem.space.size)))
-    found = {}
-    for name, of in (("given", problem), ("open", with_unknown_sigmas(problem))):
-        sharded = over_devices(of)
-        assert (sharded is of) == (jax.local_device_count() == 1)
-        found[f"log-probability {name}"] = np.array([sharded.log_probability(row) for row in u])
-    return found
+    given = make_problem()
+    sharded, opened = over_devices(given), over_devices(with_unknown_sigmas(given))
+    assert (sharded is given) == (jax.local_device_count() == 1)
+    found = []
+    for u in np.random.default_rng(0).normal(0.0, 0.3, (2, given.space.size)):
+        residuals = sharded.residuals(jnp.asarray(u))  # of both, in the same order
+        assert opened.unknown_sigmas is not None
+        marginal = opened._log_marginal(residuals, opened.unknown_sigmas)
+        found.append([-0.5 * jnp.sum(residuals**2), marginal])
+    return {"log-probability": np.array(found)}
 
 
 if __name__ == "__main__":
