@@ -126,7 +126,7 @@ def test_all_fields_of_the_record_and_all_parameters_have_a_case():
     rules = {case.leaf for case in CASES if not case.is_sloped(ik)} - fields
     assert not any(bool(parameter_tree.get(ik, rule)) for rule in rules), "off by default"
     # These clips tell no scale of strides, nothing fades and no ground is refused:
-    # `test_stride_warp`, `test_fade`, `test_limits` and `test_narrow_ground` have those that do.
+    # `test_stride_warp`, `test_fade` and `test_limits` have those that do.
     own = ("warp.", "fade.", "probe.max_", "probe.min_support", "probe.support_radius")
     declared = {name for name in parameter_tree.declarations(ik) if not name.startswith(own)}
     declared |= {"lean.tick_hz", "pelvis.tick_hz"}

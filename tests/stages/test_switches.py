@@ -184,7 +184,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 # Stages whose numbers have tests of their own: `test_stride_warp`, `test_separation`, `test_fade`.
-WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_narrow_ground`
+WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_limits`
 IN_OWN_TESTS = ("warp.", "separation.", "fade.", *WIDTHS)
 
 

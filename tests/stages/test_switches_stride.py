@@ -115,8 +115,8 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
 }
 # Stages whose numbers have tests of their own, as in `test_switches`; `test_spine_lean` is another.
-WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_narrow_ground`
-OVER = "probe.lift_over"  # in `test_swing`, since planes make no hurdle
+WIDTHS = ("probe.min_support", "probe.support_radius")  # in `test_limits`
+OVER = "probe.lift_over"  # in `test_stride_probe`, as planes make no hurdle
 CONSTANTS = ("probe.uneven_height", "probe.highest_step")
 IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS, OVER, *CONSTANTS)
 
