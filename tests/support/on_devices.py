@@ -4,9 +4,12 @@ Arguments: the file for the numbers, the number of simulated devices and, for se
 address of the first one, their number, and which of them this is.
 """
 
+import contextlib
 import dataclasses
 import os
 import sys
+from collections.abc import Iterator
+from unittest import mock
 
 import numpy as np
 
@@ -29,19 +32,54 @@ def main() -> None:
 
 
 def make_problem():
-    """Of three clips on a plane, for which programs compile sooner than for their ground."""
+    """Of three clips, each of which runs alone."""
     from fitting.experiments import problems
-    from fitting.problem.shared_world import share_world
-    from jaxik.world.terrain import plane
     from support.scenes import experiment
 
     problem = problems.make_problem(experiment())
-    ground = plane()
-    scenes = [dataclasses.replace(scene, terrain=ground, place=None) for scene in problem.data]
-    placed = tuple(share_world(scenes, problem.space.system.probe))
-    return dataclasses.replace(problem, data=placed)
+    scenes = [dataclasses.replace(scene, place=None) for scene in problem.data]
+    return dataclasses.replace(problem, data=tuple(scenes))
 
 
+def invented_errors(scene, ik):
+    """Of a system that only follows the pelvis: with a loop from a constant, as the real one."""
+    import jax
+    import jax.numpy as jnp
+
+    def step(place, target):
+        place = place + ik.pelvis.on_gain * (target - place)
+        return place, place
+
+    reference, zero = scene.reference, jnp.zeros(3, scene.frames.dt.dtype)
+    _, place = jax.lax.scan(step, zero, scene.frames.world_from_model.pos)
+    ankle = reference.ankle.pos - place[:, None]
+    return {
+        "ankle": ankle,
+        "knee": reference.knee_ws - place[:, None],
+        "pelvis": reference.pelvis.pos - place,
+        "foot": 2.0 * ankle,
+        "body": place,
+        "contact": reference.contact - ik.foot.max_pitch,
+        "smooth": jnp.diff(ankle, n=2, axis=0),
+    }
+
+
+@contextlib.contextmanager
+def invented_pipeline() -> Iterator[None]:
+    """Programs that compile at once; no others of the same types are used instead."""
+    import jax
+
+    from fitting.problem import residuals
+    from fitting.studies.many import evaluation
+
+    changes = {"run_scene": lambda ik, scene: ik, "errors_by_kind": invented_errors}
+    jax.clear_caches()
+    with mock.patch.multiple(residuals, **changes), mock.patch.multiple(evaluation, **changes):
+        yield
+    jax.clear_caches()
+
+
+@invented_pipeline()
 def evaluations(*kinds: str) -> dict[str, np.ndarray]:
     """Errors of many `systems` on clips, and of one system on all `clips` at once."""
     import fitting
@@ -58,6 +96,7 @@ def evaluations(*kinds: str) -> dict[str, np.ndarray]:
     return found
 
 
+@invented_pipeline()
 def log_probabilities() -> dict[str, np.ndarray]:
     """Log-probabilities of two points, with the sigmas that are given and with open ones."""
     import jax
