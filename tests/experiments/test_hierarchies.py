@@ -22,7 +22,6 @@ from jaxik.world import body
 from support.bodies import scaled
 from support.experiments import CLIP, ROOT, write
 
-SUBJECTS = (None, "ann", "ben")
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 
 
@@ -59,17 +58,16 @@ def test_an_experiment_without_a_hierarchy_writes_none_and_scales_nothing(tmp_pa
     assert make_problem(experiment).data[0].size is None
 
 
+BOTH = 'per_clip = ["foot.max_pitch"]\nper_subject = ["foot.max_pitch"]'
+
+
 @pytest.mark.parametrize(
     ("table", "subjects", "message"),
     [
         ("per_clips = []", ("ann",), "unknown key 'per_clips'; nearest is 'per_clip'"),
         ('per_clip = "foot.max_pitch"', ("ann", "ben"), "wanted a list of names"),
         ('per_clip = ["foot.max_roll"]', ("ann", "ben"), "'foot.max_roll' is not free; free are"),
-        (
-            'per_clip = ["foot.max_pitch"]\nper_subject = ["foot.max_pitch"]',
-            ("ann", "ben"),
-            "'foot.max_pitch' stands twice; wanted it per clip or per subject",
-        ),
+        (BOTH, ("ann", "ben"), "'foot.max_pitch' stands twice; wanted it per clip or per subject"),
         ('per_clip = ["foot.max_pitch"]', ("ann",), "per_clip needs two clips or more"),
         ('per_subject = ["foot.max_pitch"]', ("ann", None), r"in each of \[\[clips\]\]; clip 2 h"),
         ('per_subject = ["foot.max_pitch"]', ("ann", "ann"), "all clips are of 'ann'"),
@@ -104,15 +102,13 @@ def test_a_parameter_file_with_a_leg_length_follows_the_body_that_it_is_read_for
     giant = scaled(load_clip(BASE), 4.0).rig
     other, _ = parameter_files.load_system(path, giant)
     ratio = body.leg_length(giant) / 0.84
-    height, half_life = (
-        float(parameter_tree.get(other, name)) for name in ("target.foot_height", "root.half_life")
-    )
-    assert height == pytest.approx(0.1 * ratio) and half_life == pytest.approx(0.2 * ratio**0.5)
+    for name, expected in (
+        ("target.foot_height", 0.1 * ratio), ("root.half_life", 0.2 * ratio**0.5)
+    ):  # fmt: skip
+        assert float(parameter_tree.get(other, name)) == pytest.approx(expected), name
     assert jnp.isinf(parameter_tree.get(other, "pelvis.limit"))
     path.write_text('preset = "ozz"\nleg_length = 0.0\n')
-    with pytest.raises(
-        ValueError, match="leg_length is 0.0; wanted a number of metres from 0.01 to 100"
-    ):
+    with pytest.raises(ValueError, match="leg_length is 0.0; wanted a number of metres from"):
         parameter_files.load_system(path)
 
 

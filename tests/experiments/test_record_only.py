@@ -1,13 +1,19 @@
 """Fits of what the game's record holds: nothing is lost between the fit and the bytes."""
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
+from fitting.analysis import playback
 from fitting.cli import main
 from fitting.datasets.clips import load_clip
-from fitting.experiments import experiment_files, record_only
+from fitting.experiments import experiment_files, problems, record_only
+from fitting.jobs import fits
 from fitting.runtime.validation import flatten, read_toml
-from fitting.studies import run_folder
+from fitting.studies import record_price, run_folder
+from fitting.studies.fit import Fit
 from jaxik import record
 from jaxik.maths import parameter_tree
 from support import experiments
@@ -24,17 +30,14 @@ def restricted(tmp_path, **parts):
     return experiment_files.load_experiment(experiments.write(tmp_path, **parts))
 
 
-def test_what_the_record_has_no_room_for_is_neither_free_nor_other_than_its_reader_assumes(
-    tmp_path,
-):
+def test_what_the_record_has_no_room_for_is_not_free_but_what_its_reader_assumes(tmp_path):
     other = "[parameters]\nlock.lock_half_life = 0.02\nprobe.limited = true\nfoot.max_roll = 0.2"
     experiment = restricted(tmp_path, rest=other)
     assert list(experiment.free) == ["foot.max_pitch", "probe.toe_ls[1]"]
     assert record_only.left_out(experiment) == ["lock.max_speed"]
     ik = experiment.starting_system()
-    assert record.dropped(ik) == {} and float(
-        parameter_tree.get(ik, "foot.max_roll")
-    ) == pytest.approx(0.2)
+    assert record.dropped(ik) == {}
+    assert float(parameter_tree.get(ik, "foot.max_roll")) == pytest.approx(0.2)
     aside = record_only.set_aside(experiment)
     assert aside["lock.lock_half_life"] == ("0.02 s", "0.05 s") and "probe.limited" in aside
 
@@ -66,6 +69,42 @@ def test_a_restricted_experiment_is_the_same_when_read_again(tmp_path):
 def test_an_experiment_whose_fit_could_be_no_record_is_refused(tmp_path, parts, message):
     with pytest.raises(ValueError, match=rf"experiment.toml: .*{message}"):
         restricted(tmp_path, **parts)
+
+
+def test_the_price_is_that_of_one_search_with_all_that_was_free(tmp_path, monkeypatch):
+    rest = "[start]\nfoot.max_pitch = 0.5\ntarget.rise_half_life = 0.1"
+    clip = "start = 1.0\nend = 1.2"
+    free = 'foot.max_pitch = {}\n"probe.toe_ls[1]" = {}\ntarget.rise_half_life = {}\n'
+    experiment = restricted(tmp_path, rest=rest, free=free, clips=experiments.CLIP + clip)
+    problem = problems.make_problem(experiment)
+    space = problem.space
+    values = np.array([0.4, -0.05])
+    u = space.pack(dict(zip(space.names, values, strict=True)))
+    solution: Any = SimpleNamespace(u=u, names=space.names, values=values, interrupted=False)
+    solution.cost = 3.0
+    fitted = Fit(experiment, problem, solution, cast(Any, None))
+    searches, lines = [], []
+
+    def search(problem, settings, progress, start) -> Any:
+        searches.append((settings.fit.starts, *problem.space.values(start)))
+        return SimpleNamespace(u=start + [0.0, 0.0, 2.0], cost=2.0, interrupted=False)
+
+    monkeypatch.setattr(record_price, "search", search)
+    price = record_price.measure(fitted)
+    assert price is not None and searches == [pytest.approx((1, 0.4, -0.05, 0.1))]
+    assert (price.left_out, price.cost, price.whole_cost) == (("target.rise_half_life",), 3.0, 2.0)
+    (scene,) = problem.data
+    play = playback.play(scene, playback.run(fitted.ik, scene))
+    ankle = np.sqrt(np.mean(play.errors["ankle"] ** 2))
+    assert price.errors["ankle"][0] == pytest.approx(ankle)
+    assert price.errors["ankle"][1] != pytest.approx(ankle)
+    text, section = fits._price_of_record(fitted, None, lines.append)
+    assert lines == ["what the record costs: a search in which target.rise_half_life are free, too"]
+    said = "The cost is 3; with these free, too, a search from there ends at 2."
+    assert (
+        said in "".join(text) and said in section[1] and "not target.rise_half_life: " in section[1]
+    )
+    assert f"| Ankle position | {100 * ankle:.4g} cm |" in section[2]
 
 
 @pytest.mark.slow

@@ -10,7 +10,9 @@ from fitting.analysis import playback
 from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.clips import Clip, flight, load_clip, save_clip
 from fitting.experiments import problems, track_files
+from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
+from fitting.problem.problem import Problem
 from fitting.problem.scene import legs_ws, pelvis_ws
 from fitting.studies.fit import search
 from support import experiments
@@ -127,29 +129,45 @@ def test_a_free_parameter_on_a_track_is_refused(tmp_path):
         problems.make_problem(load_experiment(path))
 
 
-@pytest.mark.slow
-def test_a_fit_with_a_track_recovers_a_known_truth(tmp_path):
-    (tmp_path / "tracks.toml").write_text(
-        "[pelvis.limit]\ntimes = [1.0, 1.4, 1.8]\nvalues = [0.3, 0.02, 0.3]\n"
-    )
+TRUTH = 0.35
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory) -> tuple[Experiment, Problem]:
+    """A second in which a track limits the pelvis, which moves with a known gain."""
+    folder = tmp_path_factory.mktemp("tracked")
+    text = "[pelvis.limit]\ntimes = [1.0, 1.4, 1.8]\nvalues = [0.3, 0.02, 0.3]\n"
+    (folder / "tracks.toml").write_text(text)
     path = experiments.write(
-        tmp_path,
+        folder,
         top="faithful = true",  # its pelvis follows ankles far enough for the limit to act
         clip='tracks = "tracks.toml"\nmask_pops = false\n',
         free="pelvis.on_gain = {}\n",
     )
-    problem = problems.make_problem(load_experiment(path))
-    truth = problem.space.pack({"pelvis.on_gain": 0.35})
+    experiment = load_experiment(path)
+    problem = problems.make_problem(experiment)
     (scene,) = problem.data
-    result = playback.run(problem.space.unpack(truth), scene)
-    moved = pelvis_ws(scene, result)
-    legs = legs_ws(scene, result)
+    ik = problem.space.unpack(problem.space.pack({"pelvis.on_gain": TRUTH}))
+    result = playback.run(ik, scene)
+    moved, legs = pelvis_ws(scene, result), legs_ws(scene, result)
     reference = dataclasses.replace(
         scene.reference, pelvis=moved, knee_ws=legs.knee.pos, ankle=legs.ankle
     )
-    problem = dataclasses.replace(problem, data=(dataclasses.replace(scene, reference=reference),))
-    untracked = dataclasses.replace(problem.data[0], tracks={})
+    scene = dataclasses.replace(scene, reference=reference)
+    return experiment, dataclasses.replace(problem, data=(scene,))
+
+
+def test_the_cost_follows_the_track(tracked):
+    _, problem = tracked
+    truth = problem.space.pack({"pelvis.on_gain": TRUTH})
     assert problem.cost(truth) < 0.05, "only the prior's part is left"
-    assert dataclasses.replace(problem, data=(untracked,)).cost(truth) > 1.0
-    solution = search(problem, load_experiment(path))
-    assert problem.space.values(solution.u)[0] == pytest.approx(0.35, abs=5e-3)
+    tracks = {"pelvis.limit": np.full_like(problem.data[0].tracks["pelvis.limit"], 0.3)}
+    constant = dataclasses.replace(problem.data[0], tracks=tracks)
+    assert dataclasses.replace(problem, data=(constant,)).cost(truth) > 1.0
+
+
+@pytest.mark.slow
+def test_a_fit_with_a_track_recovers_a_known_truth(tracked):
+    experiment, problem = tracked
+    solution = search(problem, experiment)
+    assert problem.space.values(solution.u)[0] == pytest.approx(TRUTH, abs=5e-3)
