@@ -2,17 +2,19 @@
 
 import json
 import re
-import struct
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
-import jaxik
 from fitting.analysis import limit_activity, playback
 from fitting.datasets.synthetic import walker
 from fitting.experiments import known_values
@@ -34,6 +36,7 @@ from fitting.studies.fit import Fit
 from fitting.studies.sample import SampledFit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support.problems import posterior_of
 from support.profiles import parabolas
 
 VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
@@ -50,6 +53,7 @@ toe_ls = [0.0, -0.07, 0.2]
 [noise]
 ankle = 0.01
 """
+CLIP_PLOTS = ("motion", "side_view", "knees", "residuals", "locks", "noise")
 SIGMAS = {"ankle": 0.02, "pelvis": 0.03, "foot": 0.1, "contact": 0.5, "smooth": 20.0}
 SIGMAS |= {"knee": 0.03, "body": 0.2, "correlation": 0.4}
 
@@ -106,32 +110,21 @@ def fitted(experiment) -> Fit:
     return Fit(experiment, problem, solution, identifiability, known)
 
 
+@pytest.fixture(scope="module")
+def twice(fitted) -> Fit:
+    """Of the same clip and again."""
+    problem = replace(fitted.problem, data=fitted.problem.data * 2)
+    return replace(fitted, problem=problem)
+
+
 def invented_posterior(stuck: list[int] | None = None) -> Posterior:
     """Normal draws around known values."""
-    random = np.random.default_rng(0)
-    u = random.normal(size=(120, 12, 3))
+    u = np.random.default_rng(0).normal(size=(120, 12, 3))
     values = np.array([0.105, 0.3, 0.9]) + u * np.array([0.005, 0.01, 0.02])
-    return Posterior(
-        names=tuple(VALUES),
-        u=u,
-        log_probability=-0.5 * np.sum(u**2, axis=-1),
-        values=values,
-        thin_by=2,
-        burn_in=20,
-        autocorrelation_time=np.array([2.0, 3.0, 4.0]),
-        acceptance=np.full(12, 0.25),
-        isolated=[],
-        stuck=stuck or [],
-        converged=True,
-        message="Converged: the chain is long enough.",
-        seconds=3.0,
-    )
-
-
-def size_of_png(path: Path) -> tuple[int, int]:
-    head = path.read_bytes()[:24]
-    assert head[:8] == b"\x89PNG\r\n\x1a\n"
-    return struct.unpack(">II", head[16:24])
+    chain = {"thin_by": 2, "burn_in": 20, "autocorrelation_time": np.array([2.0, 3.0, 4.0])}
+    acceptance = np.full(12, 0.25)
+    posterior = posterior_of(tuple(VALUES), u, values, stuck=stuck or [], **chain)
+    return replace(posterior, acceptance=acceptance, message="Converged: the chain is long enough.")
 
 
 def line_of(text: str, name: str) -> str:
@@ -139,21 +132,13 @@ def line_of(text: str, name: str) -> str:
 
 
 def test_known_values_are_those_of_the_first_clip_that_has_any(experiment):
-    assert known_values.load_known_values(experiment) == {
-        "contact.planted_height": 0.10,
-        "pelvis.on_gain": 0.5,
-        "probe.toe_ls": pytest.approx(0.13 / 3),
-        "probe.toe_ls[0]": 0.0,
-        "probe.toe_ls[1]": -0.07,
-        "probe.toe_ls[2]": 0.2,
-    }
+    values = {"contact.planted_height": 0.10, "pelvis.on_gain": 0.5}
+    values |= {"probe.toe_ls": pytest.approx(0.13 / 3)}
+    values |= {"probe.toe_ls[0]": 0.0, "probe.toe_ls[1]": -0.07, "probe.toe_ls[2]": 0.2}
+    assert known_values.load_known_values(experiment) == values
     assert known_values.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
-
-
-def test_the_known_value_of_one_leg_is_that_of_all_legs(experiment):
     one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
-    truth = known_values.load_known_values(one_leg)
-    assert truth is not None and truth["pelvis.on_gain[1]"] == 0.5
+    assert (known_values.load_known_values(one_leg) or {})["pelvis.on_gain[1]"] == 0.5
 
 
 def test_a_truth_file_that_is_not_toml_is_rejected_by_name(experiment, tmp_path):
@@ -195,11 +180,8 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
         "| 0.1 to 0.12 |"
     )
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
-
-
-def test_the_table_of_priors_says_where_a_centre_is_not_the_systems_value(fitted):
     text = "\n".join(priors.prior_section(fitted.summary["parameters"]))
-    assert "| normal | 0.9667 (system: 0.98) | 1.6 |" in line_of(text, "leg.soften")  # of 0.8 to 1
+    assert "| normal | 0.9667 (system: 0.98) | 1.6 |" in line_of(text, "leg.soften")
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
 
 
@@ -214,37 +196,38 @@ def test_a_gain_is_shown_as_half_life_and_at_30_and_60_hz(fitted):
     assert "truth" not in text and "determined parameters within" not in text
 
 
-@pytest.mark.slow
-def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path):
+def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, monkeypatch):
+    sizes = []
+
+    def savefig(figure: Figure, path: Path, **_: object) -> None:  # drawing takes long
+        sizes.append(100 * figure.get_size_inches())  # pixels
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
     fit_report.write_fit(tmp_path, fitted)
     text = (tmp_path / run_folder.SUMMARY).read_text()
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
-    plots = {"motion.png", "side_view.png", "knees.png", "residuals.png", "locks.png", "cost.png"}
-    plots |= {"worst.png", "noise.png", "profiles.png"}
-    assert set(names) == plots
-    assert {path.name for path in tmp_path.iterdir()} == plots | {run_folder.SUMMARY}
-    for name in names:
-        width, height = size_of_png(tmp_path / name)
-        assert 1000 < width < 2000 and 400 < height < 2500, name
+    plots = {*CLIP_PLOTS, "cost", "worst", "profiles"}
+    assert set(names) == {f"{plot}.png" for plot in plots}
+    assert {path.name for path in tmp_path.iterdir()} == {*names, run_folder.SUMMARY}
+    assert len(sizes) == len(plots)
+    assert all(1000 < width < 2000 and 400 < height < 2500 for width, height in sizes)
     assert "| contact.planted_height | 0.11 | m |" in text
     assert "| contact.planted_height | m | normal | " in text.split("## Priors")[1]
     assert "Not determined: `leg.soften`." in text
     assert f"**{fitted.verdict.sentence}**" in text.split("## Goodness of fit")[1]
     assert "`pelvis.on_gain` and `leg.soften`: -0.930" in text
     assert "| leg.soften | smooth | at least 0.85 | 0.85 to 1 | 0.100 |" in text
-    down, up = limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u)[
-        "contact.planted_height"
-    ]
+    nudges = limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u)
+    down, up = nudges["contact.planted_height"]
     nudged = line_of(text.split("threshold moves")[1], "contact.planted_height")
     assert f"{down.rise:+.1f}" in nudged and f"{up.rise:+.1f}" in nudged
-    scene = fitted.problem.data[0]
-    result = playback.run(fitted.ik, scene)
-    (activity,) = limit_activity.measure(fitted.ik, (scene,), (result,))
+    (activity,) = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
 
 
-def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted):
+def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
     text = fit_report.fit_text(fitted)
     assert fitted.verdict.sentence in text
     group = next(group for group in fitted.groups if group.kind == "knee")
@@ -253,10 +236,13 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted):
     assert float(cells[3]) == pytest.approx(group.left.mean_square, rel=1e-3)
     assert float(cells[6].removesuffix(" cm")) == pytest.approx(3 * group.plain.scale, rel=1e-3)
     assert re.split(r"\s{2,}", line_of(text, "Ankle acceleration"))[4] == "–", "is not tested"
-    problem = fitted.problem
-    twice = Problem(problem.space, problem.data * 2, problem.residual_function, problem.loss)
-    rows = [line for line in fit_report.fit_text(replace(fitted, problem=twice)).splitlines()]
+    rows = fit_report.fit_text(twice).splitlines()
     assert sum("Knee position" in row and row[:1] in "12" for row in rows) == 2
+    goodness = json.loads(json.dumps(fitted.summary["goodness"], allow_nan=False))
+    assert goodness["sentence"] == fitted.verdict.sentence
+    by_kind = {row["kind"]: row for row in goodness["groups"]}
+    assert set(by_kind) == set(playback.RESIDUAL_KINDS)
+    assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
 
 
 def test_what_a_translation_leaves_is_measured_in_tolerances(fitted):
@@ -265,47 +251,27 @@ def test_what_a_translation_leaves_is_measured_in_tolerances(fitted):
     assert "tolerance | error, rms |" in texts[1] and len(texts) == 2
 
 
-def test_the_numbers_of_the_goodness_of_fit_are_plain_json(fitted):
-    goodness = json.loads(json.dumps(fitted.summary["goodness"], allow_nan=False))
-    assert goodness["sentence"] == fitted.verdict.sentence
-    by_kind = {row["kind"]: row for row in goodness["groups"]}
-    assert set(by_kind) == set(playback.RESIDUAL_KINDS)
-    assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
-
-
-def test_the_second_of_two_clips_has_its_own_plots(fitted, tmp_path, monkeypatch):
-    def save_nothing(run, name, caption, figure):
-        return {name: caption}
-
-    monkeypatch.setattr(fit_report, "save_plot", save_nothing)
-    problem = fitted.problem
-    twice = Problem(problem.space, problem.data * 2, problem.residual_function, problem.loss)
-    double = replace(fitted, problem=twice)
-    after = playback.play(problem.data[0], playback.run(fitted.ik, problem.data[0]))
-    plots = fit_report._draw_clip(tmp_path, double, 1, after, after)
-    assert set(plots) == {
-        "motion_2.png", "side_view_2.png", "knees_2.png", "residuals_2.png", "locks_2.png",
-        "noise_2.png",
-    }  # fmt: skip
+def test_the_second_of_two_clips_has_its_own_plots(fitted, twice, tmp_path, undrawn):
+    (after,) = fitted.playbacks
+    plots = fit_report._draw_clip(tmp_path, twice, 1, after, after)
+    assert set(plots) == {f"{name}_2.png" for name in CLIP_PLOTS}
     assert all(caption.startswith("hill, clip 2: ") for caption in plots.values())
     for number in (1, 2):
-        _, plot = fit_report._worst_window(tmp_path, double, number - 1, after)
+        _, plot = fit_report._worst_window(tmp_path, twice, number - 1, after)
         assert plot == f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)"
 
 
-@pytest.mark.slow
 def test_a_playback_has_the_residuals_of_the_fit(fitted):
-    scene = fitted.problem.data[0]
-    played = playback.play(scene, playback.run(fitted.ik, scene))
+    (played,) = fitted.playbacks
     assert played.fitted_kinds == list(playback.RESIDUAL_KINDS)
     shown = np.concatenate([np.ravel(played.residuals[kind]) for kind in playback.RESIDUAL_KINDS])
-    np.testing.assert_allclose(shown, residuals.residuals_of_scenes(fitted.ik, (scene,)), atol=1e-9)
+    expected = eqx.filter_jit(residuals.residuals_of_scenes)(fitted.ik, fitted.problem.data)
+    np.testing.assert_allclose(shown, expected, atol=1e-9)
 
 
 def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
-    scene = fitted.problem.data[0]
+    (scene,), captured = fitted.problem.data, fitted.playbacks[0].captured
     legs = walker.walk(seconds=2.0, fps=15.0).leg_pose_ws()
-    captured = playback.play(scene, playback.run(fitted.ik, scene)).captured
     np.testing.assert_allclose(captured.hip, legs.hip.pos, atol=1e-6)
     np.testing.assert_allclose(captured.toe, legs.toe.pos, atol=1e-6)
     span = np.linalg.norm(np.asarray(legs.hip.pos - legs.ankle.pos), axis=-1)
@@ -314,26 +280,26 @@ def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
     np.testing.assert_allclose(np.cos(captured.knee_angle), cosine, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitted):
-    scene = fitted.problem.data[0]
+    (scene,) = fitted.problem.data
+
+    def active(changed: dict[str, float]) -> Mapping[str, float]:
+        ik = parameter_tree.replace(fitted.ik, changed)
+        return limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))[0]
+
     values = {"pelvis.limit": 0.6, "leg.max_knee_angle": np.pi, "leg.min_knee_angle": 0.0}
-    ik = parameter_tree.replace(fitted.ik, values)
-    (ends,) = limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))
+    ends = active(values)
     assert [ends[name] for name in values] == [0.0, 0.0, 0.0]
-    ik = parameter_tree.replace(fitted.ik, {"pelvis.limit": 0.0})
-    (tight,) = limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))
+    tight = active({"pelvis.limit": 0.0})
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
 
 
 def test_activity_counts_locks_releases_and_ground(fitted):
-    scene = fitted.problem.data[0]
-    result = playback.run(fitted.ik, scene)
-    (activity,) = limit_activity.measure(fitted.ik, (scene,), (result,))
-    result = jaxik.run(fitted.ik, scene.rig, scene.terrain, scene.frames)
-    locked = np.asarray(result.trace.advanced.state.lock.locked)
+    (activity,) = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
+    (result,) = fitted.results
+    locked = np.asarray(playback.stage_outputs(result).advanced.state.lock.locked)
     assert activity.frames == 30 and activity.seconds == pytest.approx(2.0)
     assert activity.locks == tuple(int(n) for n in (np.diff(locked, axis=0) == 1).sum(axis=0))
     assert sum(activity.locks) > 0 and sum(activity.releases) > 0
@@ -361,6 +327,20 @@ def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     assert down.rise == pytest.approx(wanted, rel=1e-5)
 
 
+def sampled_fit(fitted: Fit, posterior: Posterior, known: Mapping[str, float] | None) -> SampledFit:
+    rows, space = fitted.summary["parameters"], fitted.problem.space
+    return SampledFit(fitted.experiment, space, rows, posterior, known)
+
+
+def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> tuple[str, dict[str, Any]]:
+    """Writes it; returns the summary and the numbers."""
+    sampled = sampled_fit(fitted, posterior, fitted.known_values)
+    run_folder.save_posterior(run, sampled)
+    posterior_report.write_posterior(run, sampled)
+    numbers = json.loads((run / run_folder.POSTERIOR).read_text())
+    return (run / run_folder.SUMMARY).read_text(), numbers
+
+
 def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitted):
     posterior = invented_posterior(stuck=[3])
     known = {"contact.planted_height": 0.106, "leg.soften": 0.8}
@@ -378,38 +358,23 @@ def test_the_text_of_a_posterior_has_intervals_and_the_state_of_the_walkers(fitt
     assert "truth" not in posterior_report.posterior_text(sampled_fit(fitted, posterior, None))
 
 
-def sampled_fit(fitted: Fit, posterior: Posterior, known: Mapping[str, float] | None) -> SampledFit:
-    rows, space = fitted.summary["parameters"], fitted.problem.space
-    return SampledFit(fitted.experiment, space, rows, posterior, known)
-
-
-def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> None:
-    sampled = sampled_fit(fitted, posterior, fitted.known_values)
-    run_folder.save_posterior(run, sampled)
-    posterior_report.write_posterior(run, sampled)
-
-
-def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path):
+def test_a_posterior_is_written_after_the_fit_and_only_once(fitted, tmp_path, undrawn):
     (tmp_path / run_folder.SUMMARY).write_text("# hill\n\n## Parameters\n\nof the fit\n")
-    write_posterior(tmp_path, fitted, invented_posterior())
-    text = (tmp_path / run_folder.SUMMARY).read_text()
-    write_posterior(tmp_path, fitted, invented_posterior())
-    assert (tmp_path / run_folder.SUMMARY).read_text() == text
+    text, _ = write_posterior(tmp_path, fitted, invented_posterior())
+    assert write_posterior(tmp_path, fitted, invented_posterior())[0] == text
     assert text.startswith("# hill\n\n## Parameters\n\nof the fit\n\n## Posterior\n")
     covered = "of 1 of 2 parameters; among those that the fit calls determined, of 1 of 2."
     assert f"contain the true values {covered}" in text
     assert "| pelvis.on_gain | 1/tick |" in text
-    for name in ("corner.png", "chain.png"):
-        assert f"({name})" in text
-        assert min(size_of_png(tmp_path / name)) > 400
+    assert "(corner.png)" in text and "(chain.png)" in text
 
 
-def test_a_posterior_stands_beside_its_prior(fitted, tmp_path):
+def test_a_posterior_stands_beside_its_prior(fitted, tmp_path, undrawn):
     posterior = invented_posterior()
-    write_posterior(tmp_path, fitted, posterior)
+    text, numbers = write_posterior(tmp_path, replace(fitted, known_values=None), posterior)
+    assert text.startswith("# hill\n\n## Posterior\n") and "true value" not in text
     assert (tmp_path / run_folder.INFERENCE_DATA).exists() == inference_data.is_available()
-    text = (tmp_path / run_folder.SUMMARY).read_text().split("### Prior and posterior")[1]
-    rows = json.loads((tmp_path / run_folder.POSTERIOR).read_text())["parameters"]
+    text, rows = text.split("### Prior and posterior")[1], numbers["parameters"]
     for row, summary in zip(rows, posterior.summary, strict=True):
         low, high = row["prior"]["interval"]
         both = f"| normal | {low:.4g} to {high:.4g} | {summary['low95']:.4g} to "
@@ -422,23 +387,20 @@ def test_a_posterior_stands_beside_its_prior(fitted, tmp_path):
     assert f"`{moved[0]}`" in text.split("Sensitive to their prior")[1]
 
 
-def test_a_chain_that_meets_a_lower_point_hands_it_back(fitted, tmp_path):
-    # as a run folder has it: with clips that are files
+def test_a_chain_that_meets_a_lower_point_hands_it_back(fitted, tmp_path, undrawn):
     posterior = replace(invented_posterior(), start_log_probability=-8.0)
     best = posterior.best_values
     assert posterior.improvement == pytest.approx(8.0, abs=0.1)
-    write_posterior(tmp_path, fitted, posterior)
-    text = (tmp_path / run_folder.SUMMARY).read_text()
+    text, numbers = write_posterior(tmp_path, fitted, posterior)
     assert f"whose log-probability is {posterior.improvement:.3g} higher" in text
     command = f"`jaxik fit {tmp_path / run_folder.LOWER_POINT} -o {tmp_path}-lower`"
     assert command in text.split("## Posterior\n")[1].split("\n- ")[0]  # first of all
     table = tomllib.loads((tmp_path / run_folder.LOWER_POINT).read_text())["start"]
     assert table["contact"]["planted_height"] == best["contact.planted_height"]
-    numbers = json.loads((tmp_path / run_folder.POSTERIOR).read_text())
     assert numbers["lower_point"] == {"gain": posterior.improvement, "values": best}
-    write_posterior(tmp_path, fitted, replace(posterior, start_log_probability=0.0))
+    posterior = replace(posterior, start_log_probability=0.0)
+    assert write_posterior(tmp_path, fitted, posterior)[1]["lower_point"] is None
     assert not (tmp_path / run_folder.LOWER_POINT).exists()
-    assert json.loads((tmp_path / run_folder.POSTERIOR).read_text())["lower_point"] is None
 
 
 def test_parameters_of_which_chain_and_fit_disagree_are_named(fitted, tmp_path):
@@ -446,24 +408,11 @@ def test_parameters_of_which_chain_and_fit_disagree_are_named(fitted, tmp_path):
     values = posterior.values.copy()
     values[..., 0] = 0.105 + 0.3 * (values[..., 0] - 0.105)  # the fit has a two-sided 0.11
     values[..., 1] += 2.0
-    write_posterior(tmp_path, fitted, replace(posterior, values=values))
-    text = (tmp_path / run_folder.SUMMARY).read_text()
+    values[..., 2] = 0.9  # never moves, and can be drawn
+    text, numbers = write_posterior(tmp_path, fitted, replace(posterior, values=values))
     assert "the 95 % interval of pelvis.on_gain" in text and "leaves out the fitted value" in text
-    found = json.loads((tmp_path / run_folder.POSTERIOR).read_text())["disagreements"]
-    reasons = {row["name"]: row["reason"] for row in found}
+    reasons = {row["name"]: row["reason"] for row in numbers["disagreements"]}
     assert reasons["pelvis.on_gain"] == "leaves out the fit"
-
-
-def test_a_posterior_starts_a_summary_where_there_is_none(fitted, tmp_path):
-    unknown = replace(fitted, known_values=None)
-    write_posterior(tmp_path, unknown, invented_posterior([0]))
-    text = (tmp_path / run_folder.SUMMARY).read_text()
-    assert text.startswith("# hill\n\n## Posterior\n") and "true value" not in text
-
-
-def test_a_parameter_that_never_moves_can_be_drawn(fitted, tmp_path):
-    posterior = invented_posterior()
-    values = posterior.values.copy()
-    values[..., 2] = 0.9
-    write_posterior(tmp_path, fitted, replace(posterior, values=values))
-    assert min(size_of_png(tmp_path / "corner.png")) > 400
+    for name in ("corner.png", "chain.png"):
+        with Image.open(tmp_path / name) as picture:
+            assert min(picture.size) > 400

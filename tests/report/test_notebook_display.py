@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fitting.experiments import experiment_files
-from fitting.inference.sampling.posterior import Posterior
 from fitting.runtime.display import data_frames, notebook
 from fitting.studies.fit import Fit
 from support.experiments import write
+from support.problems import posterior_of
 from support.runs import NAMES, invented_fit
 
 PICTURE = r'src="data:image/png;base64,([^"]+)"'
@@ -28,10 +28,8 @@ def fitted(tmp_path_factory) -> Fit:
 def tables(text: str) -> list[list[list[str]]]:
     """The cells of all tables of a page."""
     page = ElementTree.fromstring(re.sub(r"(<img [^>]*)>", r"\1/>", text))
-    return [
-        [[cell.text or "" for cell in row] for row in table.iter("tr")]
-        for table in page.iter("table")
-    ]
+    rows_of = [list(table.iter("tr")) for table in page.iter("table")]
+    return [[[cell.text or "" for cell in row] for row in rows] for rows in rows_of]
 
 
 def pictures(text: str) -> list[bytes]:
@@ -67,11 +65,7 @@ def test_a_fit_is_a_table_of_pandas(fitted):
 
 def test_a_posterior_is_shown_and_is_a_table():
     u = np.random.default_rng(0).normal(size=(200, 8, 2))
-    posterior = Posterior(
-        names=NAMES, u=u, log_probability=-0.5 * np.sum(u**2, axis=-1), values=u, thin_by=1,
-        burn_in=0, autocorrelation_time=np.full(2, 2.0), acceptance=np.full(8, 0.5), isolated=[],
-        stuck=[], converged=True, message="Converged.", seconds=1.0,
-    )  # fmt: skip
+    posterior = posterior_of(NAMES, u, u)
     text = posterior._repr_html_()
     assert "Converged." in text and len(pictures(text)) == 1
     assert [row[0] for row in tables(text)[0][1:]] == list(NAMES)

@@ -46,29 +46,22 @@ def test_feet_within_all_limits_are_no_warning():
     assert placement_report.warning_texts(GOOD, None) == []
 
 
-@pytest.mark.parametrize(
-    ("cause", "words"),
-    [
-        (
-            Cause("root"),
-            "the root stays on the animation's floor where the ground rises (use --root",
-        ),
-        (
-            Cause("units", 0.01),
-            "the terrain is in another unit of length: one of its units is 0.01 m",
-        ),
+def test_feet_off_the_ground_are_a_warning_with_frames_and_the_likely_cause():
+    sunk = dataclasses.replace(GOOD, sunk=0.62)
+    floor = "the root stays on the animation's floor where the ground rises (use --root"
+    unit = "the terrain is in another unit of length: one of its units is 0.01 m"
+    for cause, words in (
+        (Cause("root"), floor),
+        (Cause("units", 0.01), unit),
         (Cause("offset", -0.12), "all feet are 12 cm too low: check the clip's floor (--floor)"),
         (Cause("offset", 0.5), "all feet are 50 cm too high"),
         (Cause("missing"), "the terrain does not lie below the path"),
         (Cause("unknown"), "none of missing ground, units, root, floor and offset"),
-    ],
-)
-def test_feet_off_the_ground_are_a_warning_with_frames_and_the_likely_cause(cause, words):
-    sunk = dataclasses.replace(GOOD, sunk=0.62)
-    (text,) = placement_report.warning_texts(sunk, cause)
-    assert "in the ground in 62.0 % of their frames (deepest: 3.1 cm, left, frame 7)" in text
-    assert "above it in 2.0 % (highest: 2.2 cm, right, frame 8)" in text
-    assert f"likely cause: {words}" in text
+    ):
+        (text,) = placement_report.warning_texts(sunk, cause)
+        assert "in the ground in 62.0 % of their frames (deepest: 3.1 cm, left, frame 7)" in text
+        assert "above it in 2.0 % (highest: 2.2 cm, right, frame 8)" in text
+        assert f"likely cause: {words}" in text
 
 
 def test_missing_ground_slides_and_pops_are_warnings():

@@ -1,10 +1,10 @@
 """Sentences and the picture about the worst two seconds."""
 
 import dataclasses
-import struct
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from fitting.analysis.playback import Playback
 from fitting.analysis.worst_window import find_worst_window
@@ -41,9 +41,8 @@ def test_the_text_says_whether_the_foot_stands_and_whether_its_target_was_in_rea
     stance, reached = np.ones((FRAMES, 2)), np.ones((FRAMES, 2))
     stance[123, 0] = weight
     reached[123:129, 0] = weight
-    text = describe(
-        playback(error("knee", 123, 0.0, 0.1, 0.0, leg=0), stance=stance, reached=reached)
-    )
+    bent = error("knee", 123, 0.0, 0.1, 0.0, leg=0)
+    text = describe(playback(bent, stance=stance, reached=reached))
     assert f"The foot {state} at that time, according to the captured contact labels." in text
     reach, part = ("within reach", "0 %") if weight else ("out of reach", "5 %")
     assert f"target of its ankle is {reach} then; targets are out of reach in {part} of" in text
@@ -53,12 +52,8 @@ def test_the_text_about_the_body_names_the_feet_that_stand_and_the_error_of_the_
     contact = np.ones((FRAMES, 2))
     contact[:, 1] = 0.0
     unlabelled, unreached = np.zeros((FRAMES, 2)), np.zeros((FRAMES, 2))
-    text = describe(
-        playback(
-            error("pelvis", slice(0, FRAMES), 0.0, 0.03, 0.0),
-            stance=unlabelled, contact=contact, reached=unreached,
-        )
-    )  # fmt: skip
+    sunk = error("pelvis", slice(0, FRAMES), 0.0, 0.03, 0.0)
+    text = describe(playback(sunk, stance=unlabelled, contact=contact, reached=unreached))
     assert "stand at that time, according to the system's contact weights: left." in text
     assert "The ankle's target is out of reach in 100 % of" in text
     assert "The pelvis is 3.0 cm too high on average." in text
@@ -95,14 +90,13 @@ def test_the_picture_shows_the_window_with_its_stances(tmp_path):
     window = find_worst_window(play)
     figure = worst_window_plots.worst_window(play, LEGS, window, "hill: the worst two seconds")
     titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert [title.partition(",")[0].partition(" (")[0] for title in titles] == [
-        "Left ankle", "Right ankle", "Pelvis", "Left knee", "Right knee"
-    ]  # fmt: skip
+    names = ["Left ankle", "Right ankle", "Pelvis", "Left knee", "Right knee"]
+    assert [title.partition(",")[0].partition(" (")[0] for title in titles] == names
     assert figure.axes[0].get_xlim() == (play.time[window.start], play.time[window.end])
     heights = [line.get_ydata() for line in figure.axes[0].lines[:2]]
     assert np.ptp(np.asarray(heights[1])) == pytest.approx(10.0), "the fitted ankle, cm"
     bands = [len(axes.patches) for axes in figure.axes]
     assert bands == [1, 2, 1, 1, 2], "frames that were not seen, and the right foot's stance"
     save(tmp_path / "worst.png", figure)
-    width, height = struct.unpack(">II", (tmp_path / "worst.png").read_bytes()[16:24])
-    assert 1000 < width < 2000 and 1000 < height < 2500
+    with Image.open(tmp_path / "worst.png") as picture:
+        assert 1000 < picture.width < 2000 and 1000 < picture.height < 2500
