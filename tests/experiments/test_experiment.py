@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 import jaxik
+from fitting.datasets.clip_frames import raised
 from fitting.datasets.clips import Clip, load_clip, save_clip
+from fitting.datasets.synthetic import walker
+from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.experiments import experiment_files, problems
 from fitting.experiments.experiment import Experiment, FitOptions
 from fitting.inference.noise.settings import NoiseOptions
@@ -17,6 +20,7 @@ from fitting.problem.prior import ParameterPrior
 from fitting.studies import ablation
 from jaxik.maths import parameter_tree
 from support.experiments import CLIP, ROOT, SECOND, UNEVEN_WALK, write
+from support.grounds import hill
 
 
 @pytest.fixture(scope="module")
@@ -257,3 +261,52 @@ def test_a_loss_that_is_no_distribution_has_no_estimated_sigmas_in_python_either
     for loss in ("huber", "cauchy"):
         with pytest.raises(ValueError, match=f"xperiment.toml: .* the loss '{loss}'.*student"):
             dataclasses.replace(loaded, loss=loss, noise=NoiseOptions("estimated"))
+
+
+HILL = '[[clips]]\nreference = "reference.npz"\nbase = "base.npz"\nterrain = "hill.ply"\n'
+
+
+@pytest.fixture(scope="module")
+def hill_folder(tmp_path_factory):
+    """A flat walk, and the same raised onto a hill as its reference."""
+    path = tmp_path_factory.mktemp("hill")
+    base = walker.walk(8.0, 30.0)
+    rise = np.linspace(0.0, 2.0, base.frame_count)
+    save_clip(path / "base.npz", base)
+    save_clip(path / "reference.npz", raised(base, rise))
+    save_mesh(path / "hill.ply", *hill())
+    return path
+
+
+def test_by_default_the_root_follows_a_hill_and_the_log_says_so(hill_folder):
+    loaded, lines = load(hill_folder, clips=HILL), []
+    (scene,) = problems.make_problem(loaded, lines.append).data
+    assert lines[0].startswith("root of walker seed 0: on the ground below it, 0 to ")
+    data = problems.load_clip_data(loaded.clips[0], None)
+    assert data.root.rise is not None
+    np.testing.assert_allclose(scene.frames.world_from_model.pos[:, 1], data.root.rise)
+    pelvis = np.asarray((scene.frames.world_from_model @ scene.pelvis).pos)
+    placed = raised(data.base, data.root.rise)
+    np.testing.assert_allclose(pelvis, placed.positions_ws[:, 0], atol=1e-9)
+
+
+def test_the_root_can_stay_as_animated(hill_folder):
+    (scene,) = problems.make_problem(load(hill_folder, clips=HILL, clip='root = "animation"')).data
+    np.testing.assert_array_equal(scene.frames.world_from_model.pos[:, 1], 0.0)
+
+
+def test_a_system_does_not_put_itself_on_the_ground_once_more(hill_folder):
+    for root, own in (("ground", False), ("animation", True)):
+        parts = {"top": 'preset = "ozz"', "clip": f'root = "{root}"', "free": "pelvis.limit = {}"}
+        loaded = load(hill_folder, clips=HILL, **parts)
+        system = problems.make_problem(loaded).space.system
+        assert bool(parameter_tree.get(system, "root.enabled")) == own
+        assert parts["clip"] in experiment_files.experiment_to_toml(loaded)
+
+
+def test_a_system_that_is_told_to_put_itself_on_the_ground_does_so_alone(tmp_path):
+    rest, free = "[parameters]\nroot.enabled = true", "probe.stable_height = {}"
+    loaded = load(tmp_path, top='preset = "mec"', free=free, rest=rest)
+    assert [entry.root for entry in loaded.placed_clips()] == ["animation"]
+    chosen = dataclasses.replace(loaded.clips[0], root="ground")
+    assert dataclasses.replace(loaded, clips=(chosen,)).placed_clips() == (chosen,)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -20,6 +19,7 @@ from fitting.experiments.in_memory.saving import with_files
 from fitting.experiments.in_memory.selectors import free_table
 from fitting.problem.digest import digest
 from fitting.studies.ablation import without
+from jaxik.maths import parameter_tree
 from jaxik.maths.parameter_tree import Leaf, parameter
 from jaxik.stages.pelvis import LowestPelvis, ReachPelvis
 from jaxik.world import terrain as terrains
@@ -71,45 +71,40 @@ def test_free_parameters_are_named_or_picked_by_their_leaf():
     assert ranged == {"pelvis.limit": {"low": 0.1}, "foot.max_pitch": {}}
 
 
-@pytest.mark.parametrize(
-    ("free", "message"),
-    [
+def test_what_picks_no_parameter_costs_one_sentence(second):
+    for free, message in (
         ([], "names no parameter"),
         ([lambda ik: ik.pelvis.hight], "no attribute 'hight'; wanted a function that picks leaves"),
         ([lambda ik: 0.5], "a function picks .0.5.; wanted"),
         (["pelvis.hight"], "no parameter named 'pelvis.hight'; nearest is 'pelvis.limit'"),
         ([lambda ik: ik.lock.enabled], "no parameter named 'lock.enabled'"),
-    ],
-)
-def test_what_picks_no_parameter_costs_one_sentence(free, message, second):
-    with pytest.raises(ValueError, match=message):
-        make_experiment(second, free=free)
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_experiment(second, free=free)
 
 
-def test_a_rule_that_no_file_knows_is_fitted_from_memory(second):
+def test_a_rule_that_no_file_knows_is_fitted_from_memory_and_written_once_it_is_registered(
+    second, tmp_path, monkeypatch
+):
     experiment = of_own_rule(second)
     assert (experiment.preset, experiment.faithful) == ("record", False)
     space = problems.make_problem(experiment).space
-    assert space.names == ("pelvis.extra",)
-    assert isinstance(space.system.pelvis, MemoryPelvis)
+    assert space.names == ("pelvis.extra",) and isinstance(space.system.pelvis, MemoryPelvis)
     assert float(space.system.pelvis.limit) == pytest.approx(0.2)
-
-
-def test_what_is_in_memory_is_written_where_a_run_needs_it(second, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="a file can name only after fitting.register_rule"):
-        with_files(of_own_rule(second), tmp_path)
+        with_files(experiment, tmp_path)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setitem(systems.STAGES["pelvis"], "MemoryPelvis", MemoryPelvis)
-    saved = with_files(of_own_rule(second), tmp_path)
+    saved = with_files(experiment, tmp_path)
     text = experiment_files.experiment_to_toml(saved, tmp_path)
     (tmp_path / "experiment.toml").write_text(text)
     moved = tmp_path.rename(tmp_path.with_name("moved"))
     again = experiment_files.load_experiment(moved / "experiment.toml")
     (clip,) = again.clips
     assert clip.reference == moved / "captured.npz" and clip.terrain == moved / "terrain.ply"
-    space = problems.make_problem(again).space
-    assert isinstance(space.system.pelvis, MemoryPelvis)
-    assert space.parameters == problems.make_problem(of_own_rule(second)).space.parameters
+    written = problems.make_problem(again).space
+    assert isinstance(written.system.pelvis, MemoryPelvis)
+    assert written.parameters == space.parameters
     moved.rename(tmp_path)  # where pytest looks for it
 
 
@@ -138,20 +133,12 @@ def test_a_rule_is_left_out_of_a_system_in_memory(second):
 
 @pytest.mark.parametrize("own", [False, True])
 def test_files_of_what_is_in_memory_mean_the_same(second, own, tmp_path):
-    ik = jaxik.presets.ozz()
-    ik = dataclasses.replace(ik, root=dataclasses.replace(ik.root, enabled=jnp.asarray(own)))
+    ik = parameter_tree.replace(jaxik.presets.ozz(), {"root.enabled": own})
     experiment = make_experiment(second, free="pelvis.limit", system=ik)
     saved = with_files(experiment, tmp_path)
-    assert [clip.root for clip in saved.placed_clips()] == [
-        clip.root for clip in experiment.placed_clips()
-    ]
-    systems_of = [each.starting_system() for each in (experiment, saved)]
-    assert eqx.tree_equal(*systems_of)
-
-
-def test_keys_of_files_are_refused_for_a_clip_in_memory(objects):
-    with pytest.raises(ValueError, match="'scale'.*say how files are read"):
-        clip_entry(**objects, scale=0.01)
+    roots = [[clip.root for clip in each.placed_clips()] for each in (experiment, saved)]
+    assert roots[0] == roots[1]
+    assert eqx.tree_equal(experiment.starting_system(), saved.starting_system())
 
 
 def test_a_terrain_that_is_no_mesh_is_fitted_from_memory_but_not_saved(objects, tmp_path):
@@ -163,12 +150,11 @@ def test_a_terrain_that_is_no_mesh_is_fitted_from_memory_but_not_saved(objects, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_experiment_needs_a_clip():
+def test_what_a_clip_in_memory_cannot_have_costs_one_sentence(objects):
+    with pytest.raises(ValueError, match="'scale'.*say how files are read"):
+        clip_entry(**objects, scale=0.01)
     with pytest.raises(ValueError, match="no clip; wanted one at least"):
         make_experiment(free=NAMES)
-
-
-def test_messages_name_the_clip_in_memory(objects):
-    entry = clip_entry(**objects, start=900.0)
+    late = make_experiment(clip_entry(**objects, start=900.0), free=NAMES)
     with pytest.raises(ValueError, match=Path(objects["reference"].source).name):
-        problems.make_problem(make_experiment(entry, free=NAMES))
+        problems.make_problem(late)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -110,44 +111,45 @@ def test_what_an_original_cannot_hold_is_named_and_left_out_only_if_wanted(tmp_p
 
 
 def test_what_changes_nothing_is_not_missed():
-    ik = parameter_tree.replace(
-        presets.unreal(faithful=True), {"root.half_life": 0.3, "probe.max_step_up": 0.5}
-    )
+    unused = {"root.half_life": 0.3, "probe.max_step_up": 0.5}
+    ik = parameter_tree.replace(presets.unreal(faithful=True), unused)
     assert conversion.dropped(ik, ORIGINALS["unreal"]) == {}
     ik = parameter_tree.replace(ik, {"root.enabled": True})
     assert set(conversion.dropped(ik, ORIGINALS["unreal"])) == {"root.enabled", "root.half_life"}
 
 
-def test_parameters_that_are_one_setting_must_agree():
-    ik = parameter_tree.replace(presets.unreal(faithful=True), {"probe.ray_up": 0.8})
-    with pytest.raises(ValueError, match="m_IKCapsuleHalfHeight is one setting, but pelvis.half_h"):
-        conversion.to_settings(ik, "unreal")
-    legs = parameter_tree.replace(presets.ozz(faithful=True), {"leg.soften": [1.0, 0.9]})
-    with pytest.raises(ValueError, match="soften_ is one for all legs"):
-        conversion.to_settings(legs, "ozz")
-    deep = parameter_tree.replace(presets.unreal(faithful=True), {"probe.ray_down": math.inf})
-    with pytest.raises(ValueError, match="m_IKTraceDistance is finite"):
-        conversion.to_settings(deep, "unreal")
-
-
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("name", "changed", "message"),
     [
-        ('system = "unity"\n[settings]\n', "no settings of 'unity'; there are those of"),
-        ('system = "unreal"\n[settings]\nm_IKTrace = 1.0\n', "nearest is 'm_IKTraceDistance'"),
-        ('system = "unreal"\n[settings]\nm_IKTraceDistance = "x"\n', "wanted a number"),
-        ('system = "unreal"\n[settings]\nm_IKTraceDistance = [1.0, 2.0]\n', "wanted ()"),
-        ('system = "mec"\n[settings]\n"Plant Foot" = 1\n', "wanted true or false"),
-        ('[settings]\n"Plant Foot" = true\n', "there is no system"),
-        ('system = "unreal"\n[settings]\n[units]\nm_IKTraceDistance = "m"\n', "has it in 'cm'"),
+        ("unreal", {"probe.ray_up": 0.8}, "m_IKCapsuleHalfHeight is one setting, but pelvis.half_"),
+        ("ozz", {"leg.soften": [1.0, 0.9]}, "soften_ is one for all legs"),
+        ("unreal", {"probe.ray_down": math.inf}, "m_IKTraceDistance is finite"),
     ],
 )
-def test_a_wrong_table_of_settings_costs_one_sentence(text, message, tmp_path):
-    path = tmp_path / "theirs.toml"
-    path.write_text(text)
-    with pytest.raises(ValueError, match="theirs.toml") as refused:
-        jobs.export(path, tmp_path / "ours.toml")
-    assert message in str(refused.value) and not (tmp_path / "ours.toml").exists()
+def test_parameters_that_are_one_setting_must_agree(name, changed, message):
+    ik = parameter_tree.replace(Preset(name, faithful=True).system(), changed)
+    with pytest.raises(ValueError, match=message):
+        conversion.to_settings(ik, name)
+
+
+UNREAL = 'system = "unreal"\n[settings]\n'
+
+
+def test_a_wrong_table_of_settings_costs_one_sentence(tmp_path):
+    path, output = tmp_path / "theirs.toml", tmp_path / "ours.toml"
+    for text, message in (
+        ('system = "unity"\n[settings]\n', "no settings of 'unity'; there are those of"),
+        (f"{UNREAL}m_IKTrace = 1.0\n", "nearest is 'm_IKTraceDistance'"),
+        (f'{UNREAL}m_IKTraceDistance = "x"\n', "wanted a number"),
+        (f"{UNREAL}m_IKTraceDistance = [1.0, 2.0]\n", "wanted ()"),
+        ('system = "mec"\n[settings]\n"Plant Foot" = 1\n', "wanted true or false"),
+        ('[settings]\n"Plant Foot" = true\n', "there is no system"),
+        (f'{UNREAL}[units]\nm_IKTraceDistance = "m"\n', "has it in 'cm'"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=f"theirs.toml.*{re.escape(message)}"):
+            jobs.export(path, output)
+        assert not output.exists(), text
 
 
 @pytest.mark.filterwarnings("ignore:parameters do not tell the knee's axis")
