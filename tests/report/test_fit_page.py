@@ -32,14 +32,11 @@ def fitted(tmp_path_factory) -> Fit:
     """An invented fit, whose names try to be HTML."""
     fitted = runs.with_clips(runs.invented_fit(tmp_path_factory.mktemp("experiment")))
     (scene,) = fitted.problem.data
-    scene = dataclasses.replace(
-        scene, reference=dataclasses.replace(scene.reference, label=HOSTILE)
-    )
-    return dataclasses.replace(
-        fitted,
-        experiment=dataclasses.replace(fitted.experiment, name=f"walk {HOSTILE} & $x^$"),
-        problem=dataclasses.replace(fitted.problem, data=(scene,)),
-    )
+    reference = dataclasses.replace(scene.reference, label=HOSTILE)
+    scene = dataclasses.replace(scene, reference=reference)
+    problem = dataclasses.replace(fitted.problem, data=(scene,))
+    experiment = dataclasses.replace(fitted.experiment, name=f"walk {HOSTILE} & $x^$")
+    return dataclasses.replace(fitted, experiment=experiment, problem=problem)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +49,12 @@ def run(fitted, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def page(run) -> Page:
     return Page(run / run_folder.PAGE)
+
+
+@pytest.fixture(scope="module")
+def motions(fitted) -> fit_motions.ClipMotions:
+    (data,), (result,) = fitted.clips, fitted.results
+    return fit_motions.clip_motions(data, result, result)
 
 
 def array(text: str, kind: str) -> np.ndarray:
@@ -71,14 +74,6 @@ def test_the_page_is_one_small_file_that_loads_nothing(page, run):
     addresses = set(re.findall(r"\w+://[^\s\"']+", page.html))
     assert addresses <= {"http://www.w3.org/2000/svg"}  # a name, which nothing loads
     assert not re.search(r"@import|url\(|\bfetch\(|\bimport\(|XMLHttpRequest", page.html)
-
-
-def test_names_of_users_stay_text(page):
-    assert page.elements.count("script") == 2  # data and scripts of its own
-    assert f"walk {HOSTILE} & $x^$" in page.text
-    (clip,) = page.data["clips"]
-    labels = {skeleton["key"]: skeleton["label"] for skeleton in clip["skeletons"]}
-    assert labels["captured"] == HOSTILE
 
 
 def test_the_page_says_what_was_found(page, fitted):
@@ -101,9 +96,8 @@ def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
     (tmp_path / run_folder.PAGE).write_text(page)
     for count in (1, 2):
         lines = [f"chain {count} <b>"]
-        posterior_section.insert(
-            tmp_path, ["`jaxik fit` <i>: **run** it"], lines, [["parameter"], ["x"]]
-        )
+        first = ["`jaxik fit` <i>: **run** it"]
+        posterior_section.insert(tmp_path, first, lines, [["parameter"], ["x"]])
     sampled = Page(tmp_path / run_folder.PAGE)
     assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
     assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
@@ -114,7 +108,12 @@ def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
     assert (tmp_path / run_folder.PAGE).read_text() == "of another kind"
 
 
-def test_headings_are_in_order(page):
+def test_names_of_users_stay_text_and_headings_are_in_order(page):
+    assert page.elements.count("script") == 2  # data and scripts of its own
+    assert f"walk {HOSTILE} & $x^$" in page.text
+    (clip,) = page.data["clips"]
+    labels = {skeleton["key"]: skeleton["label"] for skeleton in clip["skeletons"]}
+    assert labels["captured"] == HOSTILE
     levels = [int(heading[1]) for heading in page.headings]
     assert levels[0] == 1 and levels.count(1) == 1
     assert all(after <= before + 1 for before, after in zip(levels, levels[1:], strict=False))
@@ -127,22 +126,18 @@ def test_positions_on_the_page_are_those_of_the_motions(page, fitted):
     ankles = np.asarray(legs_ws(scene, fitted.results[0]).ankle.pos)
     captured = data.reference.positions_ws
     corner = captured[0, 0] - points(clip, clip["skeletons"][2])[0, 0]
-    for skeleton, expected in ((clip["skeletons"][3], ankles), (clip["skeletons"][2], None)):
+    for number, expected in ((3, ankles), (2, data.reference.joints_ws(2))):
+        skeleton = clip["skeletons"][number]
         shown = points(clip, skeleton)[:, [legs[2] for legs in skeleton["legs"]]] + corner
-        if expected is None:
-            expected = data.reference.joints_ws(2)
         np.testing.assert_allclose(shown, expected, atol=1e-4)  # 0.1 mm
 
 
-def test_soles_in_the_ground_are_those_of_the_placement(page, fitted):
+def test_soles_in_the_ground_are_those_of_the_placement(page, motions):
     (clip,) = page.data["clips"]
-    (data,) = fitted.clips
-    before = fitted.results[0]
-    motions = fit_motions.clip_motions(data, before, fitted.results[0])
     for name, skeleton in zip(("animated", "fitted"), clip["skeletons"][::3], strict=True):
-        placed = getattr(motions, name)
         marks = array(skeleton["inGround"], "u1").reshape(clip["frames"], -1)
-        assert marks.any(axis=1).mean() == pytest.approx(placed.placement.sunk_frames)
+        placement = getattr(motions, name).placement
+        assert marks.any(axis=1).mean() == pytest.approx(placement.sunk_frames)
     assert motions.animated.in_ground.any()
 
 
@@ -166,9 +161,7 @@ def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
     assert near.mean() > 0.95  # the other rays meet the edge of a step
 
 
-def test_a_long_clip_is_shown_with_fewer_frames(fitted, monkeypatch):
-    (data,) = fitted.clips
-    motions = fit_motions.clip_motions(data, fitted.results[0], fitted.results[0])
+def test_a_long_clip_is_shown_with_fewer_frames(fitted, motions, monkeypatch):
     (play,) = fitted.playbacks
     shown = fit_page.shown(motions, "captured", worst_window.find_worst_window(play))
     (whole,) = motion_data.pack([shown])
@@ -181,10 +174,9 @@ def test_a_long_clip_is_shown_with_fewer_frames(fitted, monkeypatch):
     (packed,) = motion_data.pack([shown], spent)
     step = -(-whole["frames"] // packed["frames"])
     assert step > 2, "grounds and pictures count"
-    skeletons = packed["skeletons"][3], whole["skeletons"][3]
-    few, all_ = (points(c, s) for c, s in zip((packed, whole), skeletons, strict=True))
-    np.testing.assert_allclose(few, all_[::step], atol=1e-4)
-    marks = [array(s["inGround"], "u1").any() for s in skeletons]
+    few, every = ((clip, clip["skeletons"][3]) for clip in (packed, whole))
+    np.testing.assert_allclose(points(*few), points(*every)[::step], atol=1e-4)
+    marks = [array(skeleton["inGround"], "u1").any() for _, skeleton in (few, every)]
     assert marks[0] == marks[1]  # what happens between two frames is kept
 
 
@@ -204,25 +196,15 @@ def test_a_run_keeps_its_flat_animation_and_its_fitted_motion(run, fitted):
     np.testing.assert_array_equal(base.positions_ws, data.base.positions_ws)
     ankles = np.asarray(legs_ws(scene, fitted.results[0]).ankle.pos)
     np.testing.assert_allclose(solved.joints_ws(2), ankles, atol=1e-9)
-    several = dataclasses.replace(fitted, clips=fitted.clips * 2)
-    several = dataclasses.replace(
-        several, problem=dataclasses.replace(several.problem, data=several.problem.data * 2)
-    )
+    problem = dataclasses.replace(fitted.problem, data=fitted.problem.data * 2)
+    several = dataclasses.replace(fitted, clips=fitted.clips * 2, problem=problem)
     names = {"base_1.npz", "base_2.npz", "fitted_1.npz", "fitted_2.npz"}
     assert set(fit_motions.saved_clips(several)) == names
 
 
-@pytest.mark.parametrize(
-    ("names", "text"),
-    [
-        (["a"], "a"),
-        (["a", "b"], "a and b"),
-        (["a", "b", "c"], "a, b and c"),
-        (["a", "b", "c", "d"], "a, b and 2 others"),
-    ],
-)
-def test_many_names_become_a_number(names, text):
-    assert sentences.listed(names) == text
+def test_many_names_become_a_number():
+    texts = [sentences.listed(list("abcd"[:count])) for count in (1, 2, 3, 4)]
+    assert texts == ["a", "a and b", "a, b and c", "a, b and 2 others"]
 
 
 def test_data_cannot_end_its_script_element():

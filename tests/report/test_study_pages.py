@@ -59,15 +59,11 @@ def test_a_comparison_shows_the_animation_every_system_and_the_capture(page, mot
     assert clip["watched"] == "motion deep"
     assert [skeleton["worst"] is None for skeleton in clip["skeletons"]] == [False] * 3 + [True]
     assert page.elements.count("img") == 1 and len(page.html) < 1_000_000
+    assert page.elements.count("script") == 2
+    loads = {load for load in page.loads if not load.startswith("data:")}
+    assert loads == {"compare.md", "compare.json", "compare.png"}
     assert {"h2 Limits of the data", "h2 What was asked"} <= set(page.headings)
     assert motions.accuracy["deep"].ankle == pytest.approx(DEEP)
-
-
-def test_a_page_loads_nothing_and_names_stay_text(page):
-    beside = {"compare.md", "compare.json", "compare.png"}
-    loads = {load for load in page.loads if not load.startswith("data:")}
-    assert loads == beside
-    assert page.elements.count("script") == 2
 
 
 def test_where_feet_are_furthest_off_is_the_worst_window(motions, compared):
@@ -85,9 +81,8 @@ def test_where_feet_are_furthest_off_is_the_worst_window(motions, compared):
 
 def test_limits_say_which_fault_is_worst(motions):
     placed = motions.motions["close"].placement
-    still = dataclasses.replace(
-        placed, sunk=0.0, floating=0.0, slide=-0.01, pop=dataclasses.replace(placed.pop, value=0.0)
-    )
+    pop = dataclasses.replace(placed.pop, value=0.0)
+    still = dataclasses.replace(placed, sunk=0.0, floating=0.0, slide=-0.01, pop=pop)
     popping = dataclasses.replace(still, pop=dataclasses.replace(placed.pop, value=0.1))
     excess, words = compare_sentences.faults(popping)[0]
     assert excess == pytest.approx(2.0 / placed.size) and words.startswith("its feet pop by up to")
@@ -131,19 +126,14 @@ def test_pictures_become_small_enough_and_missing_ones_are_left_out(tmp_path, mo
     assert picture.width / picture.height == pytest.approx(1.5, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("behind", "unreliable", "first", "verdict"),
-    [
+def test_runs_that_cannot_be_told_apart_are_said_so():
+    for behind, unreliable, first, bad in (
         (5.0, 0, "`a` predicts best; `b` is 5.0 ± 1.0 below.", False),
         (1.5, 0, "The motion does not tell `a`, which predicts best, from `b`", True),
         (5.0, 2, "The figures are not fully reliable", True),
-    ],
-)
-def test_runs_that_cannot_be_told_apart_are_said_so(behind, unreliable, first, verdict):
-    runs = [
-        ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}),
-        ComparedRun("b", -10.0 - behind, 2.0, behind, 1.0, 4.0, unreliable, {1: -9.0}),
-    ]
-    findings = runs_page.findings(runs)
-    found = [finding for finding in findings if finding.text.startswith(first)]
-    assert len(findings) == 3 and [finding.bad for finding in found] == [verdict]
+    ):
+        other = ComparedRun("b", -10.0 - behind, 2.0, behind, 1.0, 4.0, unreliable, {1: -9.0})
+        runs = [ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}), other]
+        findings = runs_page.findings(runs)
+        found = [finding.bad for finding in findings if finding.text.startswith(first)]
+        assert len(findings) == 3 and found == [bad], first
