@@ -41,9 +41,8 @@ def test_a_notebook_shows_the_clips_and_the_free_parameters_of_an_experiment(tmp
     text = experiment._repr_html_()
     clips, free = tables(text)
     assert "a &lt;b&gt; &amp; c" in text and "Numbers are for an adult" in text
-    assert clips[1] == [
-        "uneven_walk.npz", "uneven_walk_base.npz", "uneven_walk.ply", "1 s", "2 s"
-    ]  # fmt: skip
+    files = ["uneven_walk.npz", "uneven_walk_base.npz", "uneven_walk.ply"]
+    assert clips[1] == [*files, "1 s", "2 s"]
     assert [row[0] for row in free[1:]] == list(NAMES) and free[2][3] == "0.1 to 1.4"
 
 
