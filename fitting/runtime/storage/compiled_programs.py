@@ -33,6 +33,13 @@ def write_complete_files() -> None:
             in_place(self, key, value)
         else:
             path = Path(self.path, f"{key}{SUFFIX}")
-            files.write(path, lambda temporary: temporary.write_bytes(value))
+            _sweep_once(path.parent)
+            files.write(path, lambda temporary: temporary.write_bytes(value), lasting=False)
 
     LRUCache.put = put
+
+
+@functools.cache
+def _sweep_once(folder: Path) -> None:
+    """Removes what killed processes have left; a folder of thousands of files takes long."""
+    files.sweep(folder)
