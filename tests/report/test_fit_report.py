@@ -131,7 +131,7 @@ def line_of(text: str, name: str) -> str:
     return next(line for line in text.splitlines() if line.strip("| ").startswith(name))
 
 
-def test_known_values_are_those_of_the_first_clip_that_has_any(experiment):
+def test_known_values_are_those_of_the_first_clip_that_has_any(experiment, tmp_path):
     values = {"contact.planted_height": 0.10, "pelvis.on_gain": 0.5}
     values |= {"probe.toe_ls": pytest.approx(0.13 / 3)}
     values |= {"probe.toe_ls[0]": 0.0, "probe.toe_ls[1]": -0.07, "probe.toe_ls[2]": 0.2}
@@ -139,14 +139,10 @@ def test_known_values_are_those_of_the_first_clip_that_has_any(experiment):
     assert known_values.load_known_values(replace(experiment, clips=experiment.clips[:1])) is None
     one_leg = replace(experiment, free={"pelvis.on_gain[1]": {}})
     assert (known_values.load_known_values(one_leg) or {})["pelvis.on_gain[1]"] == 0.5
-
-
-def test_a_truth_file_that_is_not_toml_is_rejected_by_name(experiment, tmp_path):
-    path = tmp_path / "broken.toml"
-    path.write_text("contact = [")
-    entry = replace(experiment.clips[0], truth=path)
+    (tmp_path / "broken.toml").write_text("contact = [")
+    broken = replace(experiment.clips[0], truth=tmp_path / "broken.toml")
     with pytest.raises(ValueError, match=r"broken\.toml: not TOML"):
-        known_values.load_known_values(replace(experiment, clips=(entry,)))
+        known_values.load_known_values(replace(experiment, clips=(broken,)))
 
 
 def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(fitted):
