@@ -244,25 +244,35 @@ class Case(NamedTuple):
         return rows + [(point, way, blurred) for blurred in (False, True) for point in points]
 
 
+Inputs = tuple[jaxik.FootIK, terrain.Terrain, jaxik.Frame]
+
+
+def read(inputs: Inputs, started: jax.Array, blurred: jax.Array) -> dict[str, jax.Array]:
+    """The measures of a clip on its ground."""
+    ik, ground, frames = inputs
+    state = dataclasses.replace(jaxik.init(ik, to_rig(RIG)), started=started)
+    result = jaxik.resume(ik, to_rig(RIG), ground, state, frames, Either(blurred))[1]
+    return measures(result, frames)
+
+
+@functools.partial(jax.jit, compiler_options=QUICK)
+@jax.vmap
+def valued(inputs: Inputs, started: jax.Array, blurred: jax.Array) -> dict[str, jax.Array]:
+    return read(inputs, started, blurred)
+
+
 @functools.partial(jax.jit, compiler_options=QUICK)
 @jax.vmap
 def measured(
-    inputs: tuple[jaxik.FootIK, terrain.Terrain, jaxik.Frame],
-    ways: Any,
-    started: jax.Array,
-    blurred: jax.Array,
+    inputs: Inputs, ways: Any, started: jax.Array, blurred: jax.Array
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """The measures of a clip on its ground, and their derivatives along `ways`."""
     floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
-    rig = to_rig(RIG)
-
-    def read(floats: Any) -> dict[str, jax.Array]:
-        ik, ground, frames = eqx.combine(floats, rest)
-        state = dataclasses.replace(jaxik.init(ik, rig), started=started)
-        result = jaxik.resume(ik, rig, ground, state, frames, Either(blurred))[1]
-        return measures(result, frames)
-
-    return jax.jvp(read, (floats,), (eqx.filter(ways, eqx.is_inexact_array),))
+    return jax.jvp(
+        lambda floats: read(eqx.combine(floats, rest), started, blurred),
+        (floats,),
+        (eqx.filter(ways, eqx.is_inexact_array),),
+    )
 
 
 def with_columns(rows: Sequence[dict[str, Any]], ik: jaxik.FootIK) -> jaxik.FootIK:
@@ -290,7 +300,7 @@ class Outcomes(NamedTuple):
     ik: jaxik.FootIK
     cases: Sequence[Case]
     measures: np.ndarray
-    slopes: np.ndarray
+    slopes: np.ndarray  # none where only values were asked for
 
     def without_effect(self) -> list[Any]:
         """The cases whose measure does not change as they say."""
@@ -324,25 +334,29 @@ class Outcomes(NamedTuple):
         return wrong
 
 
-def outcomes_of(cases: Sequence[Case], ik: jaxik.FootIK) -> Outcomes:
-    """What comes of all cases, some at once."""
+def outcomes_of(cases: Sequence[Case], ik: jaxik.FootIK, sloped: bool = True) -> Outcomes:
+    """What comes of all cases, some at once; without derivatives in a third of the time."""
+    each = 8 if sloped else 2  # rows of a case
     numbers = []
-    for start in range(0, len(cases), ROWS // 8):
-        some = [cases[min(start + index, len(cases) - 1)] for index in range(ROWS // 8)]
-        rows = [(case, *row) for case in some for row in case.rows(ik)]
+    for start in range(0, len(cases), ROWS // each):
+        some = [cases[min(start + index, len(cases) - 1)] for index in range(ROWS // each)]
+        rows = [(case, *row) for case in some for row in case.rows(ik)[:each]]
         clips = stacked([(case.ground, clip(case.clip)) for case, *_ in rows])
         systems = with_columns([case.base | {case.leaf: value} for case, value, *_ in rows], ik)
         ways = with_columns([{case.leaf: way} for case, _, way, _ in rows], zeros_like(ik))
         started = np.array([case.started for case, *_ in rows])
         blurred = np.array([blurred for *_, blurred in rows])
-        batch = (systems, *clips), (ways, *zeros_like(clips)), started, blurred
-        both = jax.device_get(measured(*batch))
+        inputs = (systems, *clips)
+        if sloped:
+            tables = jax.device_get(measured(inputs, (ways, *zeros_like(clips)), started, blurred))
+        else:
+            tables = jax.device_get((valued(inputs, started, blurred),))
         numbers += [
-            [table[case.change[2:]][index] for table in both]
+            [table[case.change[2:]][index] for table in tables]
             for index, (case, *_) in enumerate(rows)
         ]
-    measures, slopes = np.reshape(numbers, (-1, 8, 2))[: len(cases)].transpose(2, 0, 1)
-    return Outcomes(ik, cases, measures, slopes)
+    table = np.reshape(numbers, (-1, each, len(numbers[0])))[: len(cases)].transpose(2, 0, 1)
+    return Outcomes(ik, cases, table[0], table[-1] if sloped else np.empty(0))
 
 
 def system(name: str) -> jaxik.FootIK:
