@@ -25,6 +25,8 @@ xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
 UNOPTIMIZED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # for child processes
 jax.config.update("jax_disable_most_optimizations", UNOPTIMIZED != "0")
+# Notes in programs of where they come from, which take a tenth of the time to compile.
+jax.config.update("jax_traceback_in_locations_limit", 0)
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
 KEPT_PROGRAMS = ROOT / ".pytest_cache" / "programs"  # `--cache-clear` empties it
