@@ -9,6 +9,7 @@ import gc
 import os
 import resource
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,6 +36,9 @@ jax.config.update(PROGRAMS.lower(), os.environ[PROGRAMS])
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # of programs that are kept: all are
 jax.config.update(SHORTEST.lower(), float(os.environ.setdefault(SHORTEST, "0")))
 compiled_programs.write_complete_files()  # what one process writes another may read
+
+# Some tests send themselves what Ctrl-C does, which shells have jobs in the background ignore.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What commands print must not depend on how fast they are.
 plain_lines.PATIENCE = plain_lines.INTERVAL = plain_lines.SILENCE = float("inf")

@@ -64,6 +64,7 @@ def main() -> int:
     KEPT.mkdir(parents=True, exist_ok=True)
     os.environ.update(ENVIRONMENT)
     signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGINT, interrupt)  # which shells have jobs in the background ignore
     modules = [path for folder in options.only for path in modules_of(ROOT, folder)]
     mutants = [mutant for path in modules for mutant in mutants_of(ROOT, path)]
     chosen = sample(mutants, options.count, options.seed)
