@@ -164,7 +164,8 @@ def test_a_clip_agrees_with_the_reference(name, hz):
     compare(preset, values, clip(hz, **how), ground, to_terrain(ground))
 
 
-@pytest.mark.parametrize("hz", RATES)
+@pytest.mark.slow
+@pytest.mark.parametrize("hz", [20, 60])
 def test_feet_with_different_ups_agree_with_the_reference(hz):
     tilts = [maths.from_axis_angle(axis, 0.2) for axis in (maths.X, -maths.Z, maths.Z)]
     ups = [maths.Y, *(maths.rotate(tilt, maths.Y) for tilt in tilts)]

@@ -151,6 +151,7 @@ def strip_of(left: float, right: float, near: float, far: float) -> terrain.Terr
     return terrain.heightfield(jnp.full((2, 2), 0.04), size, (left, 0.0, near))
 
 
+@pytest.mark.slow
 def test_feet_on_a_belt_and_on_the_floor_do_not_know_which_of_them_moves():
     """By Galileo: the belt can move over the floor, or the floor under the belt."""
     moves, stands = track(line(x=0.1 * TIME, z=0.2 * TIME), 0 * TIME), MOTIONS["stands"]

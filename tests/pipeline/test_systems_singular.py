@@ -16,7 +16,9 @@ from support.cases import QUICK, RIG, Either
 from support.clips import at, to_rig
 
 COUNT = 8  # frames
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("record", "unreal", "mec", "stride")]
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("record", "unreal", "mec", "stride")
+]
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
