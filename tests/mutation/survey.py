@@ -54,13 +54,17 @@ class Survey:
         """Tests to ask about a change of a line, in the order in which they run.
 
         First, whole, the files of tests that changed since the survey; then the tests that execute
-        the statement, and last what else is in files of which a test executes the module, as
-        fixtures and compiled programs serve several tests. Quick files come before slow ones.
+        the statement, or those of the module's folder where imports alone do, and last what else
+        is in files of which a test executes the module, as fixtures and compiled programs serve
+        several tests. Quick files come before slow ones.
         """
         contexts = self._data.contexts_by_lineno(path)
         tests = {number: _tests(names) & self.seconds.keys() for number, names in contexts.items()}
         lines = statement(root / path, line)
         hitting = set().union(*(tests.get(number, set()) for number in lines))
+        if not hitting:
+            folder = Path("tests", Path(path).with_suffix("").parts[1])
+            hitting = {test for test in self.seconds if folder in Path(_file(test)).parents}
         files = {_file(test) for test in set().union(*tests.values())}
         others = {test for test in self.seconds if _file(test) in files} - hitting
         changed = [file for file in self.changed if Path(file).name.startswith("test_")]
