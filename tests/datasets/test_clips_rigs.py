@@ -12,7 +12,13 @@ from fitting.datasets.clips import load_clip
 from fitting.datasets.clips.contacts import detect_stances, runs
 from fitting.datasets.clips.formats.bvh import read_bvh
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
-from fitting.datasets.clips.rigs import LegMotion, foot_axes, knee_axis, measure_soles
+from fitting.datasets.clips.rigs import (
+    LegMotion,
+    foot_axes,
+    knee_axis,
+    left_directions,
+    measure_soles,
+)
 from jaxik.world.skeleton import Transform, forward_kinematics
 from support.sample_clips import BVH, flat_floor, stair_walk
 
@@ -103,6 +109,15 @@ def test_a_character_that_lies_on_its_side_keeps_its_last_heading_or_faces_z(wal
     positions[frames, [1, 5]] = positions[frames, [0]] + [[0, 0.1, 0], [0, -0.1, 0]]
     root = walk.with_motion(positions, walk.rotations_ws).world_from_model()
     assert np.allclose(root.rot, UPRIGHT, atol=1e-9)
+
+
+def test_left_is_where_left_hips_are_or_the_x_axis_of_a_pelvis_with_legs_on_one_side():
+    turned = Rotation.from_euler("y", [[0.0], [90.0]], degrees=True).as_quat(scalar_first=True)
+    hips_ws = np.array([[[0.0, 1.0, 0.2], [0.0, 1.0, -0.2]]] * 2)
+    both = left_directions(hips_ws, np.array([1.0, -1.0]), turned)
+    np.testing.assert_allclose(both, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
+    alone = left_directions(hips_ws, np.array([1.0, 1.0]), turned)
+    np.testing.assert_allclose(alone, [[1, 0, 0], [0, 0, -1]], atol=1e-12)
 
 
 def test_detected_stances_of_a_synthetic_walk_are_the_true_ones(walk):

@@ -10,6 +10,7 @@ from fitting.datasets.clip_frames import raised
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import gait, walker
 from jaxik.world import terrain
+from support import bodies
 from support.grounds import edges_between_footfalls, flight, hill, terrain_of
 
 STRAIGHT = walker.WalkStyle(bend=0.0)
@@ -67,12 +68,14 @@ def test_a_path_crosses_a_gap_near_the_height_of_its_edges(short, bottom):
     assert heights.min() > -0.7
 
 
-def test_a_path_falls_off_a_cliff_at_a_limited_speed(short):
-    cliff = terrain.combine(slab(-2.0, 2.0, 0.0), slab(2.0, 9.0, -3.0))
-    heights = path_of(short, cliff)
-    assert heights[-1] == pytest.approx(-3.0)
-    falling = heights[(heights < -0.01) & (heights > -1.9)]
-    np.testing.assert_allclose(np.diff(falling), -ground_path.FALL / 60.0, rtol=1e-9)
+@pytest.mark.parametrize("size", [1.0, 0.5])
+def test_a_path_falls_off_a_cliff_at_a_speed_that_is_limited_by_the_size_of_the_body(short, size):
+    cliff = terrain.combine(slab(-2.0, 2.0 * size, 0.0), slab(2.0 * size, 9.0, -3.0 * size))
+    heights = path_of(bodies.scaled(short, size), cliff)
+    assert heights[-1] == pytest.approx(-3.0 * size)
+    falling = heights[(heights < -0.01) & (heights > -1.9 * size)]
+    speed = ground_path.FALL * size**0.5
+    np.testing.assert_allclose(np.diff(falling), -speed / 60.0, rtol=1e-6)
 
 
 def test_a_path_with_less_than_half_of_its_ground_is_none(short):

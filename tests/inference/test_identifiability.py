@@ -71,6 +71,9 @@ def test_a_parameter_without_effect_has_contraction_0_whatever_its_prior(kind):
         assert report.contraction[0] == pytest.approx(0, abs=0.01), prior
         assert report.undetermined == ("x[0]",), prior
         assert report.contraction[1] > 0.9, prior
+        # At 0.4 a fraction rises by 0.24 for each unit of `u`, whose prior has the usual spread.
+        information = (0.24 / 0.02 * SPREAD) ** 2
+        assert report.eigenvalues[-1] == pytest.approx(information, rel=0.01), prior
 
 
 def test_parameters_with_the_same_effect_are_named_as_a_pair(report):
