@@ -47,6 +47,7 @@ def test_eight_devices_find_what_one_finds(evaluations, tmp_path):
     assert_alike(tmp_path / "eight.npz", evaluations | on_devices.log_probabilities())
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_finds(evaluations, tmp_path):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

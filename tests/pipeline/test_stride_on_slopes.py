@@ -123,12 +123,14 @@ def soles() -> dict[tuple[str, str, int], Soles]:
     return table
 
 
+@pytest.mark.slow
 def test_a_standing_sole_lies_on_the_slope():
     for direction, angle in SLOPES:
         error = np.abs(soles()["standing", direction, angle].error).max()
         assert error < 0.002, (direction, angle)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("footholds", ["known", "predicted"])
 def test_a_walker_keeps_its_soles_on_the_slope(footholds: str):
     stands = np.asarray(figures()[footholds].frames.stride.standing) > 0.5

@@ -312,6 +312,7 @@ def test_the_picture_marks_ranks_that_leave_their_band(made):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_noise_that_is_not_as_assumed_is_simulated_and_assumed_no_more(
     experiment_file, monkeypatch
 ):
