@@ -77,11 +77,11 @@ def connect(
         }
         with _workers_without_interrupts():
             local = LocalCluster(n_workers=workers, **options)
-        with local, Client(local) as client:
+        with local, Client(local, set_as_default=False) as client:
             yield client
         return
     try:
-        client = Client(scheduler, timeout=CONNECT_SECONDS)
+        client = Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ValueError(f"no Dask scheduler answers at {scheduler!r}: {error}") from None
     with client:
@@ -133,7 +133,7 @@ def compute(
     # A task and no `scatter`: what is lost with a worker is made again from the scheduler's copy.
     shared = client.submit(bytes, cloudpickle.dumps(function), pure=False)
     indices: dict[Future, int] = {}
-    completed = as_completed()
+    completed = as_completed(loop=client.loop)
     waiting = iter(enumerate(arguments))
 
     def submit_more() -> None:
