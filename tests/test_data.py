@@ -58,25 +58,21 @@ def cast_down(ground, points):
     return jax.jit(terrain.cast)(ground, points + np.array([0.0, 2.0, 0.0]), 4.0)
 
 
-@pytest.mark.slow
-def test_terrains_and_true_parameters_are_generated_again_to_the_byte(generated):
-    names = {f"terrains/{path.name}" for path in (DATA / "terrains").iterdir()}
-    assert names == {f"terrains/{path.name}" for path in (generated / "terrains").iterdir()}
-    for name in (*names, *(f"clips/{reference}_truth.toml" for reference in REFERENCES)):
-        assert (generated / name).read_bytes() == (DATA / name).read_bytes(), name
+def test_terrains_and_true_parameters_are_generated_again_to_the_byte(make, tmp_path):
+    for name, mesh in make.TERRAINS.items():
+        mesh_files.save_mesh(tmp_path / f"{name}.ply", *mesh())
+    assert {path.name for path in tmp_path.iterdir()} == {
+        x.name for x in (DATA / "terrains").iterdir()
+    }
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (DATA / "terrains" / path.name).read_bytes(), path.name
+    for reference in make.REFERENCES:
+        shipped = DATA / "clips" / f"{reference.name}_truth.toml"
+        assert make.truth_text(reference) == shipped.read_text(encoding="utf-8"), reference.name
 
 
-@pytest.mark.slow
-def test_the_generated_clips_are_the_shipped_ones(generated):
-    shipped = {path.name for path in (DATA / "clips").iterdir()}
-    assert shipped == {path.name for path in (generated / "clips").iterdir()}
-    assert {name.removesuffix(".npz") for name in shipped if name.endswith(".npz")} == set(CLIPS)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CLIPS)
-def test_the_motion_of_clips_is_generated_again(generated, name):
-    new, shipped = (load_clip(folder / "clips" / f"{name}.npz") for folder in (generated, DATA))
+def assert_shipped(folder: Path, name: str) -> None:
+    new, shipped = (load_clip(path / f"{name}.npz") for path in (folder, DATA / "clips"))
     np.testing.assert_allclose(new.positions_ws, shipped.positions_ws, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(new.rotations_ws, shipped.rotations_ws, rtol=0, atol=TOLERANCE)
     np.testing.assert_array_equal(new.stance, shipped.stance)
@@ -84,6 +80,21 @@ def test_the_motion_of_clips_is_generated_again(generated, name):
     if new.slide is not None and shipped.slide is not None:
         np.testing.assert_array_equal(new.slide, shipped.slide)
     assert (new.source, new.fps) == (shipped.source, shipped.fps)
+
+
+@pytest.mark.parametrize("name", WALKS)
+def test_a_flat_animation_is_generated_again(make, tmp_path, name):
+    save_clip(tmp_path / f"{name}_base.npz", make.flat_animation(name))
+    assert_shipped(tmp_path, f"{name}_base")
+
+
+@pytest.mark.slow
+def test_all_clips_are_generated_again(generated):
+    shipped = {path.name for path in (DATA / "clips").iterdir()}
+    assert shipped == {path.name for path in (generated / "clips").iterdir()}
+    assert {name.removesuffix(".npz") for name in shipped if name.endswith(".npz")} == set(CLIPS)
+    for name in CLIPS:
+        assert_shipped(generated / "clips", name)
 
 
 def test_a_clip_saved_later_has_the_same_bytes(make, tmp_path):

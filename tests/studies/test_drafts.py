@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 from fitting import jobs
 from fitting.cli import main
@@ -124,8 +125,12 @@ def test_without_ground_it_is_reconstructed_where_the_feet_stand(tmp_path, monke
     experiment = experiment_files.load_experiment(tmp_path / "walk" / draft.EXPERIMENT)
     (entry,) = experiment.clips
     assert entry.terrain == tmp_path / "walk" / "ground_uneven_walk.ply" and entry.base is None
+    clip = load_clip(WALK)
+    feet = clip.joints_ws(3)[clip.stance_labels()][:, [0, 2]]
+    reach = trimesh.load_mesh(entry.terrain, process=False).bounds[:, [0, 2]]
+    np.testing.assert_allclose(reach, [feet.min(axis=0) - 2.0, feet.max(axis=0) + 2.0], atol=0.3)
     assert experiment.record_only and list(experiment.free) == ["pelvis.limit"]
-    assert experiment.fps == (30.0 if load_clip(WALK).fps > 45 else None)
+    assert experiment.fps == (30.0 if clip.fps > 45 else None)
     assert main.main(words) == 2
     assert "experiment.toml: is there already; name another folder" in capsys.readouterr().err
 
