@@ -5,6 +5,8 @@ JAX_DISABLE_MOST_OPTIMIZATIONS=0 to compile them as for users, as notebooks do i
 processes of a run, and the next run, find compiled programs in one folder.
 """
 
+import contextlib
+import ctypes
 import gc
 import os
 import resource
@@ -51,7 +53,7 @@ gc.set_threshold(200_000, 50, 100)
 
 MAX_KEPT = 1e9  # bytes of programs, of old sources most of them
 MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530
-MAX_RESIDENT = 3e9  # bytes of one test process after a file
+MAX_RESIDENT = 2.5e9  # bytes of one test process after a file
 LONGEST = ("test_notebooks.py", "test_translation.py", "test_documents.py")
 PEAKS: list[int] = []  # bytes of memory of each test process
 
@@ -100,6 +102,8 @@ def bounded_memory() -> Iterator[None]:
     if resident > MAX_RESIDENT or mappings.read_bytes().count(b"\n") > MAX_MAPPINGS:
         jax.clear_caches()
         gc.collect()
+        with contextlib.suppress(AttributeError):  # of the GNU C library, which keeps what is freed
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="module")

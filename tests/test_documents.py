@@ -36,7 +36,7 @@ PYTHON_FILES = sorted(path for name in FOLDERS for path in (ROOT / name).rglob("
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TOOLS = {"bash", "git", "pip", "pre-commit", "pyright", "pytest", "ruff"}
 WRITTEN_PAGES = set(
-    "summary.md table.md compare.md runs.md suite.md notes.md".split()
+    "summary.md table.md compare.md runs.md suite.md notes.md PATH.md".split()
 )  # by commands
 EXPERIMENT = ROOT / "data/experiments/uneven_walk.toml"
 

@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 NAMES = [path.stem for path in NOTEBOOKS]
 FITS = {"3_fit_and_posterior"}
-LONG = {*FITS, "4_a_crowd", "5_other_systems", "6_a_rule_of_your_own"}
+LONG = {*FITS, "2_stage_by_stage", "4_a_crowd", "5_other_systems", "6_a_rule_of_your_own"}
 # What only makes a notebook's pictures fuller: the same cells run with less of it.
 SMALLER = {
     "3_fit_and_posterior": {"end=5.0,  # s": "end=2.0,  # s"},

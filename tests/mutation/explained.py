@@ -33,8 +33,29 @@ SPEED = "changes time or memory, no result"
 GUARD = "guards against a mistake of the caller, which none makes"
 BOUNDARY = "both sides are equal at the boundary"
 ROUNDING = "a few more or less roundings are as good"
+LOOK = "changes how a picture looks, which the eye judges"
 CELL = "np.clip(np.floor((corners.max(axis=1) + pad - corner) / pitch).astype(int)"
 EXPLAINED = [
+    Explained("fitting/report/plots/calibration_plots.py", "Line2D([], [], color=...", "", LOOK),
+    Explained(
+        "fitting/report/plots/fit_plots.py",
+        "edges = np.linspace(-5.0, 5.0, 41)",
+        "edges = np.linspace(-5.0, 5.0, 40)",
+        LOOK,
+    ),
+    Explained("fitting/datasets/clips/formats/gltf/writer.py", "GREY = [...", "", LOOK),
+    Explained(
+        "fitting/inference/sampling/sampler.py",
+        "self._islands = find_islands(self._chain.u[length // 2 : length])",
+        "self._islands = find_islands(self._chain.u[length // 3 : length])",
+        "the last two thirds of a chain teach as much as its last half",
+    ),
+    Explained(
+        "jaxik/solvers/two_bone.py",
+        "known = span > tiny**0.5",
+        "known = span > tiny** 1.5",
+        "nearer to the pole than 1e-8, rounding decides",
+    ),
     Explained("jaxik/batching/lanes.py", "@jax.checkpoint", "", SPEED),
     Explained("jaxik/batching/primitives.py", "UNROLLED_SUM = 8...", "UNROLLED_SUM = ...", SPEED),
     Explained(

@@ -154,8 +154,12 @@ def test_the_defaults_are_those_of_the_reference(name):
         np.testing.assert_allclose(actual, expected, rtol=1e-6, err_msg=key)
 
 
+MOVING = "on a platform that moves"
+QUICK_CASES = [pytest.param(x, marks=[pytest.mark.slow] * (x == MOVING)) for x in CASES]
+
+
 @pytest.mark.parametrize("hz", RATES)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", QUICK_CASES)
 def test_a_clip_agrees_with_the_reference(name, hz):
     preset, values, how = CASES[name]
     if preset == "stride":  # one number for both legs would be another program
