@@ -8,10 +8,9 @@ import pytest
 from fitting.inference.sampling.autocorrelation import autocorrelation_time
 from fitting.inference.sampling.posterior import WalkerStart, sample_posterior
 from fitting.inference.sampling.settings import SamplerSettings
-from fitting.problem.free_parameters import free_parameter
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
 from support import toy
+from support.problems import problem_of
 
 NAMES = ("foot.share", "foot.half_life", "body.gain")
 FRAMES = 20  # so few that the prior matters and the posterior is no normal
@@ -21,10 +20,11 @@ WARM_UP, DRAWS, CHAINS = 200, 800, 4
 def smooth_problem() -> Problem:
     """Three parameters, far from every limit, of a system whose locks they do not reach."""
     ik = toy.Toy(foot=toy.Foot(limit=(0.8, 0.8)), body=toy.Body(drop=0.4, rise=0.2))  # type: ignore[arg-type]
-    space = make_space(ik, [free_parameter(ik, name) for name in NAMES])
-    truth = space.unpack(space.pack({"foot.share": 0.9, "foot.half_life": 0.2, "body.gain": 0.1}))
-    wide = toy.make_data(truth, frames=FRAMES)
-    return Problem(space, wide, few_and_noisy)
+    wide = {"foot.limit[0]": 0.79, "foot.limit[1]": 0.79, "body.drop": 0.39, "body.rise": 0.19}
+    truth = toy.TRUTH | wide | {"foot.share": 0.9, "foot.half_life": 0.2, "body.gain": 0.1}
+    clip = toy.make_problem(truth=truth).data
+    short = jax.tree.map(lambda leaf: leaf[:FRAMES] if leaf.ndim else leaf, clip)
+    return problem_of(ik, NAMES, short, few_and_noisy)
 
 
 def few_and_noisy(ik: toy.Toy, data: toy.Data) -> jax.Array:

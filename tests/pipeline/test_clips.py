@@ -115,7 +115,8 @@ def slopes(ik: Any, pos: jax.Array, limits: jax.Array, weights: jax.Array) -> tu
         values = {"pelvis.limit": limits}
         result = jaxik.run(system, RIG, GROUND, frames, jaxik.Smooth(1.0), tracks=values)
         leaves = jax.tree.leaves(eqx.filter((result.pose, result.body), eqx.is_inexact_array))
-        return sum((weights @ leaf.reshape(COUNT, -1)).sum() for leaf in leaves)
+        sums = [(weights @ leaf.reshape(COUNT, -1)).sum() for leaf in leaves]
+        return jnp.sum(jnp.stack(sums))
 
     return jax.value_and_grad(total)((eqx.filter(ik, eqx.is_inexact_array), pos, limits))
 

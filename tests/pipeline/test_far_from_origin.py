@@ -70,7 +70,7 @@ def shifted(frames: jaxik.Frame, by: np.ndarray) -> jaxik.Frame:
     feet = {name: rounded(getattr(stride, name)) + each for name in names}
     return dataclasses.replace(
         frames,
-        world_from_model=Transform(rounded(world.pos) + by, world.rot),
+        world_from_model=Transform(jnp.asarray(rounded(world.pos) + by), world.rot),
         stride=dataclasses.replace(stride, **feet),
     )
 

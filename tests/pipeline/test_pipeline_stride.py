@@ -190,7 +190,7 @@ def compare(
 
     sensed, advanced = result.trace.sensed, result.trace.advanced
     after, hit, found = advanced.state, sensed.ground.ankle, expected["found"][..., None]
-    outputs = {
+    outputs: dict[str, Any] = {
         "found": sensed.foothold.found,
         "standing": sensed.contact.planted,
         "locked": after.lock.locked,

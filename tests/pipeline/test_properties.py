@@ -112,7 +112,7 @@ def limits_kept(values: dict, frames: jaxik.Frame, result: jaxik.Result) -> np.n
     """Frames where no lock holds a foot and no leg is beyond `soften` times its reach."""
     held = np.linalg.norm(offset_of(result), axis=-1).max(axis=-1) > 1e-6
     a, b = (np.asarray(bone) for bone in bone_lengths(frames.pose))
-    leg = to_ik(values).leg
+    leg: Any = to_ik(values).leg
     free = leg.soften * np.sqrt(a * a + b * b - 2 * a * b * np.cos(leg.max_knee_angle))
     reach = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
     return ~held & (reach <= np.asarray(free)).all(axis=-1)

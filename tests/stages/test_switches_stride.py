@@ -121,9 +121,6 @@ CONSTANTS = ("probe.uneven_height", "probe.highest_step")
 IN_OWN_TESTS = ("warp.", "lean.", "separation.", "fade.", *WIDTHS, OVER, *CONSTANTS)
 
 
-SLOPED = [pytest.param("stride", marks=pytest.mark.slow), "by speed"]
-
-
 @functools.cache
 def outcomes(name: str):
     return outcomes_of(CASES[name], system(name))
@@ -144,15 +141,16 @@ def test_all_numbers_switches_and_masks_have_a_case(name: str, stages: tuple[str
 
 @pytest.mark.parametrize("name", CASES)
 def test_each_leaf_has_the_expected_effect(name: str):
-    by_value = outcomes(name) if name != "stride" else outcomes_of(CASES[name], system(name), False)
-    assert not by_value.without_effect()
+    assert not outcomes_of(CASES[name], system(name), sloped=False).without_effect()
 
 
-@pytest.mark.parametrize("name", SLOPED)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_the_derivative_of_each_number_is_its_difference_quotient(name: str):
     assert not outcomes(name).with_wrong_slope()
 
 
-@pytest.mark.parametrize("name", SLOPED)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_values_and_derivatives_are_finite_where_formulas_are_singular(name: str):
     singular.assert_sound(name)

@@ -95,8 +95,9 @@ def test_a_right_program_is_inside_all_bounds(experiment_file):
 
 @pytest.mark.parametrize(
     ("wrong", "count"),
-    [pytest.param({"noise": 3.0}, 24, marks=pytest.mark.slow), ({"shift": 3.0}, 8)],
+    [({"noise": 3.0}, 24), ({"shift": 3.0}, 8)],
 )
+@pytest.mark.slow
 def test_a_wrong_noise_is_found_by_intervals_and_ranks(tmp_path, monkeypatch, wrong, count):
     path = small_studies.quick_calibration(tmp_path, monkeypatch, **wrong)
     assessment = calibrate(path, None, count, chains=True)

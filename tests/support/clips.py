@@ -165,7 +165,7 @@ def to_terrain(ground: PlainTerrain) -> terrain.Terrain:
 
 def in_one_cell(mesh: terrain.Terrain) -> terrain.Terrain:
     """The mesh with a grid of one cell: with as many triangles, all share a program."""
-    (surface,) = mesh.surfaces
+    surface: Any = mesh.surfaces[0]
     grid = surface.grid
     everything = dataclasses.replace(
         grid,
