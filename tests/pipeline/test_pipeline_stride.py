@@ -185,7 +185,7 @@ def compare(
     rules, rig = RULES[preset], rig_of(len(frames[0].weight))
     arrays = {key: np.asarray(x) if isinstance(x, list) else x for key, x in values.items()}
     parameters = characters.Parameters(arrays, defaults=stride.defaults(*rules))
-    expected = stride.run(parameters, rig, plain, frames, *rules)
+    expected: dict[str, Any] = stride.run(parameters, rig, plain, frames, *rules)
     result = compiled(to_ik(values, preset), to_rig(rig), ours, to_frames(frames))
 
     sensed, advanced = result.trace.sensed, result.trace.advanced
