@@ -178,9 +178,10 @@ def test_every_well_conditioned_limb_is_bent_as_in_ozz(golden, dtype):
     }
     soft = rows.softening_active
     assert soft.any() and not soft.all()
+    own = 8 * np.finfo(dtype).eps  # our rounding, on top of ozz's errors
     for joint, error in errors.items():
-        assert error[~soft].max() < FIRM[joint], joint
-        assert error[soft].max() < SOFT[joint], joint
+        assert error[~soft].max() < FIRM[joint] + own, joint
+        assert error[soft].max() < SOFT[joint] + own, joint
     np.testing.assert_array_equal(ours.reached, rows.reached)
 
 
