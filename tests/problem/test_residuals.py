@@ -19,7 +19,7 @@ from fitting.problem import residuals
 from fitting.problem.problem import Problem
 from fitting.problem.simulation import autoregression, simulate
 from fitting.runtime.program_cache import committed
-from support.experiments import CLIP, UNEVEN_WALK, write
+from support.experiments import CLIP, EVERY_KIND, UNEVEN_WALK, write
 from support.problems import compilations
 
 BESIDE = 0.1  # in u, away from where the clip was made
@@ -27,16 +27,6 @@ STEP = 1e-6  # of u, to either side
 TOLERANCE = 1e-5  # of a column's largest derivative
 SEEDS = 8
 MASKED = 9  # a frame that was not observed
-EVERY_KIND = """[sigmas]
-ankle = 0.02
-knee = 0.03
-pelvis = 0.01
-foot = 0.1
-body = 0.2
-contact = 0.5
-smooth = 20.0
-correlation = { ankle = 0.4, knee = 0.3, pelvis = 0.9, foot = 0.2, body = 0.1 }
-"""
 
 
 class Evaluated(NamedTuple):

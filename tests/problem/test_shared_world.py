@@ -20,7 +20,7 @@ from fitting.runtime.program_cache import committed
 from jaxik.maths import parameter_tree
 from jaxik.pipeline import Result
 from jaxik.world.terrain import plane
-from support.experiments import ROOT, write
+from support.experiments import EVERY_KIND, ROOT, write
 
 DATA = ROOT / "data"
 CLIPS = "".join(
@@ -39,16 +39,6 @@ end = {start + seconds}
     )
 )
 RAISED = 0.05  # m, of the second clip's ground
-EVERY_KIND = """[sigmas]
-ankle = 0.02
-knee = 0.03
-pelvis = 0.01
-foot = 0.1
-body = 0.2
-contact = 0.5
-smooth = 20.0
-correlation = { ankle = 0.4, knee = 0.3, pelvis = 0.9, foot = 0.2, body = 0.1 }
-"""
 TRACKED = "leg.soften"
 
 

@@ -16,6 +16,17 @@ pelvis.on_gain = {}
 foot.max_pitch = { low = 0.1 }
 """
 
+EVERY_KIND = """[sigmas]
+ankle = 0.02
+knee = 0.03
+pelvis = 0.01
+foot = 0.1
+body = 0.2
+contact = 0.5
+smooth = 20.0
+correlation = { ankle = 0.4, knee = 0.3, pelvis = 0.9, foot = 0.2, body = 0.1 }
+"""
+
 
 def text(
     top: str = "", clip: str = "", free: str = FREE, rest: str = "", clips: str = CLIP + SECOND
