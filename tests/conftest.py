@@ -54,7 +54,7 @@ gc.set_threshold(200_000, 50, 100)
 MAX_KEPT = 1e9  # bytes of programs, of old sources most of them
 MAX_MAPPINGS = 20_000  # of memory; Linux ends a process that asks for more than 65,530
 MAX_RESIDENT = 2.5e9  # bytes of one test process after a file
-LONGEST = ("test_notebooks.py", "test_translation.py", "test_documents.py")
+LONGEST = ("test_notebooks.py", "test_documents.py")
 PEAKS: list[int] = []  # bytes of memory of each test process
 
 
