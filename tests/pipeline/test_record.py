@@ -17,8 +17,7 @@ import jaxik
 from jaxik import record
 from jaxik.maths import parameter_tree
 from jaxik.record import FLAG_NAMES, FLOAT_NAMES, Reading, Record
-from reference import sample_poses
-from support.clips import to_rig
+from support.clips import make_rig, to_rig
 from support.records import ADULT, packed
 
 LENGTHS = (
@@ -44,53 +43,61 @@ def test_any_bytes_round_trip(data):
     assert record.to_bytes(record.from_bytes(data)) == data
 
 
-def test_nan_payloads_padding_bits_and_tail_round_trip():
-    data = bytearray(range(0x80)) + b"\x00tail\xff"
-    data[1] = 0b10101_010
-    data[4:8] = NAN_WITH_PAYLOAD
-    data[8:12] = b"\x01\x00\x80\x7f"  # a signalling NaN
-    kept = record.from_bytes(bytes(data))
-    assert record.to_bytes(kept) == data
-    assert math.isnan(kept.value("originalGroundHeightMS"))
-    assert (kept.flags >> 3, kept.padding, kept.tail) == (0b10101, b"\x02\x03", b"\x00tail\xff")
-
-
 def test_fields_lie_where_the_layout_says():
-    data = bytearray(0x80)
-    data[0], data[1] = 4, 0b011
+    data = bytearray(range(0x80)) + b"\x00tail\xff"
+    data[0], data[1] = 4, 0b10101_011
     for index, value in enumerate(ADULT.values()):
         struct.pack_into("<f", data, 4 + 4 * index, value)
+    data[4:8] = NAN_WITH_PAYLOAD
     read = record.from_bytes(bytes(data))
     assert read.knee_axis_type == 4
     assert [read.flag(name) for name in FLAG_NAMES] == [True, True, False]
+    assert (read.flags >> 3, read.padding, read.tail) == (0b10101, b"\x02\x03", b"\x00tail\xff")
     assert tuple(ADULT) == FLOAT_NAMES and len(FLOAT_NAMES) == 31
-    for name, value in ADULT.items():
-        assert read.value(name) == np.float32(value)
+    first, *others = ADULT
+    assert math.isnan(read.value(first))
+    assert [read.value(name) for name in others] == [np.float32(ADULT[name]) for name in others]
 
 
-def test_too_few_bytes_are_an_error():
-    with pytest.raises(ValueError, match="at least 128 bytes; these are 127"):
-        record.from_bytes(bytes(127))
+def replaced(changes: dict[str, Any]) -> jaxik.FootIK:
+    """The faithful system with other values."""
+    return parameter_tree.replace(jaxik.presets.record(faithful=True), changes)
 
 
-@pytest.mark.parametrize("read", [Record().value, Record().flag])
-def test_an_unknown_name_is_an_error_that_lists_the_known_ones(read):
-    with pytest.raises(ValueError, match=r"no (float|flag) 'knee'; it has \["):
-        read("knee")
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"knee_axis_type": 256}, "knee_axis_type is 256"),
-        ({"flags": -1}, "flags is -1"),
-        ({"padding": b"\0"}, "padding and floats"),
-        ({"floats": (b"\0\0\0\0",) * 30}, "padding and floats"),
-    ],
-)
-def test_a_record_that_cannot_be_stored_is_an_error(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        Record(**wrong)
+def test_what_is_no_record_or_fits_in_none_is_refused():
+    for call, message in (
+        (lambda: record.from_bytes(bytes(127)), "at least 128 bytes; these are 127"),
+        (lambda: Record().value("knee"), r"no float 'knee'; it has \["),
+        (lambda: Record().flag("knee"), r"no flag 'knee'; it has \["),
+        (lambda: Record(knee_axis_type=256), "knee_axis_type is 256"),
+        (lambda: Record(flags=-1), "flags is -1"),
+        (lambda: Record(padding=b"\0"), "padding and floats"),
+        (lambda: Record(floats=(bytes(4),) * 30), "padding and floats"),
+        (lambda: Reading(length_unit="inch"), "length_unit is 'inch'; it is one of"),
+        (lambda: Reading(knee_convention="outer"), "knee_convention is 'outer'"),
+        (lambda: Reading(lean_sign=0), "lean_sign is 0"),
+        (lambda: Reading(tick_hz=0.0), "tick_hz is 0.0"),
+        (lambda: Reading(tick_hz=math.nan), "tick_hz is nan"),
+        (lambda: to_ik(packed(undulationGain=math.nan)), "undulationGain is .*finite"),
+        (lambda: to_ik(packed(undulationGain=-math.inf)), "undulationGain is .*finite"),
+        (lambda: to_ik(Record(knee_axis_type=6)), "kneeAxisType is 6; 0 to 5"),
+        (lambda: record.knee_axis(Record(knee_axis_type=6)), "kneeAxisType is 6; 0 to 5"),
+        (lambda: record.from_ik(jaxik.presets.stride()), "LabelContact; .* there a HeightContact"),
+        (
+            lambda: record.from_ik(replaced({"foot.max_pitch": [0.5, 0.4]}), Record()),
+            r"foot.max_pitch is \[0.4, 0.5\].*one value",
+        ),
+        (
+            lambda: record.from_ik(replaced({"pelvis.limit": 1e39}), Record()),
+            "beyond a 32-bit float",
+        ),
+        (  # it would be read in another unit
+            lambda: record.from_ik(replaced({"probe.ray_up": 6.0}), Record()),
+            'written in m .* set length_unit to "m" or "cm"',
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_the_record_of_an_adult_has_the_default_parameters():
@@ -102,7 +109,6 @@ def test_the_record_of_an_adult_has_the_default_parameters():
 
 def test_each_float_and_each_flag_sets_its_own_parameter():
     before = leaves_of(to_ik(packed()))
-
     for name, ours, _ in record.FLOATS:
         after = leaves_of(to_ik(packed(**{name: ADULT[name] * 0.9 + 0.001})))
         changed = [key for key in before if not np.array_equal(before[key], after[key])]
@@ -121,27 +127,26 @@ def test_parameters_that_the_record_lacks_keep_their_defaults():
     assert ik.lean.tick_hz == ik.pelvis.tick_hz == 60.0
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_float_that_is_not_finite_is_an_error_that_names_it(value):
-    with pytest.raises(ValueError, match="undulationGain is .*finite"):
-        to_ik(packed(undulationGain=value))
-
-
-def test_centimetres_are_recognised_with_a_warning():
-    centimetres = packed(**{name: 100.0 * ADULT[name] for name in LENGTHS})
+def test_centimetres_are_recognised_with_a_warning_and_kept():
+    kept = packed(**{name: 100.0 * ADULT[name] for name in LENGTHS})
     with pytest.warns(UserWarning, match="centimetres") as caught:
-        read = leaves_of(to_ik(centimetres))
+        ik = to_ik(kept)
     assert [str(w.message).split(" = ")[0] for w in caught] == list(LENGTHS)
     for name, expected in leaves_of(to_ik(packed())).items():
-        np.testing.assert_allclose(read[name], expected, rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(leaves_of(ik)[name], expected, rtol=1e-6, err_msg=name)
+    rebuilt = record.from_ik(parameter_tree.replace(ik, {"probe.ray_up": 0.6}), kept)
+    assert rebuilt.value("raycastDistanceUp") == pytest.approx(60.0)
+    assert rebuilt.value("raycastDistanceDown") == pytest.approx(80.0)
 
 
 def test_an_explicit_length_unit_is_used_without_a_warning():
     for unit, metres in (("m", 0.16), ("cm", 0.0016)):
         ik = to_ik(packed(), Reading(length_unit=unit))
         assert ik.contact.raised_height == pytest.approx(metres)
-    ik = to_ik(packed(raycastDistanceUp=6.0), Reading(length_unit="m"))
+    in_metres = Reading(length_unit="m")
+    ik = to_ik(packed(raycastDistanceUp=6.0), in_metres)
     assert ik.probe.ray_up == 6.0
+    assert record.from_ik(ik, Record(), in_metres).value("raycastDistanceUp") == 6.0
     assert ik.target.max_ankle_height == pytest.approx(0.55), "other heights are always in metres"
 
 
@@ -169,31 +174,13 @@ def test_the_sign_of_the_lean_can_be_reversed():
     np.testing.assert_allclose([*rates, lean.gain], [0.30, 0.10, -0.80, -0.60, 0.19], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"length_unit": "inch"}, "length_unit is 'inch'; it is one of"),
-        ({"knee_convention": "outer"}, "knee_convention is 'outer'"),
-        ({"lean_sign": 0}, "lean_sign is 0"),
-        ({"tick_hz": 0.0}, "tick_hz is 0.0"),
-        ({"tick_hz": math.nan}, "tick_hz is nan"),
-    ],
-)
-def test_an_unknown_reading_is_an_error(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        Reading(**wrong)
-
-
 def test_the_knee_axis_follows_its_enum():
     axes = [record.knee_axis(Record(knee_axis_type=kind)) for kind in range(6)]
     np.testing.assert_array_equal(axes, [*np.eye(3), *-np.eye(3)])
-    for call in (record.knee_axis, record.to_ik):
-        with pytest.raises(ValueError, match="kneeAxisType is 6; 0 to 5"):
-            call(Record(knee_axis_type=6))
 
 
 def test_a_rig_gets_the_knee_axis_and_keeps_the_rest():
-    rig = to_rig(sample_poses.make_rig(np.random.default_rng(0)))
+    rig = to_rig(make_rig())
     turned = record.with_knee_axis(rig, Record(knee_axis_type=3))
     np.testing.assert_array_equal(turned.knee_axis_ls, [[-1, 0, 0]] * 2)
     assert turned.knee_axis_ls.dtype == rig.knee_axis_ls.dtype
@@ -228,11 +215,11 @@ def test_a_record_round_trips_through_parameters(length_unit, dtype):
 
 def test_parameters_round_trip_through_a_record():
     changes = {"lean.gain": 0.3, "leg.max_knee_angle": 2.8, "lock.enabled": False}
-    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), changes)
-    meant = to_ik(record.from_ik(ik, Record()))
-    for name, expected in leaves_of(ik).items():
-        np.testing.assert_allclose(leaves_of(meant)[name], expected, atol=2e-6, err_msg=name)
-    assert not parameter_tree.get(meant, "lock.enabled")
+    ik = replaced(changes | {"probe.toe_ls": [[0.01, -0.07, 0.2]] * 2})  # the same for both legs
+    meant = leaves_of(to_ik(record.from_ik(ik, Record())))
+    for name, leaf in leaves_of(ik).items():
+        expected = leaf[0] if name == "probe.toe_ls" else leaf
+        np.testing.assert_allclose(meant[name], expected, atol=2e-6, err_msg=name)
 
 
 def test_a_changed_parameter_changes_its_own_bytes_only():
@@ -243,33 +230,6 @@ def test_a_changed_parameter_changes_its_own_bytes_only():
     assert [name for name, a, b in pairs if a != b] == ["heightOffsetLimit"]
     assert rebuilt.value("heightOffsetLimit") == 0.25
     assert (rebuilt.flags, rebuilt.tail) == (0b011, kept.tail)
-
-
-def test_a_record_in_centimetres_stays_in_centimetres():
-    kept = packed(**{name: 100.0 * ADULT[name] for name in LENGTHS})
-    with pytest.warns(UserWarning, match="centimetres"):
-        ik = to_ik(kept)
-    rebuilt = record.from_ik(parameter_tree.replace(ik, {"probe.ray_up": 0.6}), kept)
-    assert rebuilt.value("raycastDistanceUp") == pytest.approx(60.0)
-    assert rebuilt.value("raycastDistanceDown") == pytest.approx(80.0)
-
-
-def test_lengths_that_would_be_read_in_another_unit_are_not_written():
-    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), {"probe.ray_up": 6.0})
-    with pytest.raises(ValueError, match='written in m .* set length_unit to "m" or "cm"'):
-        record.from_ik(ik, Record())
-    written = record.from_ik(ik, Record(), Reading(length_unit="m"))
-    assert written.value("raycastDistanceUp") == 6.0
-
-
-def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
-    ik = jaxik.presets.record(faithful=True)
-    same = parameter_tree.replace(ik, {"probe.toe_ls": [[0.01, -0.07, 0.2]] * 2})
-    assert record.from_ik(same, Record()).value("footEndLS_X") == np.float32(0.01)
-    with pytest.raises(ValueError, match=r"foot.max_pitch is \[0.4, 0.5\].*one value"):
-        record.from_ik(parameter_tree.replace(ik, {"foot.max_pitch": [0.5, 0.4]}), Record())
-    with pytest.raises(ValueError, match="beyond a 32-bit float"):
-        record.from_ik(parameter_tree.replace(ik, {"pelvis.limit": 1e39}), Record())
 
 
 @pytest.mark.parametrize(
@@ -286,7 +246,7 @@ def test_a_parameter_that_differs_between_legs_does_not_fit_the_record():
     ],
 )
 def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, value, message):
-    ik = parameter_tree.replace(jaxik.presets.record(faithful=True), {name: value})
+    ik = replaced({name: value})
     lost = f"the record cannot hold {message}; its reader takes the values in brackets"
     with pytest.raises(ValueError, match=re.escape(f"{lost}. To leave them out nevertheless")):
         record.from_ik(ik, Record())
@@ -300,11 +260,9 @@ def test_exactly_the_parameters_without_a_slot_are_dropped():
     def changed(leaf):
         if leaf.dtype == bool:
             return ~leaf
-        return (
-            leaf // 2
-            if leaf.dtype == jnp.uint32
-            else np.where(np.isinf(leaf), 1.0, leaf * 0.8 + 0.11)
-        )
+        if leaf.dtype == jnp.uint32:
+            return leaf // 2
+        return np.where(np.isinf(leaf), 1.0, leaf * 0.8 + 0.11)
 
     ik = jaxik.presets.record(faithful=True)
     leaves = {slot.name: slot.value for slot in parameter_tree.slots(ik)}
@@ -325,11 +283,6 @@ def test_a_record_without_a_base_says_what_it_takes_for_the_knee():
     assert len(caught) == 1
 
 
-def test_a_system_of_other_rules_is_no_record():
-    with pytest.raises(ValueError, match="contact is a LabelContact; .* there a HeightContact"):
-        record.from_ik(jaxik.presets.stride())
-
-
 def test_records_round_trip_through_csv_byte_for_byte():
     odd = record.from_bytes(bytes([255, 255, 1, 2]) + NAN_WITH_PAYLOAD * 31 + b"\0\xff")
     plain = Record(floats=(b"\0\0\xc0\x7f", b"\0\0\x80\xff", b"\0\0\0\x80") + packed().floats[3:])
@@ -337,19 +290,14 @@ def test_records_round_trip_through_csv_byte_for_byte():
         assert record.from_csv(record.to_csv(records)) == records
 
 
-def test_csv_uses_the_records_own_names():
+def test_csv_uses_the_records_own_names_in_any_order_with_or_without_padding():
     head, row = record.to_csv([packed()]).splitlines()
     assert head.split(",") == list(record.COLUMNS)
     cells = dict(zip(head.split(","), row.split(","), strict=True))
     assert cells["footPlantedAnkleHeightMS"] == "0.1" and cells["useFootLocking"] == "1"
     assert (cells["pad1"], cells["pad3"], cells["kneeAxisType"]) == ("0000", "", "2")
-
-
-def test_csv_without_padding_and_in_another_order_is_read():
     columns = [name for name in reversed(record.COLUMNS) if not name.startswith("pad")]
-    values = {name: str(value) for name, value in ADULT.items()}
-    values |= dict.fromkeys(FLAG_NAMES, "1") | {"kneeAxisType": "2"}
-    text = ",".join(columns) + "\n" + ", ".join(values[name] for name in columns) + "\n"
+    text = ",".join(columns) + "\n" + ", ".join(cells[name] for name in columns) + "\n"
     assert record.from_csv(text) == [packed()]
 
 
@@ -371,10 +319,9 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("expected", UNREADABLE)
-def test_an_unreadable_cell_is_an_error_that_names_row_and_column(expected):
-    for name, cells in UNREADABLE[expected].items():
-        for cell in cells:
+def test_an_unreadable_cell_is_an_error_that_names_row_and_column():
+    for expected, columns in UNREADABLE.items():
+        for name, cell in ((name, cell) for name, cells in columns.items() for cell in cells):
             message = f"row 3, column {name}: {re.escape(repr(cell))} is not {expected}"
             with pytest.raises(ValueError, match=message):
                 record.from_csv(with_cell(name, cell))
@@ -383,14 +330,13 @@ def test_an_unreadable_cell_is_an_error_that_names_row_and_column(expected):
 def test_missing_unknown_or_duplicate_columns_are_an_error():
     head, row = record.to_csv([packed()]).splitlines()
     misspelt = head.replace("undulationGain,", "undulatoinGain,")
-    for text, message in (
-        (f"{misspelt}\n{row}\n", r"no column \['undulationGain'\]"),
-        (f"{head},mass\n{row},80\n", r"unknown columns \['mass'\]; a record has \['kneeAxis"),
-        (f"{head},pad1\n{row},0000\n", r"column \['pad1'\] more than once"),
-        ("", "no column"),
+    for header, cells, message in (
+        (misspelt, row, r"no column \['undulationGain'\]"),
+        (f"{head},mass", f"{row},80", r"unknown columns \['mass'\]; a record has \['kneeAxis"),
+        (f"{head},pad1", f"{row},0000", r"column \['pad1'\] more than once"),
+        ("", "", "no column"),
+        (head, f"{row},1", "row 2 has not the 38 cells of the header"),
+        (head, row.rsplit(",", 2)[0], "row 2 has not the 38 cells of the header"),
     ):
         with pytest.raises(ValueError, match=message):
-            record.from_csv(text)
-    for cells in (row + ",1", row.rsplit(",", 2)[0]):
-        with pytest.raises(ValueError, match="row 2 has not the 38 cells of the header"):
-            record.from_csv(f"{head}\n{cells}\n")
+            record.from_csv(f"{header}\n{cells}\n".lstrip())
