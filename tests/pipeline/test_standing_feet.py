@@ -3,8 +3,10 @@
 import dataclasses
 import functools
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ import jaxik
 from fitting.datasets import clip_frames
 from fitting.datasets.clips import Clip, contacts, load_clip
 from fitting.datasets.clips.edit import drop_t_pose, resample
+from jaxik.maths import quat
 from jaxik.world import terrain
 from reference import maths
 from support.cases import QUICK
@@ -27,12 +30,9 @@ CLIPS = (
     "cmu_bvh_max/scaled_131_01.bvh",
 )
 RIG = make_rig()
-RELEASES = {  # far away, so that each test chooses what releases its feet
-    "lock.release_distance": 9.0,
-    "lock.release_cone": 1.5,
-    "lock.release_min_angle": 0.0,
-}
-run = jax.jit(jaxik.run, compiler_options=QUICK)
+# Held at once, and released by nothing unless a test says by what.
+HELD = {"lock.release_distance": 9.0, "lock.release_cone": 1.5, "lock.release_min_angle": 0.0}
+HELD |= {"lock.lock_half_life": 0.0}
 
 
 @functools.partial(jax.jit, static_argnames="preset", compiler_options=QUICK)
@@ -77,46 +77,47 @@ def test_a_standing_foot_slides_no_more_than_animated(mocap, preset: str, most: 
         assert moved[free].max(initial=0.0) < 0.01, f"{name}: as animated away from locks"
 
 
-def turning(angle: float) -> list:
-    """A character on the spot that turns by `angle`, rad, in the second second."""
-    return animate(RIG, heading=lambda time: angle * np.clip(time - 1.0, 0.0, 1.0))
+class Feet(NamedTuple):
+    """Balls (frames, legs, 3), m, and headings (frames, legs), rad, of a clip in world space."""
+
+    result: jaxik.Result
+    balls: np.ndarray
+    headings: np.ndarray
+
+    @property
+    def locked(self) -> np.ndarray:
+        """(frames, legs)"""
+        return self.result.trace.advanced.hold.locked > 0
 
 
-def solved_feet(result: jaxik.Result, frames: list) -> tuple[np.ndarray, np.ndarray]:
-    """Balls (frames, legs, 3), m, and headings (frames, legs), rad, in the world."""
-    balls, headings = [], []
-    for index, frame in enumerate(frames):
-        world = frame.world_from_model
-        balls.append([maths.apply(world, pos) for pos in np.asarray(result.pose.toe.pos)[index]])
-        rots = np.asarray(result.pose.ankle.rot)[index]
-        feet = [
-            maths.multiply(world.rot, maths.multiply(rot, ankle_from_foot))
-            for rot, ankle_from_foot in zip(rots, RIG.ankle_from_foot, strict=True)
-        ]
-        ahead = [maths.rotate(foot, maths.Z) for foot in feet]
-        headings.append([np.arctan2(axis[0], axis[2]) for axis in ahead])
-    return np.array(balls), np.array(headings)
+@functools.partial(jax.jit, compiler_options=QUICK)
+def with_feet(ik: jaxik.FootIK, frames: jaxik.Frame) -> Feet:
+    rig, world = to_rig(RIG), frames.world_from_model
+    result = jaxik.run(ik, rig, to_terrain(FLAT), frames)
+    feet = quat.multiply(result.pose.ankle.rot, rig.ankle_from_foot)
+    ahead = quat.rotate(quat.multiply(world.rot[:, None], feet), jnp.asarray(maths.Z))
+    balls = jax.vmap(jaxik.Transform.apply)(world, result.pose.toe.pos)
+    return Feet(result, balls, jnp.arctan2(ahead[..., 0], ahead[..., 2]))
+
+
+def on_the_floor(values: dict[str, Any], frames: list) -> Feet:
+    return jax.device_get(with_feet(to_ik(values, "record as it comes"), to_frames(frames)))
 
 
 def test_feet_stay_under_a_root_that_turns_until_they_point_too_far_away():
     angle, most = np.radians(60.0), 0.5
-    frames = turning(angle)
-    values = RELEASES | {"lock.lock_half_life": 0.0, "lock.release_heading": most}
-    ik = to_ik(values, "record as it comes")
-    result = run(ik, to_rig(RIG), to_terrain(FLAT), to_frames(frames))
-    locked = np.asarray(result.trace.advanced.hold.locked) > 0
-    balls, headings = solved_feet(result, frames)
-    first = int(np.argmin(locked.all(axis=1)))  # frame of the release
+    frames = animate(RIG, heading=lambda time: angle * np.clip(time - 1.0, 0.0, 1.0))
+    feet = on_the_floor(HELD | {"lock.release_heading": most}, frames)
+    first = int(np.argmin(feet.locked.all(axis=1)))  # frame of the release
     assert first == pytest.approx(60 + 60 * most / angle, abs=2), "when they point away by that"
-    assert np.ptp(balls[:first], axis=0).max() < 1e-9
-    assert np.ptp(headings[:first], axis=0).max() < 1e-9
-    free_ik = to_ik({"lock.enabled": False}, "record as it comes")
-    unlocked = run(free_ik, to_rig(RIG), to_terrain(FLAT), to_frames(frames))
-    free, _ = solved_feet(unlocked, frames)
-    pace = np.linalg.norm(np.diff(free, axis=0), axis=-1)  # as animated, m a frame
-    step = np.linalg.norm(np.diff(balls, axis=0), axis=-1)
+    assert np.ptp(feet.balls[:first], axis=0).max() < 1e-9
+    assert np.ptp(feet.headings[:first], axis=0).max() < 1e-9
+    free = on_the_floor({"lock.enabled": False}, frames)
+    # As animated and solved, m a frame.
+    pace, step = (np.linalg.norm(np.diff(x.balls, axis=0), axis=-1) for x in (free, feet))
     assert (step <= pace + 0.01 + 1e-9).all(), "goes back by at most 1 cm a frame"
-    assert (angle - headings[-1] < most).all() and (headings[-1] > headings[0] + most).all()
+    start, *_, end = feet.headings
+    assert (angle - end < most).all() and (end > start + most).all()
 
 
 def test_the_heel_rises_about_a_held_ball():
@@ -128,11 +129,8 @@ def test_the_heel_rises_about_a_held_ball():
         arms = frame.ankle.pos - frame.toe.pos
         frame.ankle.pos[:] = frame.toe.pos + [maths.rotate(tilt, arm) for arm in arms]
         frame.ankle.rot[:] = [maths.multiply(tilt, rot) for rot in frame.ankle.rot]
-    ik = to_ik(RELEASES | {"lock.lock_half_life": 0.0}, "record as it comes")
-    result = run(ik, to_rig(RIG), to_terrain(FLAT), to_frames(frames))
-    assert np.asarray(result.trace.advanced.hold.locked).all()
-    balls, _ = solved_feet(result, frames)
-    assert np.asarray(result.reached).all()
-    assert np.ptp(balls, axis=0).max() < 1e-9
-    heights = np.asarray(result.pose.ankle.pos)[..., 1]
+    feet = on_the_floor(HELD, frames)
+    assert feet.locked.all() and feet.result.reached.all()
+    assert np.ptp(feet.balls, axis=0).max() < 1e-9
+    heights = feet.result.pose.ankle.pos[..., 1]
     assert (heights[-1] - heights[0] > 0.05).all()
