@@ -10,7 +10,6 @@ nothing of heights. Printed are the rms errors of `stride` on both halves of the
 import argparse
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -27,14 +26,6 @@ LONGEST = 0.9999  # of its length, of a leg
 # As in `data/experiments/blocks_walk.toml`: the pelvis needs no smoothing on these blocks.
 EXACT = {"pelvis.rise_half_life": 0.0, "pelvis.fall_half_life": 0.0, "pelvis.spring": False}
 SHIFTS, RATES = (0.0, 0.1, 0.15, 0.2, 0.3), (0.0, -0.15, -0.25, -0.4)
-
-
-class Errors(NamedTuple):
-    """Root mean squares of one half of the walk."""
-
-    ahead_cm: float
-    knee_cm: float
-    pitch_deg: float
 
 
 def row_lengths(vectors: np.ndarray) -> np.ndarray:
@@ -92,13 +83,14 @@ def with_pelvis_by_phase(clip: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     turn = Rotation.from_rotvec(np.cross(UP, forward) * (fitted(pitch, phase) - pitch)[:, None])
 
     middle = clip["base_hip"].mean(1)
-    turned_hips = [
-        turn.apply(hip - middle) + middle + move for hip in clip["base_hip"].swapaxes(0, 1)
-    ]
-    hips = np.stack(turned_hips, 1)
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return turn.apply(points - middle) + middle + move
+
+    hips = np.stack([moved(hip) for hip in clip["base_hip"].swapaxes(0, 1)], 1)
     return clip | {
         "pelvis_rot": (turn * rot).as_quat(scalar_first=True).astype(clip["pelvis_rot"].dtype),
-        "base_pelvis": turn.apply(clip["base_pelvis"] - middle) + middle + move,
+        "base_pelvis": moved(clip["base_pelvis"]),
         "base_hip": hips,
         "base_knee": knees(hips, clip),
     }
@@ -119,8 +111,11 @@ def knees(hips: np.ndarray, clip: dict[str, np.ndarray]) -> np.ndarray:
 
 def errors_of(
     animation: Animation, ik: jaxik.FootIK, captured: dict[str, np.ndarray], base: np.ndarray
-) -> list[Errors]:
-    """Errors of the two halves; `base` are the rotations of the flat animation's pelvis."""
+) -> list[list[float]]:
+    """Of both halves, rms of hips ahead and of knees, cm, and of the pelvis' pitch, degrees.
+
+    `base` are the rotations of the flat animation's pelvis.
+    """
     result, solved = animation.solve(ik)
     joints = positions_by_role(solved)
     forward = forward_of(captured["hip"])
@@ -130,15 +125,9 @@ def errors_of(
     rots = body * Rotation.from_quat(base, scalar_first=True)
     true_rots = Rotation.from_quat(captured["pelvis_rot"], scalar_first=True)
     pitch = np.degrees(pitch_of(rots, forward) - pitch_of(true_rots, forward))
-    half = len(off) // 2
-    return [
-        Errors(
-            100.0 * rms(np.sum(off * forward, -1)[part]),
-            100.0 * rms(row_lengths(joints["knee"] - captured["knee"])[part]),
-            rms(pitch[part]),
-        )
-        for part in (slice(half), slice(half, None))
-    ]
+    ahead, knees_off = np.sum(off * forward, -1), row_lengths(joints["knee"] - captured["knee"])
+    errors, half = (100.0 * ahead, 100.0 * knees_off, pitch), len(off) // 2
+    return [[rms(x[part]) for x in errors] for part in (slice(half), slice(half, None))]
 
 
 def main() -> None:
@@ -160,9 +149,8 @@ def main() -> None:
         for value in values:
             ik = parameter_tree.replace(stride, EXACT | {other: 0.0, name: value})
             halves = errors_of(animation, ik, captured, clip["pelvis_rot"])
-            print(
-                f"{value:6.2f}  ", "  |  ".join("{:.2f}  {:.2f}  {:.2f}".format(*h) for h in halves)
-            )
+            numbers = ["  ".join(f"{error:.2f}" for error in half) for half in halves]
+            print(f"{value:6.2f}  ", "  |  ".join(numbers))
 
 
 if __name__ == "__main__":
