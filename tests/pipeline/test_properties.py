@@ -1,11 +1,14 @@
-"""Properties of any pipeline: symmetries, memory, batches, dtypes, and numbers of programs."""
+"""Properties of any pipeline: symmetries, bones, frame rates, single precision, smoothness.
+
+All clips are rows of one batch, whatever moves in them and whichever gate decides. That the other
+systems have these symmetries, too, follows from their references: see `test_pipeline`.
+"""
 
 import dataclasses
 import functools
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,42 +19,55 @@ from fitting.datasets.clip_frames import frames_from_clip
 from fitting.datasets.synthetic import walker
 from jaxik import Smooth, Transform
 from jaxik.maths import parameter_tree, quat
-from jaxik.maths.gate import AbstractGate
 from jaxik.world.skeleton import bone_lengths
 from reference import maths, sample_poses
-from reference.systems import record as reference
 from reference.terrain import Terrain as PlainTerrain
-from support.clips import (
-    BROKEN,
-    FLAT,
-    FRAMES,
-    HZ,
-    ODD,
-    assert_close,
-    at,
-    make_rig,
-    padded,
-    planes,
-    stepping,
-    to_frames,
-    to_ik,
-    to_rig,
-    to_terrain,
-    to_transform,
-    wandering,
-)
-from support.padding import three_legged
+from support import clips
+from support.cases import QUICK, Either, stacked
+from support.clips import BROKEN, FLAT, FRAMES, HZ, ODD, at, to_ik, to_rig
 
 EXACT = 1e-9  # m, and length of the difference of unit quaternions
 JOINTS = ("hip", "knee", "ankle", "toe")
+RIG = to_rig(clips.make_rig())
 DRIFTING = dataclasses.replace(BROKEN, platform=0)
 PARAMETERS = {"adult": {}, "odd": ODD}
+FLIP = np.array([-1.0, 1.0, 1.0])
+MOVES = {
+    "turned about up": maths.Transform(np.zeros(3), maths.from_axis_angle(maths.Y, 2.1)),
+    "turned, up too": maths.Transform(
+        np.array([1.7, -2.2, 0.4]), sample_poses.random_rot(np.random.default_rng(14))
+    ),
+}
+SOFTNESSES = (1.0, 0.1, 1e-2, 1e-4, 1e-6)
+
+
+class Row(NamedTuple):
+    """A clip with two legs on its ground, `record` with these values, and how soft decisions are.
+
+    The ground rides on a platform.
+    """
+
+    ground: PlainTerrain
+    frames: jaxik.Frame
+    values: dict[str, Any] = {}
+    rig: jaxik.Rig = RIG
+    softness: float = 0.0
+
+    def inputs(self) -> tuple[Any, ...]:
+        """The arguments of `jaxik.run`."""
+        frames = self.frames
+        if not frames.platforms.pos.size:
+            still = Transform(np.zeros((FRAMES, 1, 3)), np.tile(maths.IDENTITY, (FRAMES, 1, 1)))
+            frames = frames.with_platforms(still)
+        ground = clips.to_terrain(dataclasses.replace(self.ground, platform=0))
+        gate = Either(jnp.asarray(self.softness > 0.0), Smooth(self.softness or 1.0))
+        return to_ik(self.values), self.rig, ground, frames, gate
 
 
 @functools.cache
-def wander(legs: int = 2, seed: int = 1, joints: int = 0) -> jaxik.Frame:
+def wander() -> jaxik.Frame:
     """A clip with a bit of everything, for ground on a platform that drifts and turns."""
-    frames = to_frames(wandering(make_rig(joints, legs), np.random.default_rng(seed)))
+    frames = clips.to_frames(clips.wandering(clips.make_rig(), np.random.default_rng(1)))
     time = np.cumsum(np.asarray(frames.dt))
     angle = 0.1 * np.sin(2.0 * time)
     pos = np.stack([0.05 * time, 0.0 * time, 0.03 * np.sin(time)], axis=-1)
@@ -59,25 +75,112 @@ def wander(legs: int = 2, seed: int = 1, joints: int = 0) -> jaxik.Frame:
     return frames.with_platforms(Transform(jnp.asarray(pos)[:, None], jnp.asarray(rot)[:, None]))
 
 
-def run_on(
-    ground: PlainTerrain,
-    frames: jaxik.Frame,
-    values: dict[str, Any],
-    rig: jaxik.Rig | None = None,
-    gate: AbstractGate = jaxik.HARD,
-) -> jaxik.Result:
-    """The result of a clip of two legs on ground that rides on a platform: all share a program."""
-    if not frames.platforms.pos.size:
-        still = Transform(jnp.zeros((FRAMES, 1, 3)), jnp.tile(quat.identity(), (FRAMES, 1, 1)))
-        frames = frames.with_platforms(still)
-    ground = dataclasses.replace(ground, platform=0)
-    rig = to_rig(make_rig()) if rig is None else rig
-    return jaxik.run(to_ik(values), rig, to_terrain(ground), frames, gate)
+def straight_walk(seed: int) -> jaxik.Frame:
+    """A walk in the direction that it faces."""
+    walk = clips.stepping(clips.make_rig(seed), heading=0.3 * seed, foot=0.05 * seed)
+    frames = clips.to_frames(walk)
+    root = frames.world_from_model
+    root = Transform(quat.rotate(root.rot, root.pos), root.rot)
+    return dataclasses.replace(frames, world_from_model=root)
 
 
 @functools.cache
-def wandered(name: str) -> jaxik.Result:
-    return run_on(DRIFTING, wander(), PARAMETERS[name])
+def rolling_walk() -> tuple[jaxik.Rig, jaxik.Frame]:
+    """A walk whose feet roll over heel and ball; names and joints, which are static, are ours."""
+    clip = walker.walk(FRAMES / HZ, HZ, seed=3)
+    ours = {name: getattr(RIG, name) for name in ("names", "joints", "pelvis")}
+    frames = frames_from_clip(clip)
+    stride = dataclasses.replace(frames.stride, aside_ws=None)  # which other clips have not
+    return dataclasses.replace(clip.rig, **ours), dataclasses.replace(frames, stride=stride)
+
+
+def climb(hz: int) -> jaxik.Frame:
+    """Two seconds up a slope with slipping feet, at any frame rate."""
+    walk = clips.stepping(clips.make_rig(), drift=0.05, hz=hz, count=2 * hz)
+    return clips.to_frames(clips.padded(walk))
+
+
+def moved_ground(ground: PlainTerrain, by: maths.Transform) -> PlainTerrain:
+    """In the space of its platform nothing changes, only in the world."""
+    return dataclasses.replace(ground, up=maths.rotate(by.rot, ground.up))
+
+
+@jax.jit
+def moved_frames(frames: jaxik.Frame, by: Transform) -> jaxik.Frame:
+    return dataclasses.replace(
+        frames,
+        world_from_model=by @ frames.world_from_model,
+        platforms=by @ frames.platforms,
+        platforms_before=by @ frames.platforms_before,
+        velocity_ws=quat.rotate(by.rot, frames.velocity_ws),
+        stride=dataclasses.replace(
+            frames.stride,
+            last_ws=by.apply(frames.stride.last_ws),
+            next_ws=by.apply(frames.stride.next_ws),
+        ),
+    )
+
+
+def mirrored(tree):
+    """Swaps left and right in all positions and rotation axes."""
+
+    def flip(t):
+        if not isinstance(t, Transform):
+            return t
+        return Transform(t.pos * FLIP, t.rot * np.array([1.0, 1, -1, -1]))
+
+    return jax.tree.map(flip, tree, is_leaf=lambda t: isinstance(t, Transform))
+
+
+def mirrored_row(values: dict[str, Any]) -> Row:
+    rig = dataclasses.replace(
+        RIG,
+        side=-RIG.side,
+        knee_axis_ls=RIG.knee_axis_ls * np.array([1.0, -1, -1]),  # a rotation axis
+        ankle_from_foot=RIG.ankle_from_foot * np.array([1.0, 1, -1, -1]),
+    )
+    sides = [(point * FLIP, normal * FLIP) for point, normal in DRIFTING.planes]
+    ground = dataclasses.replace(DRIFTING, planes=sides)
+    twist = {"leg.twist": -parameter_tree.get(to_ik(values), "leg.twist")}
+    return Row(ground, mirrored(wander()), values | twist, rig)
+
+
+def swapped(tree: Any, axis: int = 1) -> Any:
+    """With the legs, which are along this axis, in the other order."""
+    return jax.tree.map(lambda leaf: np.flip(leaf, axis), tree)
+
+
+@functools.cache
+def rows() -> dict[str, Row]:
+    rigs = [to_rig(clips.make_rig(n)) for n in range(3)]
+    many = {f"walks {n}": Row(FLAT, straight_walk(n), {}, rig) for n, rig in enumerate(rigs)}
+    rig, frames = rolling_walk()
+    many["rolls"] = Row(FLAT, frames, {}, rig)
+    many["rolls, unlocked"] = Row(FLAT, frames, {"lock.enabled": False}, rig)
+    for name, values in PARAMETERS.items():
+        many[name] = Row(DRIFTING, wander(), values)
+        many[f"{name}, mirrored"] = mirrored_row(values)
+        for kind, by in MOVES.items():
+            frames = moved_frames(wander(), clips.to_transform(by))
+            many[f"{name}, {kind}"] = Row(moved_ground(DRIFTING, by), frames, values)
+    frames = dataclasses.replace(
+        wander(), pose=swapped(wander().pose), weight=swapped(wander().weight)
+    )
+    many["odd, swapped"] = Row(DRIFTING, frames, ODD, swapped(RIG, 0))
+    slope = clips.planes((0.1, 0.05, 0.0), (-0.1, 0.0, 0.1))
+    many |= {f"climbs at {hz} Hz": Row(slope, climb(hz)) for hz in (30, 60, 120)}
+    many |= {f"softened by {x}": Row(DRIFTING, wander(), ODD, softness=x) for x in SOFTNESSES}
+    return many
+
+
+@functools.cache
+def results() -> jaxik.Result:
+    run = jax.jit(jax.vmap(jaxik.run), compiler_options=QUICK)
+    return jax.device_get(run(*stacked([row.inputs() for row in rows().values()])))
+
+
+def result_of(name: str) -> jaxik.Result:
+    return at(results(), list(rows()).index(name))
 
 
 def offset_of(result: jaxik.Result) -> np.ndarray:
@@ -108,31 +211,27 @@ def assert_same_pose(actual, expected, tolerance: float = EXACT) -> None:
 # Flat ground.
 
 
-def limits_kept(values: dict, frames: jaxik.Frame, result: jaxik.Result) -> np.ndarray:
+def limits_kept(name: str) -> np.ndarray:
     """Frames where no lock holds a foot and no leg is beyond `soften` times its reach."""
+    row, result = rows()[name], result_of(name)
     held = np.linalg.norm(offset_of(result), axis=-1).max(axis=-1) > 1e-6
-    a, b = (np.asarray(bone) for bone in bone_lengths(frames.pose))
-    leg: Any = to_ik(values).leg
+    a, b = (np.asarray(bone) for bone in bone_lengths(row.frames.pose))
+    leg: Any = to_ik(row.values).leg
     free = leg.soften * np.sqrt(a * a + b * b - 2 * a * b * np.cos(leg.max_knee_angle))
-    reach = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
+    reach = np.linalg.norm(row.frames.pose.ankle.pos - row.frames.pose.hip.pos, axis=-1)
     return ~held & (reach <= np.asarray(free)).all(axis=-1)
 
 
 def test_flat_ground_changes_a_walk_by_less_than_a_tenth_of_a_millimetre():
-    for seed in range(3):
-        rig = make_rig(seed)
-        frames = to_frames(stepping(rig, heading=0.3 * seed, foot=0.05 * seed))
-        root = frames.world_from_model  # so that it walks in the direction it faces
-        root = Transform(quat.rotate(root.rot, root.pos), root.rot)
-        frames = dataclasses.replace(frames, world_from_model=root)
-        result = run_on(FLAT, frames, {}, to_rig(rig))
-        # Standing feet do not slip and no leg is too straight, so that all frames count.
-        assert limits_kept({}, frames, result).all()
+    """Standing feet do not slip and no leg is too straight, so that all frames count."""
+    for name in ("walks 0", "walks 1", "walks 2"):
+        result = result_of(name)
+        assert limits_kept(name).all()
         locks = np.diff(result.trace.advanced.state.lock.locked, axis=0)
         assert (locks == 1).any() and (locks == -1).any()
-        assert_same_pose(result.pose, frames.pose, 1e-4)
+        assert_same_pose(result.pose, rows()[name].frames.pose, 1e-4)
         assert np.abs(result.body.pos).max() < 1e-4
-        assert_same_rot(result.body.rot, quat.identity(), 1e-4)
+        assert_same_rot(result.body.rot, maths.IDENTITY, 1e-4)
 
 
 def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
@@ -141,19 +240,12 @@ def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
     Ankles that roll over heel and ball move while they stand, and a lock holds them: these ankles
     move by the lock's offset and no more.
     """
-    clip = walker.walk(FRAMES / HZ, HZ, seed=3)
-    frames = frames_from_clip(clip)
-    # Names and joints are static: keeping ours avoids compiling another program.
-    names = {name: getattr(to_rig(make_rig()), name) for name in ("names", "joints", "pelvis")}
-    rig = dataclasses.replace(clip.rig, **names)
-
-    unlocked = {"lock.enabled": False}
-    result = run_on(FLAT, frames, unlocked, rig)
-    kept = limits_kept(unlocked, frames, result)
+    _, frames = rolling_walk()
+    kept = limits_kept("rolls, unlocked")
     assert kept.mean() > 0.5
-    assert_same_pose(at(result.pose, kept), at(frames.pose, kept), 1e-4)
+    assert_same_pose(at(result_of("rolls, unlocked").pose, kept), at(frames.pose, kept), 1e-4)
 
-    result = run_on(FLAT, frames, {}, rig)
+    result = result_of("rolls")
     offset, reached = offset_of(result), np.asarray(result.reached) > 0
     assert reached.mean() > 0.5 and np.abs(offset[reached]).max() > 0.01
     moved = jax.vmap(lambda root, a, b: quat.rotate(root.rot, a - b))(
@@ -165,94 +257,33 @@ def test_flat_ground_changes_a_walk_with_rolling_feet_only_by_its_locks():
 # Symmetries.
 
 
-def moved_ground(ground: PlainTerrain, by: reference.Transform) -> PlainTerrain:
-    if ground.platform >= 0:  # in the space of its platform nothing changes, only in the world
-        return dataclasses.replace(ground, up=maths.rotate(by.rot, ground.up))
-    return PlainTerrain(
-        maths.rotate(by.rot, ground.up),
-        planes=[
-            (maths.apply(by, point), maths.rotate(by.rot, normal))
-            for point, normal in ground.planes
-        ],
-    )
-
-
-def moved_frames(frames: jaxik.Frame, by: Transform) -> jaxik.Frame:
-    return dataclasses.replace(
-        frames,
-        world_from_model=by @ frames.world_from_model,
-        platforms=by @ frames.platforms,
-        platforms_before=by @ frames.platforms_before,
-        velocity_ws=quat.rotate(by.rot, frames.velocity_ws),
-        stride=dataclasses.replace(
-            frames.stride,
-            last_ws=by.apply(frames.stride.last_ws),
-            next_ws=by.apply(frames.stride.next_ws),
-        ),
-    )
-
-
-def some_move(kind: str) -> reference.Transform:
-    rng = np.random.default_rng(len(kind))
-    pos = rng.uniform(-3.0, 3.0, 3)
-    if kind == "turned about up":
-        return reference.Transform(np.zeros(3), maths.from_axis_angle(maths.Y, 2.1))
-    return reference.Transform(pos, sample_poses.random_rot(rng))
-
-
 @pytest.mark.parametrize("name", PARAMETERS)
-@pytest.mark.parametrize("kind", ["turned about up", "turned, up too"])
+@pytest.mark.parametrize("kind", MOVES)
 def test_moving_the_world_moves_the_result(kind, name):
-    by, before = some_move(kind), wandered(name)
-    frames = moved_frames(wander(), to_transform(by))
-    after = run_on(moved_ground(DRIFTING, by), frames, PARAMETERS[name])
+    by = clips.to_transform(MOVES[kind])
+    before, after = result_of(name), result_of(f"{name}, {kind}")
     assert_same_pose(after.pose, before.pose)
     assert_same_transform(after.body, before.body)
     np.testing.assert_array_equal(after.reached, before.reached)
-    target_ws = to_transform(by).apply(before.trace.advanced.effector.target_ws)
+    target_ws = by.apply(before.trace.advanced.effector.target_ws)
     np.testing.assert_allclose(after.trace.advanced.effector.target_ws, target_ws, atol=EXACT)
     for joint in ("hip", "knee", "ankle"):
         actual, expected = (getattr(r.corrections, joint) for r in (after, before))
         assert_same_rot(actual, expected, EXACT)
 
 
-def mirrored(tree):
-    """Swaps left and right in all positions and rotation axes."""
-
-    def flip(t):
-        if not isinstance(t, Transform):
-            return t
-        return Transform(t.pos * jnp.array([-1.0, 1, 1]), t.rot * jnp.array([1.0, 1, -1, -1]))
-
-    return jax.tree.map(flip, tree, is_leaf=lambda t: isinstance(t, Transform))
-
-
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_mirroring_the_world_mirrors_the_result(name):
-    rig, flip = to_rig(make_rig()), np.array([-1.0, 1.0, 1.0])
-    other = dataclasses.replace(
-        rig,
-        side=-rig.side,
-        knee_axis_ls=rig.knee_axis_ls * jnp.array([1.0, -1, -1]),  # a rotation axis
-        ankle_from_foot=rig.ankle_from_foot * jnp.array([1.0, 1, -1, -1]),
-    )
-    planes = [(point * flip, normal * flip) for point, normal in DRIFTING.planes]
-    ground, values = dataclasses.replace(DRIFTING, planes=planes), PARAMETERS[name]
-    values = values | {"leg.twist": -parameter_tree.get(to_ik(values), "leg.twist")}
-    after, before = run_on(ground, mirrored(wander()), values, other), wandered(name)
+    after, before = result_of(f"{name}, mirrored"), result_of(name)
     assert_same_pose(after.pose, mirrored(before.pose))
     assert_same_transform(after.body, mirrored(before.body))
-    np.testing.assert_allclose(offset_of(after), offset_of(before) * flip, atol=EXACT)
+    np.testing.assert_allclose(offset_of(after), offset_of(before) * FLIP, atol=EXACT)
 
 
 def test_swapping_the_legs_swaps_their_results():
-    swap = lambda tree: at(tree, jnp.array([1, 0]))  # noqa: E731
-    rows = lambda tree: at(tree, (slice(None), jnp.array([1, 0])))  # noqa: E731
-    frames, rig = wander(), swap(to_rig(make_rig()))
-    swapped = dataclasses.replace(frames, pose=rows(frames.pose), weight=rows(frames.weight))
-    after = run_on(DRIFTING, swapped, ODD, rig)
-    assert_same_pose(after.pose, rows(wandered("odd").pose))
-    assert_same_transform(after.body, wandered("odd").body)
+    after, before = result_of("odd, swapped"), result_of("odd")
+    assert_same_pose(after.pose, swapped(before.pose))
+    assert_same_transform(after.body, before.body)
 
 
 # Bones.
@@ -264,7 +295,7 @@ def test_bones_keep_their_lengths(name):
         chain = [np.asarray(getattr(pose, joint).pos) for joint in JOINTS]
         return np.linalg.norm(np.diff(chain, axis=0), axis=-1)
 
-    solved = wandered(name).pose
+    solved = result_of(name).pose
     np.testing.assert_allclose(lengths(solved), lengths(wander().pose), rtol=0, atol=1e-6)
     for joint in JOINTS:
         size = np.linalg.norm(getattr(solved, joint).rot, axis=-1)
@@ -273,7 +304,7 @@ def test_bones_keep_their_lengths(name):
 
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
-    result, frames = wandered(name), wander()
+    result, frames = result_of(name), wander()
     carried = jax.vmap(lambda pose, body: pose.transformed(body))(frames.pose, result.body)
     hip_turn = quat.multiply(result.pose.hip.rot, quat.conjugate(carried.hip.rot))
     for joint, parent_turn in (("hip", quat.identity()), ("knee", hip_turn)):
@@ -292,104 +323,49 @@ def test_corrections_are_the_solved_pose_and_ankles_arrive_where_reached(name):
     assert gap[reached].max(initial=0.0) < EXACT < gap[~reached].min()
 
 
-# Frame rates.
-
-
-def walk_at(hz: float) -> jaxik.Frame:
-    """Two seconds up a slope with slipping feet, at any frame rate."""
-    return to_frames(padded(stepping(make_rig(), drift=0.05, hz=hz, count=int(2 * hz))))
-
-
 def test_rates_of_30_and_60_hz_stay_within_three_and_one_millimetres_of_120_hz():
-    ground = planes((0.1, 0.05, 0.0), (-0.1, 0.0, 0.1))
-    runs = {hz: run_on(ground, walk_at(hz), {}) for hz in (30, 60, 120)}
-    fine = at(runs[120], slice(0, FRAMES, 4))
+    fine = at(result_of("climbs at 120 Hz"), slice(0, FRAMES, 4))
     for hz, most, mean in ((30, 3e-3, 1e-3), (60, 1.2e-3, 5e-4)):  # m; measured: 2.3 and 0.8 mm
-        coarse = at(runs[hz], slice(0, 2 * hz, hz // 30))
+        coarse = at(result_of(f"climbs at {hz} Hz"), slice(0, 2 * hz, hz // 30))
         places = [(getattr(coarse.pose, j).pos, getattr(fine.pose, j).pos) for j in JOINTS]
         apart = np.stack([np.linalg.norm(a - b, axis=-1) for a, b in places])
         assert apart.max() < most and apart.mean() < mean
 
 
-# Batches.
+def test_smooth_tends_to_hard_as_softness_falls():
+    apart, hard = [], result_of("odd").pose
+    for softness in SOFTNESSES:
+        soft = result_of(f"softened by {softness}").pose
+        gaps = [np.abs(getattr(soft, j).pos - getattr(hard, j).pos).mean() for j in JOINTS]
+        apart.append(max(gaps))
+    assert apart == sorted(apart, reverse=True)
+    assert apart[0] > 1e-3 and apart[-1] < 1e-7
 
 
-CROWD_GROUNDS = [BROKEN, planes((0.1, 0.2, 0.05)), planes((-0.2, 0.0, -0.1), (0.2, 0.1, -0.2))]
-crowd_run = jax.jit(jax.vmap(jaxik.run))
-
-
-@functools.cache
-def crowd() -> tuple[jaxik.FootIK, jaxik.Rig, object, jaxik.Frame]:
-    """Two padded two-legged characters and a three-legged one, all different."""
-    iks = [to_ik({}), to_ik(ODD), to_ik({"leg.soften": 0.9, "lock.enabled": False})]
-    pairs = [three_legged(to_rig(make_rig(seed)), wander_of(seed)) for seed in range(2)]
-    pairs.append((to_rig(make_rig(legs=3)), wander(3)))
-    rigs, frames = zip(*pairs, strict=True)
-    stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
-    grounds = [to_terrain(dataclasses.replace(ground, platform=0)) for ground in CROWD_GROUNDS]
-    return tuple(jax.tree.map(stack, *each) for each in (iks, rigs, grounds, frames))  # type: ignore[return-value]
-
-
-def wander_of(seed: int) -> jaxik.Frame:
-    return wander(seed=seed, joints=seed)
-
-
-@functools.cache
-def crowd_result() -> jaxik.Result:
-    return crowd_run(*crowd())
-
-
-@pytest.mark.parametrize("member", range(2))
-def test_a_batch_equals_the_loop_and_padded_legs_change_nothing(member):
-    values = list(PARAMETERS.values())[member]
-    alone = run_on(CROWD_GROUNDS[member], wander_of(member), values, to_rig(make_rig(member)))
-    together = at(crowd_result(), member)
-    legs = at(together.pose, (slice(None), slice(2)))
-    assert_same_pose(legs, alone.pose)
-    assert_same_transform(together.body, alone.body)
-    np.testing.assert_array_equal(together.reached[:, :2], alone.reached)
-    np.testing.assert_allclose(offset_of(together)[:, :2], offset_of(alone), atol=EXACT)
-
-
-def test_a_bad_member_does_not_affect_the_others_of_a_batch():
-    for leaf in jax.tree.leaves(crowd_result()):
-        assert np.isfinite(leaf).all()
-    ik, rig, ground, frames = crowd()
-    bad = frames.pose.ankle.pos.at[1, 40:50, 0].set(jnp.nan)
-    spoiled = eqx.tree_at(lambda f: f.pose.ankle.pos, frames, bad)
-    result = crowd_run(ik, rig, ground, spoiled)
-    assert result.faulty[1].sum() == 10 and np.isfinite(result.pose.ankle.pos).all()
-    for member in (0, 2):
-        assert_close(at(result, member), at(crowd_result(), member), 0.0)
-
-
-# Precision.
+# Single precision: programs of their own, each of one character.
 
 
 def single(tree):
     return jax.tree.map(
-        lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+        lambda x: jnp.asarray(x, jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
     )
 
 
-def single_inputs():
-    return single((to_ik(ODD), to_rig(make_rig()), to_terrain(DRIFTING), wander()))
+@functools.cache
+def traced(system: str):
+    """The program of a clip in single precision; it decides by either gate."""
+    ik = clips.by_speed() if system == "by speed" else getattr(jaxik.presets, system)()
+    inputs = single((ik, *Row(DRIFTING, wander()).inputs()[1:]))
+    with jax.numpy_dtype_promotion("strict"):
+        return jax.make_jaxpr(jaxik.run)(*inputs)
 
 
 @functools.cache
-def traced(smooth: bool):
-    """The program of a clip in single precision."""
-    gate = single(Smooth(1.0)) if smooth else jaxik.HARD
+def hard_program():
+    """The traced program of `record` that only decides sharply, likewise."""
+    inputs = single(rows()["odd"].inputs()[:-1])
     with jax.numpy_dtype_promotion("strict"):
-        return jax.make_jaxpr(jaxik.run)(*single_inputs(), gate)
-
-
-@pytest.mark.parametrize("smooth", [False, True])
-def test_a_single_precision_program_contains_no_doubles(smooth):
-    assert not list(doubles(traced(smooth).jaxpr))
-    times = single_inputs()[-1].dt
-    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(times)
-    assert list(doubles(leak.jaxpr)), "the check notices doubles"
+        return jax.jit(jaxik.run, compiler_options=QUICK).trace(*inputs)
 
 
 def doubles(program):
@@ -404,45 +380,34 @@ def doubles(program):
                 yield from doubles(getattr(inner, "jaxpr", inner))
 
 
-def test_single_precision_stays_within_a_hundredth_of_a_millimetre_of_double():
-    result, double = jaxik.run(*single_inputs()), wandered("odd")
-    for path, leaf in jax.tree_util.tree_leaves_with_path(result):
-        floating = jnp.issubdtype(leaf.dtype, jnp.floating)
-        assert not floating or leaf.dtype == jnp.float32, jax.tree_util.keystr(path)
-    locked, expected = (r.trace.advanced.state.lock.locked for r in (result, double))
-    np.testing.assert_array_equal(locked, expected)
-    for joint in JOINTS:
-        actual, expected = getattr(result.pose, joint), getattr(double.pose, joint)
-        np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=1e-5)
-        assert_same_rot(actual.rot, expected.rot, 1e-4)
-    thigh = np.linalg.norm(result.pose.knee.pos - result.pose.hip.pos, axis=-1)
-    np.testing.assert_allclose(thigh, sample_poses.THIGH, atol=1e-6)
-
-
-# Programs.
-
-
-def test_other_values_need_no_new_program():
-    def programs(ground: PlainTerrain, values: dict, seed: int, softness: float) -> int:
-        rig = to_rig(make_rig(seed))
-        for gate in (jaxik.HARD, Smooth(softness)):
-            run_on(ground, wander_of(seed), values, rig, gate)
-        return jaxik.run._cache_size()  # pyright: ignore[reportFunctionMemberAccess]
-
-    level = planes((0.1, 0.0, 0.0))
-    assert programs(DRIFTING, {}, 0, 0.5) == programs(level, ODD, 1, 0.1)
+@pytest.mark.parametrize("system", ["record", "ozz", "unreal", "mec", "stride", "by speed"])
+def test_a_single_precision_program_contains_no_doubles(system: str):
+    assert not list(doubles(traced(system).jaxpr))
+    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(np.float32([1.0]))
+    assert list(doubles(leak.jaxpr)), "the check notices doubles"
 
 
 def test_only_the_smooth_program_contains_a_sigmoid():
-    hard, smooth = (set(re.findall(r"= (\w+)", str(traced(smooth)))) for smooth in (False, True))
+    hard, smooth = (
+        set(re.findall(r"= (\w+)", str(program.jaxpr)))
+        for program in (hard_program(), traced("record"))
+    )
     assert not {"logistic", "tanh", "erf"} & hard and "logistic" in smooth
 
 
-def test_smooth_tends_to_hard_as_softness_falls():
-    apart, hard = [], wandered("odd").pose
-    for softness in (1.0, 0.1, 1e-2, 1e-4, 1e-6):
-        soft = run_on(DRIFTING, wander(), ODD, gate=Smooth(softness)).pose
-        gaps = [np.abs(getattr(soft, j).pos - getattr(hard, j).pos).mean() for j in JOINTS]
-        apart.append(max(gaps))
-    assert apart == sorted(apart, reverse=True)
-    assert apart[0] > 1e-3 and apart[-1] < 1e-7
+def test_single_precision_is_within_a_hundredth_of_a_millimetre_and_one_program_has_all_values():
+    program = hard_program().lower().compile()
+    for name in PARAMETERS:
+        # It would refuse inputs whose numbers were a part of the program.
+        result, double = program(*single(rows()[name].inputs()[:-1])), result_of(name)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(result):
+            floating = jnp.issubdtype(leaf.dtype, jnp.floating)
+            assert not floating or leaf.dtype == jnp.float32, jax.tree_util.keystr(path)
+        locked, expected = (r.trace.advanced.state.lock.locked for r in (result, double))
+        np.testing.assert_array_equal(locked, expected)
+        for joint in JOINTS:
+            actual, expected = getattr(result.pose, joint), getattr(double.pose, joint)
+            np.testing.assert_allclose(actual.pos, expected.pos, rtol=0, atol=1e-5)
+            assert_same_rot(actual.rot, expected.rot, 1e-4)
+        thigh = np.linalg.norm(result.pose.knee.pos - result.pose.hip.pos, axis=-1)
+        np.testing.assert_allclose(thigh, sample_poses.THIGH, atol=1e-6)
