@@ -1,24 +1,157 @@
-"""Smoothing laws: exact at any frame time, correct at their limits, with correct gradients."""
+"""Gates and smoothing laws: exact, correct at their limits, with correct gradients.
+
+The hard gate decides, the smooth one converges to it. Laws are exact at any frame time.
+"""
 
 import itertools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.typing import ArrayLike
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from jaxik.maths import smoothing
-from support.gradients import (
-    ROWS,
-    assert_all_gradients_match,
-    finite_jacobian,
-    finite_jacobians,
-)
+from jaxik.maths.gate import HARD, Hard, Smooth
+from support.gradients import ROWS, assert_all_gradients_match, finite_jacobian, finite_jacobians
 
 RNG = np.random.default_rng(0)
+
+
+# Gates.
+
+BAND = 0.02
+SOFT = Smooth(0.5)
+SOFTNESSES = np.array([0.02, 0.5, 1.0])
+X, THRESHOLD, LOW, HIGH = RNG.uniform([[-1], [-1], [-1], [0]], [[1], [1], [0], [1]], (4, ROWS))
+THRESHOLD[:2] = X[0], X[1] + 0.01
+X[2], X[3] = LOW[2], HIGH[3]
+SETS = RNG.uniform(-1, 1, (ROWS, 4))  # to find extremes of
+SETS[:3] = [0.3, -0.2, 0.1, 0.7], [0.5, 0.5, -0.5, -0.5], [0.0, 0.0, 0.0, 0.0]
+
+
+def method(name: str, **band: float) -> Callable[..., jax.Array]:
+    """The method of any gate, as a function of the gate and of plain numbers."""
+    return lambda gate, *args: getattr(gate, name)(*map(jnp.asarray, args), **band)
+
+
+below, above, clip, minimum, maximum = (
+    method(name, band=BAND) for name in ("below", "above", "clip", "minimum", "maximum")
+)
+choose = method("choose")
+
+
+def decisions(gate, x, threshold):
+    return below(gate, x, threshold), above(gate, x, threshold)
+
+
+def clip_with_fixed_softness(gate, x, low, high):
+    return clip(jax.lax.stop_gradient(gate), x, low, high)
+
+
+def test_the_hard_gate_decides_clips_and_finds_extremes_as_numpy_does():
+    assert_allclose(below(HARD, X, THRESHOLD), X <= THRESHOLD, atol=0)
+    assert_allclose(above(HARD, X, THRESHOLD), X >= THRESHOLD, atol=0)
+    assert_allclose(below(HARD, X, X) * above(HARD, X, X), 1.0, atol=0)
+    assert_allclose(clip(HARD, X, LOW, HIGH), np.clip(X, LOW, HIGH), atol=0)
+    assert_allclose(minimum(HARD, SETS), SETS.min(axis=-1), atol=0)
+    assert_allclose(maximum(HARD, SETS), SETS.max(axis=-1), atol=0)
+    assert np.isnan(minimum(HARD, np.where(np.eye(3), np.nan, [1.0, -1.0, 0.0]))).all()
+
+
+def test_the_hard_gate_chooses_one_or_the_other_and_the_smooth_one_blends_by_the_weight():
+    weight = np.linspace(0, 1, 11)
+    assert choose(HARD, weight, 3.0, -1.0).tolist() == [-1.0] * 6 + [3.0] * 5
+    assert_allclose(choose(SOFT, weight, 3.0, -1.0), 4.0 * weight - 1.0, atol=1e-15)
+
+
+def test_the_hard_gate_gives_the_whole_gradient_to_one_of_several_equal_operands():
+    tied = np.array([0.5, 0.2, 0.2])
+    assert_allclose(finite_jacobian(minimum, HARD, tied), [[0, 1, 0]], atol=0)
+    assert_allclose(finite_jacobian(maximum, HARD, -tied), [[0, 1, 0]], atol=0)
+    for x in (-1.0, 1.0):
+        assert_allclose(finite_jacobian(clip, HARD, x, -1.0, 1.0), [[1, 0, 0]], atol=0)
+
+
+def test_the_hard_program_contains_no_sigmoid():
+    def everything(x, low, high, sets):
+        chosen = choose(HARD, x, low, high), clip(HARD, x, low, high)
+        return decisions(HARD, x, low), chosen, minimum(HARD, sets), maximum(HARD, sets)
+
+    program = str(jax.make_jaxpr(everything)(X, LOW, HIGH, SETS))
+    assert not any(word in program for word in ("logistic", "exp", "log", "tanh"))
+
+
+def test_the_smooth_gate_gives_half_at_the_threshold_and_its_weights_add_up_to_one():
+    assert_allclose(below(SOFT, X, X), 0.5, atol=1e-15)
+    weight = below(SOFT, X, THRESHOLD)
+    assert_allclose(weight + above(SOFT, X, THRESHOLD), 1.0, atol=1e-15)
+    assert ((weight >= 0) & (weight <= 1)).all()
+
+
+@pytest.mark.parametrize("exponent", range(0, 13, 2))
+def test_the_smooth_gate_converges_to_the_hard_one(exponent):
+    """A decision exponentially, a limit and an extreme in proportion to the softness."""
+    soft, width = Smooth(10.0**-exponent), BAND * 10.0**-exponent
+    apart = np.abs(X - THRESHOLD) > 1e-3
+    error = np.abs(below(soft, X, THRESHOLD) - below(HARD, X, THRESHOLD))[apart]
+    assert (error <= np.exp(-np.abs(X - THRESHOLD)[apart] / width) + 1e-15).all()
+    gap = np.abs(clip(soft, X, LOW, HIGH) - clip(HARD, X, LOW, HIGH))
+    assert (gap <= np.log(2) * width + 1e-14).all()
+    bound = (SETS.shape[1] - 1) * width / np.e + 1e-14
+    for gap in (minimum(soft, SETS) - SETS.min(-1), SETS.max(-1) - maximum(soft, SETS)):
+        assert ((gap >= -1e-14) & (gap <= bound)).all()
+
+
+def test_gradients_of_gates_match_finite_differences():
+    gaps = RNG.uniform(0.02, 1, ROWS) * RNG.choice([-1, 1], ROWS)
+    soft = Smooth(np.resize(SOFTNESSES, ROWS))
+    assert_all_gradients_match(decisions, HARD, THRESHOLD + gaps, THRESHOLD)
+    assert_all_gradients_match(decisions, soft, THRESHOLD + gaps, THRESHOLD)
+    assert_all_gradients_match(decisions, soft, THRESHOLD, THRESHOLD)
+    x, softness = np.array(list(itertools.product([-0.9, -0.5, 0.1, 0.45, 0.9], SOFTNESSES))).T
+    assert_all_gradients_match(clip, HARD, x, -0.6, 0.5)
+    assert_all_gradients_match(clip, Smooth(softness), x, -0.6, 0.5)
+    orders = np.array(list(itertools.permutations([0.3, -0.2, 0.1, 0.7])))
+    assert_all_gradients_match(minimum, HARD, orders)
+    assert_all_gradients_match(maximum, Smooth(np.resize(SOFTNESSES, len(orders))), orders)
+    for gate in (HARD, SOFT):
+        assert_all_gradients_match(choose, gate, np.array([0.0, 0.3, 1.0]), 3.0, -1.0)
+
+
+def test_gradients_of_gates_stay_finite_as_softness_falls_to_zero():
+    x, softness = np.meshgrid([-0.1, 0.1, 0.2, 0.5], [1e-3, 1e-6, 1e-12, 1e-60])
+    soft = Smooth(softness.ravel())
+    finite_jacobians(below, soft, x.ravel(), 0.1)
+    # Not in the softness itself, where it is a difference of two large numbers.
+    finite_jacobians(clip_with_fixed_softness, soft, x.ravel(), -0.1, 0.2)
+    for values in SETS[:3]:
+        finite_jacobians(minimum, soft, np.tile(values, (soft.softness.size, 1)))
+
+
+def test_a_softness_may_be_a_float_and_a_new_one_does_not_recompile():
+    x = jnp.asarray(0.1, jnp.float32)
+    assert below(Smooth(0.5), x, x).dtype == jnp.float32
+    traces = []
+
+    @jax.jit
+    def decide(gate, x):
+        traces.append(gate)
+        return below(gate, x, 0.1 * x)
+
+    for softness in (1.0, 0.1, 1e-6):
+        decide(Smooth(softness), jnp.asarray(0.3))
+    assert len(traces) == 1
+    decide(Hard(), jnp.asarray(0.3))
+    assert len(traces) == 2
+
+
+# Smoothing laws.
+
 FRAME_TIMES = RNG.permutation(np.resize([1 / 240, 1 / 120, 1 / 60, 1 / 30, 0.5], ROWS))
 TICK_HZ = RNG.choice([30.0, 60.0], ROWS)
 GAINS = np.concatenate([[0.0, 1e-6, 0.999, 1.0], RNG.uniform(0, 1, ROWS - 4)])
@@ -58,15 +191,10 @@ def test_two_half_steps_equal_one_step():
     assert_allclose(twice, expected, rtol=1e-11, atol=1e-11)
 
 
-def test_a_gain_compounds_over_ticks():
-    one, seven = (
-        call(smoothing.fraction_of_gain, GAINS, ticks / TICK_HZ, TICK_HZ) for ticks in (1, 7)
-    )
-    assert_allclose(one, GAINS, rtol=1e-13)
-    assert_allclose(seven, 1 - (1 - GAINS) ** 7, rtol=1e-9)
-
-
-def test_a_gain_and_its_half_life_give_the_same_fraction():
+def test_a_gain_compounds_over_ticks_and_gives_the_same_as_its_half_life():
+    for ticks, expected, tolerance in ((1, GAINS, 1e-13), (7, 1 - (1 - GAINS) ** 7, 1e-9)):
+        fraction = call(smoothing.fraction_of_gain, GAINS, ticks / TICK_HZ, TICK_HZ)
+        assert_allclose(fraction, expected, rtol=tolerance)
     half_life = call(smoothing.half_life_of_gain, GAINS, TICK_HZ)
     assert_allclose(call(smoothing.gain_of_half_life, half_life, TICK_HZ), GAINS, rtol=1e-12)
     assert_allclose(
@@ -76,26 +204,23 @@ def test_a_gain_and_its_half_life_give_the_same_fraction():
     )
 
 
-def test_one_half_life_closes_half_of_the_gap_and_two_close_three_quarters():
+def test_a_half_life_closes_half_of_the_gap_or_all_if_it_is_zero_and_none_if_infinite():
+    dt, hz = 1 / 60, 30.0
     assert_allclose(call(smoothing.fraction_of_half_life, 0.2, 0.2), 0.5, rtol=1e-15)
     assert_allclose(call(smoothing.fraction_of_half_life, 0.2, 0.4), 0.75, rtol=1e-15)
-    assert_allclose(call(smoothing.half_life_of_gain, 0.5, 30.0), 1 / 30, rtol=1e-15)
-
-
-def test_gain_one_and_nonpositive_half_lives_jump_and_gain_zero_stays():
-    dt, hz = 1 / 60, 30.0
+    assert_allclose(call(smoothing.half_life_of_gain, 0.5, hz), 1 / 30, rtol=1e-15)
     assert call(smoothing.fraction_of_gain, 1.0, dt, hz) == 1
     assert call(smoothing.fraction_of_gain, 0.0, dt, hz) == 0
     for half_life in (0.0, -0.1):
         assert call(smoothing.fraction_of_half_life, half_life, dt) == 1
         assert call(smoothing.gain_of_half_life, half_life, hz) == 1
         assert spring(3.0, 2.0, 1.0, half_life, dt) == (1.0, 0.0)
+    for use_spring in (False, True):
+        assert follow(3.0, 2.0, 1.0, 1.0, dt, use_spring) == (1.0, 0.0)
     assert call(smoothing.half_life_of_gain, 1.0, hz) == 0
     assert call(smoothing.half_life_of_gain, 0.0, hz) == np.inf
     assert call(smoothing.fraction_of_half_life, np.inf, dt) == 0
-
-
-def test_nothing_moves_in_no_time():
+    # And nothing moves in no time.
     assert call(smoothing.fraction_of_gain, 0.3, 0.0, 30.0) == 0
     assert call(smoothing.fraction_of_half_life, 0.3, 0.0) == 0
     assert spring(3.0, 2.0, 1.0, 0.3, 0.0) == (3.0, 2.0)
@@ -142,13 +267,8 @@ def test_following_a_goal_that_changes_every_frame_solves_the_equation_of_each_f
     for goal in np.repeat(rng.normal(size=12), 4):
         half_life = 0.15 if goal > expected[0] else 0.06
         rate = 2 * np.log(2) / half_life
-        expected = solve_ivp(
-            lambda _, x, w=rate, g=goal: [x[1], -(w**2) * (x[0] - g) - 2 * w * x[1]],
-            (0, dt),
-            expected,
-            rtol=1e-11,
-            atol=1e-12,
-        ).y[:, -1]
+        law = lambda _, x, w=rate, g=goal: [x[1], -(w**2) * (x[0] - g) - 2 * w * x[1]]  # noqa: E731
+        expected = solve_ivp(law, (0, dt), expected, rtol=1e-11, atol=1e-12).y[:, -1]
         fraction = call(smoothing.fraction_of_half_life, half_life, dt)
         sprung = np.array(follow(sprung[0], sprung[1], goal, fraction, dt, True))
         assert_allclose(sprung, expected, atol=1e-8)
@@ -156,19 +276,6 @@ def test_following_a_goal_that_changes_every_frame_solves_the_equation_of_each_f
         assert_allclose(value, goal + (eased - goal) * 2 ** (-dt / half_life), rtol=1e-12)
         assert velocity == 0
         eased = float(value)
-
-
-def test_a_fraction_of_one_jumps_and_stops():
-    for use_spring in (False, True):
-        assert follow(3.0, 2.0, 1.0, 1.0, 1 / 60, use_spring) == (1.0, 0.0)
-
-
-def test_a_spring_that_starts_at_rest_reaches_its_goal_without_overshooting():
-    zeros, times = np.zeros(100), np.linspace(0.01, 10, 100)
-    value, velocity = map(np.asarray, spring(zeros, zeros, 1.0, 0.1, times))
-    assert (np.diff(value) >= 0).all() and (value <= 1).all() and (velocity >= 0).all()
-    assert_allclose((value[-1], velocity[-1]), (1, 0), atol=1e-15)
-    assert spring(1.0, 0.0, 1.0, 0.1, 0.5) == (1.0, 0.0)
 
 
 def laws(gain, half_life, dt, tick_hz):
@@ -188,7 +295,7 @@ def clamped_speeds(speed, dt, gap):
     return fraction, smoothing.half_life_of_speed(speed, dt)
 
 
-def test_gradients_match_finite_differences():
+def test_gradients_of_laws_match_finite_differences():
     gain, half_life = RNG.uniform(0, 0.99, ROWS), RNG.uniform(0.01, 3, ROWS)
     assert_all_gradients_match(laws, gain, half_life, FRAME_TIMES, 30.0)
     assert_all_gradients_match(smoothing.half_life_of_gain, 0.005 + gain, 30.0)
@@ -197,7 +304,7 @@ def test_gradients_match_finite_differences():
     assert_all_gradients_match(clamped_speeds, speeds.ravel(), 1 / 50, gaps.ravel())
 
 
-def test_gradients_stay_finite_at_the_limits():
+def test_gradients_of_laws_stay_finite_at_the_limits():
     gains, half_lives = np.array([0.0, 1e-9, 1 - 1e-9, 1.0]), np.array([0.0, 1e-9, 1e-6, 1e9])
     jacobians = finite_jacobians(laws, gains, half_lives, 1 / 60, 30.0)
     assert_allclose(jacobians[-1, 0], 0, atol=0)
