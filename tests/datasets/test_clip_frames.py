@@ -11,13 +11,16 @@ from scipy.spatial.transform import Rotation
 
 import jaxik
 from fitting.datasets import clip_frames
-from fitting.datasets.clips import contacts
+from fitting.datasets.clips import Clip, contacts
+from fitting.datasets.cut_off_swings import with_cut_off_swings
+from fitting.datasets.ground_path import place_root
 from fitting.datasets.synthetic import gait, speed_profile, walker
+from fitting.studies.animations import Animation
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support.grounds import edges_between_footfalls, flight, terrain_of
 
 FPS = 60.0
-SLOPE = 0.15  # m per metre of z
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +30,7 @@ def clip():
 
 @pytest.fixture(scope="module")
 def result(clip):
-    ground = terrain.plane(normal=(0.0, 1.0, -SLOPE))
+    ground = terrain.plane(normal=(0.0, 1.0, -0.15))
     ik = parameter_tree.replace(jaxik.presets.record(), {"lean.forward_rate": 0.5})
     return jaxik.run(ik, clip.rig, ground, clip_frames.frames_from_clip(clip))
 
@@ -61,18 +64,6 @@ def test_frames_hold_the_clip_in_model_space_above_the_floor(clip):
     np.testing.assert_array_equal([frame.speed, frame.slide], [[0.0], [0.0]])
 
 
-def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(clip, result):
-    solved = clip_frames.clip_from_result(clip, result)
-    joints = solved.positions_ws[:, np.array(clip.rig.joints)]
-    np.testing.assert_allclose(joints, placed(clip.world_from_model(), result.pose), atol=1e-9)
-    lengths = [
-        np.linalg.norm(c.positions_ws[:, 1] - c.positions_ws[:, 0], axis=-1) for c in (clip, solved)
-    ]
-    np.testing.assert_allclose(*lengths, rtol=0, atol=1e-9)
-    assert rotation(solved.rotations_ws[100, 0]).magnitude() > 0.03
-    assert solved.rig.joints == clip.rig.joints
-
-
 def with_joints(clip, joints):
     """The clip with further joints: name, parent, and offset in the parent's space, m."""
     for name, parent, offset in joints:
@@ -90,7 +81,17 @@ def with_joints(clip, joints):
     return clip
 
 
-def test_joints_above_the_pelvis_and_below_a_foot_stay_rigid_on_their_parents(clip, result):
+def test_the_solved_clip_has_the_solved_legs_and_the_rest_moves_with_the_body(clip, result):
+    solved = clip_frames.clip_from_result(clip, result)
+    joints = solved.positions_ws[:, np.array(clip.rig.joints)]
+    np.testing.assert_allclose(joints, placed(clip.world_from_model(), result.pose), atol=1e-9)
+    lengths = [
+        np.linalg.norm(c.positions_ws[:, 1] - c.positions_ws[:, 0], axis=-1) for c in (clip, solved)
+    ]
+    np.testing.assert_allclose(*lengths, rtol=0, atol=1e-9)
+    assert rotation(solved.rotations_ws[100, 0]).magnitude() > 0.03
+    assert solved.rig.joints == clip.rig.joints
+    # Joints above the pelvis and below a foot stay rigid on their parents.
     added = [("tip", 4, [0.01, -0.02, 0.05]), ("head", 0, [0.0, 0.6, 0.0])]
     solved = clip_frames.clip_from_result(with_joints(clip, added), result)
     for joint, (_, parent, offset) in enumerate(added, 9):
@@ -127,20 +128,30 @@ def test_spine_and_head_lean_as_the_system_says(clip, result):
     np.testing.assert_array_equal(legs_only.positions_ws, plain.positions_ws[:, :9])
 
 
-QUIET = {"lock.enabled": jnp.array(False)}
+def test_a_raised_character_has_the_pose_speeds_and_contact_labels_of_its_floor(clip):
+    rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
+    frames, flat = (clip_frames.frames_from_clip(clip, rise=height) for height in (rise, None))
+    moved = np.asarray(frames.world_from_model.pos - flat.world_from_model.pos)
+    np.testing.assert_allclose(moved, rise[:, None] * [0.0, 1.0, 0.0], atol=1e-12)
+    same = dataclasses.replace(frames, world_from_model=flat.world_from_model)
+    jax.tree.map(np.testing.assert_array_equal, same, flat)
+    # Foot IK that changes nothing gives the raised clip.
+    nothing = {"lock.enabled": jnp.array(False), "leg.weight": jnp.array(0.0)}
+    ik = parameter_tree.replace(jaxik.presets.record(), nothing)
+    result = jaxik.run(ik, clip.rig, terrain.plane((0.0, -9.0, 0.0)), frames)
+    solved = clip_frames.clip_from_result(clip, result, rise=rise)
+    raised = clip_frames.raised(clip, rise)
+    np.testing.assert_allclose(solved.positions_ws, raised.positions_ws, rtol=0, atol=1e-9)
+    unlabelled = dataclasses.replace(clip, stance=None)
+    raised = clip_frames.raised(unlabelled, np.linspace(0.0, 2.0, clip.frame_count))
+    np.testing.assert_array_equal(raised.stance_labels(), unlabelled.stance_labels())
+    assert clip_frames.raised(clip, None) is clip
 
 
-def test_flat_ground_leaves_a_clip_away_from_its_limits_unchanged(clip):
-    quiet = QUIET | {"leg.max_knee_angle": 3.1415, "leg.soften": 1.0}
-    ik = parameter_tree.replace(jaxik.presets.record(), quiet)
-    result = jaxik.run(ik, clip.rig, terrain.plane(), clip_frames.frames_from_clip(clip))
-    solved = clip_frames.clip_from_result(clip, result)
-    np.testing.assert_allclose(solved.positions_ws, clip.positions_ws, rtol=0, atol=1e-4)
-    cosine = np.abs(np.sum(solved.rotations_ws * clip.rotations_ws, axis=-1))
-    assert cosine.min() > np.cos(0.5e-3)
+# Strides
 
 
-def test_strides_go_from_stance_to_stance(clip):
+def test_strides_go_from_stance_to_stance_and_are_unknown_where_a_foot_never_stands(clip):
     stride = jax.tree.map(np.asarray, clip_frames.frames_from_clip(clip).stride)
     stance = clip.stance_labels()
     np.testing.assert_array_equal(stride.standing, stance)
@@ -160,50 +171,23 @@ def test_strides_go_from_stance_to_stance(clip):
             np.testing.assert_array_equal(stride.fraction[first : last + 1, leg], 0.0)
             steps = np.diff(stride.fraction[last:landing, leg])
             np.testing.assert_allclose(steps, 1 / (landing - last), rtol=1e-9)
-
-
-@pytest.mark.parametrize("up_ws", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
-def test_strides_say_where_swings_bend(up_ws):
-    """A ball on a parabola, 0.12 m beside the straight way in the middle."""
-    up = np.array(up_ws)
-    ahead = np.roll(up, 1)
-    right = np.cross(up, ahead)
-    part = np.clip((np.arange(40) - 10) / 20, 0.0, 1.0)[:, None]
-    arc = 4.0 * part * (1.0 - part)
-    ball_ws = [0.3, 0.2, -0.4] + 0.7 * part * ahead + arc * (0.1 * up + 0.12 * right)
-    stance = (part[:, 0] == 0.0) | (part[:, 0] == 1.0)
-    aside_ws = contacts.footfalls(ball_ws, stance, up_ws).aside_ws
-    np.testing.assert_allclose(aside_ws, [0.12 * right, np.zeros(3)], rtol=0, atol=1e-12)
-
-
-def test_a_foot_that_never_stands_has_an_unknown_stride(clip):
-    stance = clip.stance_labels().copy()
-    stance[:, 1] = False
-    stride = clip_frames.frames_from_clip(dataclasses.replace(clip, stance=stance)).stride
+    hopping = dataclasses.replace(clip, stance=stance & np.array([True, False]))
+    stride = clip_frames.frames_from_clip(hopping).stride
     np.testing.assert_array_equal(stride.known[:, 1], 0.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(stride))
 
 
-def test_a_raised_character_has_the_pose_speeds_and_contact_labels_of_its_floor(clip):
-    rise = 0.5 * np.arange(clip.frame_count) / clip.frame_count
-    frames, flat = (clip_frames.frames_from_clip(clip, rise=height) for height in (rise, None))
-    moved = np.asarray(frames.world_from_model.pos - flat.world_from_model.pos)
-    np.testing.assert_allclose(moved, rise[:, None] * [0.0, 1.0, 0.0], atol=1e-12)
-    same = dataclasses.replace(frames, world_from_model=flat.world_from_model)
-    jax.tree.map(np.testing.assert_array_equal, same, flat)
-    # Foot IK that changes nothing gives the raised clip.
-    ik = parameter_tree.replace(jaxik.presets.record(), QUIET | {"leg.weight": jnp.array(0.0)})
-    result = jaxik.run(ik, clip.rig, terrain.plane((0.0, -9.0, 0.0)), frames)
-    solved = clip_frames.clip_from_result(clip, result, rise=rise)
-    raised = clip_frames.raised(clip, rise)
-    np.testing.assert_allclose(solved.positions_ws, raised.positions_ws, rtol=0, atol=1e-9)
-    unlabelled = dataclasses.replace(clip, stance=None)
-    raised = clip_frames.raised(unlabelled, np.linspace(0.0, 2.0, clip.frame_count))
-    np.testing.assert_array_equal(raised.stance_labels(), unlabelled.stance_labels())
-    assert clip_frames.raised(clip, None) is clip
-
-
-# Teleports
+def test_strides_say_where_swings_bend():
+    """A ball on a parabola, 0.12 m beside the straight way in the middle."""
+    part = np.clip((np.arange(40) - 10) / 20, 0.0, 1.0)[:, None]
+    arc = 4.0 * part * (1.0 - part)
+    for up in np.eye(3)[1:]:
+        ahead = np.roll(up, 1)
+        right = np.cross(up, ahead)
+        ball_ws = [0.3, 0.2, -0.4] + 0.7 * part * ahead + arc * (0.1 * up + 0.12 * right)
+        stance = (part[:, 0] == 0.0) | (part[:, 0] == 1.0)
+        aside_ws = contacts.footfalls(ball_ws, stance, tuple(up)).aside_ws
+        np.testing.assert_allclose(aside_ws, [0.12 * right, np.zeros(3)], rtol=0, atol=1e-12)
 
 
 def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
@@ -221,13 +205,82 @@ def test_a_teleport_restarts_with_the_speeds_and_strides_that_follow(clip):
     leaves = (jax.tree.leaves(each.stride) for each in (frames, *parts))
     for found, *each in zip(*leaves, strict=True):
         np.testing.assert_allclose(found, np.concatenate(each), atol=1e-6)
+    for fps in (10.0, 60.0):  # neither a sprint nor a stray frame is a teleport
+        clip = walker.walk(2.0, fps)
+        ahead = np.arange(clip.frame_count)[:, None, None] / fps * [0, 0, 12.0]
+        assert clip.with_motion(clip.positions_ws + ahead, clip.rotations_ws).cuts == (), fps
+        stray = clip.positions_ws.copy()
+        stray[clip.frame_count // 2] += [5.0, 0.0, 0.0]
+        assert clip.with_motion(stray, clip.rotations_ws).cuts == (), fps
 
 
-@pytest.mark.parametrize("fps", [10.0, 60.0])
-def test_neither_a_sprint_nor_a_stray_frame_is_a_teleport(fps):
-    clip = walker.walk(2.0, fps)
-    fast = clip.positions_ws + 12.0 * np.arange(clip.frame_count)[:, None, None] / fps * [0, 0, 1]
-    assert clip.with_motion(fast, clip.rotations_ws).cuts == ()
-    stray = clip.positions_ws.copy()
-    stray[clip.frame_count // 2] += [5.0, 0.0, 0.0]
-    assert clip.with_motion(stray, clip.rotations_ws).cuts == ()
+# Swings that the start of a clip cuts off, against those of the whole clip
+
+LEG = 1
+
+
+@pytest.fixture(scope="module")
+def walk() -> Clip:
+    walk = walker.walk(8.0, FPS, style=walker.WalkStyle(bend=0.0))
+    return dataclasses.replace(walk, stance=walk.stance_labels())
+
+
+def swing_of(walk: Clip) -> tuple[int, int]:
+    """The last frame of a stance in the middle of the walk, and the first one of the next."""
+    stances = contacts.runs(walk.stance_labels()[:, LEG])
+    return stances[3][1], stances[4][0]
+
+
+def cut(walk: Clip, part: float) -> Clip:
+    """The walk from where so much of a swing has passed."""
+    leaving, landing = swing_of(walk)
+    return walk.select(np.arange(round(leaving + part * (landing - leaving)), walk.frame_count))
+
+
+def stairs(walk: Clip, rise: float) -> terrain.Terrain:
+    return terrain_of(flight(edges_between_footfalls(walk, 12), rise))
+
+
+def test_a_swing_that_is_cut_off_begins_where_the_whole_clip_shows_it(walk):
+    leaving, landing = swing_of(walk)
+    first, last = contacts.runs(walk.stance_labels()[:, LEG])[3]
+    expected = np.median(walk.joints_ws(3)[first : last + 1, LEG], axis=0)
+    for part in (0.05, 0.3, 0.6, 0.95):
+        clip = cut(walk, part)
+        cut_off = contacts.cut_off_swing(clip.joints_ws(3)[:, LEG], clip.stance_labels()[:, LEG])
+        assert cut_off is not None, part
+        np.testing.assert_allclose(cut_off.last_ws[[0, 2]], expected[[0, 2]], atol=0.06)
+        frames = np.arange(walk.frame_count - clip.frame_count, landing)
+        fraction, frame = (frames - leaving) / (landing - leaving), 1 / (landing - leaving)
+        np.testing.assert_allclose(cut_off.fraction, fraction, atol=2 * frame)
+    clip = cut(walk, 0.5)
+    balls_ws, stance = clip.joints_ws(3)[:, LEG], clip.stance_labels()[:, LEG]
+    first, last = contacts.runs(stance)[0]
+    for frames in (slice(first, None), slice(last + 5), slice(first)):
+        # It starts standing, or lands once, or never.
+        assert contacts.cut_off_swing(balls_ws[frames], stance[frames]) is None
+
+
+def test_only_higher_ground_under_a_swing_that_is_cut_off_counts_also_after_a_teleport(walk):
+    clip = cut(walk, 0.3)
+    plain = clip_frames.frames_from_clip(clip)
+    before = contacts.runs(clip.stance_labels()[:, LEG])[0][0]
+    for rise in (0.15, 0.0, -0.15):
+        stride = with_cut_off_swings(plain, clip, stairs(walk, rise)).stride
+        assert np.any(stride.last_ws != plain.stride.last_ws) == (rise < 0), rise
+        assert np.any(stride.fraction != plain.stride.fraction) == (rise < 0), rise
+        np.testing.assert_array_equal(stride.last_ws[before:], plain.stride.last_ws[before:])
+        np.testing.assert_array_equal(stride.next_ws, plain.stride.next_ws)
+    both = walk.select(np.r_[np.arange(60), np.arange(walk.frame_count)[-clip.frame_count :]])
+    assert both.cuts == (60,)
+    frames = clip_frames.frames_from_clip(both)
+    joined = with_cut_off_swings(frames, both, stairs(walk, -0.15)).stride
+    np.testing.assert_array_equal(joined.last_ws[60:], stride.last_ws)
+    np.testing.assert_array_equal(joined.fraction[60:], stride.fraction)
+    # An animation's frames know of it.
+    down = stairs(walk, -0.15)
+    clip, root = place_root(cut(walk, 0.1), down)
+    frames = clip_frames.frames_from_clip(clip, rise=root.rise)
+    expected = with_cut_off_swings(frames, clip, down)
+    assert np.any(expected.stride.last_ws != frames.stride.last_ws)
+    jax.tree.map(np.testing.assert_array_equal, Animation(clip, down, root=root).frames, expected)
