@@ -1,9 +1,19 @@
-"""Clips as BVH, GLB and CSV: they come back as they were, in the user's own skeleton."""
+"""Clips as BVH, GLB and CSV: they come back as they were, in the user's own skeleton.
+
+Blender reads our files and writes some for us. As a module (`bpy`) it needs an older NumPy than
+JAX, so it lives in an environment of its own, whose Python the variable BLENDER_PYTHON names:
+
+    python3.11 -m venv blender && blender/bin/pip install bpy==4.5.15
+    BLENDER_PYTHON=blender/bin/python python -m pytest tests/datasets/test_clip_writers.py
+"""
 
 import csv
 import json
+import os
 import re
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,17 +39,17 @@ def bvh_file(tmp_path):
     return tmp_path / "walk.bvh"
 
 
-def moved(clip: Clip, seed: int = 0) -> Clip:
+def moved(clip: Clip) -> Clip:
     """The clip with its joints turned and its root moved, all bones as long as they were."""
-    random = np.random.default_rng(seed)
+    random, count = np.random.default_rng(0), len(clip.parents)
     positions_ls, rotations_ls = local_from_world(
         clip.parents, clip.positions_ws, clip.rotations_ws
     )
-    turns = Rotation.from_rotvec(0.4 * random.standard_normal((len(clip.parents), 3)))
-    ends = [joint for joint, name in enumerate(clip.joint_names) if re.search(r"_end\d*$", name)]
-    for joint in set(range(len(clip.parents))) - set(ends):
-        rot = turns[joint] * Rotation.from_quat(rotations_ls[:, joint], scalar_first=True)
-        rotations_ls[:, joint] = rot.as_quat(scalar_first=True)
+    turns = Rotation.from_rotvec(0.4 * random.standard_normal((count, 3)))
+    for joint, name in enumerate(clip.joint_names):
+        if not re.search(r"_end\d*$", name):
+            rot = turns[joint] * Rotation.from_quat(rotations_ls[:, joint], scalar_first=True)
+            rotations_ls[:, joint] = rot.as_quat(scalar_first=True)
     positions_ls[:, 0] += [0.3, 0.2, -0.1]
     return clip.with_motion(*world_from_local(clip.parents, positions_ls, rotations_ls))
 
@@ -75,30 +85,28 @@ def test_a_bvh_goes_back_into_its_own_hierarchy(mocap, tmp_path, name):
     save_clip(path, solved)
     back = reloaded(path, clip)
     assert error(solved, back) < TOLERANCE
-    assert (back.channels, back.fps, back.raw_frame_time) == (
-        clip.channels, clip.fps, clip.raw_frame_time,
-    )  # fmt: skip
-    original = (mocap / "clips" / name).read_text(errors="replace")
-    assert [line for line in hierarchy(path.read_text()) if line[0] != "OFFSET"] == [
-        line for line in hierarchy(original) if line[0] != "OFFSET"
-    ]
+    assert back.channels == clip.channels
+    assert (back.fps, back.raw_frame_time) == (clip.fps, clip.raw_frame_time)
+    texts = path.read_text(), (mocap / "clips" / name).read_text(errors="replace")
+    ours, original = ([line for line in hierarchy(text) if line[0] != "OFFSET"] for text in texts)
+    assert ours == original
     np.testing.assert_allclose(back.offsets_ls, clip.offsets_ls, atol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", [".bvh", ".glb", ".npz"])
-@pytest.mark.parametrize("up", ["y", "z"])
-def test_joints_come_back_where_they_were(bvh_file, tmp_path, suffix, up):
-    clip = moved(load_clip(bvh_file, up=up))
-    path = tmp_path / f"out{suffix}"
-    save_clip(path, clip)
-    back = reloaded(path, clip)
-    assert back.joint_names == clip.joint_names and back.fps == 120.0
-    assert error(clip, back) < TOLERANCE
-    turn = np.abs(np.sum(back.rotations_ws * clip.rotations_ws, axis=-1))
-    np.testing.assert_allclose(turn, 1.0, atol=1e-6)
+def test_joints_come_back_where_they_were(bvh_file, tmp_path):
+    for up in "yz":
+        clip = moved(load_clip(bvh_file, up=up))
+        for suffix in (".bvh", ".glb", ".npz"):
+            path = tmp_path / f"out{suffix}"
+            save_clip(path, clip)
+            back = reloaded(path, clip)
+            assert back.joint_names == clip.joint_names and back.fps == 120.0
+            assert error(clip, back) < TOLERANCE, (up, suffix)
+            turn = np.abs(np.sum(back.rotations_ws * clip.rotations_ws, axis=-1))
+            np.testing.assert_allclose(turn, 1.0, atol=1e-6)
 
 
-def test_numbers_of_an_untouched_bvh_are_its_own(bvh_file, tmp_path):
+def test_numbers_of_a_bvh_are_its_own_and_do_not_jump_over_whole_turns(bvh_file, tmp_path):
     save_clip(tmp_path / "out.bvh", load_clip(bvh_file))
     first, second = (
         np.array([line.split() for line in path.read_text().splitlines()[-3:]], float)
@@ -109,6 +117,16 @@ def test_numbers_of_an_untouched_bvh_are_its_own(bvh_file, tmp_path):
     assert "Frame Time: 0.0083333\n" in (tmp_path / "out.bvh").read_text()
     save_clip(tmp_path / "out.bvh", resample(load_clip(bvh_file), 60.0))
     assert load_clip(tmp_path / "out.bvh").fps == 60.0
+    clip = load_clip(bvh_file)
+    many = clip.select(np.zeros(200, int))
+    yaw = Rotation.from_euler("y", np.linspace(0.0, 720.0, 200)[:, None], degrees=True)
+    local = local_from_world(clip.parents, many.positions_ws, many.rotations_ws)
+    local[1][:, 0] = yaw.as_quat(scalar_first=True)
+    save_clip(tmp_path / "out.bvh", many.with_motion(*world_from_local(clip.parents, *local)))
+    rows = (tmp_path / "out.bvh").read_text().splitlines()[-200:]
+    angles = np.array([row.split() for row in rows], float)[:, 3:6]
+    assert np.abs(np.diff(angles, axis=0)).max() < 4.0
+    assert angles[-1, 2] == pytest.approx(720.0)
 
 
 def test_a_joint_gets_the_channels_that_its_motion_needs_and_a_warning_says_so(tmp_path):
@@ -134,19 +152,6 @@ def test_a_joint_gets_the_channels_that_its_motion_needs_and_a_warning_says_so(t
     assert np.abs(reloaded(tmp_path / "long.bvh", clip).positions_ws - stretched).max() < TOLERANCE
 
 
-def test_angles_do_not_jump_over_whole_turns(bvh_file, tmp_path):
-    clip = load_clip(bvh_file)
-    many = clip.select(np.zeros(200, int))
-    yaw = Rotation.from_euler("y", np.linspace(0.0, 720.0, 200)[:, None], degrees=True)
-    local = local_from_world(clip.parents, many.positions_ws, many.rotations_ws)
-    local[1][:, 0] = yaw.as_quat(scalar_first=True)
-    save_clip(tmp_path / "out.bvh", many.with_motion(*world_from_local(clip.parents, *local)))
-    rows = (tmp_path / "out.bvh").read_text().splitlines()[-200:]
-    angles = np.array([row.split() for row in rows], float)[:, 3:6]
-    assert np.abs(np.diff(angles, axis=0)).max() < 4.0
-    assert angles[-1, 2] == pytest.approx(720.0)
-
-
 def test_other_clips_get_a_standard_bvh_in_centimetres(tmp_path):
     (tmp_path / "walk.asf").write_text(ASF)
     (tmp_path / "walk.amc").write_text(AMC)
@@ -160,7 +165,7 @@ def test_other_clips_get_a_standard_bvh_in_centimetres(tmp_path):
         assert text.count("End Site") == len(ends)
 
 
-def test_channels_and_rest_pose_outlive_an_archive_and_a_mirror(bvh_file, tmp_path):
+def test_channels_and_rest_pose_outlive_an_archive_a_mirror_and_a_glb(bvh_file, tmp_path):
     clip = load_clip(bvh_file)
     rest = np.tile([0.8, 0.6, 0.0, 0.0], (len(clip.parents), 1))
     save_clip(tmp_path / "clip.npz", replace(clip, rest_rotations_ls=rest))
@@ -173,10 +178,6 @@ def test_channels_and_rest_pose_outlive_an_archive_and_a_mirror(bvh_file, tmp_pa
     np.savez(tmp_path / "odd.npz", **content)
     with pytest.raises(ValueError, match="odd.npz: channels has 'sideways'; wanted such as Xpos"):
         load_clip(tmp_path / "odd.npz")
-
-
-def test_a_glb_has_the_rest_pose_and_names_of_the_skeleton(bvh_file, tmp_path):
-    clip = load_clip(bvh_file)
     save_clip(tmp_path / "out.glb", clip)
     back = load_clip(tmp_path / "out.glb")
     np.testing.assert_allclose(back.offsets_ls, clip.offsets_ls, atol=1e-6)
@@ -246,10 +247,9 @@ def test_the_cells_of_a_heightfield_become_triangles_but_its_holes_do_not():
 def test_a_csv_has_the_time_and_all_joints_by_name(tmp_path):
     clip = stair_walk()
     save_clip(tmp_path / "out.csv", clip)
-    with (tmp_path / "out.csv").open(newline="") as file:
-        header, *rows = csv.reader(file)
-    assert " ".join(header[:5]) == "time_s root_x_m root_y_m root_z_m root_qw"
-    assert header[5:8] == ["root_qx", "root_qy", "root_qz"]
+    header, *rows = csv.reader((tmp_path / "out.csv").read_text().splitlines())
+    expected = "time_s root_x_m root_y_m root_z_m root_qw root_qx root_qy root_qz"
+    assert " ".join(header[:8]) == expected
     table = np.array(rows, float)
     np.testing.assert_allclose(table[:, 0], np.arange(clip.frame_count) / 60.0, atol=1e-6)
     column = header.index("left_knee_x_m")
@@ -267,3 +267,64 @@ def test_a_clip_that_a_format_cannot_hold_is_refused(tmp_path):
     save_clip(tmp_path / "out.glb", two_roots)
     assert len(load_clip(tmp_path / "out.glb").joint_names) < len(clip.joint_names)
     assert not (tmp_path / "out.bvh").exists()
+
+
+# Motion in and out against Blender
+
+
+@pytest.fixture(scope="module")
+def strides() -> Clip:
+    return resample(stair_walk(), 30.0).select(slice(0, 40))
+
+
+@pytest.fixture(scope="module")
+def folder(strides, tmp_path_factory) -> Path:
+    """Our files, what Blender exports of them, and where it sees their joints."""
+    python = os.environ.get("BLENDER_PYTHON")
+    if python is None:
+        pytest.skip("BLENDER_PYTHON names no Python with Blender as a module (bpy)")
+    ready = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True)
+    if ready.returncode:
+        pytest.skip(f"{python} cannot import bpy: {ready.stderr.strip()[-200:]}")
+    folder = tmp_path_factory.mktemp("blender")
+    files = [str(folder / name) for name in ("walk.bvh", "walk.glb")]
+    for file in files:
+        save_clip(file, strides)
+    script = Path(__file__).parents[1] / "support" / "blender_scenes.py"
+    words = [python, str(script), *files, str(folder)]
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, env=environment)
+    assert not done.returncode, done.stderr[-2000:]
+    return folder
+
+
+def error_in_blender(clip: Clip, folder: Path, name: str, scale: float) -> float:
+    """Largest distance, m, between joints of a clip and bones in Blender, all of which it has."""
+    with np.load(folder / f"{name}.npz") as seen:
+        names, heads = seen["names"].tolist(), seen["heads"] * scale
+    assert len(heads) == clip.frame_count and set(names) <= set(clip.joint_names)
+    order = [clip.joint_names.index(name) for name in names]
+    return float(np.linalg.norm(heads - clip.positions_ws[:, order], axis=-1).max())
+
+
+def test_blender_sees_our_joints_where_they_are_and_draws_bones_along_them(folder, strides):
+    for name, scale in (("imported.bvh", 0.01), ("imported.glb", 1.0)):
+        assert error_in_blender(strides, folder, name, scale) < TOLERANCE, name
+    vertices = np.load(folder / "body.npz")["vertices"]
+    joints = strides.positions_ws[-1, sorted({parent for parent in strides.parents if parent >= 0})]
+    off = np.linalg.norm(vertices - joints[:, None], axis=-1).min(axis=1)
+    assert len(joints) == 7 and off.max() < TOLERANCE
+
+
+def test_we_see_the_joints_and_actions_of_blender(folder, strides):
+    for name in ("exported.bvh", "exported.glb", "dressed.glb", "dressed.gltf"):
+        is_bvh = name == "exported.bvh"
+        clip = load_clip(folder / name, **({"scale": 0.01, "up": "z"} if is_bvh else {}))
+        assert clip.fps == 30.0 and clip.dialect == "jaxik"
+        assert set(strides.joint_names) <= set(clip.joint_names)
+        assert error_in_blender(clip, folder, name, 0.01 if is_bvh else 1.0) < TOLERANCE, name
+        if is_bvh:  # comes back as it was
+            assert error(strides, clip) < TOLERANCE
+    with pytest.raises(ValueError, match="2 animations: .*'Still'.*choose one with animation="):
+        load_clip(folder / "two.glb")
+    assert load_clip(folder / "two.glb", animation="Still").frame_count == 40
