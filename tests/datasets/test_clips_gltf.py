@@ -26,8 +26,6 @@ TURNING = TENTH, QUATS[:2], "LINEAR"  # keys of a rotation
 
 @pytest.fixture
 def load(tmp_path):
-    """Writes a file and reads it as a recording."""
-
     def load(file: Gltf, **options):
         (tmp_path / "walk.gltf").write_text(file.text())
         return read_gltf(tmp_path / "walk.gltf", **options)
@@ -93,7 +91,7 @@ def test_values_between_keys_follow_the_interpolation(load, fps):
     assert (turns_of(recording, 4) * expected.inv()).magnitude().max() < 1e-6
 
 
-def test_the_rate_is_that_on_which_most_keys_lie(load):
+def test_the_rate_is_that_on_which_most_keys_lie_and_frames_are_not_endless(load):
     times = (np.arange(100) / 23.976).astype(np.float32)
     kept = np.unique(np.append(np.random.default_rng(0).permutation(100)[:40], [0, 98, 99]))
     guess = ("its keys follow no frame rate; sampled at 30 Hz",)
@@ -107,6 +105,11 @@ def test_the_rate_is_that_on_which_most_keys_lie(load):
         recording = load(Gltf(chain("a", "b")).animate("w", still))
         assert recording.positions_ls.shape == (count, 2, 3) and recording.remarks == remarks
         assert frame_time is None or recording.frame_time == pytest.approx(frame_time, rel=1e-5)
+    keys = {(0, "translation"): ([0.0, 1e5], [[0, 0, 0], [1, 0, 0]], "LINEAR")}
+    file = Gltf(chain("a", "b")).animate("w", keys)
+    with pytest.raises(ValueError, match="1e.05 s at 30 frames per second; wanted at most 500000"):
+        load(file)
+    assert len(load(file, fps=1.0).positions_ls) == 100_001
 
 
 def test_all_that_is_above_the_skeleton_moves_it(load):
@@ -128,46 +131,39 @@ def test_all_that_is_above_the_skeleton_moves_it(load):
 
 
 def test_bones_may_be_scaled_to_any_size_and_to_nothing_keep_the_rotation_of_parents(load):
-    keys = {(0, "rotation"): (TENTH, QUATS[1:3], "LINEAR")}
-    keys |= {(1, "scale"): (TENTH, np.zeros((2, 3)), "STEP")}
-    recording = load(Gltf(chain("a", "b", "c")).animate("w", keys))
+    turning = {(0, "rotation"): (TENTH, QUATS[1:3], "LINEAR")}
+    vanishing = {(1, "scale"): (TENTH, np.zeros((2, 3)), "STEP")}
+    recording = load(Gltf(chain("a", "b", "c")).animate("w", turning | vanishing))
     np.testing.assert_allclose(recording.positions_ls[:, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(np.abs(recording.rotations_ls[:, 1:, 0]), 1.0, atol=1e-6)
     for size in (1e-200, 1e20):
-        nodes = chain("a", "b", "c")
-        for node in nodes[:2]:
-            node["scale"] = [size] * 3
-        recording = load(Gltf(nodes).animate("w", {(0, "rotation"): keys[0, "rotation"]}))
+        nodes = [node | {"scale": [size] * 3} for node in chain("a", "b", "c")]
+        recording = load(Gltf(nodes).animate("w", turning))
         assert (turns_of(recording, 0) * TURNS[1:3].inv()).magnitude().max() < 1e-6
 
 
-def test_a_matrix_is_a_transform_too(load):
-    nodes = chain("a", "b")
+def test_a_matrix_is_a_transform_too_but_is_not_animated(load):
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = Rotation.from_euler("y", 90, degrees=True).as_matrix(), [0, 5, 0]
-    nodes[0] = {"name": "a", "children": [1], "matrix": turn.T.ravel().tolist()}
+    root = {"name": "a", "children": [1], "matrix": turn.T.ravel().tolist()}
+    nodes, skins = [root, chain("b")[0]], [{"joints": [0, 1]}]
     keys = {(1, "rotation"): TURNING}
-    recording = load(Gltf(nodes, skins=[{"joints": [0, 1]}]).animate("w", keys))
+    recording = load(Gltf(nodes, skins=skins).animate("w", keys))
     np.testing.assert_allclose(recording.positions_ls[0], [[0, 5, 0], [1, 0, 0]], atol=1e-6)
-    keys |= {(0, "rotation"): TURNING}
     with pytest.raises(ValueError, match="walk.gltf: node 0 has a matrix and is animated"):
-        load(Gltf(nodes, skins=[{"joints": [0, 1]}]).animate("w", keys))
+        load(Gltf(nodes, skins=skins).animate("w", keys | {(0, "rotation"): TURNING}))
 
 
-def test_nodes_without_a_skin_are_joints_if_they_move_or_hang_from_what_moves(load):
+def test_joints_are_those_of_the_larger_skin_or_else_what_moves_and_hangs_from_it(load):
     nodes = [{"name": "scene", "children": [1, 5]}, {"name": "hips", "children": [2, 3]}]
     nodes += [{"name": "leg", "children": [4]}, {"name": "shirt", "mesh": 0}, {"name": "foot"}]
     nodes += [{"name": "tree"}]
     keys = {(1, "rotation"): TURNING}
     assert load(Gltf(nodes).animate("w", keys)).names == ("hips", "leg", "foot")
-
-
-def test_the_larger_of_two_skeletons_is_taken_and_equal_names_are_told_apart(load):
     nodes = chain("hips", "leg", "leg") + [{"name": "prop"}, {}]
     file = Gltf(nodes, skins=[{"joints": [0, 1, 2]}, {"joints": [3]}, {"joints": [4]}])
-    keys = {(node, "rotation"): TURNING for node in (0, 3)}
-    recording = load(file.animate("w", keys))
-    assert recording.names == ("hips", "leg", "leg_2")
+    recording = load(file.animate("w", {(node, "rotation"): TURNING for node in (0, 3)}))
+    assert recording.names == ("hips", "leg", "leg_2")  # equal names are told apart
     assert recording.remarks == ("1 joints of other skeletons in the file are left out",)
 
 
@@ -190,39 +186,32 @@ def test_one_of_several_animations_is_chosen_by_its_name(tmp_path):
             load_clip(tmp_path / other, animation="Run")
 
 
-def test_normalised_integers_are_fractions(load):
-    file = Gltf(chain("a", "b"))
-    quats = np.round(QUATS[:2] * 32767)
-    output = file.add(quats, "i2", normalized=True)
-    recording = load(file.animate("w", {(0, "rotation"): (TENTH, output, "LINEAR")}))
-    assert (turns_of(recording, 0) * TURNS[:2].inv()).magnitude().max() < 1e-4
-
-
-def test_arrays_may_lie_between_each_other_and_in_a_file_beside(tmp_path):
+def test_numbers_may_be_integers_lie_between_each_other_and_in_a_file_beside(tmp_path):
+    file, path = Gltf(chain("a", "b")), tmp_path / "walk.gltf"
+    output = file.add(np.round(QUATS[:2] * 32767), "i2", normalized=True)
+    path.write_text(file.animate("w", {(0, "rotation"): (TENTH, output, "LINEAR")}).text())
+    assert (turns_of(read_gltf(path), 0) * TURNS[:2].inv()).magnitude().max() < 1e-4
     file = Gltf(chain("a", "b"))
     pairs = b"".join(struct.pack("<f3f", t, *point) for t, point in zip(RAMP, PATH, strict=True))
-    file.content = b"\0" * 4 + pairs
-    file.header["bufferViews"] = [
-        {"buffer": 0, "byteOffset": 4, "byteLength": len(pairs), "byteStride": 16}
-    ]
+    view = {"buffer": 0, "byteOffset": 4, "byteLength": len(pairs), "byteStride": 16}
     floats = {"bufferView": 0, "componentType": 5126, "count": 5}
     times, points = floats | {"type": "SCALAR"}, floats | {"type": "VEC3", "byteOffset": 4}
-    file.header["accessors"] = [times, points]
     channel = {"sampler": 0, "target": {"node": 1, "path": "translation"}}
-    samplers = [{"input": 0, "output": 1}]
-    file.header["animations"] = [{"samplers": samplers, "channels": [channel]}]
+    animation = {"samplers": [{"input": 0, "output": 1}], "channels": [channel]}
+    file.content = b"\0" * 4 + pairs
+    file.header |= {"bufferViews": [view], "accessors": [times, points], "animations": [animation]}
     header = json.loads(file.text())
     header["buffers"][0]["uri"] = "two%20words.bin"
     (tmp_path / "two words.bin").write_bytes(file.content)
-    (tmp_path / "walk.gltf").write_text(json.dumps(header))
-    recording = read_gltf(tmp_path / "walk.gltf")
+    path.write_text(json.dumps(header))
+    recording = read_gltf(path)
     assert recording.names == ("b",)
     np.testing.assert_allclose(recording.positions_ls[:, 0], PATH + [1.0, 0, 0], atol=1e-6)
     for uri in ("../two%20words.bin", "/etc/passwd", "https://example.org/x.bin", "no.bin", ""):
         header["buffers"][0]["uri"] = uri
-        (tmp_path / "walk.gltf").write_text(json.dumps(header))
+        path.write_text(json.dumps(header))
         with pytest.raises(ValueError, match="walk.gltf: .*(beside this one|no such file)"):
-            read_gltf(tmp_path / "walk.gltf")
+            read_gltf(path)
 
 
 def test_what_is_no_motion_is_refused_in_one_sentence(tmp_path):
@@ -257,18 +246,8 @@ def test_what_is_no_motion_is_refused_in_one_sentence(tmp_path):
         with pytest.raises(ValueError, match=f"walk.gltf: .*({message})") as error:
             load_clip(tmp_path / "walk.gltf")
         assert "\n" not in str(error.value)
-
-
-def test_an_animation_of_a_small_file_may_not_be_endless(load):
-    keys = {(0, "translation"): ([0.0, 1e5], [[0, 0, 0], [1, 0, 0]], "LINEAR")}
-    with pytest.raises(ValueError, match="1e.05 s at 30 frames per second; wanted at most 500000"):
-        load(Gltf(chain("a", "b")).animate("w", keys))
-    assert len(load(Gltf(chain("a", "b")).animate("w", keys), fps=1.0).positions_ls) == 100_001
-
-
-@pytest.mark.parametrize("content", [b"", b"glTF", b"{", b"[]", b"glTF\2\0\0\0\xff\xff\xff\xff"])
-def test_a_file_that_is_not_whole_is_refused(content, tmp_path):
-    for name in ("walk.glb", "walk.gltf"):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=f"{name}: "):
-            load_clip(tmp_path / name)
+    for content in (b"", b"glTF", b"{", b"[]", b"glTF\2\0\0\0\xff\xff\xff\xff"):
+        for name in ("walk.glb", "walk.gltf"):
+            (tmp_path / name).write_bytes(content)
+            with pytest.raises(ValueError, match=f"{name}: "):
+                load_clip(tmp_path / name)
