@@ -4,6 +4,7 @@ The bodies are a child, a giant, a robot with short shins, and one whose legs ar
 """
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +21,14 @@ from fitting.datasets.terrain.mesh_files import save_mesh
 from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
+from fitting.runtime import program_cache
 from fitting.studies.animations import Animation
 from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.stages.inputs import Inputs, Moment
 from jaxik.world import body, terrain
 from support.bodies import scaled, with_shins
-from support.experiments import ROOT
+from support.experiments import ROOT, write
 from support.grounds import edges_between_footfalls, flight, hill, terrain_of
 
 CLIPS = ROOT / "data" / "clips"
@@ -39,7 +41,6 @@ BODIES = {
     "left and right unlike": lambda clip: with_shins(clip, 0.75, 0.6),
 }
 FLOOR = terrain.plane()
-run = jax.jit(jaxik.run)
 
 
 @pytest.fixture(scope="module")
@@ -84,13 +85,14 @@ def test_feet_stand_as_long_as_an_adults_whatever_the_body(source, request):
             assert contact_share(other, preset) == pytest.approx(share, abs=0.02), (preset, name)
 
 
-@pytest.mark.parametrize("name", BODIES)
-def test_with_ozz_soles_are_on_a_flat_floor_untouched(name, walk):
-    other = BODIES[name](walk)
-    result = run(presets.ozz(other.rig), other.rig, FLOOR, frames_from_clip(other))
-    soles = measures.soles(clip_from_result(other, result))
-    lowest = soles[..., 1].min(axis=-1)[other.stance_labels()]
-    assert np.abs(lowest).max() < 0.005
+def test_with_ozz_soles_are_on_a_flat_floor_untouched(walk):
+    run = jax.jit(jaxik.run)
+    for name, make in BODIES.items():
+        other = make(walk)
+        result = run(presets.ozz(other.rig), other.rig, FLOOR, frames_from_clip(other))
+        soles = measures.soles(clip_from_result(other, result))
+        lowest = soles[..., 1].min(axis=-1)[other.stance_labels()]
+        assert np.abs(lowest).max() < 0.005, name
 
 
 def test_stances_are_detected_alike_at_the_same_and_at_an_equal_froude_speed(captured):
@@ -127,24 +129,14 @@ def test_what_is_visible_of_a_foot_is_as_large_as_its_body(walk):
 
 
 def test_an_experiment_is_for_the_body_of_its_clip_unless_it_says_adult(tmp_path):
-    path, giant, ground = (tmp_path / name for name in ("e.toml", "giant.npz", "floor.ply"))
     corners = np.array([[-100.0, 0.0, -100.0], [-100, 0, 100], [100, 0, 100], [100, 0, -100]])
-    save_mesh(ground, corners, np.array([[0, 1, 2], [0, 2, 3]]))  # wide enough for a giant
-    save_clip(giant, scaled(load_clip(CLIPS / "uneven_walk_base.npz"), 2.5))
-    text = f"""
-        preset = "record"
-        [[clips]]
-        reference = "{CLIPS / "uneven_walk.npz"}"
-        base = "{giant}"
-        terrain = "{ground}"
-        root = "animation"
-        [free]
-        pelvis.limit = {{}}
-        lean.gain = {{}}
-    """
+    save_mesh(tmp_path / "floor.ply", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    save_clip(tmp_path / "giant.npz", scaled(load_clip(CLIPS / "uneven_walk_base.npz"), 2.5))
+    files = f'reference = "{CLIPS / "uneven_walk.npz"}"\nbase = "giant.npz"\n'
+    clips = f'[[clips]]\n{files}terrain = "floor.ply"\nroot = "animation"\n'
 
-    def limits(line: str) -> tuple[float, float]:
-        path.write_text(line + text, encoding="utf-8")
+    def limits(top: str) -> tuple[float, float]:
+        path = write(tmp_path, top=top, clips=clips, free="pelvis.limit = {}\nlean.gain = {}")
         space = make_problem(load_experiment(path)).space
         assert space.parameters[1].high == 0.95
         return space.parameters[0].high, float(parameter_tree.get(space.system, "pelvis.limit"))
@@ -200,54 +192,26 @@ def on_a_floor() -> Clip:
     return walker.walk(10.0, 60.0, style=walker.WalkStyle(bend=0.0))
 
 
-@pytest.fixture(scope="module")
-def grounds(on_a_floor) -> dict[str, terrain.Terrain]:
+def test_the_root_rises_without_pops_on_a_hill_and_on_stairs(on_a_floor):
     edges = edges_between_footfalls(on_a_floor, 8)
-    meshes = {"hill": hill(), "four steps": flight(edges[:4]), "eight steps": flight(edges)}
-    return {name: terrain_of(mesh) for name, mesh in meshes.items()}
+    for ground in (hill(), flight(edges[:4]), flight(edges)):
+        _, root = place_root(on_a_floor, terrain_of(ground))
+        assert root.root == "ground" and root.rise is not None
+        assert np.abs(np.diff(root.rise)).max() < 0.02 and root.rise.max() > 0.5
 
 
-def placed(clip: Clip, ground: terrain.Terrain) -> Animation:
-    """The walk with its root on the ground."""
-    clip, root = place_root(clip, ground)
-    assert root.root == "ground"
-    return Animation(clip, ground, root=root)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ground", ["hill", "eight steps"])
-@pytest.mark.parametrize("preset", ["record", "stride"])
-def test_standing_feet_are_on_the_ground(on_a_floor, grounds, preset, ground):
-    animation = placed(on_a_floor, grounds[ground])
-    _, solved = animation.solve(systems.preset_system(preset))
-    found, cause = animation.assess(solved)
-    assert found.groundless == 0.0 and cause is None
-    assert found.sunk <= 0.01 and found.floating < 0.05
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ground", ["four steps", "eight steps"])
-def test_neither_root_nor_pelvis_pops_on_stairs(on_a_floor, grounds, ground):
-    animation = placed(on_a_floor, grounds[ground])
-    _, solved = animation.solve(systems.preset_system("record"))
-    rise, pelvis = animation.root.rise, solved.positions_ws[:, solved.rig.pelvis, 1]
-    assert rise is not None and np.abs(np.diff(rise)).max() < 0.02
-    assert np.abs(np.diff(pelvis)).max() < 0.02
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("preset", "ground"), [("record", "hill"), ("record", "four steps"), ("stride", "hill")]
-)
-def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor, grounds, preset, ground):
-    animation = Animation(on_a_floor, grounds[ground], root=AS_ANIMATED)
-    found, cause = animation.assess(animation.solve(systems.preset_system(preset))[1])
-    assert found.misplaced and found.sunk > 0.5
+def test_a_root_left_on_its_floor_is_named_as_the_cause(on_a_floor):
+    animation = Animation(on_a_floor, terrain_of(hill()), root=AS_ANIMATED)
+    placed, cause = animation.assess(on_a_floor)
+    assert placed.misplaced and placed.sunk > 0.5
     assert cause is not None and cause.kind == "root"
 
 
-@pytest.mark.slow
-def test_a_system_with_a_root_rule_of_its_own_is_raised_once(on_a_floor, grounds):
-    _, solved = placed(on_a_floor, grounds["hill"]).solve(systems.preset_system("ozz"))
-    feet = solved.joints_ws(2)[..., 1]
-    assert feet.max() < 2.4 and feet.max() > 2.0
+def test_a_system_with_a_root_rule_of_its_own_leaves_a_placed_root_alone(walk, monkeypatch):
+    ground = terrain.plane(point=(0.0, 1.0, 0.0))
+    clip, root = place_root(walk, ground, "ground")
+    run = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr(program_cache, "run", run)
+    with pytest.raises(KeyboardInterrupt):
+        Animation(clip, ground, root=root).solve(presets.ozz())
+    assert not parameter_tree.get(run.call_args.args[0], "root.enabled")

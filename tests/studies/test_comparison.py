@@ -1,9 +1,12 @@
 """Comparisons: which systems, what is measured, at which frame rates, and what is written."""
 
 import dataclasses
+import io
 import json
 import struct
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -23,25 +26,22 @@ from fitting.experiments.systems import preset_system
 from fitting.report import comparison_report
 from fitting.report.labels import MEASURES
 from fitting.report.plots import comparison_plots, style
-from fitting.runtime import program_cache
-from fitting.runtime.precision import in_float64, with_floats
 from fitting.studies import comparison, frame_rates, run_folder
-from fitting.studies.animations import Animation, AnimationFiles, load_animation
+from fitting.studies.animations import Animation
 from fitting.studies.frame_rates import every_frame, measure
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
+from support import comparisons
 from support.experiments import ROOT
 from support.pages import Page
 from support.refusals import refusal
 
-SHOWN = "always::fitting.report.placement_report.PlacementWarning"
-pytestmark = pytest.mark.filterwarnings(SHOWN)
+pytestmark = pytest.mark.filterwarnings("always::fitting.report.placement_report.PlacementWarning")
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
 TERRACES = ROOT / "data" / "terrains" / "terraces.ply"
-CAPTURED = ROOT.parent / "shared" / "mocap" / "blocks"
-STILL = "lock.enabled = false\n[leg]\nweight = 0.0\n"  # changes nothing in the animation
+STILL = "[leg]\nweight = 0.0\n"  # changes nothing in the animation
 
 
 @pytest.fixture(scope="module")
@@ -53,18 +53,22 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-def compare(folder: Path, out: Path, *more: object) -> int:
-    """The command's exit status, for the preset `record` and more."""
-    words = ["compare", folder / "walk.npz", "--terrain", GROUND, "-o", out, *more]
-    return main.main([*map(str, words), "--presets", "record"])
+class Compared(NamedTuple):
+    """What the command wrote, and what it printed."""
+
+    folder: Path
+    out: str
+    err: str
 
 
 @pytest.fixture(scope="module")
-def compared(folder) -> Path:
-    """The folder that the command writes; tests must not change it."""
-    out = folder / "new" / "compared"
-    assert compare(folder, out, "--parameters", folder / "still.toml") == 0
-    return out
+def compared(folder) -> Compared:
+    """The preset `record` and a system that changes nothing; tests must not change the folder."""
+    out, systems = folder / "new" / "compared", ["--parameters", folder / "still.toml"]
+    words = ["compare", folder / "walk.npz", "--terrain", GROUND, "-o", out, *systems]
+    with redirect_stdout(io.StringIO()) as shown, redirect_stderr(io.StringIO()) as warned:
+        assert main.main([*map(str, words), "--presets", "record"]) == 0
+    return Compared(out, shown.getvalue(), warned.getvalue())
 
 
 def numbers(folder: Path) -> dict[str, dict]:
@@ -75,26 +79,17 @@ def numbers(folder: Path) -> dict[str, dict]:
 # Which systems
 
 
-def test_systems_are_in_the_order_of_the_options(tmp_path):
-    files = [tmp_path / "b.toml", tmp_path / "a.toml"]
-    for file in files:
-        file.write_text(STILL)
-    words = ["compare", "c", "--parameters", "{}, {}".format(*files), "--presets", "record"]
-    options = make_parser().parse_args(words)
-    systems = comparison.named_systems(options.systems)
-    assert list(systems) == ["b", "a", "record"]
-    assert float(systems["a"].leg.weight) == 0.0 and float(systems["record"].leg.weight) == 1.0
-
-
-def test_runs_are_named_by_their_folders_and_files_by_as_many_as_tell_them_apart(tmp_path):
+def test_systems_are_in_the_order_of_the_options_and_have_as_long_names_as_they_need(tmp_path):
     runs = ["walk/parameters.toml", "stairs/parameters.toml"]
     others = ["a/own.toml", "b/own.toml", "c.toml"]
     for place in runs + others:
         (tmp_path / place).parent.mkdir(exist_ok=True)
-        (tmp_path / place).write_text('preset = "ozz"\n')
+        (tmp_path / place).write_text(STILL)
     files = [str(tmp_path / place) for place in ("walk", runs[1], *others)]
-    systems = comparison.named_systems([("--parameters", ",".join(files)), ("--presets", "ozz")])
-    assert list(systems) == ["walk", "stairs", "a/own", "b/own", "c", "ozz"]
+    words = ["compare", "clip", "--parameters", ", ".join(files), "--presets", "record"]
+    systems = comparison.named_systems(make_parser().parse_args(words).systems)
+    assert list(systems) == ["walk", "stairs", "a/own", "b/own", "c", "record"]
+    assert [float(ik.leg.weight) for ik in systems.values()] == [0.0] * 5 + [1.0]
     with pytest.raises(ValueError, match="already is a system named 'walk'"):
         comparison.named_systems([("--parameters", f"{files[0]},{files[0]}/parameters.toml")])
     with pytest.raises(ValueError, match="parameters.toml: no such file"):
@@ -104,18 +99,13 @@ def test_runs_are_named_by_their_folders_and_files_by_as_many_as_tell_them_apart
 # What is measured
 
 
-def test_a_system_without_weight_measures_as_the_animation_does(compared):
-    systems = numbers(compared)
+def test_a_system_without_weight_measures_as_the_animation_and_another_brings_feet_down(compared):
+    systems = numbers(compared.folder)
     assert list(systems) == [comparison.ANIMATED, "still", "record"]
-    animated, still = systems[comparison.ANIMATED], systems["still"]
+    animated, still, record = systems.values()
     assert animated.pop("reached") is None and still.pop("reached") is not None
     assert still == pytest.approx(animated, rel=1e-4, abs=1e-6)
     assert animated["pops"] == animated["pop_max"] == 0.0
-
-
-def test_foot_ik_brings_feet_out_of_the_ground_and_down_to_it(compared):
-    systems = numbers(compared)
-    animated, record = systems[comparison.ANIMATED], systems["record"]
     assert record["penetration_mean"] < 0.2 * animated["penetration_mean"]
     # The ground is up to 32 cm from the floor that the root stays on: some feet do not reach it.
     assert record["clearance"] < 0.25 * animated["clearance"]
@@ -127,7 +117,7 @@ def test_the_measures_are_those_of_the_clip_that_run_writes(compared, folder):
     words = ["run", folder / "walk.npz", "--terrain", GROUND, "-o", out, "--preset", "record"]
     assert main.main([str(word) for word in words]) == 0
     solved, walk = clips.load_clip(out), clips.load_clip(folder / "walk.npz")
-    record, stance = numbers(compared)["record"], walk.stance_labels()
+    record, stance = numbers(compared.folder)["record"], walk.stance_labels()
     slide = measures.slide_per_stance(solved.joints_ws(3), stance)
     assert record["slide"] == pytest.approx(slide, rel=1e-6)
     jerk = measures.jerk(solved.positions_ws[:, solved.rig.pelvis, 1], solved.fps)
@@ -173,17 +163,16 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
 
 
 def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
-    assert {path.name for path in compared.iterdir()} == {
-        run_folder.PAGE, comparison_report.TABLE, comparison_report.NUMBERS,
-        comparison_report.FIGURE,
-    }  # fmt: skip
-    page = Page(compared / run_folder.PAGE)
-    (clip,) = page.data["clips"]
+    folder = compared.folder
+    table, figure = folder / comparison_report.TABLE, folder / comparison_report.FIGURE
+    page, files = folder / run_folder.PAGE, {path.name for path in folder.iterdir()}
+    assert files == {page.name, table.name, figure.name, comparison_report.NUMBERS}
+    (clip,) = Page(page).data["clips"]
     labels = [skeleton["label"] for skeleton in clip["skeletons"]]
     assert clip["frames"] == 61 and labels == ["flat animation", "still", "record"]
-    text, systems = (compared / comparison_report.TABLE).read_text(), numbers(compared)
+    text, systems = table.read_text(), numbers(folder)
     assert text.startswith("# walk.npz on uneven_walk.ply\n\n61 frames, 2.00 s at 30 Hz.")
-    assert f"]({comparison_report.FIGURE})" in text and "have no ground" not in text
+    assert f"]({figure.name})" in text and "have no ground" not in text
     for column in MEASURES.values():
         assert f"- **{column.heading}** ({column.unit}): {column.meaning}" in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
@@ -191,31 +180,15 @@ def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
         values = [np.nan if value is None else value for value in system.values()]
         cells = [MEASURES[key].format(value) for key, value in zip(MEASURES, values, strict=True)]
         assert row == "| " + " | ".join([name, *cells]) + " |"
-    assert all(pixels > 1000 for pixels in size_of_png(compared / comparison_report.FIGURE))
+    assert all(pixels > 1000 for pixels in struct.unpack(">II", figure.read_bytes()[16:24]))
 
 
-def size_of_png(path: Path) -> tuple[int, int]:
-    return struct.unpack(">II", path.read_bytes()[16:24])
-
-
-def test_the_terminal_shows_the_table_and_warnings(folder, compared, capsys):
-    assert compare(folder, folder / "again") == 0
-    output = capsys.readouterr()
-    assert output.out.splitlines()[0].split() == ["system", "as", "animated", "record"]
-    assert f"read {folder / 'again' / comparison_report.TABLE}" in output.out
-    assert "\nroot: as animated: the ground is " in output.out
-    assert all(line.startswith("jaxik: record: ") for line in output.err.splitlines())
-    assert numbers(folder / "again")["record"] == numbers(compared)["record"]
-
-
-def test_an_interrupt_writes_nothing(folder, tmp_path, monkeypatch, capsys):
-    def interrupt(*_, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(program_cache, "run", interrupt)
-    assert compare(folder, tmp_path / "out") == main.INTERRUPTED
-    assert capsys.readouterr().err == "\njaxik compare: interrupted\n"
-    assert not list(tmp_path.iterdir())
+def test_the_terminal_shows_the_table_and_warnings(compared):
+    assert compared.out.splitlines()[0].split() == ["system", "as", "animated", "still", "record"]
+    assert f"read {compared.folder / comparison_report.TABLE}" in compared.out
+    assert "\nroot: as animated: the ground is " in compared.out
+    lines = compared.err.splitlines()
+    assert lines and all(line.startswith(("jaxik: record: ", "jaxik: still: ")) for line in lines)
 
 
 def test_a_figure_distinguishes_more_systems_than_there_are_colours():
@@ -225,26 +198,25 @@ def test_a_figure_distinguishes_more_systems_than_there_are_colours():
     assert styles["system 0"]["color"] == style.BEFORE
 
 
-@pytest.mark.parametrize("legs", [2, 4])
-def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure(legs):
-    still = [np.zeros((300, legs, 3)) for _ in range(4)]
-    motion = Motion(np.zeros((300, 3)), *still)
+def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure():
+    compared = comparisons.invented_comparison(comparisons.walk())
+    motion = Motion(np.zeros((300, 3)), *[np.zeros((300, 2, 3)) for _ in range(4)])
     unknown = Measures(**{key: float("nan") for key in MEASURES})
-    zero = Measures(**{key: 0.0 for key in MEASURES})
-    compared = comparison.Comparison(
-        "title", tuple(f"leg {leg}" for leg in range(legs)), 30.0,
-        np.full((300, legs), np.nan), 0.0,
-        Animation(load_flat_animation(BASE), terrain.plane()), {},
-        {"as animated": motion, "other": motion}, {"as animated": unknown, "other": zero}, {},
-    )  # fmt: skip
+    compared = dataclasses.replace(
+        compared,
+        ground=np.full((300, 2), np.nan),
+        motions=dict.fromkeys(compared.motions, motion),
+        measures={**compared.measures, comparison.ANIMATED: unknown},
+    )
     figure = comparison_plots.overview(compared)
     upper, lower = figure.subfigs
-    assert len(upper.axes) == 2 * (legs + 1) and len(lower.axes) == len(MEASURES)
-    assert [text.get_text() for text in lower.axes[0].texts] == ["–", "0.00"]
+    assert len(upper.axes) == 2 * (2 + 1) and len(lower.axes) == len(MEASURES)
+    assert [text.get_text() for text in lower.axes[0].texts] == ["–", "0.00", "0.00"]
     for axes, column in zip(lower.axes, MEASURES.values(), strict=True):
         assert axes.get_title(loc="left").endswith(f", {column.unit}")
     (legend,) = figure.legends
-    assert [text.get_text() for text in legend.texts] == ["as animated", "other", "ground"]
+    names = [text.get_text() for text in legend.texts]
+    assert names == [comparison.ANIMATED, "close", "deep", "ground"]
 
 
 def test_poses_that_are_not_finite_name_their_system_and_are_not_written(folder, tmp_path, capsys):
@@ -271,45 +243,29 @@ def fast() -> Animation:
 
 def raised_by_frame_time(animation, ik):
     """A result that needs no pipeline: everything is raised by ten times the frame time, m."""
-    clip = animation.clip
-    return None, clip.with_motion(
-        clip.positions_ws + [0.0, 10.0 / clip.fps, 0.0], clip.rotations_ws
-    )
+    clip, up = animation.clip, [0.0, 10.0 / animation.clip.fps, 0.0]
+    return None, clip.with_motion(clip.positions_ws + up, clip.rotations_ws)
 
 
-def test_every_fourth_frame_is_played_with_the_strides_and_speeds_of_the_clip(fast):
-    played = every_frame(fast, 4)
-    own, frames = fast.frames, played.frames
+def test_every_fourth_frame_is_played_with_the_strides_speeds_and_restarts_of_the_clip(fast):
+    restart = np.isin(np.arange(fast.clip.frame_count), [5, 8])
+    own = dataclasses.replace(fast.frames, restart=restart)
+    played = every_frame(dataclasses.replace(fast, given_frames=own), 4)
+    frames = played.frames
     assert played.clip.fps == 30.0 and len(frames.dt) == 90
     np.testing.assert_allclose(frames.dt, 1 / 30, rtol=1e-6)
     np.testing.assert_array_equal(frames.stride.fraction, own.stride.fraction[::4])
     np.testing.assert_array_equal(frames.toe_speed, own.toe_speed[::4])
     np.testing.assert_array_equal(frames.pose.ankle.pos, own.pose.ankle.pos[::4])
+    assert frames.restart is not None
+    assert np.flatnonzero(frames.restart).tolist() == [2], "at the next frame that is played"
 
 
-def test_a_restart_between_two_frames_that_are_played_is_at_the_next_one(fast):
-    restart = np.isin(np.arange(fast.clip.frame_count), [5, 8])
-    frames = dataclasses.replace(fast.frames, restart=restart)
-    cut = dataclasses.replace(fast, given_frames=frames)
-    restart = every_frame(cut, 4).frames.restart
-    assert restart is not None
-    np.testing.assert_array_equal(np.flatnonzero(restart), [2])
-
-
-def test_differences_are_those_at_the_frames_of_both(fast, monkeypatch):
-    monkeypatch.setattr(Animation, "solve", raised_by_frame_time)
-    half, quarter = measure({"still": preset_system("ozz")}, fast, [60.0, 30.0])
-    assert (half.system, half.fps, quarter.fps) == ("still", 60.0, 30.0)
-    for joint in frame_rates.JOINTS:
-        assert half.rms[joint] == pytest.approx(10 / 60 - 10 / 120)
-        assert half.largest[joint] == pytest.approx(10 / 60 - 10 / 120)
-        assert quarter.rms[joint] == pytest.approx(10 / 30 - 10 / 120)
-
-
-@pytest.mark.parametrize("fps", [50.0, 240.0, 119.0])
-def test_a_rate_of_which_the_clips_is_no_multiple_is_refused(fast, fps):
-    with pytest.raises(ValueError, match=f"{fps:g} Hz; wanted a part .*: 120, 60, 40, 30, ... Hz"):
-        measure({"ozz": preset_system("ozz")}, fast, [fps])
+def test_a_rate_of_which_the_clips_is_no_multiple_is_refused(fast):
+    for fps in (50.0, 240.0, 119.0):
+        message = f"{fps:g} Hz; wanted a part .*: 120, 60, 40, 30, ... Hz"
+        with pytest.raises(ValueError, match=message):
+            measure({"ozz": preset_system("ozz")}, fast, [fps])
 
 
 def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path, capsys):
@@ -324,27 +280,9 @@ def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path
     text = (tmp_path / "out" / comparison_report.TABLE).read_text()
     assert "## At other frame rates" in text
     assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text
-    entries = json.loads((tmp_path / "out" / comparison_report.NUMBERS).read_text())["rates"]
-    assert [entry["fps"] for entry in entries] == [60.0, 30.0]
-
-
-@in_float64
-def differences(animation: Animation, rates: list[float], *presets: str) -> dict:
-    """The largest rms of any joint, mm, by preset and rate."""
-    systems = {name: with_floats(preset_system(name), np.float64) for name in presets}
-    rows = measure(systems, animation, rates)
-    return {(row.system, row.fps): 1000 * max(row.rms.values()) for row in rows}
-
-
-@pytest.mark.slow
-def test_stride_hardly_depends_on_the_frame_rate(fast):
-    found = differences(fast, [60.0], "stride")
-    assert found["stride", 60.0] < 2.5
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not CAPTURED.exists(), reason="needs captured clips")
-def test_stride_hardly_depends_on_the_frame_rate_on_real_ground():
-    files = AnimationFiles(CAPTURED / "03_03.npz", CAPTURED / "terrain.ply")
-    found = differences(load_animation(files), [60.0, 30.0], "stride")
-    assert found["stride", 60.0] < 2.0 and found["stride", 30.0] < 4.0
+    half, quarter = json.loads((tmp_path / "out/compare.json").read_text())["rates"]
+    assert (half["system"], half["fps"], quarter["fps"]) == ("ozz", 60.0, 30.0)
+    for joint in frame_rates.JOINTS:
+        assert half["rms"][joint] == pytest.approx(10 / 60 - 10 / 120)
+        assert half["largest"][joint] == pytest.approx(10 / 60 - 10 / 120)
+        assert quarter["rms"][joint] == pytest.approx(10 / 30 - 10 / 120)

@@ -1,4 +1,4 @@
-"""Many fits: what is fitted, what is kept, and what survives failures."""
+"""Many fits and evaluations: what is computed, what is kept, and what failures do."""
 
 import csv
 import dataclasses
@@ -7,20 +7,31 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pyarrow.parquet
 import pytest
 from distributed import LocalCluster
 
 import fitting
+import jaxik
 from fitting.cli import main
 from fitting.experiments.experiment_files import load_experiment
+from fitting.experiments.problems import make_problem
 from fitting.jobs.many import task as task_of_worker
+from fitting.problem.residuals import errors_by_kind, residuals_by_kind
+from fitting.problem.scene import Scene
+from fitting.problem.shared_world import run_scene
 from fitting.runtime.parallel import first_use
 from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
-from fitting.studies.many import rows, table
+from fitting.studies.many import evaluation, rows, table
 from fitting.studies.many.tasks import plan
-from support import small_studies
+from jaxik.maths import parameter_tree
+from jaxik.world import similarity
+from support import scenes, small_studies
 from support.experiments import ROOT
 
 
@@ -51,6 +62,10 @@ def out(finished, tmp_path, undrawn) -> Path:
 def read(path: Path) -> list[dict[str, str]]:
     with open(path, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def cells(fits: fitting.ManyFits) -> list[dict[str, Any]]:
+    return [table.cells(row) for row in fits.rows]
 
 
 # What is fitted
@@ -100,18 +115,18 @@ def test_each_fit_is_a_run_and_a_row(finished):
     assert {"fits.png", "summary.md", "report.html"} <= files
 
 
-def cells(fits: fitting.ManyFits) -> list[dict[str, Any]]:
-    return [table.cells(row) for row in fits.rows]
-
-
 def test_only_what_is_not_whole_is_fitted_again(finished, out, experiment_file, monkeypatch):
     lines: list[str] = []
     (out / finished.rows[0]["run"] / rows.ROW).unlink()
     assert fit_many(experiment_file, out, seeds=2, log=lines.append).made == 1
     assert "4 fits of 1 experiment, 2 seeds for each clip; 3 are there already" in lines
     monkeypatch.setattr(task_of_worker, "fit", None)
-    again = fit_many(experiment_file, out, seeds=2)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (out / table.PARQUET).unlink()
+    again = fit_many(experiment_file, out, seeds=2, log=lines.append)
     assert again.rows[1:] == finished.rows[1:] and again.made == 0
+    assert "no fits.parquet, as pyarrow is not installed: pip install 'jaxik[parquet]'" in lines
+    assert (out / table.CSV).is_file() and not (out / table.PARQUET).exists()
 
 
 def test_workers_of_a_scheduler_at_an_address_make_the_same_fits(
@@ -156,23 +171,8 @@ def test_a_fit_that_fails_tells_why_stops_nothing_and_is_tried_again(
     trace = out / first["run"] / task_of_worker.ERROR
     assert "RuntimeError: no\nluck" in trace.read_text()
     assert "no luck" in (out / "report.html").read_text()
-
     assert not fit_many(experiment_file, out).failed
     assert not trace.exists()
-
-
-def test_without_pyarrow_there_is_the_csv_and_a_line_that_says_so(
-    out, experiment_file, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    (out / table.PARQUET).unlink()
-    lines: list[str] = []
-    fit_many(experiment_file, out, seeds=2, log=lines.append)
-    assert "no fits.parquet, as pyarrow is not installed: pip install 'jaxik[parquet]'" in lines
-    assert (out / table.CSV).is_file() and not (out / table.PARQUET).exists()
-
-
-# Several processes; `test_interruptions.py` kills them
 
 
 def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch):
@@ -192,3 +192,115 @@ def test_only_the_first_process_compiles_while_others_wait(tmp_path, monkeypatch
         assert len(looks) == 3
     with claimed(tmp_path / f"first-{key}"), first_use.first_alone(key):
         assert len(looks) == 3  # they are kept by now, and nobody waits
+
+
+# Many systems on many clips: the numbers of each, in chunks, by one program
+
+GAINS = np.linspace(0.05, 0.9, 5)
+COST = "cost"
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return make_problem(scenes.experiment())
+
+
+@pytest.fixture(scope="module")
+def ik(problem):
+    return problem.space.unpack(problem.space.start)
+
+
+@eqx.filter_jit
+def run_alone(ik: jaxik.FootIK, scene: Scene) -> tuple[jax.Array, dict[str, jax.Array], jax.Array]:
+    """Knees, errors, and the cost of a clip alone, as long as it is."""
+    result = run_scene(ik, scene)
+    errors = errors_by_kind(scene, result)
+    residuals = [of_kind.ravel() for of_kind in residuals_by_kind(scene, errors).values()]
+    return result.pose.knee.pos, errors, 0.5 * jnp.sum(jnp.concatenate(residuals) ** 2)
+
+
+def test_each_system_and_clip_has_the_cost_of_its_residuals(problem, ik):
+    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
+    numbers = fitting.evaluate_many(batch, problem.data, chunk=2)
+    assert {values.shape for values in numbers.values()} == {(5, 3)}
+    scene = problem.data[1]
+    _, errors, cost = run_alone(parameter_tree.replace(ik, {"pelvis.on_gain": GAINS[3]}), scene)
+    assert numbers[COST][3, 1] == pytest.approx(float(cost), rel=1e-10)
+    seen = np.asarray(scene.reference.observed)
+    expected = np.sqrt(np.mean(np.asarray(errors["pelvis"])[seen] ** 2, axis=0).sum())
+    assert numbers["pelvis"][3, 1] == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_clip_of_another_body_is_run_by_a_system_that_is_similar(problem, ik):
+    scene, size = problem.data[1], jnp.asarray(1.3)
+    sized = eqx.tree_at(lambda s: s.size, scene, size, is_leaf=lambda leaf: leaf is None)
+    knees, expected, plain = (
+        np.asarray(run_alone(system, clip)[0])
+        for system, clip in ((ik, sized), (similarity.similar(ik, size), scene), (ik, scene))
+    )
+    np.testing.assert_allclose(knees, expected, rtol=1e-9)
+    assert np.abs(knees - plain).max() > 0.001
+
+
+def test_no_chunk_and_no_second_call_compiles_anew(problem, ik):
+    traced: list[int] = []  # frames of the clips for which a program is compiled
+
+    def cost(scene: Scene, result: jaxik.Result) -> dict[str, jax.Array]:
+        traced.append(scene.frames.dt.shape[-1])
+        return {COST: evaluation.errors_and_cost(scene, result)[COST]}
+
+    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
+    fitting.evaluate_many(batch, problem.data, cost, chunk=2)
+    before = len(traced)
+    assert before >= 1
+    more = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, 7)})
+    numbers = fitting.evaluate_many(more, problem.data, cost, chunk=2)
+    assert len(traced) == before and numbers[COST].shape == (7, 3)
+
+
+def calls_of(ik, scenes, systems: int, chunk: int | None, memory: float) -> evaluation._Calls:
+    """What evaluates so many systems on clips of one length."""
+    batch = fitting.vary(ik, {"pelvis.on_gain": np.linspace(0.1, 0.8, systems)})
+    mesh = jax.sharding.Mesh(np.array(jax.local_devices()), (evaluation.BATCH,))
+    (stack,) = evaluation.stacking.stack(scenes)
+    arrays, measure = jax.tree.map(np.asarray, batch), evaluation.errors_and_cost
+    return evaluation._Calls(arrays, systems, stack, measure, mesh, chunk, memory)
+
+
+def test_a_chunk_follows_from_the_memory_that_it_may_take(problem, ik, monkeypatch):
+    monkeypatch.setattr(evaluation, "usable_cores", lambda: 2)
+
+    def size(chunk: int | None, memory: float) -> int:
+        return calls_of(ik, problem.data, 1000, chunk, memory)._size()
+
+    assert size(None, 0.0) == 1 and size(None, 1e15) == evaluation.CACHED
+    assert 1 < size(None, 1e7) < size(None, 5e7) <= evaluation.CACHED
+    assert size(10, 0.0) == 10 and size(5000, 0.0) == 1000
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
+@pytest.mark.parametrize(("systems", "clips"), [(16, 1), (1, 16)])
+def test_a_chunk_takes_no_more_memory_than_reckoned(problem, ik, systems, clips):
+    calls = calls_of(ik, problem.data * clips, systems, 16, 1.0)
+    memory = evaluation._along.lower(*calls.arguments(0, 0, 16)).compile().memory_analysis()
+    assert memory is not None
+    taken = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+    assert 0.1 * 16 * calls._bytes_each() < taken < 16 * calls._bytes_each()
+
+
+def test_what_cannot_be_evaluated_is_refused(problem, ik):
+    batch = fitting.vary(ik, {"pelvis.on_gain": GAINS})
+    for systems, clips, chunk, message in (
+        (ik, problem.data, None, "an array of the systems has no axis for them"),
+        (batch, (), None, "no clips; wanted one or more"),
+        (batch, problem.data, 0, "chunk is 0; wanted 1 or more"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fitting.evaluate_many(systems, clips, chunk=chunk)
+    for values, message in (
+        ({"pelvis.on_gain": GAINS, "pelvis.limit": GAINS[:3]}, "wanted the same number of each"),
+        ({"pelvis.wings": GAINS}, "no parameter named 'pelvis.wings'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fitting.vary(ik, values)
