@@ -1,89 +1,46 @@
-"""Parameters, rigs, frames and memory of the characters that the references move."""
+"""Parameters, rigs, frames and legs of the characters that the references move."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from reference import maths
-from reference.maths import Array, Motion, Transform
-from reference.terrain import ALL_LAYERS, Hit, LegTerrains
+from reference.maths import Array, Transform, across, apply, length, multiply, rotate, unit
+from reference.terrain import Hit, LegTerrains, Terrain
+
+JOINTS = ("hip", "knee", "ankle", "toe")
+Ground = Terrain | LegTerrains
+
+
+def named(stage: str, **values: Any) -> dict[str, Any]:
+    """Values of a stage's parameters by dotted name."""
+    return {f"{stage}.{name}": value for name, value in values.items()}
+
 
 # Defaults of the `record` system for a 1.8 m adult; gains per tick of 30 Hz.
-DEFAULTS: dict[str, Any] = {
-    "contact.ground_height": 0.0,
-    "contact.planted_height": 0.10,
-    "contact.raised_height": 0.16,
-    "probe.ray_up": 0.50,
-    "probe.ray_down": 0.80,
-    "probe.toe_ls": np.array([0.0, -0.07, 0.20]),
-    "probe.use_toe": True,
-    "target.min_ankle_height": -0.30,
-    "target.max_ankle_height": 0.55,
-    "target.foot_height": 0.08,
-    "target.max_slope": math.radians(60.0),
-    "target.rise_half_life": 0.0,
-    "target.fall_half_life": 0.0,
-    "target.spring": False,
-    "target.follow_slopes": False,
-    "lean.forward_rate": -0.30,
-    "lean.side_rate": -0.10,
-    "lean.forward_rate_slide": 0.80,
-    "lean.side_rate_slide": 0.60,
-    "lean.gain": 0.19,
-    "lean.gain_slide": 0.294,
-    "lean.slide_on_gain": 0.226,
-    "lean.slide_off_gain": 0.135,
-    "lean.tick_hz": 30.0,
-    "lean.spring": False,
-    "lock.enabled": True,
-    "lock.release_min_angle": math.radians(50.0),
-    "lock.release_max_angle": math.radians(172.0),
-    "lock.release_cone": math.radians(25.0),
-    "lock.relock_threshold": 0.20,
-    "lock.lock_half_life": 0.05,
-    "lock.unlock_half_life": 0.10,
-    "lock.release_distance": 0.20,
-    "lock.max_speed": math.inf,
-    "lock.hold_ball": False,
-    "lock.release_heading": math.pi,
-    "lock.release_speed": math.inf,
-    "lock.return_speed": math.inf,
-    "pelvis.limit": 0.30,
-    "pelvis.on_gain": 0.225,
-    "pelvis.off_gain": 0.116,
-    "pelvis.vertical_only": True,
-    "pelvis.wait_to_rise": False,
-    "pelvis.tick_hz": 30.0,
-    "leg.max_knee_angle": math.acos(-0.990),
-    "leg.min_knee_angle": math.acos(0.766),
-    "leg.soften": 0.98,
-    "leg.twist": 0.0,
-    "leg.as_animated": False,
-    "leg.weight": 1.0,
-    "foot.max_pitch": 0.52,
-    "foot.min_pitch": -0.79,
-    "foot.max_roll": 0.26,
-    "foot.min_roll": -0.52,
-}
-
-
-class Ground(Protocol):
-    """Something that rays can be cast onto."""
-
-    @property
-    def up(self) -> Array: ...
-
-    def cast(self, origin: Array, reach: float, mask: int = ALL_LAYERS) -> Hit: ...
-
-    def at(self, platforms: Sequence[Transform]) -> "Ground": ...
-
-
-def under(terrain: Ground, leg: int) -> Ground:
-    """The ground as the rays of `leg` hit it."""
-    return terrain.legs[leg] if isinstance(terrain, LegTerrains) else terrain
+DEFAULTS = (
+    named("contact", ground_height=0.0, planted_height=0.10, raised_height=0.16)
+    | named("probe", ray_up=0.50, ray_down=0.80, use_toe=True, toe_ls=np.array([0.0, -0.07, 0.20]))
+    | named("target", min_ankle_height=-0.30, max_ankle_height=0.55, foot_height=0.08)
+    | named("target", max_slope=math.radians(60.0), rise_half_life=0.0, fall_half_life=0.0)
+    | named("target", spring=False, follow_slopes=False)
+    | named("lean", forward_rate=-0.30, side_rate=-0.10, gain=0.19, tick_hz=30.0, spring=False)
+    | named("lean", forward_rate_slide=0.80, side_rate_slide=0.60, gain_slide=0.294)
+    | named("lean", slide_on_gain=0.226, slide_off_gain=0.135)
+    | named("lock", enabled=True, lock_half_life=0.05, unlock_half_life=0.10, max_speed=math.inf)
+    | named("lock", release_min_angle=math.radians(50.0), release_max_angle=math.radians(172.0))
+    | named("lock", release_cone=math.radians(25.0), release_distance=0.20, relock_threshold=0.20)
+    | named("lock", release_heading=math.pi, release_speed=math.inf, return_speed=math.inf)
+    | named("lock", hold_ball=False)
+    | named("pelvis", limit=0.30, on_gain=0.225, off_gain=0.116, tick_hz=30.0)
+    | named("pelvis", vertical_only=True, wait_to_rise=False)
+    | named("leg", max_knee_angle=math.acos(-0.990), min_knee_angle=math.acos(0.766))
+    | named("leg", soften=0.98, twist=0.0, weight=1.0, as_animated=False)
+    | named("foot", max_pitch=0.52, min_pitch=-0.79, max_roll=0.26, min_roll=-0.52)
+)
 
 
 class Parameters:
@@ -103,16 +60,16 @@ class Parameters:
         unknown = set(changes or {}) - set(defaults)
         if unknown:
             raise ValueError(f"no parameters {sorted(unknown)}; there are {sorted(defaults)}")
-        self.defaults = defaults
         self.values = {**defaults, **(changes or {})}
+        self.per_leg = {x for x in self.values if np.ndim(self.values[x]) > np.ndim(defaults[x])}
 
     def __getitem__(self, name: str) -> Any:
         return self.values[name]
 
     def of_leg(self, name: str, leg: int) -> Any:
         """The value for `leg`."""
-        value = np.asarray(self.values[name])
-        return value[leg] if value.ndim > np.ndim(self.defaults[name]) else self.values[name]
+        value = self.values[name]
+        return value[leg] if name in self.per_leg else value
 
 
 @dataclass
@@ -146,12 +103,6 @@ class Stride:
     known: Array
     aside_ws: Array | None = None
 
-    @classmethod
-    def unknown(cls, legs: int) -> "Stride":
-        """The stride of an animation without labels."""
-        origin = np.zeros((legs, 3))
-        return cls(np.ones(legs), origin, origin, np.zeros(legs), np.zeros(legs))
-
 
 @dataclass
 class Frame:
@@ -160,7 +111,7 @@ class Frame:
     `grounded` is 0..1, 0 in the air. `speed` is that of the character, `foot_speed` (legs) that of
     the animated ankles and `toe_speed` (legs) that of the toes, m/s, over the ground; all default
     to 0. Without `velocity_ws` (3), m/s, the character moves forward. `platforms` are
-    world_from_platform.
+    world_from_platform. Without labels of the animation no stride is known.
     """
 
     world_from_model: Transform
@@ -181,87 +132,104 @@ class Frame:
     grounded: float = 1.0
 
     def __post_init__(self) -> None:
-        legs = len(self.weight)
-        if len(self.foot_speed) == 0:
-            self.foot_speed = np.zeros(legs)
-        if len(self.toe_speed) == 0:
-            self.toe_speed = np.zeros(legs)
-        if self.stride is None:
-            self.stride = Stride.unknown(legs)
+        none, origin = np.zeros(len(self.weight)), np.zeros((len(self.weight), 3))
+        self.foot_speed = self.foot_speed if len(self.foot_speed) else none
+        self.toe_speed = self.toe_speed if len(self.toe_speed) else none
+        self.stride = self.stride or Stride(1.0 + none, origin, origin, none, none)
 
     @property
     def travel_ws(self) -> Array:
         """The character's velocity, m/s."""
         if self.velocity_ws is not None:
             return self.velocity_ws
-        return self.speed * maths.rotate(self.world_from_model.rot, maths.Z)
+        return self.speed * rotate(self.world_from_model.rot, maths.Z)
 
 
-@dataclass
-class Hold:
-    """Memory of one foot's lock, in the world."""
-
-    locked: bool
-    factor: float
-    offset: Array
-    turn: float  # rad about up, from the animated heading to the one it keeps
-    foothold: Array
-    ball: Array
-    heading: Array
+def forward(rot: Array, up: Array) -> Array:
+    """The model's forward at right angles to up; made of its own up where it looks along up."""
+    return unit(across(rotate(rot, maths.Z), up), unit(across(rotate(rot, maths.Y), up), up))
 
 
-@dataclass
-class Followed:
-    """Height of the ground as a foothold follows it, and the foothold where the ground is."""
+@dataclass(frozen=True)
+class Footing:
+    """The parameters of a leg, by name, and the ground as its rays hit it."""
 
-    height: Motion
-    foothold_ws: Array
+    index: int
+    parameters: Parameters
+    terrain: Ground
 
-
-@dataclass
-class State:
-    """Memory of the `record` system; lists have one entry per leg."""
-
-    ground: list[Followed]
-    slope: list[Motion]  # ahead and to the right
-    slide_weight: float
-    pelvis_height: float
-    pelvis_offset_ws: Array
-    holds: list[Hold]
-    standing: list[Any]  # where feet stand by speed
-
-
-@dataclass
-class Foot:
-    """One leg in this frame: animated joints, contact, hits and foothold, world space.
-
-    `ball_ws` is the toe joint; `heading_ws` is the unit forward of the foot at right angles to up.
-    `swing_lift`, m, is the part of `lift` that is not animated.
-    """
-
-    hip_ws: Array
-    ankle_ws: Array
-    ball_ws: Array
-    heading_ws: Array
-    lift: float
-    contact: float
-    planted: bool
-    lifted: bool
-    hit: Hit
-    toe_hit: Hit
-    foothold_ws: Array
-    turns_in_swing: bool = False
-    swing_lift: float = 0.0
+    def __getitem__(self, name: str) -> Any:
+        return self.parameters.of_leg(name, self.index)
 
     @property
-    def turned(self) -> float:
-        """0..1, how far the foot turns to the ground under it."""
-        return float(self.hit.found) if self.turns_in_swing else self.grounded
+    def up(self) -> Array:
+        """Up of this leg (3)."""
+        return self.terrain.up
+
+
+@dataclass(frozen=True)
+class Leg(Footing):
+    """A leg in a frame."""
+
+    rig: Rig
+    frame: Frame
 
     @property
-    def grounded(self) -> float:
-        """Contact weight of a foot with ground under it, else 0."""
-        return self.contact if self.hit.found else 0.0
+    def weight(self) -> float:
+        """How much foot IK the leg gets, 0..1."""
+        return float(self.frame.grounded * self.frame.weight[self.index] * self["leg.weight"])
+
+    @property
+    def length(self) -> float:
+        """Thigh and shin together, m."""
+        hip, knee, ankle, _ = (self.joint(name).pos for name in JOINTS)
+        return length(hip - knee) + length(knee - ankle)
+
+    def joint(self, name: str) -> Transform:
+        """A joint as animated, model space."""
+        pos, rot = getattr(self.frame, name)
+        return Transform(pos[self.index], rot[self.index])
+
+    def pos_ws(self, joint: str) -> Array:
+        """Where a joint is as animated, m."""
+        return apply(self.frame.world_from_model, self.joint(joint).pos)
+
+    @property
+    def ankle_rot_ws(self) -> Array:
+        """Rotation of the animated ankle (4)."""
+        return multiply(self.frame.world_from_model.rot, self.joint("ankle").rot)
+
+    @property
+    def world_from_foot(self) -> Array:
+        """Rotation from the axes of the animated foot (x left, y up, z forward) to the world's."""
+        return multiply(self.ankle_rot_ws, self.rig.ankle_from_foot[self.index])
+
+    @property
+    def forward_ws(self) -> Array:
+        """The model's forward at right angles to up."""
+        return forward(self.frame.world_from_model.rot, self.up)
+
+    @property
+    def heading_ws(self) -> Array:
+        """The foot's forward at right angles to up; the model's where the foot is along up."""
+        return unit(across(rotate(self.world_from_foot, maths.Z), self.up), self.forward_ws)
+
+    def with_foot_moved(self, offset_ws: Array) -> "Leg":
+        """The leg with its ankle and toe moved, m; its knee stays."""
+        moved = {}
+        for name in ("ankle", "toe"):
+            joint = getattr(self.frame, name)
+            pos = np.array(joint.pos)
+            pos[self.index] += rotate(maths.inverse(self.frame.world_from_model.rot), offset_ws)
+            moved[name] = joint._replace(pos=pos)
+        return replace(self, frame=replace(self.frame, **moved))
+
+
+def legs_of(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame) -> list[Leg]:
+    """All legs of a character."""
+    count = len(frame.weight)
+    grounds = terrain.legs if isinstance(terrain, LegTerrains) else [terrain] * count
+    return [Leg(index, parameters, grounds[index], rig, frame) for index in range(count)]
 
 
 def carried(frame: Frame, hit: Hit, point: Array) -> Array:
@@ -269,7 +237,7 @@ def carried(frame: Frame, hit: Hit, point: Array) -> Array:
     if hit.platform < 0:
         return point
     before, now = frame.platforms_before[hit.platform], frame.platforms[hit.platform]
-    return maths.apply(now, maths.unapply(before, point))
+    return apply(now, maths.unapply(before, point))
 
 
 def turned(frame: Frame, hit: Hit, rot: Array) -> Array:
@@ -277,33 +245,17 @@ def turned(frame: Frame, hit: Hit, rot: Array) -> Array:
     if hit.platform < 0:
         return rot
     before, now = frame.platforms_before[hit.platform], frame.platforms[hit.platform]
-    return maths.multiply(now.rot, maths.multiply(maths.inverse(before.rot), rot))
+    return multiply(now.rot, multiply(maths.inverse(before.rot), rot))
 
 
-def world_from_foot(rig: Rig, frame: Frame, leg: int) -> Array:
-    """Rotation from the axes of the animated foot (x left, y up, z forward) to the world's."""
-    world_from_ankle = maths.multiply(frame.world_from_model.rot, frame.ankle.rot[leg])
-    return maths.multiply(world_from_ankle, rig.ankle_from_foot[leg])
-
-
-def with_moved_foot(frame: Frame, leg: int, offset_ws: Array) -> Frame:
-    """The frame with the ankle and toe of a leg moved, m; its knee stays."""
-    moved = {}
-    for name in ("ankle", "toe"):
-        joint = getattr(frame, name)
-        pos = np.array(joint.pos)
-        pos[leg] += maths.rotate(maths.inverse(frame.world_from_model.rot), offset_ws)
-        moved[name] = joint._replace(pos=pos)
-    return replace(frame, **moved)
-
-
-def joints(legs: Sequence[Sequence[Transform]]) -> dict[str, Array]:
-    """Output of the solved joints: hip, knee, ankle and toe of each leg, model space."""
-    output = {}
-    for index, name in enumerate(("hip", "knee", "ankle", "toe")):
-        output[f"{name}_pos"] = np.array([leg[index].pos for leg in legs])
-        output[f"{name}_rot"] = np.array([leg[index].rot for leg in legs])
-    return output
+def solution(body: Transform, legs: Sequence[tuple[Any, ...]]) -> dict[str, Array]:
+    """Output of the motion of the body, and of each leg's joints and whether it reaches."""
+    output = {"body_pos": body.pos, "body_rot": body.rot}
+    *joints, reached = zip(*legs, strict=True)
+    for name, each in zip(JOINTS, joints, strict=True):
+        output[f"{name}_pos"] = np.array([joint.pos for joint in each])
+        output[f"{name}_rot"] = np.array([joint.rot for joint in each])
+    return output | {"reached": np.array(reached)}
 
 
 def run(

@@ -44,9 +44,7 @@ def length(v: Array) -> float:
 def unit(v: Array, fallback: Array) -> Array:
     """`v` scaled to length one; `fallback` where `v` has no direction."""
     size = length(v)
-    if size < DIRECTIONLESS:
-        return fallback
-    return v / size
+    return fallback if size < DIRECTIONLESS else v / size
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -120,9 +118,7 @@ def from_axis_angle(axis: Array, angle: float) -> Array:
 def from_rotvec(vector: Array) -> Array:
     """Rotation about `vector` by its length in radians."""
     angle = length(vector)
-    if angle == 0.0:
-        return IDENTITY
-    return from_axis_angle(vector / angle, angle)
+    return IDENTITY if angle == 0.0 else from_axis_angle(vector / angle, angle)
 
 
 def shortest_arc(a: Array, b: Array, spare_axis: Array) -> Array:
@@ -161,16 +157,12 @@ def clip(value: float, low: float, high: float) -> float:
 
 def fraction_of_gain(gain: float, tick_hz: float, dt: float) -> float:
     """Fraction of the gap closed in `dt` s by a gain per tick; a gain of 1 or more jumps."""
-    if gain >= 1.0:
-        return 1.0
-    return 1.0 - (1.0 - gain) ** (dt * tick_hz)
+    return 1.0 if gain >= 1.0 else 1.0 - (1.0 - gain) ** (dt * tick_hz)
 
 
 def fraction_of_half_life(half_life: float, dt: float) -> float:
     """Fraction of the gap closed in `dt` s; a half-life <= 0 s jumps, an infinite one stays."""
-    if half_life <= 0.0:
-        return 1.0
-    return 1.0 - 2.0 ** (-dt / half_life)
+    return 1.0 if half_life <= 0.0 else 1.0 - 2.0 ** (-dt / half_life)
 
 
 def move_by_speed(value: float, goal: float, speed: float, dt: float) -> float:
@@ -217,9 +209,7 @@ def smooth01(x: float) -> float:
 
 def move_towards(value: float, goal: float, step: float) -> float:
     """`value` moved towards `goal` by at most `step`."""
-    if abs(goal - value) <= step:
-        return goal
-    return value + step if goal > value else value - step
+    return clip(goal, value - step, value + step)
 
 
 def apply(transform: Transform, point: Array) -> Array:

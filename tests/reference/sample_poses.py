@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
 from reference import maths
-from reference.characters import Frame, Rig
+from reference.characters import JOINTS, Frame, Rig
 from reference.maths import Transform
 from reference.terrain import Terrain
 
@@ -43,12 +44,11 @@ def make_frame(
     In knee space the rig's knee axis is the hinge; in ankle space the foot is flat and points
     along model forward.
     """
-    columns = {name: ([], []) for name in ("hip", "knee", "ankle", "toe")}
+    columns = {name: ([], []) for name in JOINTS}
     for leg, ankle in enumerate(np.asarray(ankles, dtype=float)):
         hip = np.array([0.1 * rig.side[leg], hip_height, 0.0])
-        reach = ankle - hip
-        distance = np.linalg.norm(reach)
-        down = reach / distance
+        distance = np.linalg.norm(ankle - hip)
+        down = (ankle - hip) / distance
         hinge = maths.rotate(maths.from_axis_angle(maths.Y, hinge_yaw), -maths.X)
         hinge = maths.unit(maths.across(hinge, down), hinge)
         bend = math.acos((THIGH**2 + distance**2 - SHIN**2) / (2 * THIGH * distance))
@@ -56,23 +56,14 @@ def make_frame(
         knee_rot = maths.shortest_arc(rig.knee_axis_ls[leg], hinge, maths.Y)
         ankle_rot = maths.inverse(rig.ankle_from_foot[leg])
         toe = ankle + np.array([0.0, 0.02 - ANKLE, 0.15])
-        placed = {"hip": (hip, maths.IDENTITY), "knee": (knee, knee_rot)}
-        placed |= {"ankle": (ankle, ankle_rot), "toe": (toe, ankle_rot)}
-        for name, (pos, rot) in placed.items():
+        rots = (maths.IDENTITY, knee_rot, ankle_rot, ankle_rot)
+        for name, pos, rot in zip(JOINTS, (hip, knee, ankle, toe), rots, strict=True):
             columns[name][0].append(pos)
             columns[name][1].append(rot)
     joints = {name: Transform(np.array(pos), np.array(rot)) for name, (pos, rot) in columns.items()}
-    frame = Frame(
-        world_from_model=STILL,
-        hip=joints["hip"],
-        knee=joints["knee"],
-        ankle=joints["ankle"],
-        toe=joints["toe"],
-        weight=np.ones(len(ankles)),
-        slide=0.0,
-        dt=1 / 60,
-    )
-    return dataclasses.replace(frame, **changes)
+    rest = {"world_from_model": STILL, "weight": np.ones(len(ankles)), "slide": 0.0, "dt": 1 / 60}
+    fields: dict[str, Any] = joints | rest | changes
+    return Frame(**fields)
 
 
 def with_speeds(frames: list[Frame]) -> list[Frame]:
@@ -80,28 +71,22 @@ def with_speeds(frames: list[Frame]) -> list[Frame]:
 
     The first frame gets the speeds of the second.
     """
-    roots = [frame.world_from_model.pos for frame in frames]
-    ankles, toes = (
-        [
-            np.array(
-                [maths.apply(frame.world_from_model, pos) for pos in getattr(frame, joint).pos]
-            )
-            for frame in frames
-        ]
-        for joint in ("ankle", "toe")
-    )
+
+    def places(frame: Frame, joint: str) -> np.ndarray:
+        return np.array([maths.apply(frame.world_from_model, x) for x in getattr(frame, joint).pos])
+
     timed = []
     for index, frame in enumerate(frames):
         now = max(index, min(1, len(frames) - 1))
-        before, dt = max(now - 1, 0), frames[now].dt
-        velocity = (roots[now] - roots[before]) / dt
-        motion = {
-            "speed": float(np.linalg.norm(velocity)),
-            "velocity_ws": velocity,
-            "foot_speed": np.linalg.norm(ankles[now] - ankles[before], axis=-1) / dt,
-            "toe_speed": np.linalg.norm(toes[now] - toes[before], axis=-1) / dt,
-        }
-        timed.append(dataclasses.replace(frame, **motion))
+        after, before = frames[now], frames[max(now - 1, 0)]
+        velocity = (after.world_from_model.pos - before.world_from_model.pos) / after.dt
+        foot_speed, toe_speed = (
+            np.linalg.norm(places(after, joint) - places(before, joint), axis=-1) / after.dt
+            for joint in ("ankle", "toe")
+        )
+        speeds = {"velocity_ws": velocity, "speed": float(np.linalg.norm(velocity))}
+        speeds |= {"foot_speed": foot_speed, "toe_speed": toe_speed}
+        timed.append(dataclasses.replace(frame, **speeds))
     return timed
 
 
@@ -109,26 +94,6 @@ def standing(heights: tuple[float, ...] = (ANKLE, ANKLE), forward: float = 0.05)
     """Ankles (legs, 3) under the hips at the given heights."""
     sides = (0.1, -0.1, 0.0)
     return np.array([[x, y, forward] for x, y in zip(sides, heights, strict=False)])
-
-
-def stepping(rig: Rig, count: int = 60) -> list[Frame]:
-    """A walk, rotated in the world: each foot rises vertically, swings, and comes down.
-
-    While an ankle is below the raised height it does not move horizontally.
-    """
-    frames = []
-    heading = maths.from_axis_angle(maths.Y, 0.7)
-    for index in range(count):
-        ankles = []
-        for leg in range(2):
-            cycle, phase = divmod(index / 30 + 0.5 * leg, 1.0)
-            swing = min(max((phase - 0.65) / 0.2, 0.0), 1.0)
-            height = ANKLE + 0.12 * min(max((phase - 0.5) / 0.15, 0.0), 1.0, (1.0 - phase) / 0.15)
-            stride = 0.3 * (cycle + swing - 0.5 * leg)
-            ankles.append([0.1 - 0.2 * leg, height, stride - 0.3 * index / 30 + 0.05])
-        root = maths.rotate(heading, np.array([0.3, 0.0, 0.3 * index / 30]))
-        frames.append(make_frame(rig, np.array(ankles), world_from_model=Transform(root, heading)))
-    return with_speeds(frames)
 
 
 def plane(slope_forward: float, slope_left: float, height: float = 0.0) -> Terrain:

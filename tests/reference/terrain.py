@@ -50,20 +50,25 @@ class Terrain:
         self.plane_layers = list(self.plane_layers) or [0] * len(self.planes)
         if len(self.triangle_layers) == 0:
             self.triangle_layers = np.zeros(len(self.triangles), int)
-        self.triangle_layers = np.asarray(self.triangle_layers)
-        self._corner = self.triangles[:, 0]
-        self._first = self.triangles[:, 1] - self._corner
-        self._second = self.triangles[:, 2] - self._corner
-        normal = np.cross(self._first, self._second)
-        size = np.linalg.norm(normal, axis=-1)
-        solid = size > 0.0
-        normal = normal / np.where(solid, size, 1.0)[:, None]
-        self._normal = normal * np.where(normal @ self.up < 0.0, -1.0, 1.0)[:, None]
-        # Moeller and Trumbore, with the direction -up: what does not depend on the origin.
-        self._side = np.cross(-self.up, self._second)
-        volume = np.sum(self._first * self._side, axis=-1)
-        self._usable = solid & (self._normal @ self.up > EDGE_ON)
-        self._scale = np.where(self._usable, 1.0 / np.where(self._usable, volume, 1.0), 0.0)
+        self._layers = np.concatenate([self.plane_layers, self.triangle_layers]).astype(int)
+        points, normals = np.reshape(self.planes, (-1, 2, 3)).swapaxes(0, 1)
+        corners = self.triangles[:, 0]
+        first, second = self.triangles[:, 1] - corners, self.triangles[:, 2] - corners
+        self._points = np.concatenate([points, corners])
+        normals = np.concatenate([normals, np.cross(first, second)])
+        size = np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = normals / np.where(size > 0.0, size, 1.0)
+        self._normals = normals * np.where(normals @ self.up < 0.0, -1.0, 1.0)[:, None]
+        facing = self._normals @ self.up
+        self._usable = facing > EDGE_ON
+        # What gives, of the way from a point of a surface to a ray's origin, the distance down and
+        # the barycentric coordinates there, 0 for planes: after Moeller and Trumbore.
+        sides = np.cross(-self.up, second), np.cross(first, -self.up)
+        volume = np.sum(first * sides[0], axis=-1, keepdims=True)
+        scale = np.where(volume == 0.0, 0.0, 1.0 / np.where(volume == 0.0, 1.0, volume))
+        self._axes = np.zeros((3, *self._points.shape))
+        self._axes[0] = self._normals / np.where(self._usable, facing, 1.0)[:, None]
+        self._axes[1:, len(points) :] = np.array(sides) * scale
 
     def at(self, platforms: Sequence[Transform]) -> "Terrain":
         """The terrain where its platform is, in world space."""
@@ -85,38 +90,16 @@ class Terrain:
         Rays pass through surfaces whose layer is not in `mask`. Among surfaces at the same
         distance the first in the list wins, planes before triangles.
         """
-        nearest, normal, found = reach, self.up, False
-        for (point, plane_normal), layer in zip(self.planes, self.plane_layers, strict=True):
-            if not mask >> layer & 1:
-                continue
-            facing = plane_normal / np.linalg.norm(plane_normal)
-            facing = -facing if facing @ self.up < 0.0 else facing
-            if facing @ self.up <= EDGE_ON:
-                continue
-            distance = float((origin - point) @ facing / (facing @ self.up))
-            if 0.0 <= distance <= reach and (not found or distance < nearest):
-                nearest, normal, found = distance, facing, True
-        if len(self.triangles):
-            visible = (mask >> np.asarray(self.triangle_layers)) & 1 == 1
-            distances = np.where(visible, self._distances(origin), np.inf)
-            best = int(np.argmin(distances))
-            distance = float(distances[best])
-            if math.isfinite(distance) and distance <= reach and (not found or distance < nearest):
-                nearest, normal, found = distance, self._normal[best], True
-        platform = self.platform if found else -1
-        if math.isinf(nearest):
-            return Hit(found, origin, normal, platform)
-        return Hit(found, origin - self.up * nearest, normal, platform)
-
-    def _distances(self, origin: Array) -> Array:
-        """Distance down to every triangle (count), infinite where the ray misses it."""
-        away = origin - self._corner
-        first = np.sum(away * self._side, axis=-1) * self._scale
-        cross = np.cross(away, self._first)
-        second = (cross @ -self.up) * self._scale
-        distance = np.sum(cross * self._second, axis=-1) * self._scale
+        away = origin - self._points
+        distances, first, second = np.einsum("kij,ij->ki", self._axes, away)
         inside = (first >= -SLACK) & (second >= -SLACK) & (first + second <= 1.0 + SLACK)
-        return np.where(self._usable & inside & (distance >= 0.0), distance, np.inf)
+        hit = self._usable & inside & (mask >> self._layers & 1 == 1)
+        hit &= (distances >= 0.0) & (distances <= reach)
+        if not hit.any():
+            return Hit(False, origin - self.up * reach if math.isfinite(reach) else origin, self.up)
+        best = int(np.argmin(np.where(hit, distances, np.inf)))
+        point = origin - self.up * distances[best]
+        return Hit(True, point, self._normals[best], self.platform)
 
 
 @dataclass

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reference import maths
-from reference.maths import Array, length, rotate
+from reference.maths import Array, length, multiply, rotate
 
 SETTLED = 1.0  # s without a change of weights
 
@@ -28,16 +28,11 @@ class Wish:
     balls: Array
     targets: Array
     target_rots: Array
-    tilts: Array
-    """How far each foot turns to the ground, as the length of the normal less up."""
-    reach: Array
-    """Thigh and shin, m."""
-    lift: Array
-    """Offset of the root, m."""
-    offset: Array
-    """Of the body, m."""
-    rot: Array
-    """Of the body."""
+    tilts: Array  # how far each foot turns to the ground, as the length of the normal less up
+    reach: Array  # thigh and shin, m
+    lift: Array  # offset of the root, m
+    offset: Array  # of the body, m
+    rot: Array  # of the body
 
 
 @dataclass
@@ -56,30 +51,23 @@ class Memory:
 def step(speed: float, wish: Wish, before: Memory | None) -> Memory:
     """Memory after one frame: `weights`, `offset` and `rot` are what legs and body get."""
     hip_height = float(np.mean(wish.hips - wish.lift, axis=0) @ wish.up)
+    offset, rot = wish.offset, wish.rot
     if before is None:
-        return Memory(
-            wish.weights, wish.weights, wish.offset, wish.rot, SETTLED + 1.0, hip_height, 0.0
-        )
-    since = before.since + wish.dt
-    if not np.array_equal(wish.weights, before.wanted):
-        since = 0.0
-    falling = max((before.hip_height - hip_height) / wish.dt, 0.0)
+        return Memory(wish.weights, wish.weights, offset, rot, SETTLED + 1.0, hip_height, 0.0)
+    since = before.since + wish.dt if np.array_equal(wish.weights, before.wanted) else 0.0
+    fall = falling = max((before.hip_height - hip_height) / wish.dt, 0.0)
     if wish.weights.any():
         fall = before.fall if since < SETTLED else 0.0
-    else:
-        fall = falling
     limit = max(speed, fall - falling) * wish.dt
 
     legs_fade = not np.array_equal(wish.weights, before.weights)
     body_limit = limit / 2.0 if legs_fade else limit
-    turn = maths.multiply(wish.rot, maths.inverse(before.rot))
-    angle = 2.0 * math.atan2(length(turn[1:]), abs(turn[0]))
-    gap = length(wish.offset - before.offset) + float(np.max(wish.reach)) * angle
-    offset, rot = wish.offset, wish.rot
+    angle = angle_of(multiply(rot, maths.inverse(before.rot)))
+    gap = length(offset - before.offset) + float(np.max(wish.reach)) * angle
     if since < SETTLED and gap > body_limit:
         since = 0.0
-        offset = before.offset + (wish.offset - before.offset) * body_limit / gap
-        rot = maths.nlerp(before.rot, wish.rot, body_limit / gap)
+        offset = before.offset + (offset - before.offset) * body_limit / gap
+        rot = maths.nlerp(before.rot, rot, body_limit / gap)
 
     weights = []
     for leg, weight in enumerate(before.weights):
@@ -90,22 +78,24 @@ def step(speed: float, wish: Wish, before: Memory | None) -> Memory:
     return Memory(wish.weights, np.array(weights), offset, rot, since, hip_height, fall)
 
 
+def angle_of(rot: Array) -> float:
+    """Of a rotation by at most pi."""
+    return 2.0 * math.atan2(length(rot[1:]), abs(rot[0]))
+
+
 def correction(wish: Wish, leg: int, offset: Array, rot: Array, weight: float) -> float:
     """How far ankle and ball of a leg move per unit of its weight, m, at most."""
-    pivot = np.mean(wish.hips, axis=0)
+    pivot, reach = np.mean(wish.hips, axis=0), wish.reach[leg]
     hip, ankle = (
         pivot + offset + rotate(rot, point - pivot) for point in (wish.hips[leg], wish.ankles[leg])
     )
     to_target = wish.targets[leg] - hip
-    if length(to_target) > wish.reach[leg]:
-        to_target = to_target * wish.reach[leg] / length(to_target)
+    if length(to_target) > reach:
+        to_target = to_target * reach / length(to_target)
     way = length(hip + to_target - ankle)
     from_middle = abs(2.0 * weight - 1.0)
-    part = way / wish.reach[leg]
-    turn = maths.multiply(
-        wish.target_rots[leg], maths.inverse(maths.multiply(rot, wish.ankle_rots[leg]))
-    )
-    foot_turn = 2.0 * math.atan2(length(turn[1:]), abs(turn[0])) + wish.tilts[leg]
-    leg_turn = part + math.sqrt(2.0 * part)
+    turn = multiply(wish.target_rots[leg], maths.inverse(multiply(rot, wish.ankle_rots[leg])))
+    leg_turn = way / reach + math.sqrt(2.0 * way / reach)
     arm = length(wish.balls[leg] - wish.ankles[leg])
+    foot_turn = angle_of(turn) + wish.tilts[leg]
     return way * (1.0 + from_middle) + arm * (from_middle * leg_turn + foot_turn)

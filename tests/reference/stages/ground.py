@@ -1,100 +1,140 @@
 """Contact, probe, lean, target, lock and pelvis of the `record` reference.
 
-`up` is that of the terrain, unit; everything is in world space unless it says _ms.
+Everything is in world space unless it says _ms. The other systems share what they share.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from reference import maths
-from reference.characters import (
-    Followed,
-    Foot,
-    Frame,
-    Ground,
-    Hold,
-    Parameters,
-    Rig,
-    State,
-    carried,
-    turned,
-    world_from_foot,
-)
-from reference.maths import (
-    Array,
-    Motion,
-    across,
-    apply,
-    clip,
-    cross,
-    length,
-    lerp,
-    rotate,
-    unit,
-)
+from reference.characters import Frame, Leg, Parameters, carried, named, turned
+from reference.maths import Array, Motion, across, clip, cross, length, lerp, rotate, unit
 from reference.terrain import Hit
 
-
-def forward(rot: Array, up: Array) -> Array:
-    """The model's forward at right angles to up; made of its own up where it looks along up."""
-    return unit(across(rotate(rot, maths.Z), up), unit(across(rotate(rot, maths.Y), up), up))
-
-
-def heading(rig: Rig, frame: Frame, leg: int, up: Array) -> Array:
-    """The animated foot's forward at right angles to up; the model's where the foot is along up."""
-    sole = rotate(world_from_foot(rig, frame, leg), maths.Z)
-    return unit(across(sole, up), forward(frame.world_from_model.rot, up))
+# Of contact by speed.
+BY_SPEED = named("contact", ground_height=0.0, planted_height=0.075, raised_height=0.10) | named(
+    "contact", planted_speed=0.25, raised_speed=0.50, half_life=0.0
+)
 
 
-def sense(parameters: Parameters, rig: Rig, terrain: Ground, frame: Frame, leg: int) -> Foot:
-    """Contact, rays and foothold of one leg."""
-    up = terrain.up
-    ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg])
-    lift = frame.ankle.pos[leg][1] - parameters.of_leg("contact.ground_height", leg)
-    planted_height = parameters.of_leg("contact.planted_height", leg)
-    raised_height = parameters.of_leg("contact.raised_height", leg)
-    if raised_height > planted_height:
-        contact = clip((raised_height - lift) / (raised_height - planted_height), 0.0, 1.0)
-    else:
-        contact = 1.0 if lift <= planted_height else 0.0
+@dataclass
+class Standing:
+    """Contact of one foot: whether it stands, and the smoothed weight of that."""
 
-    ray_up = parameters.of_leg("probe.ray_up", leg)
-    reach = ray_up + parameters.of_leg("probe.ray_down", leg)
-    hit = terrain.cast(ankle_ws + up * ray_up, reach)
-    if parameters.of_leg("probe.use_toe", leg):
-        toe_ls = np.array(parameters.of_leg("probe.toe_ls", leg))
-        toe_ls[0] *= rig.side[leg]
-        toe_ws = ankle_ws + rotate(world_from_foot(rig, frame, leg), toe_ls)
-        toe_hit = terrain.cast(toe_ws + up * ray_up, reach)
-    else:
-        toe_hit = Hit(False, ankle_ws, up)
+    standing: bool
+    weight: float
 
+
+@dataclass
+class Followed:
+    """Height of the ground as a foothold follows it, and the foothold where the ground is."""
+
+    height: Motion
+    foothold_ws: Array
+
+
+@dataclass
+class Hold:
+    """Memory of one foot's lock."""
+
+    locked: bool
+    factor: float
+    offset: Array
+    turn: float  # rad about up, from the animated heading to the one it keeps
+    foothold: Array
+    ball: Array
+    heading: Array
+
+
+@dataclass
+class State:
+    """Memory of the `record` system; lists have one entry per leg."""
+
+    ground: list[Followed]
+    slope: list[Motion]  # ahead and to the right
+    slide_weight: float
+    pelvis_height: float
+    pelvis_offset_ws: Array
+    holds: list[Hold]
+    standing: Sequence[Standing | None]  # where feet stand by speed
+
+
+@dataclass(frozen=True)
+class Foot(Leg):
+    """A leg in a frame, with its contact, hits and foothold.
+
+    `swing_lift`, m, is the part of `lift` that is not animated.
+    """
+
+    lift: float
+    contact: float
+    planted: bool
+    lifted: bool
+    hit: Hit
+    toe_hit: Hit
+    turns_in_swing: bool = False
+    swing_lift: float = 0.0
+
+    @property
+    def turned(self) -> float:
+        """0..1, how far the foot turns to the ground under it."""
+        return float(self.hit.found) if self.turns_in_swing else self.grounded
+
+    @property
+    def grounded(self) -> float:
+        """Contact weight of a foot with ground under it, else 0."""
+        return self.contact if self.hit.found else 0.0
+
+    @property
+    def foothold_ws(self) -> Array:
+        """Where the foot would stand: the hit, raised by what a flat sole on a slope needs."""
+        if not self.hit.found:
+            return self.pos_ws("ankle") - self.up * self.lift
+        cosine = max(float(self.hit.normal @ self.up), math.cos(self["target.max_slope"]))
+        return self.hit.point + self.up * (self["target.foot_height"] * (1.0 / cosine - 1.0))
+
+
+def sense(leg: Leg) -> Foot:
+    """Contact by height, and the hits of one leg."""
+    ankle_ws = leg.pos_ws("ankle")
+    lift = float(leg.joint("ankle").pos[1] - leg["contact.ground_height"])
+    planted, raised = leg["contact.planted_height"], leg["contact.raised_height"]
+    contact = float(lift <= planted)
+    if raised > planted:
+        contact = clip((raised - lift) / (raised - planted), 0.0, 1.0)
+
+    above = leg.up * leg["probe.ray_up"]
+    reach = leg["probe.ray_up"] + leg["probe.ray_down"]
+    toe_hit = Hit(False, ankle_ws, leg.up)
+    if leg["probe.use_toe"]:
+        toe_ls = leg["probe.toe_ls"] * np.array([leg.rig.side[leg.index], 1.0, 1.0])
+        toe_hit = leg.terrain.cast(ankle_ws + rotate(leg.world_from_foot, toe_ls) + above, reach)
     return Foot(
-        hip_ws=apply(frame.world_from_model, frame.hip.pos[leg]),
-        ankle_ws=ankle_ws,
-        ball_ws=apply(frame.world_from_model, frame.toe.pos[leg]),
-        heading_ws=heading(rig, frame, leg, up),
-        lift=float(lift),
-        contact=float(contact),
-        planted=bool(lift <= planted_height),
-        lifted=bool(lift >= raised_height),
-        hit=hit,
+        **vars(leg),
+        lift=lift,
+        contact=contact,
+        planted=lift <= planted,
+        lifted=lift >= raised,
+        hit=leg.terrain.cast(ankle_ws + above, reach),
         toe_hit=toe_hit,
-        foothold_ws=foothold(parameters, leg, hit, ankle_ws, float(lift), up),
     )
 
 
-def foothold(
-    parameters: Parameters, leg: int, hit: Hit, ankle_ws: Array, lift: float, up: Array
-) -> Array:
-    """Where the foot would stand: the hit, raised by as much as a flat sole on a slope needs."""
-    if not hit.found:
-        return ankle_ws - up * lift
-    steepest = math.cos(parameters.of_leg("target.max_slope", leg))
-    cosine = max(float(hit.normal @ up), steepest)
-    sole = parameters.of_leg("target.foot_height", leg)
-    return hit.point + up * (sole * (1.0 / cosine - 1.0))
+def stand(leg: Leg, before: Standing | None) -> Standing:
+    """Contact by speed: a foot stands once its toe is low and slow, until it is high or fast."""
+    height = leg.joint("toe").pos[1] - leg["contact.ground_height"]
+    speed = leg.frame.toe_speed[leg.index]
+    lifted = height > leg["contact.raised_height"] or speed > leg["contact.raised_speed"]
+    planted = height <= leg["contact.planted_height"] and speed <= leg["contact.planted_speed"]
+    if before is None:
+        stands = bool(planted and not lifted)
+        return Standing(stands, float(stands))
+    stands = bool(not lifted and (planted or before.standing))
+    fraction = maths.fraction_of_half_life(leg["contact.half_life"], leg.frame.dt)
+    return Standing(stands, lerp(before.weight, float(stands), fraction))
 
 
 def lean(
@@ -105,24 +145,18 @@ def lean(
     state: State | None,
     frame: Frame,
 ) -> tuple[float, list[Motion], Array, Array]:
-    """Slide weight, smoothed slope (2), body rotation (4) and smoothed normal (3), world."""
+    """Slide weight, smoothed slope (2), body rotation (4) and smoothed normal (3)."""
     right = cross(forward, up)
-    leg_weights = weights_of_legs(parameters, frame)
-    weights = [foot.grounded * w for foot, w in zip(feet, leg_weights, strict=True)]
-    normal = np.zeros(3)
-    for foot, weight in zip(feet, weights, strict=True):
-        normal = normal + weight * foot.hit.normal
-    if sum(weights) == 0.0:
-        normal = up
+    weights = [foot.grounded * foot.weight for foot in feet]
+    normal = up if sum(weights) == 0.0 else weights @ np.array([foot.hit.normal for foot in feet])
     goals = [math.atan2(-float(normal @ axis), float(normal @ up)) for axis in (forward, right)]
 
-    hz = parameters["lean.tick_hz"]
     if state is None:
         slide, slope = float(frame.slide), [Motion(goal, 0.0) for goal in goals]
     else:
-        rising = frame.slide > state.slide_weight
-        slide_gain = parameters["lean.slide_on_gain" if rising else "lean.slide_off_gain"]
-        fraction = maths.fraction_of_gain(slide_gain, hz, frame.dt)
+        hz = parameters["lean.tick_hz"]
+        direction = "on" if frame.slide > state.slide_weight else "off"
+        fraction = maths.fraction_of_gain(parameters[f"lean.slide_{direction}_gain"], hz, frame.dt)
         slide = lerp(state.slide_weight, float(frame.slide), fraction)
         gain = lerp(parameters["lean.gain"], parameters["lean.gain_slide"], slide)
         half_life, spring = maths.half_life_of_gain(gain, hz), parameters["lean.spring"]
@@ -131,184 +165,169 @@ def lean(
             for before, goal in zip(state.slope, goals, strict=True)
         ]
 
-    angles = [eased.value for eased in slope]
+    ahead, aside = (eased.value for eased in slope)
     lean_forward, lean_side = (
         lerp(parameters[f"lean.{name}_rate"], parameters[f"lean.{name}_rate_slide"], slide) * angle
-        for name, angle in zip(("forward", "side"), angles, strict=True)
+        for name, angle in (("forward", ahead), ("side", aside))
     )
     body_rot = maths.from_rotvec(right * lean_forward - forward * lean_side)
-    smooth_normal = unit(up - math.tan(angles[0]) * forward - math.tan(angles[1]) * right, up)
+    smooth_normal = unit(up - math.tan(ahead) * forward - math.tan(aside) * right, up)
     return slide, slope, body_rot, smooth_normal
 
 
-def smooth_height(
-    parameters: Parameters, leg: int, foot: Foot, up: Array, memory: Followed | None, frame: Frame
-) -> Followed:
+def smooth_height(foot: Foot, memory: Followed | None) -> Followed:
     """Smoothed height along up of the foothold and of what the swing adds to the lift, m.
 
     With `follow_slopes` the height first moves as the plane of the ground does under the foothold.
     """
-    foothold, before = float(up @ foot.foothold_ws), None
+    foothold, before = float(foot.up @ foot.foothold_ws), None
     goal = foothold + foot.swing_lift
     if memory is not None:
-        origin = carried(frame, foot.hit, np.zeros(3))
-        turn = turned(frame, foot.hit, maths.IDENTITY)
+        origin = carried(foot.frame, foot.hit, np.zeros(3))
+        turn = turned(foot.frame, foot.hit, maths.IDENTITY)
         place_before = rotate(maths.inverse(turn), foot.foothold_ws - origin)
-        height = memory.height.value + foothold - float(up @ place_before)
-        if parameters.of_leg("target.follow_slopes", leg):
-            way = foot.foothold_ws - carried(frame, foot.hit, memory.foothold_ws)
-            height += slope_rise(parameters, leg, foot.hit.normal, way, up)
+        height = memory.height.value + foothold - float(foot.up @ place_before)
+        if foot["target.follow_slopes"]:
+            height += slope_rise(
+                foot, foot.foothold_ws - carried(foot.frame, foot.hit, memory.foothold_ws)
+            )
         before = Motion(height, memory.height.velocity)
-    rises = before is None or goal > before.value
-    half_life = parameters.of_leg(f"target.{'rise' if rises else 'fall'}_half_life", leg)
-    spring = parameters.of_leg("target.spring", leg)
-    return Followed(maths.follow(before, goal, half_life, frame.dt, spring), foot.foothold_ws)
+    return Followed(ease(foot, "target", before, goal, foot.frame.dt), foot.foothold_ws)
 
 
-def slope_rise(parameters: Parameters, leg: int, normal: Array, way: Array, up: Array) -> float:
-    """How far a plane with this normal rises along a way, m: as far as it is at most this steep."""
-    steepness = math.acos(clip(float(normal @ up), -1.0, 1.0))
-    uphill = across(-normal, up)
-    if steepness <= parameters.of_leg("target.max_slope", leg):
-        return float(way @ unit(uphill, up)) * math.tan(steepness)
-    return float(way @ uphill) / math.cos(parameters.of_leg("target.max_slope", leg))
+def ease(
+    values: Leg | Parameters, stage: str, before: Motion | None, goal: float, dt: float
+) -> Motion:
+    """A height after a frame, m, that rises and falls with the half-lives of a stage."""
+    direction = "rise" if before is None or goal > before.value else "fall"
+    half_life = values[f"{stage}.{direction}_half_life"]
+    return maths.follow(before, goal, half_life, dt, values[f"{stage}.spring"])
 
 
-def clamped_target(
-    parameters: Parameters, leg: int, foot: Foot, up: Array, height: float, frame: Frame
-) -> tuple[Array, Array]:
+def slope_rise(foot: Foot, way: Array) -> float:
+    """How far the ground rises along a way, m, as far as it is at most as steep as it may be."""
+    steepness = math.acos(clip(float(foot.hit.normal @ foot.up), -1.0, 1.0))
+    uphill = across(-foot.hit.normal, foot.up)
+    if steepness <= foot["target.max_slope"]:
+        return float(way @ unit(uphill, foot.up)) * math.tan(steepness)
+    return float(way @ uphill) / math.cos(foot["target.max_slope"])
+
+
+def clamped_target(foot: Foot, height: float) -> tuple[Array, Array]:
     """Foothold at the smoothed height and the ankle target above it, both within the limits."""
+    up = foot.up
     foothold = foot.foothold_ws + up * (height - foot.swing_lift - up @ foot.foothold_ws)
     target = foothold + up * foot.lift
-    lowest = parameters.of_leg("target.min_ankle_height", leg)
-    highest = parameters.of_leg("target.max_ankle_height", leg)
-    height_ms = maths.unapply(frame.world_from_model, target)[1]
-    shift = up * (clip(height_ms, lowest, highest) - height_ms)
+    height_ms = maths.unapply(foot.frame.world_from_model, target)[1]
+    allowed = clip(height_ms, foot["target.min_ankle_height"], foot["target.max_ankle_height"])
+    shift = up * (allowed - height_ms)
     return foothold + shift, target + shift
 
 
 def lock(
-    parameters: Parameters,
-    leg: int,
-    foot: Foot,
-    foothold: Array,
-    up: Array,
-    before: Hold | None,
-    pelvis_offset: Array,
-    frame: Frame,
+    foot: Foot, foothold: Array, before: Hold | None, pelvis_offset: Array
 ) -> tuple[Hold, Array, Array]:
     """Memory of the foot's lock after this frame; offset of the target (3), turn of the foot (4).
 
-    `pelvis_offset` (3) is that of the previous frame. All of this is in world space.
+    `pelvis_offset` (3) is that of the previous frame.
     """
-    holds_ball = parameters.of_leg("lock.hold_ball", leg)
-    if before is None:
-        was_locked, factor, turn, swung = False, 0.0, 0.0, 0.0
-        offset = moved = np.zeros(3)
-    else:
+    up, frame, heading = foot.up, foot.frame, foot.heading_ws
+    hip_ws, ankle_ws, ball_ws = (foot.pos_ws(name) for name in ("hip", "ankle", "toe"))
+    was_locked, factor, turn, swung = False, 0.0, 0.0, 0.0
+    offset = moved = np.zeros(3)
+    if before is not None:
         was_locked, factor, turn = before.locked, before.factor, before.turn
         carried_rot = turned(frame, foot.hit, maths.IDENTITY)
         offset = rotate(carried_rot, before.offset)
         moved = foothold - carried(frame, foot.hit, before.foothold)
-        if holds_ball:
-            rolled = foot.ball_ws - carried(frame, foot.hit, before.ball)
+        if foot["lock.hold_ball"]:
+            rolled = ball_ws - carried(frame, foot.hit, before.ball)
             moved = across(rolled, up) + up * float(up @ moved)
         pointed = rotate(carried_rot, before.heading)
-        swung = math.atan2(float(cross(pointed, foot.heading_ws) @ up), pointed @ foot.heading_ws)
+        swung = math.atan2(float(cross(pointed, heading) @ up), pointed @ heading)
 
     def of_ankle(offset: Array, turn: float) -> Array:
         """How far the ankle moves if the ball moves by the offset and the foot turns about it."""
-        if not holds_ball:
+        if not foot["lock.hold_ball"]:
             return offset
-        arm = foot.ankle_ws - foot.ball_ws
+        arm = ankle_ws - ball_ws
         return offset + rotate(maths.from_axis_angle(up, turn), arm) - arm
 
+    def is_slow(name: str) -> bool:
+        """Whether the move respects the speed limit of that name, which may be infinite."""
+        return math.isinf(foot[name]) or length(moved) <= foot[name] * frame.dt
+
     # Where the ankle would be if the foot stayed, relative to where the hip probably is.
-    hip = foot.hip_ws + pelvis_offset
+    hip = hip_ws + pelvis_offset
     kept = foothold + of_ankle(offset - moved, turn - swung) + up * foot.lift
-    thigh = length(frame.hip.pos[leg] - frame.knee.pos[leg])
-    shin = length(frame.knee.pos[leg] - frame.ankle.pos[leg])
+    hip_ms, knee_ms, ankle_ms = (foot.joint(name).pos for name in ("hip", "knee", "ankle"))
+    thigh, shin = length(hip_ms - knee_ms), length(knee_ms - ankle_ms)
     knee_angle = maths.interior_angle(thigh, shin, float((kept - hip) @ (kept - hip)))
-    deviation = maths.angle_between(kept - hip, foot.ankle_ws - foot.hip_ws)
-    takes_part = weights_of_legs(parameters, frame)[leg] > 0.0
-    most_turned = parameters.of_leg("lock.release_heading", leg)
+    most_turned = foot["lock.release_heading"]
     must_release = (
         foot.lifted
-        or knee_angle < parameters.of_leg("lock.release_min_angle", leg)
-        or knee_angle > parameters.of_leg("lock.release_max_angle", leg)
-        or deviation > parameters.of_leg("lock.release_cone", leg)
-        or length(offset - moved) > parameters.of_leg("lock.release_distance", leg)
+        or not foot["lock.release_min_angle"] <= knee_angle <= foot["lock.release_max_angle"]
+        or maths.angle_between(kept - hip, ankle_ws - hip_ws) > foot["lock.release_cone"]
+        or length(offset - moved) > foot["lock.release_distance"]
         or (most_turned < math.pi and abs(turn - swung) > most_turned)
-        or not is_slow(parameters, "lock.release_speed", leg, moved, frame.dt)
-        or not parameters.of_leg("lock.enabled", leg)
-        or not takes_part
+        or not is_slow("lock.release_speed")
+        or not foot["lock.enabled"]
+        or foot.weight == 0.0
     )
-    if was_locked:
-        locked = not must_release
-    else:
-        slow = is_slow(parameters, "lock.max_speed", leg, moved, frame.dt)
-        relockable = factor <= parameters.of_leg("lock.relock_threshold", leg)
-        locked = foot.planted and relockable and slow and foot.hit.found and not must_release
+    relockable = factor <= foot["lock.relock_threshold"] and is_slow("lock.max_speed")
+    may_lock = was_locked or (foot.planted and relockable and foot.hit.found)
+    locked = may_lock and not must_release
 
     if locked:
-        half_life = parameters.of_leg("lock.lock_half_life", leg)
-        factor += maths.fraction_of_half_life(half_life, frame.dt) * (1.0 - factor)
+        fraction = maths.fraction_of_half_life(foot["lock.lock_half_life"], frame.dt)
+        factor += fraction * (1.0 - factor)
         offset, turn = offset - factor * moved, turn - factor * swung
     else:
-        half_life = parameters.of_leg("lock.unlock_half_life", leg)
-        fraction = maths.fraction_of_half_life(half_life, frame.dt)
+        fraction = maths.fraction_of_half_life(foot["lock.unlock_half_life"], frame.dt)
         factor *= 1.0 - fraction
         way = length(offset)
-        if holds_ball:
-            way += abs(turn) * length(foot.ankle_ws - foot.ball_ws)
-        fastest = parameters.of_leg("lock.return_speed", leg)
+        if foot["lock.hold_ball"]:
+            way += abs(turn) * length(ankle_ws - ball_ws)
+        fastest = foot["lock.return_speed"]
         if fraction * way > fastest * frame.dt:
             fraction = fastest * frame.dt / way
         offset, turn = offset * (1.0 - fraction), turn * (1.0 - fraction)
-    after = Hold(locked, factor, offset, turn, foothold, foot.ball_ws, foot.heading_ws)
-    rot = maths.from_axis_angle(up, turn) if holds_ball else maths.IDENTITY
+    after = Hold(locked, factor, offset, turn, foothold, ball_ws, heading)
+    rot = maths.from_axis_angle(up, turn) if foot["lock.hold_ball"] else maths.IDENTITY
     return after, of_ankle(offset, turn), rot
 
 
-def is_slow(parameters: Parameters, name: str, leg: int, moved: Array, dt: float) -> bool:
-    """Whether a move, m, in `dt` s respects the speed limit of that name, which may be infinite."""
-    limit = parameters.of_leg(name, leg)
-    return math.isinf(limit) or length(moved) <= limit * dt
+def lowest_of(gaps: Sequence[float], weights: Sequence[float]) -> float:
+    """The lowest of heights, m, of which one with a partial weight is partly the highest; or 0."""
+    top = max(gaps, default=0.0)
+    return min((top + w * (gap - top) for w, gap in zip(weights, gaps, strict=True)), default=0.0)
 
 
-def weights_of_legs(parameters: Parameters, frame: Frame) -> list[float]:
-    """How much foot IK each leg gets, 0..1."""
-    return [
-        float(frame.grounded * weight * parameters.of_leg("leg.weight", leg))
-        for leg, weight in enumerate(frame.weight)
-    ]
+def follow_by_gain(
+    parameters: Parameters, low: float, contact: float, before: float | None, dt: float
+) -> float:
+    """Height of the body after a frame, m, of which feet with a contact want `low`."""
+    goal = contact * clip(low, -parameters["pelvis.limit"], parameters["pelvis.limit"])
+    if before is None:
+        return goal
+    off, on = (
+        maths.fraction_of_gain(parameters[f"pelvis.{name}_gain"], parameters["pelvis.tick_hz"], dt)
+        for name in ("off", "on")
+    )
+    return lerp(before, goal, lerp(off, on, contact))
 
 
 def pelvis_height(
-    parameters: Parameters,
-    feet: list[Foot],
-    targets: list[Array],
-    up: Array,
-    state: State | None,
-    frame: Frame,
+    parameters: Parameters, feet: list[Foot], targets: list[Array], up: Array, before: float | None
 ) -> float:
     """Smoothed height of the body above its animated position, m along up or the normal."""
-    leg_weights = weights_of_legs(parameters, frame)
-    weights = [foot.grounded * w for foot, w in zip(feet, leg_weights, strict=True)]
-    gaps = [float(up @ (t - foot.ankle_ws)) for t, foot in zip(targets, feet, strict=True)]
-    taking_part = [
-        (w, gap) for w, gap, total in zip(weights, gaps, leg_weights, strict=True) if total > 0.0
-    ]
-    top = max((gap for _, gap in taking_part), default=0.0)
-    low = min((top + w * (gap - top) for w, gap in taking_part), default=0.0)
+    gaps, weights = [], []
+    for foot, target in zip(feet, targets, strict=True):
+        if foot.weight > 0.0:
+            gaps.append(float(up @ (target - foot.pos_ws("ankle"))))
+            weights.append(foot.grounded * foot.weight)
+    low = lowest_of(gaps, weights)
     if parameters["pelvis.wait_to_rise"]:
-        low = min(low, max(0.0, min((gap for _, gap in taking_part), default=0.0)))
-    contact = max(weights)
-    limit = parameters["pelvis.limit"]
-    goal = contact * clip(low, -limit, limit)
-    if state is None:
-        return goal
-    hz = parameters["pelvis.tick_hz"]
-    on = maths.fraction_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
-    off = maths.fraction_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
-    return lerp(state.pelvis_height, goal, lerp(off, on, contact))
+        low = min(low, max(0.0, min(gaps, default=0.0)))
+    contact = max(weights, default=0.0)
+    return follow_by_gain(parameters, low, contact, before, feet[0].frame.dt)

@@ -1,27 +1,28 @@
-"""Body, leg and foot of the `record` reference: what moves the joints, without memory."""
+"""What moves the joints, without memory: body, leg, heel, foot and toe."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from reference import maths
-from reference.characters import Foot, Frame, Parameters, Rig
-from reference.maths import (
-    Array,
-    Transform,
-    across,
-    apply,
-    clip,
-    cross,
-    from_axis_angle,
-    length,
-    rotate,
-    unit,
-)
-from reference.stages import ground
+from reference.characters import Frame, Leg
+from reference.maths import Array, Transform, across, clip, cross, length, multiply, rotate, unit
+from reference.stages.ground import Foot
 
 # Forward distance from ankle hit to toe hit, m, below which their heights give no pitch.
 SHORT_FOOT = 0.01
+# Sine of a leg's angle ahead of its hip, up to which a heel rises, and from which it stays.
+RISES, STAYS = 0.2, 0.4
+
+
+class Solved(NamedTuple):
+    """Joints of a leg, model space, and whether its ankle reaches what it should."""
+
+    hip: Transform
+    knee: Transform
+    ankle: Transform
+    reached: bool
 
 
 def body(frame: Frame, offset_ws: Array, rot_ws: Array) -> Transform:
@@ -32,92 +33,74 @@ def body(frame: Frame, offset_ws: Array, rot_ws: Array) -> Transform:
     return Transform(pivot + rotate(model_from_world, offset_ws) - rotate(rot, pivot), rot)
 
 
-def carry(transform: Transform, joint: Transform, leg: int) -> Transform:
-    """One leg's joint, moved rigidly with the body."""
-    return Transform(
-        apply(transform, joint.pos[leg]), maths.multiply(transform.rot, joint.rot[leg])
+def carry(body: Transform, leg: Leg) -> tuple[Transform, Transform, Transform]:
+    """Hip, knee and ankle, moved rigidly with the body; model space."""
+    hip, knee, ankle = (
+        Transform(maths.apply(body, pos), multiply(body.rot, rot))
+        for pos, rot in map(leg.joint, ("hip", "knee", "ankle"))
     )
+    return hip, knee, ankle
 
 
-def solve_leg(
-    parameters: Parameters, rig: Rig, leg: int, frame: Frame, body: Transform, target: Array
-) -> tuple[Transform, Transform, Transform, bool]:
-    """Hip, knee and ankle that bring the ankle to `target`, and whether they do; model space."""
-    hip, knee, ankle = (carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle))
-    weight = ground.weights_of_legs(parameters, frame)[leg]
-    axis = rotate(knee.rot, rig.knee_axis_ls[leg])
+def hinge_of(leg: Leg, knee: Transform) -> Array:
+    """The axis, unit, about which a positive angle opens a knee."""
+    return rotate(knee.rot, leg.rig.knee_axis_ls[leg.index])
+
+
+# The leg that bends as animated
+
+
+def solve_leg(leg: Leg, body: Transform, target: Array) -> Solved:
+    """The leg whose ankle is brought to `target`, model space."""
+    hip, knee, ankle = carry(body, leg)
+    axis = hinge_of(leg, knee)
     distance = length(target - hip.pos)
-
-    as_animated = parameters.of_leg("leg.as_animated", leg)
-    nearest, soft_from, wanted = _wanted_distance(
-        length(hip.pos - knee.pos),
-        length(ankle.pos - knee.pos),
-        distance,
-        parameters.of_leg("leg.min_knee_angle", leg),
-        parameters.of_leg("leg.max_knee_angle", leg),
-        parameters.of_leg("leg.soften", leg),
-        length(ankle.pos - hip.pos) if as_animated else None,
-    )
-    reached = nearest <= distance <= soft_from and weight >= 1.0
-
-    knee_rot = from_axis_angle(
+    nearest, soft_from, wanted = _wanted_distance(leg, hip.pos, knee.pos, ankle.pos, distance)
+    knee_rot = maths.from_axis_angle(
         axis, _knee_angle(hip.pos - knee.pos, ankle.pos - knee.pos, axis, wanted)
     )
     bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
-    hip_rot = _hip_rotation(
-        bent - hip.pos, target - hip.pos, axis, parameters.of_leg("leg.twist", leg)
-    )
-
-    return *rotated(hip, knee, ankle, hip_rot, knee_rot, weight), reached
+    hip_rot = _hip_rotation(bent - hip.pos, target - hip.pos, axis, leg["leg.twist"])
+    reached = nearest <= distance <= soft_from and leg.weight >= 1.0
+    return _rotated(Solved(hip, knee, ankle, reached), hip_rot, knee_rot, leg.weight)
 
 
-def rotated(
-    hip: Transform,
-    knee: Transform,
-    ankle: Transform,
-    hip_rot: Array,
-    knee_rot: Array,
-    weight: float,
-) -> tuple[Transform, Transform, Transform]:
-    """Hip, knee and ankle after both rotations by a weight, the knee's first."""
+def _rotated(leg: Solved, hip_rot: Array, knee_rot: Array, weight: float) -> Solved:
+    """A leg after both rotations by a weight, the knee's first."""
+    hip, knee, ankle, reached = leg
     knee_rot = maths.nlerp(maths.IDENTITY, knee_rot, weight)
     hip_rot = maths.nlerp(maths.IDENTITY, hip_rot, weight)
     bent = knee.pos + rotate(knee_rot, ankle.pos - knee.pos)
-    shin_rot = maths.multiply(hip_rot, knee_rot)
-    return (
-        Transform(hip.pos, maths.multiply(hip_rot, hip.rot)),
-        Transform(
-            hip.pos + rotate(hip_rot, knee.pos - hip.pos), maths.multiply(shin_rot, knee.rot)
-        ),
-        Transform(hip.pos + rotate(hip_rot, bent - hip.pos), maths.multiply(shin_rot, ankle.rot)),
+    shin_rot = multiply(hip_rot, knee_rot)
+    moved_knee, moved_ankle = (hip.pos + rotate(hip_rot, x - hip.pos) for x in (knee.pos, bent))
+    return Solved(
+        Transform(hip.pos, multiply(hip_rot, hip.rot)),
+        Transform(moved_knee, multiply(shin_rot, knee.rot)),
+        Transform(moved_ankle, multiply(shin_rot, ankle.rot)),
+        reached,
     )
 
 
 def _wanted_distance(
-    a: float,
-    b: float,
-    distance: float,
-    min_angle: float,
-    max_angle: float,
-    soften: float,
-    animated: float | None,
+    leg: Leg, hip: Array, knee: Array, ankle: Array, distance: float
 ) -> tuple[float, float, float]:
     """Nearest hip-ankle distance, where softening starts, and the softened distance, all m.
 
-    The animated distance, if not None, is neither limited nor softened.
+    A leg as long as animated is neither limited nor softened where that is asked for.
     """
-    nearest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(min_angle), 0.0))
-    farthest = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(max_angle), 0.0))
-    soft_from = soften * farthest
-    if animated is not None:
+    a, b, animated = length(hip - knee), length(ankle - knee), length(ankle - hip)
+    nearest, farthest = (
+        math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(leg[f"leg.{name}_knee_angle"]), 0.0))
+        for name in ("min", "max")
+    )
+    soft_from = leg["leg.soften"] * farthest
+    if leg["leg.as_animated"]:
         nearest, farthest = min(nearest, animated), max(farthest, animated)
         soft_from = max(soft_from, animated)
     room = farthest - soft_from
-    wanted = distance
-    if distance > soft_from:
-        wanted = soft_from
-        if room > 0.0:
-            wanted += room * (1.0 - math.exp(-(distance - soft_from) / room))
+    wanted = min(distance, soft_from)
+    if distance > soft_from and room > 0.0:
+        wanted += room * (1.0 - math.exp(-(distance - soft_from) / room))
     return nearest, soft_from, max(wanted, nearest)
 
 
@@ -139,80 +122,178 @@ def _hip_rotation(bent: Array, target: Array, axis: Array, twist: float) -> Arra
     along_leg = unit(bent, unit(target, -maths.Y))
     direction = unit(target, along_leg)
     arc = maths.shortest_arc(along_leg, direction, axis)
-    level = from_axis_angle(direction, maths.signed_angle(rotate(arc, axis), axis, direction))
-    return maths.multiply(from_axis_angle(direction, twist), maths.multiply(level, arc))
+    level = maths.from_axis_angle(direction, maths.signed_angle(rotate(arc, axis), axis, direction))
+    return multiply(maths.from_axis_angle(direction, twist), multiply(level, arc))
 
 
-def foot(
-    parameters: Parameters,
-    rig: Rig,
-    leg: int,
-    foot: Foot,
-    frame: Frame,
-    knee: Transform,
-    ankle: Transform,
-    rot_ws: Array,
-    forward: Array,
-    up: Array,
-) -> Array:
+# The leg in the plane of a pole, after ozz's job; `ozz` and `mec` share it
+
+
+def solve_leg_to_pole(
+    leg: Leg, body: Transform, target: Array, pole: Array, weight: float
+) -> Solved:
+    """The leg whose ankle is brought to `target`, model space.
+
+    Args:
+        leg: the animated pose, which moves with the body first.
+        body: motion of the body.
+        target: position of the ankle (3), m.
+        pole: direction (3, any length) that the bend plane is to contain.
+        weight: of both rotations, 0..1.
+    """
+    hip, knee, ankle = carry(body, leg)
+    hip_rot, knee_rot, in_reach = joint_rotations(
+        knee.pos - hip.pos,
+        ankle.pos - hip.pos,
+        hinge_of(leg, knee),
+        target - hip.pos,
+        pole,
+        leg["leg.soften"],
+        leg["leg.twist"],
+    )
+    carried = Solved(hip, knee, ankle, in_reach and weight >= 1.0)
+    return _rotated(carried, hip_rot, knee_rot, weight)
+
+
+def joint_rotations(
+    knee: Array,
+    ankle: Array,
+    hinge: Array,
+    target: Array,
+    pole: Array,
+    soften: float,
+    twist: float,
+) -> tuple[Array, Array, bool]:
+    """Rotations of the hip and, before it, of the knee; whether the target is within reach.
+
+    Positions (3) are relative to the hip, m; a rotation about the unit `hinge` (3) opens the knee.
+    """
+    thigh, shin, distance = length(knee), length(ankle - knee), length(target)
+    soft_from = clip(soften, 0.0, 1.0) * (thigh + shin)
+    wanted = _softened(distance, soft_from, thigh + shin)
+    in_reach = abs(thigh - shin) < distance <= soft_from
+
+    # Full lengths count, whether or not the hinge is at right angles to the bones.
+    present = maths.interior_angle(thigh, shin, float(ankle @ ankle))
+    if hinge @ cross(-knee, ankle - knee) < 0.0:
+        present = -present
+    knee_rot = maths.from_axis_angle(hinge, maths.interior_angle(thigh, shin, wanted**2) - present)
+
+    bent = knee + rotate(knee_rot, ankle - knee)
+    if distance < maths.DIRECTIONLESS:
+        return maths.IDENTITY, knee_rot, in_reach
+    direction = target / distance
+    arc = maths.shortest_arc(unit(bent, direction), direction, hinge)
+    level = _to_pole(rotate(arc, hinge), direction, pole)
+    hip_rot = multiply(maths.from_axis_angle(direction, twist), multiply(level, arc))
+    return hip_rot, knee_rot, in_reach
+
+
+def _softened(distance: float, soft_from: float, chain: float) -> float:
+    """Softened distance, m: beyond `soft_from` it tends to the length of the chain."""
+    room = chain - soft_from
+    if distance <= soft_from or room <= 0.0:
+        return distance
+    alpha = (distance - soft_from) / room
+    return soft_from + room * (1.0 - (3.0 / (alpha + 3.0)) ** 4)
+
+
+def _to_pole(hinge: Array, direction: Array, pole: Array) -> Array:
+    """Rotation about the unit `direction` that brings `pole` into the plane across `hinge`."""
+    wanted = cross(direction, unit(pole, direction))
+    if length(wanted) < maths.DIRECTIONLESS:
+        return maths.IDENTITY
+    angle = math.acos(clip(float(wanted @ hinge) / length(wanted), -1.0, 1.0))
+    return maths.from_axis_angle(direction, -angle if hinge @ pole < 0.0 else angle)
+
+
+# Heel, foot and toe
+
+
+def raise_heel(
+    foot: Foot, target: Array, turn: Array, offset_ws: Array
+) -> tuple[Array, Array, float]:
+    """Ankle target, ankle rotation, and the angle by which the heel rises about the ball, rad.
+
+    A heel rises where the leg would be too long. `turn` is the rotation (4) that the foot's lock
+    gives it, `offset_ws` the way of the body; world space.
+    """
+    hip_ws, ankle_ws, heading = foot.pos_ws("hip"), foot.pos_ws("ankle"), foot.heading_ws
+    # A level sole comes to lie on the ground, as far as the foot turns.
+    whole = maths.shortest_arc(foot.up, foot.hit.normal, heading)
+    tilt = maths.nlerp(maths.IDENTITY, whole, foot.turned)
+    from_ball = rotate(tilt, rotate(turn, ankle_ws - foot.pos_ws("toe")))
+    ball = target - from_ball
+    hip = hip_ws + offset_ws
+    longest = max(foot["effector.extension"] * foot.length, length(ankle_ws - hip_ws))
+    level_axis = cross(heading, foot.up)
+    axis = rotate(tilt, level_axis)
+    square = across(from_ball, axis)
+    fixed = ball - hip + (from_ball - square)
+    middle = float(fixed @ fixed) + float(square @ square)
+    by_cosine = 2.0 * float(fixed @ square)
+    by_sine = -2.0 * float(fixed @ cross(axis, square))
+    lift = 0.0
+    if by_sine < 0.0:
+        reach = math.hypot(by_cosine, by_sine)
+        angle = math.acos(clip((longest**2 - middle) / reach, -1.0, 1.0))
+        lift = clip(angle + math.atan2(by_sine, by_cosine), 0.0, foot["effector.max_lift"])
+    to_ankle = target - hip
+    ahead = float(to_ankle @ heading) / length(to_ankle)
+    lift *= 1.0 - maths.smooth01((ahead - RISES) / (STAYS - RISES))
+    ankle = ball + rotate(maths.from_axis_angle(axis, -lift), from_ball)
+    # The foot stage tilts the foot after its heel has risen.
+    rot_ws = multiply(maths.from_axis_angle(level_axis, -lift), multiply(turn, foot.ankle_rot_ws))
+    return ankle, rot_ws, lift
+
+
+def turn_foot(foot: Foot, leg: Solved, rot_ws: Array, forward: Array) -> Array:
     """Model-space rotation of the ankle: `rot_ws`, tilted onto the ground within limits."""
-    world_from_model = frame.world_from_model.rot
-    foot_rot = maths.multiply(rot_ws, rig.ankle_from_foot[leg])
+    world_from_model, up = foot.frame.world_from_model.rot, foot.up
+    foot_rot = multiply(rot_ws, foot.rig.ankle_from_foot[foot.index])
     foot_forward = rotate(foot_rot, maths.Z)
     heading = unit(across(foot_forward, up), forward)
     right = cross(heading, up)
-    side = float(rig.side[leg])
+    side = float(foot.rig.side[foot.index])
     lateral = -side * right
+    shin = unit(rotate(world_from_model, leg.ankle.pos - leg.knee.pos), -up)
 
-    pitch, roll = _ground_angles(foot, heading, right, lateral, up)
-    pitch, roll = pitch * foot.turned, roll * foot.turned
+    def limited(name: str, axis: Array, angle: float) -> float:
+        """By how much of an angle the axis of the foot may rise from where it is, rad."""
+        now = math.atan2(-float(axis @ shin), length(across(axis, shin)))
+        low, high = foot[f"foot.min_{name}"], foot[f"foot.max_{name}"]
+        return clip(now + angle * foot.turned, min(now, low), max(now, high)) - now
 
-    shin = unit(rotate(world_from_model, ankle.pos - knee.pos), -up)
-    joint_pitch = _joint_angle(foot_forward, shin)
-    pitch = clip(
-        joint_pitch + pitch,
-        min(joint_pitch, parameters.of_leg("foot.min_pitch", leg)),
-        max(joint_pitch, parameters.of_leg("foot.max_pitch", leg)),
-    )
-    tilt = from_axis_angle(right, pitch - joint_pitch)
+    pitch, roll = _ground_angles(foot, heading, right, lateral)
+    tilt = maths.from_axis_angle(right, limited("pitch", foot_forward, pitch))
     if side != 0.0:
-        joint_roll = _joint_angle(side * rotate(foot_rot, maths.X), shin)
-        roll = clip(
-            joint_roll + roll,
-            min(joint_roll, parameters.of_leg("foot.min_roll", leg)),
-            max(joint_roll, parameters.of_leg("foot.max_roll", leg)),
-        )
         roll_axis = rotate(tilt, unit(cross(lateral, up), heading))
-        tilt = maths.multiply(from_axis_angle(roll_axis, roll - joint_roll), tilt)
+        angle = limited("roll", side * rotate(foot_rot, maths.X), roll)
+        tilt = multiply(maths.from_axis_angle(roll_axis, angle), tilt)
+    wanted = multiply(maths.inverse(world_from_model), multiply(tilt, rot_ws))
+    return maths.nlerp(leg.ankle.rot, wanted, foot.weight)
 
-    wanted = maths.multiply(maths.inverse(world_from_model), maths.multiply(tilt, rot_ws))
-    weight = ground.weights_of_legs(parameters, frame)[leg]
-    return maths.nlerp(ankle.rot, wanted, weight)
 
-
-def _ground_angles(
-    foot: Foot, heading: Array, right: Array, lateral: Array, up: Array
-) -> tuple[float, float]:
+def _ground_angles(foot: Foot, heading: Array, right: Array, lateral: Array) -> tuple[float, float]:
     """Pitch (+ toes up) and then roll (+ outer edge up) of the ground under the foot."""
     if not foot.hit.found:
         return 0.0, 0.0
-    normal = foot.hit.normal
+    normal, up = foot.hit.normal, foot.up
     pitch = math.atan2(-float(normal @ heading), float(normal @ up))
     if foot.toe_hit.found:
         sole = foot.toe_hit.point - foot.hit.point
         if sole @ heading > SHORT_FOOT:
             pitch = math.atan2(float(sole @ up), float(sole @ heading))
-    pitched_up = rotate(from_axis_angle(right, pitch), up)
+    pitched_up = rotate(maths.from_axis_angle(right, pitch), up)
     return pitch, math.atan2(-float(normal @ lateral), float(normal @ pitched_up))
 
 
-def _joint_angle(foot_axis: Array, shin: Array) -> float:
-    """Angle by which a foot's axis rises from the plane at right angles to the shin."""
-    return math.atan2(-float(foot_axis @ shin), length(across(foot_axis, shin)))
-
-
-def toe(frame: Frame, leg: int, ankle: Transform) -> Transform:
-    """The toe, carried rigidly with the solved ankle."""
-    change = maths.multiply(ankle.rot, maths.inverse(frame.ankle.rot[leg]))
-    reach = frame.toe.pos[leg] - frame.ankle.pos[leg]
-    return Transform(ankle.pos + rotate(change, reach), maths.multiply(change, frame.toe.rot[leg]))
+def with_foot(
+    leg: Leg, solved: Solved, rot: Array
+) -> tuple[Transform, Transform, Transform, Transform, bool]:
+    """Hip, knee, ankle with this rotation, the toe carried rigidly with it, and `reached`."""
+    hip, knee, (ankle, _), reached = solved
+    change = multiply(rot, maths.inverse(leg.joint("ankle").rot))
+    reach = leg.joint("toe").pos - leg.joint("ankle").pos
+    toe = Transform(ankle + rotate(change, reach), multiply(change, leg.joint("toe").rot))
+    return hip, knee, Transform(ankle, rot), toe, reached

@@ -6,34 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from reference import maths
-from reference.characters import Parameters
+from reference.characters import Parameters, forward, named
 from reference.maths import Array, cross, lerp
-from reference.stages.ground import forward
 
-DEFAULTS = {
-    "lean.uphill_rate": -0.65,
-    "lean.downhill_rate": -0.25,
-    "lean.side_rate": 0.0,
-    "lean.forward_rate_slide": 0.0,
-    "lean.side_rate_slide": 0.0,
-    "lean.head_share": 0.5,
-    "lean.pelvis_rate": -0.25,
-    "lean.pelvis_side_rate": 0.0,
-    "lean.spacing": 0.3,
-    "lean.half_life": 0.2,
-}
+DEFAULTS = (
+    named("lean", uphill_rate=-0.65, downhill_rate=-0.25, side_rate=0.0, head_share=0.5)
+    | named("lean", forward_rate_slide=0.0, side_rate_slide=0.0)
+    | named("lean", pelvis_rate=-0.25, pelvis_side_rate=0.0, spacing=0.3, half_life=0.2)
+)
 
 
 @dataclass
 class State:
     """Memory between frames."""
 
-    ahead: float
-    """Slope ahead, rad."""
-    aside: float
-    """Slope to the right, rad."""
-    slide: float
-    """Weight of sliding, 0..1."""
+    ahead: float  # slope, rad
+    aside: float  # slope to the right, rad
+    slide: float  # weight of sliding, 0..1
 
 
 def lean(
@@ -66,7 +55,7 @@ def lean(
     """
     ahead_ws = forward(root_rot, up)
     right_ws = cross(ahead_ws, up)
-    normal = up if weights.sum() == 0 else (weights[:, None] * normals).sum(axis=0)
+    normal = weights @ normals if weights.any() else up
     legs = np.ones(len(points)) if legs is None else legs
     ahead, aside = (
         between_feet(
@@ -79,20 +68,19 @@ def lean(
         for along_ws in (ahead_ws, right_ws)
     )
     if state is not None:
-        half_life = parameters["lean.half_life"]
-        fraction = maths.fraction_of_half_life(half_life, dt)
+        fraction = maths.fraction_of_half_life(parameters["lean.half_life"], dt)
         slide = lerp(state.slide, slide, fraction)
         ahead, aside = lerp(state.ahead, ahead, fraction), lerp(state.aside, aside, fraction)
     rate = parameters["lean.uphill_rate" if ahead >= 0 else "lean.downhill_rate"]
     pitch = ahead * lerp(rate, parameters["lean.forward_rate_slide"], slide)
     roll = aside * lerp(parameters["lean.side_rate"], parameters["lean.side_rate_slide"], slide)
     bend = right_ws * pitch - ahead_ws * roll
+    pelvis_pitch = (1.0 - slide) * parameters["lean.pelvis_rate"] * ahead
+    pelvis_roll = (1.0 - slide) * parameters["lean.pelvis_side_rate"] * aside
+    tilt = right_ws * pelvis_pitch - ahead_ws * pelvis_roll
     back = -parameters["lean.head_share"] * bend
-    upright = 1.0 - slide
-    tilt = right_ws * (upright * parameters["lean.pelvis_rate"] * ahead)
-    tilt = tilt - ahead_ws * (upright * parameters["lean.pelvis_side_rate"] * aside)
-    bent, turned_back, tilted = (maths.from_rotvec(np.asarray(x)) for x in (bend, back, tilt))
-    return State(ahead, aside, slide), bent, turned_back, tilted
+    trunk, head, pelvis = (maths.from_rotvec(turn) for turn in (bend, back, tilt))
+    return State(ahead, aside, slide), trunk, head, pelvis
 
 
 def between_feet(

@@ -1,83 +1,68 @@
-"""The `mec` system in plain NumPy float64: three rays per foot, planting, hints, fades.
+"""The `mec` system: three rays per foot, planting, hints, fades."""
 
-One character, one leg, one frame at a time, written from the description of the rules and not from
-the code that is tested. Metres, radians, seconds; suffixes _ws world, _ms model.
-Each foot has an up of its own, that of its terrain; the body has another.
-"""
-
+import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from reference import characters, maths
-from reference.characters import Frame, Ground, Parameters, Rig
-from reference.maths import Array, Transform, apply, rotate
-from reference.stages import contact_by_speed, ground, limb, pole, three_ray_probe
-from reference.stages.contact_by_speed import Standing
-from reference.stages.three_ray_probe import Foot
-from reference.terrain import ALL_LAYERS
+from reference.characters import Frame, Ground, Leg, Parameters, Rig, named
+from reference.maths import Array, across, cross, from_axis_angle, multiply, rotate, unit
+from reference.stages import ground, limb
+from reference.stages.ground import Standing
+from reference.terrain import ALL_LAYERS, Hit
 
-DEFAULTS: dict[str, Any] = {
-    "probe.ray_up": 0.5,
-    "probe.foot_length": 0.2,
-    "probe.half_width": 0.05,
-    "probe.forward": np.array([0.0, 0.0, 1.0]),
-    "probe.active": True,
-    "probe.extra": 0.2,
-    "probe.by_height": True,
-    "probe.by_speed": False,
-    "probe.extra_min": 0.0,
-    "probe.extra_max": 0.3,
-    "probe.stable_height": 0.12,
-    "probe.stable_speed": 0.5,
-    "probe.layers": ALL_LAYERS,
-    "target.foot_height": 0.10,
-    "lock.plant": True,
-    "lock.plant_weight": 1.0,
-    "lock.plant_speed": math.inf,
-    "pelvis.enabled": True,
-    "pelvis.min_length": 0.5,
-    "pelvis.max_length": 0.88,
-    "pelvis.damp": True,
-    "pelvis.speed": 10.0,
-    "effector.transition_time": 0.2,
-    "leg.hint_offset": np.zeros(3),
-    "leg.soften": 1.0,
-    "leg.twist": 0.0,
-    "leg.weight": 1.0,
-    "foot.max_tilt": math.radians(45.0),
-}
+AS_IT_COMES = (
+    named("probe", ray_up=0.5, foot_length=0.2, half_width=0.05, forward=maths.Z, active=True)
+    | named("probe", extra=0.2, by_height=True, by_speed=False, extra_min=0.0, extra_max=0.3)
+    | named("probe", stable_height=0.12, stable_speed=0.5, layers=ALL_LAYERS)
+    | {"target.foot_height": 0.10, "effector.transition_time": 0.2}
+    | named("lock", plant=True, plant_weight=1.0, plant_speed=math.inf)
+    | named("pelvis", enabled=True, min_length=0.5, max_length=0.88, damp=True, speed=10.0)
+    | {"leg.soften": 1.0, "leg.twist": 0.0, "leg.weight": 1.0, "foot.max_tilt": math.radians(45.0)}
+)
+DEFAULTS = AS_IT_COMES | {"leg.hint_offset": np.zeros(3)}
+"""Of the faithful system."""
+STANDS_BY_SPEED = (
+    AS_IT_COMES
+    | ground.BY_SPEED
+    | named("contact", planted_height=0.09, raised_height=0.12, raised_speed=0.35)
+    | named("probe", by_speed=True, stable_speed=0.25, stable_height=0.095, extra_min=-0.03)
+    | {"target.foot_height": 0.085}
+)
+"""As it comes."""
 
-# As it comes; `DEFAULTS` are those of the faithful system.
-STANDS_BY_SPEED: dict[str, Any] = {
-    **{name: value for name, value in DEFAULTS.items() if name != "leg.hint_offset"},
-    **contact_by_speed.DEFAULTS,
-    "contact.planted_height": 0.09,
-    "contact.raised_height": 0.12,
-    "contact.raised_speed": 0.35,
-    "probe.by_speed": True,
-    "probe.stable_speed": 0.25,
-    "probe.stable_height": 0.095,
-    "probe.extra_min": -0.03,
-    "target.foot_height": 0.085,
-}
+
+@dataclass(frozen=True)
+class Foot(Leg):
+    """A leg in a frame with what its three rays found. Where `found` is false, `hit` means nothing.
+
+    `ahead` is the unit forward of the foot at right angles to up.
+    """
+
+    extra: float
+    found: bool
+    hit: Hit
+    ahead: Array
+    pitch: float
+    roll: float
+    toe_point: Array
 
 
 @dataclass
-class Leg:
-    """Memory of one leg."""
+class Memory:
+    """Memory of one leg, world space."""
 
     plant_weight: float
     planted: bool
-    kept_point: Array  # m, world
+    kept_point: Array  # m
     kept_rot: Array  # from the axes of the foot to the world
-    fade: float
-    offset_ws: Array  # m, from the animated ankle to the last goal
-    rot_ws: Array  # from the animated rotation to the last goal's
-    standing: Standing | None = None  # None where all feet always stand
+    standing: Standing | None  # None where all feet always stand
+    fade: float = 0.0
+    # From the animated ankle, m, and its rotation to the last goal.
+    offset_ws: Array = field(default_factory=lambda: np.zeros(3))
+    rot_ws: Array = field(default_factory=maths.IDENTITY.copy)
 
 
 @dataclass
@@ -85,7 +70,7 @@ class State:
     """Memory between frames."""
 
     pelvis_height: float
-    legs: list[Leg]
+    legs: list[Memory]
 
 
 def step(
@@ -93,147 +78,166 @@ def step(
 ) -> tuple[State, dict[str, Array]]:
     """One frame. Without a state it is the first: smoothed values start on their goals."""
     up = terrain.up
-    legs = range(len(frame.weight))
-    leg_weights = ground.weights_of_legs(parameters, frame)
-    feet, memory, goals = [], [], []
-    for leg in legs:
-        below = characters.under(terrain, leg)
-        foot = three_ray_probe.sense(parameters, rig, below, frame, leg, leg_weights[leg])
-        before = None if state is None else state.legs[leg]
-        standing = None
-        if "contact.planted_speed" in parameters.values:
-            stood = None if before is None else before.standing
-            standing = contact_by_speed.stand(parameters, frame, leg, stood)
-        after, point, rot = plant(parameters, below, frame, leg, foot, standing, before)
-        height = parameters.of_leg("target.foot_height", leg)
-        goals.append(
-            fade(parameters, frame, leg, foot, before, after, point + foot.up * height, rot)
-        )
+    feet, memory, targets, goal_rots = [], [], [], []
+    for leg in characters.legs_of(parameters, rig, terrain, frame):
+        foot, before = sense(leg), state.legs[leg.index] if state else None
+        after, point, rot = plant(foot, before)
+        goal = point + leg.up * leg["target.foot_height"]
+        target, rot = fade(foot, before, after, goal, rot)
         feet.append(foot)
         memory.append(after)
+        targets.append(target)
+        goal_rots.append(rot)
 
-    targets = [target for target, _ in goals]
-    pelvis = pelvis_height(parameters, feet, targets, up, state, frame)
+    pelvis = pelvis_height(parameters, feet, targets, up, state)
     offset_ws = up * pelvis * frame.grounded
     body = limb.body(frame, offset_ws, maths.IDENTITY)
 
-    solved, reached, weights, hints = [], [], [], []
-    for leg in legs:
-        target_ws, rot_ws = goals[leg]
-        weight = leg_weights[leg] * memory[leg].fade
-        bends_as_animated = "leg.hint_offset" not in parameters.values
-        hint_ws = None if bends_as_animated else knee_hint(parameters, frame, leg, feet[leg])
-        hip, knee, ankle, arrived = solve_leg(
-            parameters, rig, leg, frame, body, target_ws, hint_ws, weight
-        )
-        model_from_foot = maths.multiply(maths.inverse(frame.world_from_model.rot), rot_ws)
-        wanted = maths.multiply(model_from_foot, maths.inverse(rig.ankle_from_foot[leg]))
-        ankle = Transform(ankle.pos, maths.nlerp(ankle.rot, wanted, weight))
-        solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle)))
-        reached.append(arrived)
+    solved, weights, hints = [], [], []
+    for foot, after, target, rot in zip(feet, memory, targets, goal_rots, strict=True):
+        weight = foot.weight * after.fade
+        hint_ws = np.zeros(3)
+        hip, knee, ankle = limb.carry(body, foot)
+        if "leg.hint_offset" in parameters.values:
+            calf = foot.joint("knee").pos - foot.joint("ankle").pos + foot["leg.hint_offset"]
+            hint_ws = foot.toe_point + rotate(frame.world_from_model.rot, calf)
+            towards = maths.unapply(frame.world_from_model, hint_ws) - hip.pos
+        else:  # the knee bends as animated
+            towards = cross(limb.hinge_of(foot, knee), ankle.pos - knee.pos)
+        target_ms = maths.unapply(frame.world_from_model, target)
+        leg = limb.solve_leg_to_pole(foot, body, target_ms, towards, weight)
+        model_from_foot = multiply(maths.inverse(frame.world_from_model.rot), rot)
+        wanted = multiply(model_from_foot, maths.inverse(rig.ankle_from_foot[foot.index]))
+        solved.append(limb.with_foot(foot, leg, maths.nlerp(leg.ankle.rot, wanted, weight)))
         weights.append(weight)
-        hints.append(np.zeros(3) if hint_ws is None else hint_ws)
+        hints.append(hint_ws)
 
-    output = {
-        "body_pos": body.pos,
-        "body_rot": body.rot,
+    output = characters.solution(body, solved) | {
         "pelvis_height": np.array(pelvis),
         "pelvis_offset_ws": offset_ws,
         "body_offset_ws": offset_ws,
-        "found": np.array([foot.found for foot in feet]),
-        "extra": np.array([foot.extra for foot in feet]),
-        "pitch": np.array([foot.pitch for foot in feet]),
-        "roll": np.array([foot.roll for foot in feet]),
         "target_ws": np.array(targets),
-        "goal_rot": np.array([rot for _, rot in goals]),
-        "planted": np.array([after.planted for after in memory]),
-        "plant_weight": np.array([after.plant_weight for after in memory]),
-        "fade": np.array([after.fade for after in memory]),
+        "goal_rot": np.array(goal_rots),
         "weight": np.array(weights),
         "hint_ws": np.array(hints),
-        "reached": np.array(reached),
     }
-    return State(pelvis, memory), output | characters.joints(solved)
+    for name in ("found", "extra", "pitch", "roll"):
+        output[name] = np.array([getattr(foot, name) for foot in feet])
+    for name in ("planted", "plant_weight", "fade"):
+        output[name] = np.array([getattr(after, name) for after in memory])
+    return State(pelvis, memory), output
 
 
-def run(
-    parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
-) -> dict[str, Array]:
-    """All outputs of `step` for a whole clip, stacked over the frames."""
-    return characters.run(step, parameters, rig, terrain, frames)
+run = functools.partial(characters.run, step)
 
 
-def plant(
-    parameters: Parameters,
-    terrain: Ground,
-    frame: Frame,
-    leg: int,
-    foot: Foot,
-    standing: Standing | None,
-    before: Leg | None,
-) -> tuple[Leg, Array, Array]:
+def sense(leg: Leg) -> Foot:
+    """The foot's three rays and the tilt of the ground that follows from them."""
+    up, ankle_ws, ground_under = leg.up, leg.pos_ws("ankle"), leg.terrain
+    foot_forward = rotate(leg.world_from_foot, np.asarray(leg["probe.forward"]))
+    ahead = unit(across(foot_forward, up), leg.forward_ws)
+    right = cross(ahead, up)
+
+    sole, extra = leg["target.foot_height"], extra_length(leg)
+    above = up * leg["probe.ray_up"]
+    reach, mask = leg["probe.ray_up"] + sole + extra, int(leg["probe.layers"])
+    foot_length, half_width = leg["probe.foot_length"], leg["probe.half_width"]
+
+    hit = ground_under.cast(ankle_ws + above, reach, mask)
+    found = bool(hit.found and leg["probe.active"])
+    pitch, roll = 0.0, 0.0
+    toe_point = (hit.point if found else ankle_ws - up * sole) + ahead * foot_length
+    if found:
+        goal = hit.point + up * sole
+        toe = ground_under.cast(goal + ahead * foot_length + above, reach, mask)
+        if toe.found:
+            toe_point = toe.point
+            pitch = math.atan2(float(up @ (toe.point - hit.point)), foot_length)
+        corner = ground_under.cast(goal + right * half_width + above, reach, mask)
+        if corner.found:
+            roll = math.atan2(float(up @ (corner.point - hit.point)), half_width)
+    return Foot(
+        **vars(leg),
+        extra=extra,
+        found=found,
+        hit=hit,
+        ahead=ahead,
+        pitch=pitch,
+        roll=roll,
+        toe_point=toe_point,
+    )
+
+
+def extra_length(leg: Leg) -> float:
+    """How far the rays reach below the sole, m."""
+    if not leg["probe.by_height"] and not leg["probe.by_speed"]:
+        return float(leg["probe.extra"])
+    height = float(leg.up @ (leg.pos_ws("ankle") - leg.frame.world_from_model.pos))
+    too_high = leg["probe.by_height"] and height > leg["probe.stable_height"]
+    speed = leg.frame.foot_speed[leg.index]
+    too_fast = leg["probe.by_speed"] and speed > leg["probe.stable_speed"]
+    return float(leg["probe.extra_min" if too_high or too_fast else "probe.extra_max"])
+
+
+def flat_foot(foot: Foot) -> Array:
+    """Rotation from the foot's axes to the world that lays it flat with its animated yaw."""
+    pitch = from_axis_angle(cross(foot.ahead, foot.up), foot.pitch)
+    tilt = multiply(pitch, from_axis_angle(foot.ahead, -foot.roll))
+    sine = maths.length(tilt[1:])
+    if 2.0 * math.atan2(sine, float(tilt[0])) > foot["foot.max_tilt"]:
+        tilt = from_axis_angle(tilt[1:] / sine, foot["foot.max_tilt"])
+    upright = maths.shortest_arc(maths.Y, foot.up, maths.X)
+    level = unit(across(np.asarray(foot["probe.forward"]), maths.Y), maths.Z)
+    yaw = maths.signed_angle(rotate(upright, level), foot.ahead, foot.up)
+    return multiply(tilt, multiply(from_axis_angle(foot.up, yaw), upright))
+
+
+def plant(foot: Foot, before: Memory | None) -> tuple[Memory, Array, Array]:
     """Memory of the leg without its fade; foothold and rotation of the foot there, world."""
-    goal_weight = parameters.of_leg("lock.plant_weight", leg)
-    speed = parameters.of_leg("lock.plant_speed", leg)
-    if before is None or math.isinf(speed):
-        weight = goal_weight
-    else:
-        weight = maths.move_towards(before.plant_weight, goal_weight, speed * frame.dt)
+    standing = None
+    if "contact.planted_speed" in foot.parameters.values:
+        standing = ground.stand(foot, before.standing if before else None)
+    weight, speed = foot["lock.plant_weight"], foot["lock.plant_speed"]
+    if before is not None and math.isfinite(speed):
+        weight = maths.move_towards(before.plant_weight, weight, speed * foot.frame.dt)
 
-    point, rot = foot.hit.point, foot.animated_rot
-    if foot.found:
-        rot = three_ray_probe.flat_foot(parameters, leg, foot)
+    point = foot.hit.point
+    rot = flat_foot(foot) if foot.found else foot.world_from_foot
     stands = standing is None or standing.standing
-    takes_part = ground.weights_of_legs(parameters, frame)[leg] > 0.0
-    plants = parameters.of_leg("lock.plant", leg) and takes_part
-    planted = bool(foot.found and stands and plants)
+    planted = bool(foot.found and stands and foot["lock.plant"] and foot.weight > 0.0)
     kept_point, kept_rot = np.zeros(3), maths.IDENTITY
     if planted:
+        kept_point, kept_rot = point, rot
         if before is not None and before.planted:
-            kept_point = characters.carried(frame, foot.hit, before.kept_point)
-            kept_rot = characters.turned(frame, foot.hit, before.kept_rot)
-        else:
-            kept_point, kept_rot = point, rot
-        followed_point = followed(parameters, terrain, leg, foot, kept_point)
-        point = point + weight * (followed_point - point)
+            kept_point = characters.carried(foot.frame, foot.hit, before.kept_point)
+            kept_rot = characters.turned(foot.frame, foot.hit, before.kept_rot)
+        point = point + weight * (followed(foot, kept_point) - point)
         rot = maths.nlerp(rot, kept_rot, weight)
-    after = Leg(weight, planted, kept_point, kept_rot, 0.0, np.zeros(3), maths.IDENTITY, standing)
-    return after, point, rot
+    return Memory(weight, planted, kept_point, kept_rot, standing), point, rot
 
 
-def followed(parameters: Parameters, terrain: Ground, leg: int, foot: Foot, kept: Array) -> Array:
+def followed(foot: Foot, kept: Array) -> Array:
     """The kept point at the present height of the ground."""
-    above = parameters.of_leg("target.foot_height", leg) + parameters.of_leg("probe.ray_up", leg)
-    mask = int(parameters.of_leg("probe.layers", leg))
-    hit = terrain.cast(kept + foot.up * above, above + foot.extra, mask)
-    if not hit.found:
-        return kept
-    return kept + foot.up * float(foot.up @ (hit.point - kept))
+    above = foot["target.foot_height"] + foot["probe.ray_up"]
+    mask = int(foot["probe.layers"])
+    hit = foot.terrain.cast(kept + foot.up * above, above + foot.extra, mask)
+    return kept + foot.up * float(foot.up @ (hit.point - kept)) if hit.found else kept
 
 
 def fade(
-    parameters: Parameters,
-    frame: Frame,
-    leg: int,
-    foot: Foot,
-    before: Leg | None,
-    after: Leg,
-    goal_ws: Array,
-    goal_rot: Array,
+    foot: Foot, before: Memory | None, after: Memory, goal_ws: Array, goal_rot: Array
 ) -> tuple[Array, Array]:
     """Ankle target and foot rotation, world; completes the memory `after`."""
-    end = 1.0 if foot.found else 0.0
-    time = parameters.of_leg("effector.transition_time", leg)
-    if before is None or time <= 0.0:
-        after.fade = end
-    else:
-        after.fade = maths.move_towards(before.fade, end, frame.dt / time)
+    after.fade = float(foot.found)
+    time = foot["effector.transition_time"]
+    if before is not None and time > 0.0:
+        after.fade = maths.move_towards(before.fade, after.fade, foot.frame.dt / time)
     if foot.found:
-        after.offset_ws = goal_ws - foot.ankle_ws
-        after.rot_ws = maths.multiply(goal_rot, maths.inverse(foot.animated_rot))
+        after.offset_ws = goal_ws - foot.pos_ws("ankle")
+        after.rot_ws = multiply(goal_rot, maths.inverse(foot.world_from_foot))
     elif before is not None:
         after.offset_ws, after.rot_ws = before.offset_ws, before.rot_ws
-    return foot.ankle_ws + after.offset_ws, maths.multiply(after.rot_ws, foot.animated_rot)
+    return foot.pos_ws("ankle") + after.offset_ws, multiply(after.rot_ws, foot.world_from_foot)
 
 
 def pelvis_height(
@@ -242,64 +246,19 @@ def pelvis_height(
     targets: list[Array],
     up: Array,
     state: State | None,
-    frame: Frame,
 ) -> float:
     """Height of the body above its animated position, m, at which every leg is long enough."""
     goal, lows, highs = 0.0, [], []
-    for leg, (foot, target) in enumerate(zip(feet, targets, strict=True)):
-        if not foot.found or foot.weight <= 0.0:
-            continue
-        gap = target - apply(frame.world_from_model, frame.hip.pos[leg])
-        along = float(gap @ up)
-        across_squared = float(gap @ gap) - along**2
-        shortest = parameters.of_leg("pelvis.min_length", leg)
-        longest = parameters.of_leg("pelvis.max_length", leg)
-        lows.append(along + math.sqrt(max(shortest**2 - across_squared, 0.0)))
-        highs.append(along + math.sqrt(max(longest**2 - across_squared, 0.0)))
+    for foot, target in zip(feet, targets, strict=True):
+        if foot.found and foot.weight > 0.0:
+            gap = target - foot.pos_ws("hip")
+            along = float(gap @ up)
+            across_squared = float(gap @ gap) - along**2
+            for ends, name in ((lows, "pelvis.min_length"), (highs, "pelvis.max_length")):
+                ends.append(along + math.sqrt(max(foot[name] ** 2 - across_squared, 0.0)))
     if lows and parameters["pelvis.enabled"]:
-        goal = min(max(0.0, max(lows)), min(highs))
+        goal = min(max(0.0, *lows), *highs)
     if state is None or not parameters["pelvis.damp"]:
         return goal
-    return maths.move_by_speed(state.pelvis_height, goal, parameters["pelvis.speed"], frame.dt)
-
-
-def knee_hint(parameters: Parameters, frame: Frame, leg: int, foot: Foot) -> Array:
-    """The point that the knee is to look at from the hip, m, world."""
-    calf = frame.knee.pos[leg] - frame.ankle.pos[leg]
-    moved = calf + np.asarray(parameters.of_leg("leg.hint_offset", leg))
-    return foot.toe_point + rotate(frame.world_from_model.rot, moved)
-
-
-def solve_leg(
-    parameters: Parameters,
-    rig: Rig,
-    leg: int,
-    frame: Frame,
-    body: Transform,
-    target_ws: Array,
-    hint_ws: Array | None,
-    weight: float,
-) -> tuple[Transform, Transform, Transform, bool]:
-    """Hip, knee and ankle, model space.
-
-    The pole leads from the carried hip to the hint; without one it is that of the animated knee.
-    """
-    hip, knee, ankle = (
-        limb.carry(body, joint, leg) for joint in (frame.hip, frame.knee, frame.ankle)
-    )
-    if hint_ws is None:
-        hinge = rotate(knee.rot, rig.knee_axis_ls[leg])
-        towards = maths.cross(hinge, ankle.pos - knee.pos)
-    else:
-        towards = maths.unapply(frame.world_from_model, hint_ws) - hip.pos
-    return pole.solve_leg(
-        rig,
-        leg,
-        frame,
-        body,
-        target=maths.unapply(frame.world_from_model, target_ws),
-        pole=towards,
-        soften=parameters.of_leg("leg.soften", leg),
-        twist=parameters.of_leg("leg.twist", leg),
-        weight=weight,
-    )
+    dt = feet[0].frame.dt
+    return maths.move_by_speed(state.pelvis_height, goal, parameters["pelvis.speed"], dt)

@@ -1,61 +1,52 @@
-"""The `ozz` system in plain NumPy float64, after the foot IK sample of ozz-animation.
+"""The `ozz` system, after the foot IK sample of ozz-animation."""
 
-One character, one leg, one frame at a time, written from the description of the rules and not from
-the code that is tested. Metres, radians, seconds; suffixes _ws world, _ms model.
-`up` is that of the body; the rays and ankle height of a leg use its own.
-"""
-
+import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from reference import characters, maths
-from reference.characters import Frame, Ground, Parameters, Rig
-from reference.maths import Array, Transform, apply, cross, from_axis_angle, length, rotate, unit
-from reference.stages import ground, limb, pole, root
-from reference.terrain import Hit
+from reference.characters import Frame, Ground, Leg, Parameters, Rig, carried, named
+from reference.maths import Array, Motion, across, clip, cross, length, multiply, rotate, unit
+from reference.stages import ground, limb
+from reference.terrain import ALL_LAYERS, Hit
 
-DEFAULTS: dict[str, Any] = {
-    **root.DEFAULTS,
-    "probe.ray_up": 0.5,
-    "probe.ray_down": math.inf,
-    "target.foot_height": 0.12,
-    "target.max_slope": 1.5,
-    "pelvis.enabled": True,
-    "pelvis.limit": math.inf,
-    "pelvis.on_gain": 1.0,
-    "pelvis.off_gain": 1.0,
-    "pelvis.tick_hz": 30.0,
-    "leg.enabled": True,
-    "leg.soften": 1.0,
-    "leg.twist": 0.0,
-    "leg.weight": 1.0,
-    "foot.enabled": True,
-    "foot.twist": 0.0,
-    "foot.weight": 1.0,
-    "foot.offset": np.zeros(3),
-}
+DEFAULTS = (
+    named("root", enabled=True, ray_up=10.0, ray_down=math.inf, layers=ALL_LAYERS)
+    | named("root", half_life=0.2, max_speed=4.0, max_step=0.4)
+    | named("probe", ray_up=0.5, ray_down=math.inf)
+    | named("target", foot_height=0.12, max_slope=1.5)
+    | named("pelvis", enabled=True, limit=math.inf, on_gain=1.0, off_gain=1.0, tick_hz=30.0)
+    | named("leg", enabled=True, soften=1.0, twist=0.0, weight=1.0)
+    | named("foot", enabled=True, twist=0.0, weight=1.0, offset=np.zeros(3))
+)
+
+
+@dataclass
+class Root:
+    """Memory of the root: where it was put, m along up, how fast it moved there, m/s."""
+
+    height: float
+    velocity: float
+    lift: float  # m, of that height above the character's origin
 
 
 @dataclass
 class State:
     """Memory between frames."""
 
-    root: root.Root
+    root: Root
     pelvis_height: float
 
 
-@dataclass
-class Foot:
-    """One leg in this frame, world space, with the character already put on the ground."""
+@dataclass(frozen=True)
+class Foot(Leg):
+    """A leg in a frame with its hit and target, the character already put on the ground."""
 
     ankle_ws: Array
     hit: Hit
     target_ws: Array
-    weight: float
 
 
 def step(
@@ -63,153 +54,120 @@ def step(
 ) -> tuple[State, dict[str, Array]]:
     """One frame."""
     up = terrain.up
-    legs = range(len(frame.weight))
-    placed = root.place(parameters, terrain, frame, None if state is None else state.root)
-    lift = placed.lift
-    leg_weights = ground.weights_of_legs(parameters, frame)
-    feet = [
-        sense(parameters, characters.under(terrain, leg), frame, leg, up * lift, leg_weights[leg])
-        for leg in legs
-    ]
-    pelvis = pelvis_height(parameters, feet, up, state, frame)
+    root = place_root(parameters, terrain, frame, state.root if state else None)
+    legs = characters.legs_of(parameters, rig, terrain, frame)
+    feet = [sense(leg, up * root.lift) for leg in legs]
+    pelvis = pelvis_height(parameters, feet, up, state)
     pelvis_offset_ws = up * pelvis * frame.grounded
-    body_offset_ws = up * lift + pelvis_offset_ws
+    body_offset_ws = up * root.lift + pelvis_offset_ws
     body = limb.body(frame, body_offset_ws, maths.IDENTITY)
 
-    solved, reached, foot_reached, weights = [], [], [], []
-    for leg, foot in zip(legs, feet, strict=True):
+    solved, foot_reached, weights = [], [], []
+    for foot in feet:
         weight = foot.weight if foot.hit.found else 0.0
-        leg_weight = weight if parameters.of_leg("leg.enabled", leg) else 0.0
-        hip, knee, ankle, arrived = solve_leg(parameters, rig, leg, frame, body, foot, leg_weight)
-        rot, aimed = aim_foot(parameters, rig, leg, frame, foot, ankle, weight)
-        ankle = Transform(ankle.pos, rot)
-        solved.append((hip, knee, ankle, limb.toe(frame, leg, ankle)))
-        reached.append(arrived)
+        leg_weight = weight if foot["leg.enabled"] else 0.0
+        # The pole is the y axis of the carried knee.
+        _, knee, ankle = limb.carry(body, foot)
+        along_shin = unit(ankle.pos - knee.pos, np.zeros(3))
+        target_ms = maths.unapply(frame.world_from_model, foot.target_ws)
+        pole = cross(limb.hinge_of(foot, knee), along_shin)
+        leg = limb.solve_leg_to_pole(foot, body, target_ms, pole, leg_weight)
+        rot, aimed = aim_foot(foot, leg.ankle, weight)
+        solved.append(limb.with_foot(foot, leg, rot))
         foot_reached.append(aimed)
         weights.append(leg_weight)
 
-    output = {
-        "body_pos": body.pos,
-        "body_rot": body.rot,
-        "lift": np.array(lift),
+    output = characters.solution(body, solved) | {
+        "lift": np.array(root.lift),
         "pelvis_height": np.array(pelvis),
         "pelvis_offset_ws": pelvis_offset_ws,
         "body_offset_ws": body_offset_ws,
         "found": np.array([foot.hit.found for foot in feet]),
         "target_ws": np.array([foot.target_ws for foot in feet]),
         "weight": np.array(weights),
-        "reached": np.array(reached),
         "foot_reached": np.array(foot_reached),
     }
-    return State(placed, pelvis), output | characters.joints(solved)
+    return State(root, pelvis), output
 
 
-def run(
-    parameters: Parameters, rig: Rig, terrain: Ground, frames: Sequence[Frame]
-) -> dict[str, Array]:
-    """All outputs of `step` for a whole clip, stacked over the frames."""
-    return characters.run(step, parameters, rig, terrain, frames)
+run = functools.partial(characters.run, step)
 
 
-def sense(
-    parameters: Parameters, terrain: Ground, frame: Frame, leg: int, lift_ws: Array, weight: float
-) -> Foot:
+def place_root(parameters: Parameters, terrain: Ground, frame: Frame, before: Root | None) -> Root:
+    """The root after this frame; without one before, it starts on the ground."""
+    up, origin = terrain.up, frame.world_from_model.pos
+    half_life = parameters["root.half_life"]
+    lag = max(half_life / math.log(2.0) - frame.dt / 2.0, 0.0)
+    travel = across(frame.travel_ws, up) * lag
+    ray_up = parameters["root.ray_up"]
+    reach, mask = ray_up + parameters["root.ray_down"], int(parameters["root.layers"])
+    here, there = (
+        terrain.cast(point + up * ray_up, reach, mask) for point in (origin, origin + travel)
+    )
+    if not (parameters["root.enabled"] and here.found and frame.grounded > 0.5):
+        lift = before.lift if before else 0.0
+        return Root(float(up @ origin) + lift, 0.0, lift)
+
+    below = goal = float(up @ here.point)
+    if there.found:
+        step = abs(float(up @ there.point) - goal) - length(travel)
+        goal = float(up @ there.point) if step <= parameters["root.max_step"] else goal
+    fastest = parameters["root.max_speed"] if half_life > 0.0 else math.inf
+    if before is None:
+        velocity = clip((goal - below) / lag, -fastest, fastest) if lag > 0.0 else 0.0
+        return Root(below, velocity, below - float(up @ origin))
+
+    # The platform's point that is below the character now was elsewhere one frame ago.
+    start, *moved = (carried(frame, here, point) for point in (np.zeros(3), *np.eye(3)))
+    axes = np.array(moved) - start
+    height = before.height + float(up @ (here.point - axes @ (here.point - start)))
+    eased = maths.follow(Motion(height, before.velocity), goal, half_life, frame.dt, True)
+    height += clip(eased.value - height, -fastest * frame.dt, fastest * frame.dt)
+    velocity = clip(eased.velocity, -fastest, fastest)
+    return Root(height, velocity, height - float(up @ origin))
+
+
+def sense(leg: Leg, lift_ws: Array) -> Foot:
     """Ray and ankle target of one leg."""
-    up = terrain.up
-    ankle_ws = apply(frame.world_from_model, frame.ankle.pos[leg]) + lift_ws
-    ray_up = parameters.of_leg("probe.ray_up", leg)
-    reach = ray_up + parameters.of_leg("probe.ray_down", leg)
-    hit = terrain.cast(ankle_ws + up * ray_up, reach)
-    target = ankle_ws
+    up, ray_up = leg.up, leg["probe.ray_up"]
+    target = ankle_ws = leg.pos_ws("ankle") + lift_ws
+    hit = leg.terrain.cast(ankle_ws + up * ray_up, ray_up + leg["probe.ray_down"])
     if hit.found:
-        steepest = math.cos(parameters.of_leg("target.max_slope", leg))
-        cosine = max(float(hit.normal @ up), steepest)
-        target = hit.point + up * (parameters.of_leg("target.foot_height", leg) / cosine)
-    return Foot(ankle_ws=ankle_ws, hit=hit, target_ws=target, weight=weight)
+        cosine = max(float(hit.normal @ up), math.cos(leg["target.max_slope"]))
+        target = hit.point + up * (leg["target.foot_height"] / cosine)
+    return Foot(**vars(leg), ankle_ws=ankle_ws, hit=hit, target_ws=target)
 
 
 def pelvis_height(
-    parameters: Parameters, feet: list[Foot], up: Array, state: State | None, frame: Frame
+    parameters: Parameters, feet: list[Foot], up: Array, state: State | None
 ) -> float:
-    """Height of the body above its animated position along up, m.
-
-    A foot with a partial weight counts as partly between the highest foot and itself.
-    """
-    gaps, weights = [], []
-    for foot in feet:
-        if foot.weight > 0.0:
-            gaps.append(float(up @ (foot.target_ws - foot.ankle_ws)))
-            weights.append(foot.weight if foot.hit.found else 0.0)
-    contact = max(weights, default=0.0)
-    if not parameters["pelvis.enabled"]:
-        contact = 0.0
-    top = max(gaps, default=0.0)
-    low = min((top + w * (gap - top) for w, gap in zip(weights, gaps, strict=True)), default=0.0)
-    limit = parameters["pelvis.limit"]
-    goal = contact * maths.clip(low, -limit, limit)
-    if state is None:
-        return goal
-    hz = parameters["pelvis.tick_hz"]
-    on = maths.fraction_of_gain(parameters["pelvis.on_gain"], hz, frame.dt)
-    off = maths.fraction_of_gain(parameters["pelvis.off_gain"], hz, frame.dt)
-    return maths.lerp(state.pelvis_height, goal, maths.lerp(off, on, contact))
+    """Height of the body above its animated position along up, m."""
+    taking_part = [foot for foot in feet if foot.weight > 0.0]
+    gaps = [float(up @ (foot.target_ws - foot.ankle_ws)) for foot in taking_part]
+    weights = [foot.weight if foot.hit.found else 0.0 for foot in taking_part]
+    contact = max(weights, default=0.0) if parameters["pelvis.enabled"] else 0.0
+    before = state.pelvis_height if state else None
+    low = ground.lowest_of(gaps, weights)
+    return ground.follow_by_gain(parameters, low, contact, before, feet[0].frame.dt)
 
 
-def solve_leg(
-    parameters: Parameters,
-    rig: Rig,
-    leg: int,
-    frame: Frame,
-    body: Transform,
-    foot: Foot,
-    weight: float,
-) -> tuple[Transform, Transform, Transform, bool]:
-    """Hip, knee and ankle, model space; the pole is the carried knee's y axis."""
-    knee = limb.carry(body, frame.knee, leg)
-    ankle = limb.carry(body, frame.ankle, leg)
-    hinge = rotate(knee.rot, rig.knee_axis_ls[leg])
-    along_shin = unit(ankle.pos - knee.pos, np.zeros(3))
-    return pole.solve_leg(
-        rig,
-        leg,
-        frame,
-        body,
-        target=maths.unapply(frame.world_from_model, foot.target_ws),
-        pole=cross(hinge, along_shin),
-        soften=parameters.of_leg("leg.soften", leg),
-        twist=parameters.of_leg("leg.twist", leg),
-        weight=weight,
-    )
-
-
-def aim_foot(
-    parameters: Parameters,
-    rig: Rig,
-    leg: int,
-    frame: Frame,
-    foot: Foot,
-    ankle: Transform,
-    weight: float,
-) -> tuple[Array, bool]:
+def aim_foot(foot: Foot, ankle: maths.Transform, weight: float) -> tuple[Array, bool]:
     """Model-space rotation of the ankle with its sole on the ground, and whether it gets there."""
-    weight = weight * parameters.of_leg("foot.weight", leg)
-    if not parameters.of_leg("foot.enabled", leg):
-        weight = 0.0
-    carried_ws = maths.multiply(frame.world_from_model.rot, ankle.rot)
-    world_from_foot = maths.multiply(carried_ws, rig.ankle_from_foot[leg])
+    weight = weight * foot["foot.weight"] if foot["foot.enabled"] else 0.0
+    world = foot.frame.world_from_model
+    carried_ws = multiply(world.rot, ankle.rot)
+    world_from_foot = multiply(carried_ws, foot.rig.ankle_from_foot[foot.index])
     toes = rotate(world_from_foot, maths.Z)
-    look_at = foot.target_ws + foot.hit.normal
     correction, reached = aim(
         forward=rotate(world_from_foot, maths.Y),
-        offset=rotate(world_from_foot, np.asarray(parameters.of_leg("foot.offset", leg))),
+        offset=rotate(world_from_foot, np.asarray(foot["foot.offset"])),
         up=toes,
-        target=look_at - apply(frame.world_from_model, ankle.pos),
+        target=foot.target_ws + foot.hit.normal - maths.apply(world, ankle.pos),
         pole=toes,
-        twist=parameters.of_leg("foot.twist", leg),
+        twist=foot["foot.twist"],
     )
     correction = maths.nlerp(maths.IDENTITY, correction, weight)
-    model_from_world = maths.inverse(frame.world_from_model.rot)
-    rot = maths.multiply(model_from_world, maths.multiply(correction, carried_ws))
+    rot = multiply(maths.inverse(world.rot), multiply(correction, carried_ws))
     return rot, reached and weight >= 1.0
 
 
@@ -232,5 +190,5 @@ def aim(
     direction = target / distance
     reach = offset + forward * (math.sqrt(root) - along)
     arc = maths.shortest_arc(unit(reach, direction), direction, up)
-    to_pole = from_axis_angle(direction, maths.signed_angle(rotate(arc, up), pole, direction))
-    return maths.multiply(from_axis_angle(direction, twist), maths.multiply(to_pole, arc)), True
+    to_pole = maths.from_axis_angle(direction, maths.signed_angle(rotate(arc, up), pole, direction))
+    return multiply(maths.from_axis_angle(direction, twist), multiply(to_pole, arc)), True
