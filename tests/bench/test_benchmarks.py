@@ -1,9 +1,11 @@
-"""Every benchmark of `jaxik bench` runs at small sizes and measures what it says."""
+"""`jaxik bench`: how it measures, counts and reports; each benchmark runs at small sizes."""
 
 import dataclasses
+import json
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import equinox as eqx
 import jax
@@ -11,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.bench import host, measurement, report, runner, suite, workloads
-from fitting.bench import sizes as bench_sizes
+from fitting.bench import host, measurement, report, roofline, runner, sizes, suite, workloads
 from fitting.bench.benchmarks import (
     baselines,
     ceilings,
@@ -24,17 +25,239 @@ from fitting.bench.benchmarks import (
     many,
     scaling,
 )
-from fitting.bench.measurement import Figure, Measurement
+from fitting.bench.measurement import Figure, FigureSpec, Measurement, Series
+from fitting.bench.roofline import Work
+from fitting.bench.runner import Benchmark
 from fitting.bench.sizes import Sizes
+from fitting.cli import main
 from fitting.inference.optimisation.search import find_best_fit
-from fitting.problem.free_parameters import free_parameter
-from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
 from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
+from support.problems import problem_of
 from support.quick import TARGETS, residuals_of_scenes
+from support.refusals import refusal
+
+
+@pytest.fixture(autouse=True)
+def short_samples(monkeypatch):
+    monkeypatch.setattr(measurement, "SAMPLE", 0.0)
+
+
+def test_a_figure_is_met_on_the_right_side_of_its_target_and_a_slope_is_a_power():
+    def met(value, **target):
+        return Figure("x", value, "s", **target).met
+
+    assert met(2.0, at_most=2.0) and not met(2.1, at_most=2.0)
+    assert met(3.0, at_least=3.0) and not met(2.9, at_least=3.0)
+    assert met(1.0) is None
+    sizes = [10, 100, 1000]
+    for power in (0.5, 1.0, 2.0):
+        curve = Series("size", sizes, {"a": [7.0, *(3.0 * size**power for size in sizes[1:])]})
+        slopes = curve.slope("a", 2), curve.slope("a")
+        assert slopes[0] == pytest.approx(power) and slopes[1] != pytest.approx(power)
+    assert np.isnan(Series("size", [10], {"a": [1.0]}).slope("a"))
+
+
+def test_calls_run_in_turns_in_random_order_and_compiling_is_timed_separately(monkeypatch):
+    calls = []
+    timings = Measurement("x", "x", 6)
+    medians = timings.time_in_turns({name: lambda name=name: calls.append(name) for name in "ab"})
+    timed = calls[4:]  # two of each warm up
+    assert timed.count("a") == timed.count("b") == 6
+    turns = {tuple(timed[i : i + 2]) for i in range(0, 12, 2)}
+    assert turns == {("a", "b"), ("b", "a")}
+    assert len(timings.samples["a"]) == 6
+    assert medians == {name: np.median(samples) for name, samples in timings.samples.items()}
+    calls.clear()
+    monkeypatch.setattr(measurement, "SAMPLE", 1e-3)
+    Measurement("x", "x", 1).time_in_turns({"a": lambda: calls.append(0)})
+    assert len(calls) > 100, "until its sample is long enough"
+    timings = Measurement("x", "x", 1)
+    call = timings.compile_call("twice", lambda x: 2 * x, jnp.arange(8.0, dtype=jnp.float32))
+    np.testing.assert_array_equal(call(), 2 * np.arange(8.0))
+    assert timings.compile_s["twice"] > 0 and timings.samples == {}
+    assert timings.work["twice"].moved == 64.0 and timings.work["twice"].operations == 8.0
+
+
+def test_peak_memory_counts_from_the_last_reset():
+    if np.isnan(host.peak_memory_mb()):
+        pytest.skip("this system does not report peak memory")
+    large = np.ones(20_000_000)
+    del large
+    host.reset_peak_memory()
+    before = host.peak_memory_mb()
+    large = np.ones(10_000_000)
+    assert host.peak_memory_mb() - before > 0.9 * large.nbytes / 1e6
+
+
+def test_a_timing_has_its_spread_its_cpu_time_and_its_limit_and_so_has_a_ratio():
+    ceilings = {"memory": 100.0, "float32": 1.0, "float64": 0.5, "dispatch": 0.01}
+    timings = Measurement("x", "x", 3, "float32", ceilings=ceilings)
+    timings.samples, timings.busy = {"a": [2.0, 1.0, 4.0]}, {"a": [2.0, 3.0, 6.0]}
+    timings.work = {"a": Work(operations=0.5, moved=20.0)}
+    timings.add_timing("a", FigureSpec(what="time", unit="ms", scale=1e3, threads=2))
+    timings.add_timing(
+        "a", FigureSpec(what="rate", unit="M", scale=8.0, rate=True, floats="float64")
+    )
+    time, rate = timings.figures
+    assert (time.value, time.spread, time.busy) == (2000.0, (1000.0, 4000.0), 1500.0)
+    assert (time.limit, time.bound, time.closeness) == (500.0, "arithmetic", 0.25)
+    assert (rate.value, rate.spread) == (4.0, (2.0, 8.0))
+    assert (rate.limit, rate.closeness) == (8.0, 0.5)
+    timings.samples = {"slow": [4.0, 9.0, 6.0], "fast": [2.0, 3.0, 1.0]}
+    timings.add_ratio("slow", "fast", FigureSpec(what="slow in fast", at_least=3.0))
+    ratio = timings.figures[-1]  # of the medians; its spread is that of the turns
+    assert (ratio.value, ratio.spread, ratio.met) == (3.0, (2.0, 6.0), True)
+    ceilings = {"memory": 100.0, "float32": 2.0, "float64": 1.0, "dispatch": 0.5}
+    for work, *bound in (  # what takes longest
+        (Work(1.0, 1000.0), 10.0, "memory"),
+        (Work(8.0, 100.0), 4.0, "arithmetic"),
+        (Work(0.0, 0.0), 0.5, "dispatch"),
+    ):
+        assert roofline.lower_bound(work, ceilings, "float32") == tuple(bound)
+
+
+def counted(function, *arguments, sparse=()) -> Work:
+    traced = jax.jit(function).trace(*arguments)
+    return roofline.work_of_program(traced, traced.lower().compile(), sparse)
+
+
+def test_operations_and_bytes_count_as_far_as_results_depend_on_them():
+    x = jnp.ones(10)
+    matrix = jnp.ones((3, 4))
+
+    def looped(x):
+        jnp.sin(x)  # no result depends on it
+        return jax.lax.scan(lambda c, _: (c * c + 1.0, None), x, None, length=7)[0]
+
+    def branched(x):
+        return jax.lax.cond(x[0] > 0, lambda x: x + x, lambda x: jnp.exp(x) * x, x)
+
+    assert counted(looped, x).operations == 7 * 2 * 10
+    assert counted(branched, x).operations == 2 * 10
+    assert counted(lambda m: m @ m.T, matrix).operations == 2 * 3 * 3 * 4
+    assert counted(lambda n: n + n, jnp.arange(10)).operations == 0  # only floats count
+    assert counted(jax.vmap(jnp.sum), matrix).operations == 12
+    # A failure names a function whose operations a new version of JAX calls otherwise.
+    for function in (jnp.add, jnp.arctan2, jnp.maximum):
+        assert counted(function, x, x).operations == 10, function
+    for function in (jnp.sqrt, jnp.sin, jnp.arccos, jnp.square, jnp.exp, jnp.sum):
+        assert counted(function, x).operations == 10, function
+
+    @jax.jit
+    def called(x, y):
+        return jnp.sin(x), jnp.exp(y) * y
+
+    work = counted(lambda x, y: called(x, y)[0], jnp.ones(10), jnp.ones(1000))
+    assert work.operations == 10 and work.moved == 2 * jnp.ones(10).nbytes
+    x, unused, table = jnp.ones(10), jnp.ones(1000), jnp.ones(5000)
+    work = counted(lambda x, unused, table: x + table[3], x, unused, table, sparse=table)
+    assert work.moved == 2 * x.nbytes
+    assert (work * 3).moved == 6 * x.nbytes and (work * 3).workspace == work.workspace
+
+
+@pytest.fixture
+def trivial_suite(monkeypatch):
+    """Benchmarks that take no time: one measures, Ctrl-C interrupts one, and two fail."""
+
+    def quick(timings: Measurement, sizes: Sizes) -> None:
+        timings.time_in_turns({"ours": lambda: None, "theirs": lambda: None})
+        timings.add_timing("ours", FigureSpec(what="ours", unit="s", at_most=1.0))
+        timings.add(Figure("a ratio", 2.0, "times", at_least=3.0, note="of nothing"))
+        timings.series.append(Series("size", [1, 10], {"ours": [1.0, 10.0]}))
+
+    def stopped(timings: Measurement, sizes: Sizes) -> None:
+        timings.add(Figure("before", 1.0, "s"))
+        raise KeyboardInterrupt
+
+    child = runner.subprocess.CalledProcessError(1, "python", stderr="Traceback\nKeyError: 'a'\n")
+    benchmarks = {
+        "full": Benchmark("a row that fails", "", Mock(side_effect=MemoryError)),
+        "child": Benchmark("a row whose process fails", "", Mock(side_effect=child)),
+        "quick": Benchmark("a quick row", "float32", quick),
+        "stopped": Benchmark("a row that is stopped", "float64", stopped, True),
+        "never": Benchmark("a row after that", "float32", quick),
+    }
+    monkeypatch.setattr(suite, "BENCHMARKS", benchmarks)
+
+
+def test_the_command_prints_a_table_with_the_hardware_and_its_json_is_complete(
+    trivial_suite, tmp_path, capsys
+):
+    assert main.main(["bench", "--quick", "--only", "quick"]) == 0
+    output = capsys.readouterr()
+    assert f"JAX {jax.__version__}" in output.out and "threads used" in output.out
+    assert "load average" in output.out and "XLA flags: " in output.out
+    assert "Quick: smaller sizes" in output.out
+    ours, ratio = (line for line in output.out.splitlines() if line.startswith("quick "))
+    assert ours.endswith("yes") and "≤ 1" in ours and " to " in ours
+    assert ratio.split() == ["quick", "a", "ratio", "2", "times", "≥", "3", "no"]
+    assert "quick: a ratio: of nothing" in output.out
+    assert "[1/1] quick: a quick row" in output.err
+    numbers = tmp_path / "bench.json"
+    assert main.main(["bench", "--only", "quick", "--json", str(numbers)]) == 0
+    assert str(numbers) in capsys.readouterr().out and (tmp_path / "bench.png").is_file()
+    content = json.loads(numbers.read_text())
+    assert not content["quick"] and not content["interrupted"]
+    assert set(content["machine"]) == {*host.Hardware.__annotations__, "load"}
+    assert len(content["machine"]["load"]) == 2  # at the start and at the end
+    (row,) = content["rows"]
+    assert row["name"] == "quick" and row["floats"] == "float32"
+    assert [figure["met"] for figure in row["figures"]] == [True, False]
+    samples = row["samples"]
+    assert set(samples) == {"ours", "theirs"} and len(samples["ours"]) == sizes.FULL.repeats
+    assert row["medians"] == {name: np.median(each) for name, each in samples.items()}
+    assert row["series"][0]["slopes"] == {"ours": pytest.approx(1.0)}
+    timings = Measurement("x", "x", 1, load=np.nan)  # what is not finite is null
+    timings.add(Figure("memory", np.nan, "MB", limit=np.inf))
+    (row,) = json.loads(report.to_json(runner.Report(False, [timings])))["rows"]
+    assert row["figures"][0]["value"] is row["figures"][0]["limit"] is row["load"] is None
+
+
+def test_failures_are_told_and_an_interrupt_prints_and_writes_what_was_measured(
+    trivial_suite, tmp_path, capsys
+):
+    numbers = tmp_path / "bench.json"
+    assert main.main(["bench", "--json", str(numbers)]) == main.INTERRUPTED
+    output = capsys.readouterr()
+    assert "Interrupted: this is what" in output.out and "before" in output.out
+    content = json.loads(numbers.read_text())
+    assert content["interrupted"]
+    assert [row["name"] for row in content["rows"]] == ["full", "child", "quick", "stopped"]
+    for row, message in (("full", "failed: MemoryError"), ("child", "KeyError: 'a'")):
+        note = next(line for line in output.out.splitlines() if line.startswith(f"{row}: failed"))
+        assert message in note and message in output.err
+
+
+def test_a_mistake_in_the_options_is_reported_before_anything_is_measured(
+    capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for options, message in (
+        ("--only legs,wings", "no rows named ['wings']; there are ['machine', 'start', 'legs'"),
+        ("--only ,", "wanted names of rows"),
+        ("--plot curves.svg", "curves.svg: wanted a name that ends in .png"),
+        ("--json nowhere/bench.json", "there is no folder nowhere"),
+    ):
+        assert message in refusal(["bench", *options.split()], tmp_path, capsys)
+
+
+def test_a_quick_run_has_smaller_sizes_and_no_long_benchmarks_unless_they_are_named():
+    for field in dataclasses.fields(Sizes):
+        quick, full = (getattr(values, field.name) for values in (sizes.QUICK, sizes.FULL))
+        if isinstance(full, tuple):
+            quick, full = sorted(quick), sorted(full)
+        assert quick <= full or quick[-1] <= full[-1], field.name
+    benchmarks = suite.BENCHMARKS
+    left_out = set(benchmarks) - set(suite.choose(benchmarks, None, quick=True))
+    assert left_out == {"clips", "first", "fit", "many", "scaling"}
+    assert list(suite.choose(benchmarks, "fit", quick=True)) == ["machine", "fit"]
+    assert list(suite.choose(benchmarks, None)) == list(benchmarks)
+
+
+# Each benchmark at small sizes
 
 SMALL = Sizes(
     repeats=2, legs=12, feet=12, characters=5, derived=3, frames=12, chunk=2,
@@ -42,12 +265,6 @@ SMALL = Sizes(
     batches=(2, 8), lengths=(10, 20), grids=(3, 6), parameters=(2, 3), legs_each=(2, 3),
 )  # fmt: skip
 CALLS = "", ", program", ", Character"  # of a step
-
-
-@pytest.fixture(autouse=True)
-def short_samples(monkeypatch):
-    """A sample is one call."""
-    monkeypatch.setattr(measurement, "SAMPLE", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +288,6 @@ def run_suite(name: str, sizes: Sizes = SMALL) -> runner.Report:
 
 
 def measure(name: str, **changes) -> Measurement:
-    """Runs one benchmark at small sizes."""
     *_, timings = run_suite(name, dataclasses.replace(SMALL, **changes)).measurements
     assert timings.seconds > 0 and not timings.failures
     for figure in timings.figures:
@@ -81,7 +297,6 @@ def measure(name: str, **changes) -> Measurement:
 
 
 def figures(timings: Measurement) -> dict[str, Figure]:
-    """Figures of a measurement by what they are."""
     return {figure.what: figure for figure in timings.figures}
 
 
@@ -104,16 +319,13 @@ def test_import_times_do_not_include_that_of_jax(monkeypatch):
     }  # fmt: skip
 
 
-def test_legs_and_feet_have_their_targets(legs, monkeypatch):
+def test_legs_and_feet_have_their_targets_and_the_leg_in_numpy_is_the_same(legs, monkeypatch):
     monkeypatch.setattr(xla, "vector_bits", lambda: 256)
     timings = measure("legs")
     assert figures(timings)["a leg and core"].at_most == 45.0
     ratio = np.median(timings.samples["NumPy"]) / np.median(timings.samples["ours"])
     assert figures(timings)["NumPy's time in ours"].value == pytest.approx(ratio)
     assert figures(measure("feet"))["a leg and core"].at_most == 110.0
-
-
-def test_the_leg_in_numpy_is_the_same_as_ours(legs):
     corrections = kernels.leg_corrections(legs.ik, legs.lanes)
     ours = [np.asarray(rotations)[0].T for rotations in corrections]
     theirs = baselines.two_bone(*kernels.numpy_arguments(legs))
@@ -182,15 +394,6 @@ def test_a_benchmark_runs_with_the_whole_pipeline(name):
     assert measure(name).figures
 
 
-def test_the_jacobian_is_measured_in_evaluations(small_problem):
-    timings = measure("jacobian")
-    for floats in ("float64", "float32"):
-        rows, slopes = (
-            np.median(timings.samples[f"{what}, {floats}"]) for what in ("rows", "slopes")
-        )
-        assert figures(timings)[f"in evaluations, {floats}"].value == pytest.approx(slopes / rows)
-
-
 def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
     subject = live.subject(12)
     (take,), (system,) = subject.takes, subject.starts.values()
@@ -198,7 +401,7 @@ def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
     assert system.leg is not None and subject.cost is not None
     problem = workloads.problem(12)
     assert problem.space.size == 20 and all(problem.space.smooth)
-    count = max(bench_sizes.FULL.parameters)
+    count = max(sizes.FULL.parameters)
     names = workloads.parameter_names(count)
     assert len(set(names)) == len(names) == count and set(problem.space.names) < set(names)
 
@@ -207,17 +410,16 @@ def test_the_fit_has_twenty_smooth_parameters_as_has_the_view():
 def small_problem(monkeypatch):
     """A problem of two parameters, whose residuals compile at once."""
 
-    def problem(frame_count: int, names: tuple[str, ...] = ()) -> Problem:
-        ik = presets.record()
-        return Problem(
-            make_space(ik, [free_parameter(ik, n) for n in TARGETS]), (), residuals_of_scenes
-        )
+    def problem(frame_count: int, names: tuple[str, ...] = ()):
+        return problem_of(presets.record(), list(TARGETS), (), residuals_of_scenes)
 
     monkeypatch.setattr(workloads, "TRUTH", TARGETS)
     monkeypatch.setattr(workloads, "problem", problem)
 
 
-def test_a_fit_is_measured_warm_and_in_processes_of_its_own(small_problem, monkeypatch):
+def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interrupted(
+    small_problem, monkeypatch
+):
     processes = []
 
     def run(command, env, **options):
@@ -237,8 +439,21 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own(small_problem, monke
     assert sum("cost" in figure.note for figure in timings.figures) == 3
     assert timings.samples["its search, empty cache"] == [1.0]
 
+    def interrupted(problem, progress):
+        return dataclasses.replace(find_best_fit(problem), interrupted=True)
 
-def test_a_posterior_is_sampled_for_all_its_steps(small_problem):
+    monkeypatch.setattr(inference, "find_best_fit", interrupted)
+    stopped = run_suite("fit")
+    assert stopped.interrupted and stopped.measurements[-1].figures == []
+
+
+def test_the_jacobian_is_measured_in_evaluations_and_a_posterior_for_all_its_steps(small_problem):
+    timings = measure("jacobian")
+    for floats in ("float64", "float32"):
+        rows, slopes = (
+            np.median(timings.samples[f"{what}, {floats}"]) for what in ("rows", "slopes")
+        )
+        assert figures(timings)[f"in evaluations, {floats}"].value == pytest.approx(slopes / rows)
     timings = measure("posterior")
     (figure,) = timings.figures
     assert figure.met is None and figure.what == "40 walkers, 2 steps"
@@ -277,15 +492,6 @@ def test_scaling_has_a_curve_and_a_slope_for_each_size(small_problem, legs, tmp_
     numbers, curves = tmp_path / "bench.json", tmp_path / "bench.png"
     assert report.write(measured, numbers, curves) == [numbers, curves]
     assert curves.read_bytes().startswith(b"\x89PNG")
-
-
-def test_an_interrupted_fit_adds_no_figure(small_problem, monkeypatch):
-    def interrupted(problem, progress):
-        return dataclasses.replace(find_best_fit(problem), interrupted=True)
-
-    monkeypatch.setattr(inference, "find_best_fit", interrupted)
-    measured = run_suite("fit")
-    assert measured.interrupted and measured.measurements[-1].figures == []
 
 
 def measured(what: str, count: int) -> dict[str, float]:

@@ -1,36 +1,46 @@
-"""Experiment files, and the problems that are made of them."""
+"""Experiments, of files and of objects in memory, and the problems that are made of them."""
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 import jaxik
 from fitting.datasets.clip_frames import raised
-from fitting.datasets.clips import Clip, load_clip, save_clip
+from fitting.datasets.clips import load_clip, save_clip
 from fitting.datasets.synthetic import walker
-from fitting.datasets.terrain.mesh_files import save_mesh
-from fitting.experiments import experiment_files, problems
-from fitting.experiments.experiment import Experiment, FitOptions
-from fitting.inference.noise.settings import NoiseOptions
+from fitting.datasets.terrain.mesh_files import load_terrain, save_mesh
+from fitting.datasets.terrain.meshes import mesh_of
+from fitting.experiments import experiment_files, problems, systems
+from fitting.experiments.ablations import Ablation
+from fitting.experiments.experiment import ClipEntry, Experiment, FitOptions
+from fitting.experiments.in_memory.making import clip_entry, make_experiment
+from fitting.experiments.in_memory.saving import with_files
+from fitting.experiments.in_memory.selectors import free_table
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
+from fitting.problem.digest import digest
 from fitting.problem.prior import ParameterPrior
 from fitting.studies import ablation
 from jaxik.maths import parameter_tree
-from support.experiments import CLIP, ROOT, SECOND, UNEVEN_WALK, write
+from jaxik.stages.pelvis import LowestPelvis, ReachPelvis
+from jaxik.world import terrain as terrains
+from support.experiments import CLIP, ROOT, SECOND, write
 from support.grounds import hill
+from support.problems import parameter
 
 
 @pytest.fixture(scope="module")
-def reference() -> Clip:
-    return load_clip(ROOT / "data/clips/uneven_walk.npz")
-
-
-@pytest.fixture(scope="module")
-def base() -> Clip:
-    return load_clip(ROOT / "data/clips/uneven_walk_base.npz")
+def objects() -> dict[str, Any]:
+    """The captured walk, its flat animation and its ground, as a notebook has loaded them."""
+    return {
+        "reference": load_clip(ROOT / "data/clips/uneven_walk.npz"),
+        "base": load_clip(ROOT / "data/clips/uneven_walk_base.npz"),
+        "terrain": load_terrain(ROOT / "data/terrains/uneven_walk.ply"),
+    }
 
 
 def instead_of(name: str, other: str) -> str:
@@ -42,26 +52,9 @@ def load(folder: Path, **parts: str) -> Experiment:
     return experiment_files.load_experiment(write(folder, **parts))
 
 
-def again(folder: Path, experiment: Experiment) -> Experiment:
-    """The experiment, written and read."""
-    path = folder / "again.toml"
-    path.write_text(experiment_files.experiment_to_toml(experiment))
-    return experiment_files.load_experiment(path)
-
-
-def test_the_embedded_experiment_has_its_files_and_values():
-    loaded = experiment_files.load_experiment(UNEVEN_WALK)
-    values = loaded.name, loaded.preset, loaded.loss, loaded.seed
-    assert values == ("uneven walk", "record", "squares", 0)
-    (clip,) = loaded.clips
-    paths = (clip.reference, clip.base, clip.terrain, clip.truth)
-    assert all(path is not None and path.is_absolute() and path.is_file() for path in paths)
-    assert len(loaded.free) >= 12 and loaded.free["pelvis.on_gain"] == {}
-    assert loaded.parameters["lean.gain_slide"] == 0.15
-    assert loaded.sigmas["ankle"] == 0.002
-
-
-def test_missing_keys_have_defaults_which_are_not_written(tmp_path):
+def test_missing_keys_have_defaults_which_are_not_written_and_paths_are_relative_to_the_file(
+    tmp_path, monkeypatch
+):
     loaded = load(tmp_path, name="hill.toml")
     assert loaded.name == "hill" and loaded.fps is None and loaded.parameters == {}
     assert loaded.fit == FitOptions() and loaded.sample == SamplerSettings()
@@ -70,56 +63,6 @@ def test_missing_keys_have_defaults_which_are_not_written(tmp_path):
     assert "[fit]\nstarts = 6\nmax_steps = 1000\n" in text and "[fit.search]" not in text
     assert "[sample]\nmax_steps = 20000\nthin_by = 1\nstop_at = 50.0\n" in text
     assert "check_every" not in text
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ({"free": "pelvis.on_gian = {}"}, r"\[free\]: no parameter named 'pelvis.on_gian'"),
-        ({"rest": "[parameters]\nlean.gain = [0.1, 0.2]"}, r"gain has shape \(2,\), wanted \(\)"),
-        (
-            {"rest": "[parameters]\nfoot.max_roll = [1, 2, 3]"},
-            r"max_roll has shape \(3,\), .* \(2,\), one per leg",
-        ),
-        ({"clips": CLIP, "clip": "end = 100.0"}, "uneven_walk.npz: trim from 0.0 s to 100.0 s"),
-    ],
-)
-def test_what_does_not_fit_the_clip_or_the_system_makes_no_problem(tmp_path, parts, message):
-    with pytest.raises(ValueError, match=message):
-        problems.make_problem(load(tmp_path, **parts))
-
-
-@pytest.mark.parametrize("body", ["clip", "adult"])
-def test_a_point_outside_the_range_is_refused_before_clips_are_prepared(
-    tmp_path, monkeypatch, body
-):
-    def fail(*_: object) -> None:
-        raise AssertionError("called")
-
-    monkeypatch.setattr(problems, "load_clip_data", fail)
-    if body == "adult":
-        monkeypatch.setattr(problems, "load_flat_animation", fail)
-    for rest, message in (
-        ("[prior.pelvis]\nlimit = { centre = 2 }", r"\[prior\]: pelvis.limit: centre is 2, wan"),
-        ("[start]\npelvis.limit = -1", r"\[start\]: pelvis.limit: start is -1, wanted from 0 to"),
-    ):
-        loaded = load(tmp_path, top=f'body = "{body}"', free="pelvis.limit = {}", rest=rest)
-        with pytest.raises(ValueError, match=message):
-            problems.make_problem(loaded)
-
-
-def test_a_missing_file_or_one_that_is_not_toml_is_rejected(tmp_path):
-    (tmp_path / "bad.toml").write_text("clips = [")
-    for name, message in (
-        ("no.toml", "no.toml: no such file, wanted an experiment file"),
-        (".", "a folder, wanted an experiment file"),
-        ("bad.toml", "bad.toml: not TOML"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            experiment_files.load_experiment(tmp_path / name)
-
-
-def test_paths_are_relative_to_the_file_and_not_to_the_working_folder(tmp_path, monkeypatch):
     for name in ("clips/uneven_walk.npz", "terrains/uneven_walk.ply"):
         (tmp_path / Path(name).name).symlink_to(ROOT / "data" / name)
     clips = '[[clips]]\nreference = "uneven_walk.npz"\nterrain = "uneven_walk.ply"\n'
@@ -129,18 +72,44 @@ def test_paths_are_relative_to_the_file_and_not_to_the_working_folder(tmp_path, 
     assert clip.reference.is_absolute() and clip.base is None
 
 
-def test_free_parameters_start_at_the_values_of_the_system_with_its_fixed_ones(tmp_path):
+def test_what_does_not_fit_the_clip_or_the_system_makes_no_problem(tmp_path):
+    for rest, message in (
+        ("lean.gain = [0.1, 0.2]", r"lean.gain has shape \(2,\), wanted \(\)"),
+        ("foot.max_roll = [1, 2, 3]", r"max_roll has shape \(3,\), .* \(2,\), one per leg"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            problems.make_problem(load(tmp_path, rest=f"[parameters]\n{rest}"))
+    with pytest.raises(ValueError, match="uneven_walk.npz: trim from 0.0 s to 100.0 s"):
+        problems.make_problem(load(tmp_path, clips=CLIP, clip="end = 100.0"))
+
+
+@pytest.mark.parametrize("body", ["clip", "adult"])
+def test_a_point_outside_the_range_is_refused_before_clips_are_prepared(
+    tmp_path, monkeypatch, body
+):
+    for loading in ("load_clip_data", *["load_flat_animation"] * (body == "adult")):
+        monkeypatch.setattr(problems, loading, pytest.fail)
+    for rest, message in (
+        ("[prior.pelvis]\nlimit = { centre = 2 }", r"\[prior\]: pelvis.limit: centre is 2, wan"),
+        ("[start]\npelvis.limit = -1", r"\[start\]: pelvis.limit: start is -1, wanted from 0 to"),
+    ):
+        loaded = load(tmp_path, top=f'body = "{body}"', free="pelvis.limit = {}", rest=rest)
+        with pytest.raises(ValueError, match=message):
+            problems.make_problem(loaded)
+
+
+def test_a_problem_has_the_clips_cut_and_resampled_alike_and_starts_at_the_values_of_its_system(
+    tmp_path, objects
+):
+    reference, base = objects["reference"], objects["base"]
     rest = "[parameters]\nlock.enabled = false\nfoot.max_pitch = [0.3, 0.5]"
-    space = problems.make_problem(load(tmp_path, rest=rest)).space
+    problem = problems.make_problem(load(tmp_path, top="fps = 15.0", rest=rest))
+    space, (scene,) = problem.space, problem.data
     assert not parameter_tree.get(space.system, "lock.enabled")
     np.testing.assert_array_equal(parameter_tree.get(space.system, "foot.max_pitch"), [0.3, 0.5])
     gain = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
     assert space.names == ("pelvis.on_gain", "foot.max_pitch")
     np.testing.assert_allclose(space.values(space.start), [gain, 0.4], rtol=1e-6)
-
-
-def test_reference_and_animation_are_cut_and_resampled_alike(tmp_path, reference, base):
-    (scene,) = problems.make_problem(load(tmp_path, top="fps = 15.0")).data
     assert scene.frames.dt.shape == (16,) and float(scene.frames.dt[0]) == pytest.approx(1 / 15)
     frames = slice(30, 61, 2)
     ankles = reference.joints_ws(2)[frames]
@@ -151,26 +120,28 @@ def test_reference_and_animation_are_cut_and_resampled_alike(tmp_path, reference
     assert scene.reference.observed.all()
 
 
-def test_a_frame_with_a_marker_pop_is_not_observed(tmp_path, reference):
+def test_a_frame_with_a_marker_pop_is_not_observed_and_contacts_count_where_there_are_labels(
+    tmp_path, objects
+):
+    reference = objects["reference"]
     positions = reference.positions_ws.copy()
     positions[45, reference.rig.joints[0][2]] += 0.2
-    save_clip(tmp_path / "popped.npz", dataclasses.replace(reference, positions_ws=positions))
-    loaded = load(tmp_path, clips=instead_of("uneven_walk", "popped.npz") + SECOND)
+    bare = dataclasses.replace(reference, positions_ws=positions, stance=None)
+    save_clip(tmp_path / "popped.npz", bare)
+    clips, rest = instead_of("uneven_walk", "popped.npz") + SECOND, "[sigmas]\ncontact = 0.5"
+    loaded = load(tmp_path, clips=clips, rest=rest)
     (scene,) = problems.make_problem(loaded).data
     observed = np.asarray(scene.reference.observed)
     assert not observed[15] and observed[[0, 12, 18, 30]].all()
+    assert scene.sigmas.contact == np.inf
+    assert problems.make_problem(load(tmp_path, rest=rest)).data[0].sigmas.contact == 0.5
     resampled = dataclasses.replace(loaded, fps=15.0)
     assert not problems.make_problem(resampled).data[0].reference.observed[7]
 
 
-def test_contacts_count_only_where_the_clip_has_labels(tmp_path, reference):
-    save_clip(tmp_path / "bare.npz", dataclasses.replace(reference, stance=None))
-    for clips, sigma in ((CLIP, 0.5), (instead_of("uneven_walk", "bare.npz"), np.inf)):
-        loaded = load(tmp_path, rest="[sigmas]\ncontact = 0.5", clips=clips + SECOND)
-        assert float(problems.make_problem(loaded).data[0].sigmas.contact) == sigma, clips
-
-
-def test_a_missing_flat_animation_is_made_from_the_reference(tmp_path):
+def test_a_missing_flat_animation_is_made_from_the_reference_and_one_with_other_frames_refused(
+    tmp_path, objects
+):
     clips = "".join(line for line in CLIP.splitlines(True) if not line.startswith("base"))
     loaded = load(tmp_path, clips=clips + SECOND)
     reference, base, _, root, _ = problems.load_clip_data(loaded.clips[0], None)
@@ -179,10 +150,7 @@ def test_a_missing_flat_animation_is_made_from_the_reference(tmp_path):
     assert np.abs(base.joints_ws(3)[..., 1][stands]).max() < 0.2
     assert np.ptp(base.positions_ws[:, base.rig.pelvis, 1]) < 1e-9
     assert base.frame_count == reference.frame_count
-
-
-def test_a_flat_animation_with_other_frames_is_rejected(tmp_path, base):
-    wanted = "the reference has 360"
+    base, wanted = objects["base"], "the reference has 360"
     for clip, message in (
         (base.select(slice(0, 90)), f"has 90 frames at 30 Hz of the legs .*; {wanted}"),
         (dataclasses.replace(base, fps=60.0), f"360 frames at 60 Hz .*; {wanted} frames at 30 Hz"),
@@ -202,38 +170,30 @@ def test_the_blocks_experiments_make_a_problem(mocap, name):
     assert 0.9 < float(scene.reference.observed.mean()) < 1.0
 
 
-def test_settings_of_the_search_and_the_sampler_can_be_overridden(tmp_path):
-    rest = "[fit]\nstarts = 2\nmax_steps = 50\n[fit.search]\nelite = 4\nagreement = 1"
-    loaded = load(tmp_path, rest=f"{rest}\n[sample]\nmax_steps = 300\ncheck_every = 30")
-    for experiment in (loaded, again(tmp_path, loaded)):
-        search = SearchSettings(max_steps=50, elite=4, agreement=1.0)
-        assert experiment.fit == FitOptions(2, search)
-        assert experiment.sample == SamplerSettings(max_steps=300, check_every=30)
-
-
-PRIOR = """
-[prior]
-shape = "uniform"
-[prior.pelvis]
-on_gain = { shape = "normal", centre = 0.3, spread = 1.0 }
-[start]
-foot.max_pitch = 0.5
+SETTINGS = """
+fit = { starts = 2, max_steps = 50, search = { elite = 4, agreement = 1 } }
+sample = { max_steps = 300, check_every = 30 }
+prior.shape = "uniform"
+prior.pelvis.on_gain = { shape = "normal", centre = 0.3, spread = 1.0 }
+start.foot.max_pitch = 0.5
 """
 
 
-def test_prior_and_start_are_those_of_the_file_and_are_written_back(tmp_path):
-    loaded = load(tmp_path, rest=PRIOR)
+def test_settings_priors_and_start_are_those_of_the_file_and_are_written_back(tmp_path):
+    loaded = load(tmp_path, top=SETTINGS)
+    assert loaded.fit == FitOptions(2, SearchSettings(max_steps=50, elite=4, agreement=1.0))
+    assert loaded.sample == SamplerSettings(max_steps=300, check_every=30)
     space = problems.make_problem(loaded).space
     np.testing.assert_array_equal(space.prior.uniform, [False, True])
     np.testing.assert_allclose(space.prior.spread, 1.0)
     assert float(space.values(space.prior.centre)[0]) == pytest.approx(0.3)
     preset = float(parameter_tree.get(jaxik.presets.record(), "pelvis.on_gain"))
     np.testing.assert_allclose(space.values(space.start), [preset, 0.5])
-    reloaded = again(tmp_path, loaded)
-    assert (reloaded.prior, reloaded.start) == (loaded.prior, loaded.start)
-
-
-def test_a_parameter_has_the_spread_of_the_table_unless_it_is_uniform(tmp_path):
+    path = tmp_path / "again.toml"
+    path.write_text(experiment_files.experiment_to_toml(loaded))
+    reloaded = experiment_files.load_experiment(path)
+    for field in ("fit", "sample", "prior", "start"):
+        assert getattr(reloaded, field) == getattr(loaded, field)
     for table, expected in (
         ("shape = 'uniform'", ParameterPrior("uniform")),
         ("centre = 0.1", ParameterPrior(centre=0.1, spread=0.7)),
@@ -242,9 +202,7 @@ def test_a_parameter_has_the_spread_of_the_table_unless_it_is_uniform(tmp_path):
         prior = load(tmp_path, rest=rest).prior
         assert prior.of("foot.max_pitch") == ParameterPrior(spread=0.7)
         assert prior.of("pelvis.on_gain") == expected
-
-
-def test_a_parameter_that_only_a_variant_frees_may_have_a_prior(tmp_path):
+    # Also one that only a variant frees.
     variant = "[[without]]\nname = 'x'\nfree = { pelvis.limit = {} }"
     prior = "[prior.pelvis]\nlimit = { shape = 'uniform' }\n[start]\npelvis.limit = 0.2"
     loaded = load(tmp_path, rest=f"{variant}\n{prior}")
@@ -254,13 +212,6 @@ def test_a_parameter_that_only_a_variant_frees_may_have_a_prior(tmp_path):
     limit = space.names.index("pelvis.limit")
     assert space.prior.uniform[limit]
     assert float(space.values(space.start)[limit]) == pytest.approx(0.2)
-
-
-def test_a_loss_that_is_no_distribution_has_no_estimated_sigmas_in_python_either(tmp_path):
-    loaded = load(tmp_path)
-    for loss in ("huber", "cauchy"):
-        with pytest.raises(ValueError, match=f"xperiment.toml: .* the loss '{loss}'.*student"):
-            dataclasses.replace(loaded, loss=loss, noise=NoiseOptions("estimated"))
 
 
 HILL = '[[clips]]\nreference = "reference.npz"\nbase = "base.npz"\nterrain = "hill.ply"\n'
@@ -278,7 +229,9 @@ def hill_folder(tmp_path_factory):
     return path
 
 
-def test_by_default_the_root_follows_a_hill_and_the_log_says_so(hill_folder):
+def test_the_root_follows_a_hill_unless_it_stays_as_animated_or_its_system_puts_it_there(
+    hill_folder,
+):
     loaded, lines = load(hill_folder, clips=HILL), []
     (scene,) = problems.make_problem(loaded, lines.append).data
     assert lines[0].startswith("root of walker seed 0: on the ground below it, 0 to ")
@@ -288,25 +241,122 @@ def test_by_default_the_root_follows_a_hill_and_the_log_says_so(hill_folder):
     pelvis = np.asarray((scene.frames.world_from_model @ scene.pelvis).pos)
     placed = raised(data.base, data.root.rise)
     np.testing.assert_allclose(pelvis, placed.positions_ws[:, 0], atol=1e-9)
-
-
-def test_the_root_can_stay_as_animated(hill_folder):
     (scene,) = problems.make_problem(load(hill_folder, clips=HILL, clip='root = "animation"')).data
     np.testing.assert_array_equal(scene.frames.world_from_model.pos[:, 1], 0.0)
-
-
-def test_a_system_does_not_put_itself_on_the_ground_once_more(hill_folder):
     for root, own in (("ground", False), ("animation", True)):
         parts = {"top": 'preset = "ozz"', "clip": f'root = "{root}"', "free": "pelvis.limit = {}"}
         loaded = load(hill_folder, clips=HILL, **parts)
         system = problems.make_problem(loaded).space.system
         assert bool(parameter_tree.get(system, "root.enabled")) == own
         assert parts["clip"] in experiment_files.experiment_to_toml(loaded)
-
-
-def test_a_system_that_is_told_to_put_itself_on_the_ground_does_so_alone(tmp_path):
     rest, free = "[parameters]\nroot.enabled = true", "probe.stable_height = {}"
-    loaded = load(tmp_path, top='preset = "mec"', free=free, rest=rest)
+    loaded = load(hill_folder, top='preset = "mec"', free=free, rest=rest)
     assert [entry.root for entry in loaded.placed_clips()] == ["animation"]
     chosen = dataclasses.replace(loaded.clips[0], root="ground")
     assert dataclasses.replace(loaded, clips=(chosen,)).placed_clips() == (chosen,)
+
+
+# In memory
+
+NAMES = ("pelvis.on_gain", "foot.max_pitch")
+
+
+class MemoryPelvis(LowestPelvis):
+    """A rule that no file knows."""
+
+    extra: parameter_tree.Leaf = parameter(0.3, "1", 0.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def second(objects) -> ClipEntry:
+    return clip_entry(**objects, start=1.0, end=2.0)
+
+
+def test_objects_make_the_problem_that_their_files_make(second, tmp_path):
+    path = write(tmp_path, free="pelvis.on_gain = {}\nfoot.max_pitch = {}")
+    of_files = problems.make_problem(experiment_files.load_experiment(path))
+    free = ["pelvis.on_gain", lambda ik: ik.foot.max_pitch]
+    assert digest(problems.make_problem(make_experiment(second, free=free))) == digest(of_files)
+
+
+def test_free_parameters_are_named_or_picked_by_their_leaf_or_cost_one_sentence(objects, second):
+    ik = jaxik.presets.record()
+    assert free_table("pelvis.limit", ik) == {"pelvis.limit": {}}
+    both = free_table(lambda ik: (ik.pelvis.limit, ik.foot.max_pitch[0]), ik)
+    assert both == {"pelvis.limit": {}, "foot.max_pitch[0]": {}}
+    ranged = free_table({lambda ik: ik.pelvis.limit: {"low": 0.1}, "foot.max_pitch": {}}, ik)
+    assert ranged == {"pelvis.limit": {"low": 0.1}, "foot.max_pitch": {}}
+    for free, message in (
+        ([], "names no parameter"),
+        ([lambda ik: ik.pelvis.hight], "no attribute 'hight'; wanted a function that picks leaves"),
+        ([lambda ik: 0.5], "a function picks .0.5.; wanted"),
+        (["pelvis.hight"], "no parameter named 'pelvis.hight'; nearest is 'pelvis.limit'"),
+        ([lambda ik: ik.lock.enabled], "no parameter named 'lock.enabled'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_experiment(second, free=free)
+    with pytest.raises(ValueError, match="'scale'.*say how files are read"):
+        clip_entry(**objects, scale=0.01)
+    with pytest.raises(ValueError, match="no clip; wanted one at least"):
+        make_experiment(free=NAMES)
+    late = make_experiment(clip_entry(**objects, start=900.0), free=NAMES)
+    with pytest.raises(ValueError, match=Path(objects["reference"].source).name):
+        problems.make_problem(late)
+
+
+def test_a_rule_that_no_file_knows_is_fitted_from_memory_and_written_once_it_is_registered(
+    second, tmp_path, monkeypatch
+):
+    ik = dataclasses.replace(jaxik.presets.record(), pelvis=MemoryPelvis(limit=0.2))
+    experiment = make_experiment(second, free=[lambda ik: ik.pelvis.extra], system=ik)
+    assert (experiment.preset, experiment.faithful) == ("record", False)
+    space = problems.make_problem(experiment).space
+    assert space.names == ("pelvis.extra",) and isinstance(space.system.pelvis, MemoryPelvis)
+    assert float(space.system.pelvis.limit) == pytest.approx(0.2)
+    with pytest.raises(ValueError, match="a file can name only after fitting.register_rule"):
+        with_files(experiment, tmp_path)
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setitem(systems.STAGES["pelvis"], "MemoryPelvis", MemoryPelvis)
+    saved = with_files(experiment, tmp_path)
+    (tmp_path / "experiment.toml").write_text(experiment_files.experiment_to_toml(saved, tmp_path))
+    moved = tmp_path.rename(tmp_path.with_name("moved"))
+    again = experiment_files.load_experiment(moved / "experiment.toml")
+    (clip,) = again.clips
+    assert clip.reference == moved / "captured.npz" and clip.terrain == moved / "terrain.ply"
+    written = problems.make_problem(again).space
+    assert isinstance(written.system.pelvis, MemoryPelvis)
+    assert written.parameters == space.parameters
+    moved.rename(tmp_path)  # where pytest looks for it
+
+
+def test_clips_of_one_source_keep_their_own_ground(objects, tmp_path):
+    heights, entries = [0.0, 0.5], []
+    for height in heights:
+        corners = np.array([[-9.0, height, -9.0], [9.0, height, -9.0], [0.0, height, 9.0]])
+        ground = terrains.mesh(corners, np.array([[0, 2, 1]]))
+        entries.append(clip_entry(**objects | {"terrain": ground}))
+    saved = with_files(make_experiment(*entries, free=NAMES), tmp_path)
+    meshes = [mesh_of(load_terrain(entry.terrain)) for entry in saved.clips]
+    assert [mesh.vertices[:, 1].max() for mesh in meshes] == pytest.approx(heights)
+
+
+def test_a_system_in_memory_means_the_same_in_files_and_can_lose_a_rule(second, tmp_path):
+    variant = Ablation("another pelvis", rules={"pelvis": "ReachPelvis"})
+    for own in (False, True):
+        ik = parameter_tree.replace(jaxik.presets.ozz(), {"root.enabled": own})
+        experiment = make_experiment(second, free="pelvis.limit", system=ik, without=(variant,))
+        saved = with_files(experiment, tmp_path)
+        roots = [[clip.root for clip in each.placed_clips()] for each in (experiment, saved)]
+        assert roots[0] == roots[1]
+        assert eqx.tree_equal(experiment.starting_system(), saved.starting_system())
+    left = ablation.without(experiment, variant).starting_system()
+    assert isinstance(left.pelvis, ReachPelvis)
+
+
+def test_a_terrain_that_is_no_mesh_is_fitted_from_memory_but_not_saved(objects, tmp_path):
+    entry = clip_entry(objects["reference"], terrains.plane(), objects["base"], root="animation")
+    experiment = make_experiment(entry, free="pelvis.limit")
+    assert with_files(experiment, None) is experiment
+    with pytest.raises(ValueError, match="its terrain cannot be saved; fit without an output: a"):
+        with_files(experiment, tmp_path)
+    assert list(tmp_path.iterdir()) == []
