@@ -1,13 +1,15 @@
-"""Effects of all parameters and switches of the record, and their derivatives."""
+"""Effects of all numbers, switches and masks of the record and of `stride`, and derivatives.
+
+Those of rules that can replace rules of `stride`, too.
+"""
 
 import functools
 
-from jaxik import presets
-from jaxik import record as game
-from jaxik.maths import parameter_tree
-from support import singular
-from support.cases import ANKLE_DEEP, KINK, RAMP_DOWN, RAMP_UP, Case, outcomes_of, tilted
-from support.clips import to_ik
+import jax
+import pytest
+
+from support import cases, singular
+from support.cases import ALL, ANKLE_DEEP, KINK, NONE, RAMP_DOWN, RAMP_UP, Case, tilted
 
 NO_LOCK, LOCKED = {"lock.enabled": False}, {"lock.enabled": True}
 FREE = {"foot.max_pitch": 1.0}
@@ -38,10 +40,38 @@ LATE = tilted((0, 0, 0), (0.5, 0, -1.2))  # begins to rise where "goes forward" 
 HOVERS = functools.partial(Case, ground=tilted((0.2, 0, 0)), clip="hovering")
 WALKS = functools.partial(Case, clip="goes forward")
 DRIFTS = functools.partial(Case, clip="drifts")
+BENDS = {"leg.as_animated": False, "effector.max_lift": 0.0}
+WIDE = {"probe.way_slope": 0.5}  # ground beside an edge counts
+# A root that stands while the feet walk.
+EAGER = {"contact.planted_speed": 1.0, "contact.raised_speed": 1.5}
+ANIMATED = {"probe.swing_as_animated": True}
+STEP_UP = tilted((0, 0, 0), (1.0, 0, -0.25))  # rises 0.2 m ahead of the ankles
+STEP_DOWN = tilted((0, 0, 0), (-1.0, 0, 0.15))  # falls until 0.1 m ahead of the ankles
+# Rise or fall by 0.2 m between one ray and the next on the way of a swinging foot.
+STAIRS_UP, STAIRS_DOWN = tilted((0, 0, 0), (2.0, 0, -0.8)), tilted((0, 0, 0), (-2.0, 0, 0))
+CLIMBS, LOW_STEPS = {"probe.max_slope": 1.3}, {"probe.max_step_up": 0.12}
+# The left foot higher.
+TILTED, STEEP, WALL = tilted((0, 0.4, 0)), tilted((0, 0.9, 0)), tilted((0, 4.0, 0))
+BESIDE = tilted((0, 0, 0), (0, 1.0, 0))  # level to the right, steep to the left
+BLOCK = tilted((0, 0, 0), (2.0, 0, -1.1))  # too steep for a sole, under the toes that land
+RAISED = tilted((0, 0, 0.1))
+PREDICTED = "swings, footholds unknown"
+LANDS = functools.partial(Case, clip="comes down")
+LIFTS = functools.partial(Case, clip="lifts off")
 
 
 def toe(x: float = 0.0, y: float = -0.07, z: float = 0.20) -> tuple[float, float, float]:
     return x, y, z
+
+
+def followed(**base: float) -> tuple[Case, ...]:
+    """Cases of how the pelvis follows its goal."""
+    eased = base | {"pelvis.rise_half_life": 0.2}
+    return (
+        WALKS("pelvis.rise_half_life", (0.05, 0.2), "- pelvis height", RAMP_UP, base),
+        WALKS("pelvis.fall_half_life", (0.05, 0.2), "+ pelvis height", RAMP_DOWN, base),
+        WALKS("pelvis.spring", (False, True), "- pelvis height", RAMP_UP, eased),
+    )
 
 
 # Of `SlopeTarget`, `OffsetLock` and `PitchRollFoot`, which `stride` has too.
@@ -75,71 +105,149 @@ FEET = (
     Case("foot.max_roll", (0.2, 0.4), "+ left roll", tilted((0, 0.8, 0))),
     Case("foot.min_roll", (-0.4, -0.2), "+ left roll", tilted((0, -0.8, 0))),
 )
-CASES = (
-    *TARGETS,
-    *LOCKS,
-    *FEET,
-    Case("contact.ground_height", (0.0, 0.01), "- target height"),
-    HOVERS("contact.planted_height", (0.10, 0.12), "+ pitch"),
-    HOVERS("contact.raised_height", (0.16, 0.20), "+ pitch"),
-    Case("probe.ray_up", (0.1, 0.5), "+ pitch", ANKLE_DEEP, slope=False),
-    Case("probe.ray_down", (0.3, 0.8), "+ pitch", tilted((0.2, 0, -0.5)), slope=False),
-    Case("probe.toe_ls[0]", (toe(x=-0.02), toe(x=0.02)), "+ left pitch", tilted((0, 0.4, 0))),
-    Case("probe.toe_ls[1]", (toe(z=0.3), toe(y=0.03, z=0.3)), "- pitch", KINK, FREE, "toes up"),
-    Case("probe.toe_ls[2]", (toe(z=0.25), toe(z=0.30)), "+ pitch", KINK),
-    Case("probe.use_toe", (False, True), "+ pitch", KINK, {"probe.toe_ls": toe(z=0.3)}),
-    Case("lean.forward_rate", (-0.3, 0.3), "- lean forward", AHEAD),
-    Case("lean.side_rate", (-0.3, 0.3), "- lean right", ASIDE),
-    Case("lean.forward_rate_slide", (0, 0.8), "- lean forward", AHEAD, clip="sliding"),
-    Case("lean.side_rate_slide", (0, 0.8), "- lean right", ASIDE, clip="sliding"),
-    WALKS("lean.gain", (0.05, 0.3), "- lean forward", RAMP_UP, LEANS),
-    Case("lean.gain_slide", (0.05, 0.3), "- lean forward", RAMP_UP, clip="slides forward"),
-    Case("lean.slide_on_gain", (0.05, 0.3), "- lean forward", AHEAD, clip="begins to slide"),
-    Case("lean.slide_off_gain", (0.05, 0.3), "+ lean forward", AHEAD, clip="ceases to slide"),
-    WALKS("lean.tick_hz", (30.0, 60.0), "- lean forward", RAMP_UP, LEANS),
-    WALKS("lean.spring", (False, True), "+ lean forward", LATE, LEANS),
-    Case("lock.hold_ball", (False, True), "- ball slip", base=LOOSE | HEEL_UP, clip="walks"),
-    Case("pelvis.limit", (0.1, 0.2), "- pelvis height", DEEP),
-    WALKS("pelvis.on_gain", (0.1, 0.3), "+ pelvis height", RAMP_UP, NO_LOCK),
-    Case("pelvis.off_gain", (0.05, 0.2), "+ pelvis height", BELOW, clip="lifts its feet"),
-    WALKS("pelvis.tick_hz", (30.0, 60.0), "+ pelvis height", RAMP_UP, NO_LOCK),
-    Case("pelvis.vertical_only", (False, True), "- pelvis forward", tilted((0.3, 0, -0.2))),
-    Case("pelvis.wait_to_rise", (False, True), "- pelvis height", RAMP_DOWN, clip="walks"),
-    Case("leg.max_knee_angle", (2.6, 2.8), "+ knee angle", BELOW, STIFF),
-    Case("leg.min_knee_angle", (0.9, 1.2), "+ knee angle", HIGH, STIFF | REACHES_UP),
-    Case("leg.soften", (0.85, 0.95), "+ knee angle", BELOW, STIFF),
-    Case("leg.twist", (0.0, 0.2), "- knee left"),
-    Case("leg.weight", (0.3, 0.8), "- miss", tilted((0, 0, 0.1)), STIFF),
-    Case("leg.as_animated", (False, True), "+ knee angle", clip="walks"),
-)
+CASES: dict[str, tuple[Case, ...]] = {
+    "record": (
+        *TARGETS,
+        *LOCKS,
+        *FEET,
+        Case("contact.ground_height", (0.0, 0.01), "- target height"),
+        HOVERS("contact.planted_height", (0.10, 0.12), "+ pitch"),
+        HOVERS("contact.raised_height", (0.16, 0.20), "+ pitch"),
+        Case("probe.ray_up", (0.1, 0.5), "+ pitch", ANKLE_DEEP, slope=False),
+        Case("probe.ray_down", (0.3, 0.8), "+ pitch", tilted((0.2, 0, -0.5)), slope=False),
+        Case("probe.toe_ls[0]", (toe(x=-0.02), toe(x=0.02)), "+ left pitch", tilted((0, 0.4, 0))),
+        Case("probe.toe_ls[1]", (toe(z=0.3), toe(y=0.03, z=0.3)), "- pitch", KINK, FREE, "toes up"),
+        Case("probe.toe_ls[2]", (toe(z=0.25), toe(z=0.30)), "+ pitch", KINK),
+        Case("probe.use_toe", (False, True), "+ pitch", KINK, {"probe.toe_ls": toe(z=0.3)}),
+        Case("lean.forward_rate", (-0.3, 0.3), "- lean forward", AHEAD),
+        Case("lean.side_rate", (-0.3, 0.3), "- lean right", ASIDE),
+        Case("lean.forward_rate_slide", (0, 0.8), "- lean forward", AHEAD, clip="sliding"),
+        Case("lean.side_rate_slide", (0, 0.8), "- lean right", ASIDE, clip="sliding"),
+        WALKS("lean.gain", (0.05, 0.3), "- lean forward", RAMP_UP, LEANS),
+        Case("lean.gain_slide", (0.05, 0.3), "- lean forward", RAMP_UP, clip="slides forward"),
+        Case("lean.slide_on_gain", (0.05, 0.3), "- lean forward", AHEAD, clip="begins to slide"),
+        Case("lean.slide_off_gain", (0.05, 0.3), "+ lean forward", AHEAD, clip="ceases to slide"),
+        WALKS("lean.tick_hz", (30.0, 60.0), "- lean forward", RAMP_UP, LEANS),
+        WALKS("lean.spring", (False, True), "+ lean forward", LATE, LEANS),
+        Case("lock.hold_ball", (False, True), "- ball slip", base=LOOSE | HEEL_UP, clip="walks"),
+        Case("pelvis.limit", (0.1, 0.2), "- pelvis height", DEEP),
+        WALKS("pelvis.on_gain", (0.1, 0.3), "+ pelvis height", RAMP_UP, NO_LOCK),
+        Case("pelvis.off_gain", (0.05, 0.2), "+ pelvis height", BELOW, clip="lifts its feet"),
+        WALKS("pelvis.tick_hz", (30.0, 60.0), "+ pelvis height", RAMP_UP, NO_LOCK),
+        Case("pelvis.vertical_only", (False, True), "- pelvis forward", tilted((0.3, 0, -0.2))),
+        Case("pelvis.wait_to_rise", (False, True), "- pelvis height", RAMP_DOWN, clip="walks"),
+        Case("leg.max_knee_angle", (2.6, 2.8), "+ knee angle", BELOW, STIFF),
+        Case("leg.min_knee_angle", (0.9, 1.2), "+ knee angle", HIGH, STIFF | REACHES_UP),
+        Case("leg.soften", (0.85, 0.95), "+ knee angle", BELOW, STIFF),
+        Case("leg.twist", (0.0, 0.2), "- knee left"),
+        Case("leg.weight", (0.3, 0.8), "- miss", tilted((0, 0, 0.1)), STIFF),
+        Case("leg.as_animated", (False, True), "+ knee angle", clip="walks"),
+    ),
+    "stride": (
+        *TARGETS,
+        *LOCKS,
+        *FEET,
+        *followed(),
+        Case("contact.ground_height", (0.0, 0.01), "- target height"),
+        Case("probe.ray_up", (0.2, 0.6), "+ target height", tilted((0, 0, 0.4)), slope=False),
+        Case("probe.ray_down", (0.3, 0.8), "- target height", DEEP, slope=False),
+        Case("probe.layers", (NONE, ALL), "+ target height", RAISED),
+        LANDS("probe.rise_start", (0.0, 0.3), "- target height", STEP_UP),
+        LANDS("probe.rise_end", (0.8, 1.0), "- target height", STEP_UP),
+        LANDS("probe.steepness", (1.0, 2.0), "+ target height", STEP_UP),
+        LANDS("probe.max_step_up", (0.12, 0.18), "+ target height", STAIRS_UP, CLIMBS),
+        LANDS("probe.max_step_down", (0.12, 0.18), "- target height", STAIRS_DOWN, CLIMBS),
+        LANDS("probe.step_fade", (0.1, 0.2), "+ target height", STAIRS_UP, CLIMBS | LOW_STEPS),
+        LANDS("probe.max_slope", (0.3, 0.36), "+ target height", tilted((0.4, 0, 0))),
+        LIFTS("probe.clearance", (0.0, 0.05), "+ target height", STEP_UP, WIDE),
+        LIFTS("probe.way_slope", (0.5, 1.0), "- target height", STEP_UP),
+        LANDS("probe.heel_length", (0.05, 0.09), "+ target height", STEP_DOWN, ANIMATED),
+        LIFTS("probe.toe_length", (0.03, 0.06), "+ target height", STEP_UP, ANIMATED | WIDE),
+        LIFTS("probe.held_lift", (0.3, 0.6), "- target height", STEP_DOWN),
+        LANDS("probe.toe_clearance", (0.02, 0.04), "+ target height", STEP_UP),
+        LANDS("probe.lift_per_rise", (0.3, 0.5), "+ target height", STEP_UP),
+        LIFTS("probe.lift_per_fall", (0.3, 0.5), "+ target height", STEP_DOWN),
+        LIFTS("probe.toes_up", (0.1, 0.2), "- target height", STEP_DOWN),
+        LANDS("probe.toes_down", (0.1, 0.2), "+ target height", STEP_UP),
+        LANDS("probe.toes_down_per_height", (0.5, 0.9), "+ target height", STEP_UP),
+        Case("probe.toes_first", (0.4, 0.8), "- pitch", BESIDE, clip="toes up"),
+        LANDS("probe.min_sole", (0.4, 0.8), "- target forward", BLOCK),
+        LANDS("probe.max_slide", (0.08, 0.12), "- target forward", BLOCK),
+        LANDS("probe.swing_as_animated", (False, True), "- target height", STEP_UP),
+        LANDS("probe.use_strides", (False, True), "+ target height", STEP_UP),
+        LIFTS("probe.ball_height", (0.03, 0.06), "+ target height", STEP_UP, WIDE),
+        Case("probe.stance_time", (0.5, 0.7), "+ target height", KINK, clip=PREDICTED),
+        Case("probe.swing_time", (0.3, 0.5), "+ target height", KINK, clip=PREDICTED),
+        Case("lock.hold_ball", (False, True), "- ball slip", base=LOCKED, clip="walks"),
+        Case("pelvis.highest_share", (0.3, 0.8), "+ pelvis height", TILTED),
+        Case("pelvis.extension", (0.92, 0.95), "+ pelvis height", TILTED),
+        Case("pelvis.shift", (0.1, 0.3), "- pelvis forward", STEP_UP, clip="walks"),
+        Case("pelvis.softness", (0.01, 0.05), "+ pelvis height", TILTED),
+        LIFTS("effector.by_contact", (False, True), "+ miss", TILTED),
+        Case("effector.extension", (0.92, 0.95), "+ pitch", STEEP),
+        Case("effector.max_lift", (0.05, 0.15), "- pitch", STEEP, {"effector.extension": 0.92}),
+        Case("leg.max_knee_angle", (2.6, 2.8), "+ knee angle", STEEP, BENDS),
+        Case("leg.min_knee_angle", (0.9, 1.2), "+ knee angle", WALL),
+        Case("leg.soften", (0.85, 0.95), "+ knee angle", STEEP, BENDS),
+        Case("leg.as_animated", (False, True), "+ knee angle", clip="walks"),
+        Case("leg.twist", (0.0, 0.2), "- knee left"),
+        Case("leg.weight", (0.3, 0.8), "- miss", TILTED),
+    ),
+    "by speed": (
+        *followed(**EAGER),
+        Case("contact.ground_height", (0.0, 0.01), "- target height"),
+        Case("contact.planted_height", (0.05, 0.08), "+ locked", base=LOOSE, clip="hovering"),
+        Case("contact.raised_height", (0.08, 0.11), "+ locked", base=LOOSE, clip="rises slowly"),
+        Case("contact.planted_speed", (0.2, 0.45), "+ locked", base=LOOSE, clip="drifts"),
+        Case("contact.raised_speed", (0.3, 0.6), "+ locked", base=LOOSE, clip="speeds up"),
+        Case("contact.half_life", (0.05, 0.2), "+ contact", clip="speeds up"),
+        Case("pelvis.lowest_share", (0.2, 0.8), "- pelvis height", TILTED),
+    ),
+}
+# In `test_own_rules`, `test_limits`, and `test_switches`, where `ozz` has the record's probe.
+WIDTHS = ("probe.min_support", "probe.support_radius")
+OVER = "probe.lift_over"  # in `test_stride`, as planes make no hurdle
+SWITCHES = ("pelvis.enabled", "effector.by_contact")  # of `ozz`, too
+CONSTANTS = ("probe.uneven_height", "probe.highest_step")
+IN_OWN_TESTS = {
+    "record": ("warp.", "probe.max_", "probe.step_fade", "probe.layers", *WIDTHS, *SWITCHES),
+    "stride": ("warp.", "lean.", "separation.", *WIDTHS, OVER, *CONSTANTS),
+}
+# `tests/pipeline` compares odd values of all of these with NumPy's answers, and does so quickly.
+STRIDE = pytest.param("stride", marks=pytest.mark.slow)
+SLOW = pytest.param("by speed", marks=pytest.mark.slow)
 
 
 @functools.cache
-def outcomes():
-    return outcomes_of(CASES, to_ik({}))
+def outcomes(name: str) -> cases.Outcomes:
+    return cases.outcomes_of(CASES[name], cases.system(name))
 
 
-def test_all_fields_of_the_record_and_all_parameters_have_a_case():
-    ik = presets.record(faithful=True)
-    fields = {ours for _, _, ours in game.FLAGS}
-    assert {case.name for case in CASES} >= {ours for _, ours, _ in game.FLOATS} | fields
-    rules = {case.leaf for case in CASES if not case.is_sloped(ik)} - fields
-    assert not any(bool(parameter_tree.get(ik, rule)) for rule in rules), "off by default"
-    # These clips tell no scale of strides, nothing fades and no ground is refused:
-    # `test_stride_warp`, `test_fade` and `test_limits` have those that do.
-    own = ("warp.", "fade.", "probe.max_", "probe.min_support", "probe.support_radius")
-    declared = {name for name in parameter_tree.declarations(ik) if not name.startswith(own)}
-    declared |= {"lean.tick_hz", "pelvis.tick_hz"}
-    assert {case.leaf for case in CASES} == declared | fields | rules
+@pytest.mark.parametrize("name", CASES)
+def test_all_numbers_switches_and_masks_have_a_case(name: str):
+    paths = jax.tree_util.tree_leaves_with_path(cases.system(name))
+    leaves = {jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths}
+    if name == "by speed":
+        expected = {leaf for leaf in leaves if leaf.startswith(("contact.", "pelvis."))}
+    else:
+        expected = {leaf for leaf in leaves if not leaf.startswith(IN_OWN_TESTS[name])}
+    assert {case.leaf for case in CASES[name]} == expected
 
 
-def test_each_parameter_has_the_expected_effect():
-    assert not outcomes().without_effect()
+@pytest.mark.parametrize("name", ["record", STRIDE, "by speed"])
+def test_each_leaf_has_the_expected_effect(name: str):
+    if name == "by speed":  # whose derivatives are slow
+        by_value = cases.outcomes_of(CASES[name], cases.system(name), sloped=False)
+        assert not by_value.without_effect()
+    else:
+        assert not outcomes(name).without_effect()
 
 
-def test_the_derivative_of_each_parameter_is_its_difference_quotient():
-    assert not outcomes().with_wrong_slope()
+@pytest.mark.parametrize("name", ["record", STRIDE, SLOW])
+def test_the_derivative_of_each_number_is_its_difference_quotient(name: str):
+    assert not outcomes(name).with_wrong_slope()
 
 
-def test_derivatives_of_animation_and_terrain_are_right_and_finite_where_formulas_are_singular():
-    singular.assert_sound("record", limps=True)
+@pytest.mark.parametrize("name", ["record", SLOW])
+def test_values_and_derivatives_are_finite_where_formulas_are_singular(name: str):
+    singular.assert_sound(name, limps=name == "record")
