@@ -1,12 +1,19 @@
-"""Rules in one frame by themselves, by hand."""
+"""Rules by themselves, by hand: contact by speed, and others in one frame."""
+
+import dataclasses
+import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxik
 from jaxik import HARD
+from jaxik.pipeline.phases import sense_first
 from jaxik.stages import foot
+from jaxik.stages.contact import SpeedState
 from jaxik.stages.effector import BodyEffector, BodyState
 from jaxik.stages.inputs import Inputs, SensedMoment
 from jaxik.stages.lock import OffsetLock, PlantLock
@@ -16,28 +23,91 @@ from jaxik.stages.target import SlopeTarget, TargetState
 from jaxik.world.frame import Contact, Foothold, GroundHits, Sensed
 from jaxik.world.skeleton import Still, Transform
 from jaxik.world.terrain import Hit, Terrain
-from support.cases import QUICK
-from support.clips import FLAT, animate, make_rig, to_frames, to_rig, to_terrain
+from support import clips
+from support.cases import QUICK, RIG
+from support.clips import animate, assert_close, at, to_frames, to_ik, to_rig, to_terrain
 from support.fragments import fragment
 
+LEVEL = to_terrain(clips.FLAT)
 DT, UP, AHEAD = 1 / 60, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 BOTH, ZEROS = np.ones(2), np.zeros((2, 3))
 
 
-def moment(started: bool = True, **sensed) -> SensedMoment:
+# Contact by speed and height: hysteresis, smoothing and memory.
+
+FRAMES, HALF = 240, 120
+SPEEDS = (1.0, 0.4, 0.2, 0.4, 0.6, 0.4)  # m/s, of the toes, one after the other
+HEIGHTS = (0.12, 0.09, 0.07, 0.09, 0.11, 0.09)  # m, likewise
+STANDS = (0, 0, 1, 1, 0, 0)  # between 0.25 and 0.5 m/s, 0.075 and 0.1 m: as before
+
+
+def clip(speed: Any, height: Any = 0.02) -> jaxik.Frame:
+    """Standing legs whose toes have these speeds, m/s, and heights, m, in equal parts of it."""
+    frames = to_frames(animate(RIG, count=FRAMES))
+    speeds, heights = (
+        jnp.asarray(np.repeat(x, FRAMES // np.size(x)), float)[:, None] for x in (speed, height)
+    )
+    toe = frames.pose.toe.pos.at[..., 1].set(heights)
+    pose = dataclasses.replace(frames.pose, toe=jaxik.Transform(toe, frames.pose.toe.rot))
+    return dataclasses.replace(frames, pose=pose, toe_speed=jnp.tile(speeds, (1, 2)))
+
+
+@jax.jit
+def sense(
+    frames: jaxik.Frame, half_life: float = 0.0, memory: SpeedState | None = None
+) -> tuple[SpeedState, Contact]:
+    """Memory and contact in each frame, from a memory or from a fresh start."""
+    ik, rig = to_ik({}, "by speed"), to_rig(RIG)
+    contact = dataclasses.replace(ik.contact, half_life=jnp.asarray(half_life))
+    ik, state = dataclasses.replace(ik, contact=contact), jaxik.init(ik, rig)
+    if memory is not None:
+        state = dataclasses.replace(state, started=jnp.ones((), bool), contact=memory)
+    inputs = Inputs(rig, LEVEL, frames, jaxik.HARD)
+    return sense_first("contact", ik, state, inputs, None, {})
+
+
+def test_a_foot_between_the_thresholds_stays_as_it_was_and_swings_in_the_first_frame():
+    expected = np.repeat(STANDS, FRAMES // len(STANDS))[:, None].repeat(2, axis=-1)
+    for frames in (clip(SPEEDS), clip(0.0, HEIGHTS)):
+        contact = sense(frames)[1]
+        np.testing.assert_array_equal(contact.planted, expected)
+        np.testing.assert_array_equal(contact.lifted, 1 - expected)
+        np.testing.assert_array_equal(contact.weight, expected)
+    assert not np.asarray(sense(clip(0.4))[1].planted).any()
+
+
+def test_weight_goes_half_the_way_in_a_half_life_and_starts_settled():
+    """A tenth of a second is six frames."""
+    weight = np.asarray(sense(clip([0.0, 1.0, 0.0]), half_life=0.1)[1].weight)[:, 0]
+    assert weight[0] == 1.0
+    falls, rises = FRAMES // 3 - 1, 2 * (FRAMES // 3) - 1
+    np.testing.assert_allclose(weight[[falls + 6, falls + 12]], [0.5, 0.25], rtol=1e-12)
+    np.testing.assert_allclose(weight[rises + 6], 0.5, rtol=0, atol=1e-3)
+
+
+def test_a_clip_resumed_from_the_memory_of_one_of_its_frames_goes_on_as_the_whole():
+    frames = clip(np.random.default_rng(0).choice(SPEEDS, FRAMES))
+    memories, contact = whole = sense(frames, half_life=0.1)
+    assert 0.1 < np.asarray(contact.planted).mean() < 0.9
+    resumed = sense(at(frames, slice(HALF, None)), 0.1, at(memories, HALF - 1))
+    assert_close(resumed, at(whole, slice(HALF, None)), 1e-12)
+
+
+# One frame.
+
+
+def moment(started: Any = True, **sensed) -> SensedMoment:
     """A frame of a character on ground whose up is +y, with what the rule reads of it."""
     up = jnp.asarray(UP)
     arrays = {name: jnp.asarray(x) for name, x in sensed.items() if isinstance(x, np.ndarray)}
     frame = fragment(Sensed, leg_up_ws=up, carry=Still(), **(sensed | arrays))
-    return SensedMoment(
-        jnp.asarray(DT), jnp.asarray(started), HARD, frame, fragment(Terrain, up_ws=up)
-    )
+    ground = fragment(Terrain, up_ws=up)
+    return SensedMoment(jnp.asarray(DT), jnp.asarray(started), HARD, frame, ground)
 
 
 def test_a_faulty_leg_counts_as_one_that_is_not_there_and_no_other_does():
-    rig, frames = to_rig(make_rig()), to_frames(animate(make_rig(), count=1))
-    frame = jax.tree.map(lambda x: x[0], frames)
-    inputs = Inputs(rig, to_terrain(FLAT), frame, HARD)
+    frame = at(to_frames(animate(RIG, count=1)), 0)
+    inputs = Inputs(to_rig(RIG), LEVEL, frame, HARD)
     np.testing.assert_array_equal(inputs.at(frame).rig.present, [True, True])
     for faulty in ([True, False], [False, True], [False, False]):
         present = inputs.at(frame, jnp.array(faulty)).rig.present
@@ -47,9 +117,7 @@ def test_a_faulty_leg_counts_as_one_that_is_not_there_and_no_other_does():
 # Effectors: feet that follow their heights relative to the body.
 
 
-@pytest.mark.parametrize(
-    ("started", "fraction"), [(True, 0.25), (False, 1.0)], ids=["later", "first frame"]
-)
+@pytest.mark.parametrize(("started", "fraction"), [(True, 0.25), (False, 1.0)])
 def test_feet_cover_a_part_of_their_way_to_their_heights_over_the_body(started, fraction):
     """At 15 / s a quarter in 1/60 s; all of it in the first frame."""
     requested, goal, before = np.array([0.10, -0.05]), -0.05, np.array([0.02, 0.0])
@@ -57,9 +125,8 @@ def test_feet_cover_a_part_of_their_way_to_their_heights_over_the_body(started, 
     now = moment(started, ankle_ws=ZEROS, weight=BOTH, contact=contact)
     target = Transform(jnp.asarray(requested[:, None] * UP), jnp.eye(4)[jnp.zeros(2, int)])
     pelvis = fragment(PelvisState, goal=jnp.asarray(goal), offset_ws=jnp.asarray(-0.03 * UP))
-    state, effector = BodyEffector(speed=15.0).advance(
-        now, target, pelvis, BodyState(jnp.asarray(before), jnp.zeros(()))
-    )
+    memory = BodyState(jnp.asarray(before), jnp.zeros(()))
+    state, effector = BodyEffector(speed=15.0).advance(now, target, pelvis, memory)
     height = before + fraction * (requested - goal - before)
     np.testing.assert_allclose(state.height, height, rtol=0, atol=1e-12)
     np.testing.assert_allclose(effector.target_ws[:, 1], height - 0.03, rtol=0, atol=1e-12)
@@ -68,12 +135,7 @@ def test_feet_cover_a_part_of_their_way_to_their_heights_over_the_body(started, 
 # Targets: how far the smoothing of a foothold's height moves it.
 
 
-@pytest.mark.parametrize(
-    ("rise", "fall", "started", "moved"),
-    [(DT, DT, True, [-0.1, 0.1]), (DT, DT / 2, True, [-0.1, 0.05]), (0.5, 0.5, False, [0.0, 0.0])],
-    ids=["half-lives", "falls faster", "first frame"],
-)
-def test_a_foothold_covers_half_its_way_in_a_half_life_up_and_down(rise, fall, started, moved):
+def test_a_foothold_covers_half_its_way_in_a_half_life_up_and_down():
     """From 0 to 0.2 m and from 0.3 to 0.1 m; all of it in the first frame."""
     foothold = fragment(
         Foothold,
@@ -82,12 +144,20 @@ def test_a_foothold_covers_half_its_way_in_a_half_life_up_and_down(rise, fall, s
         ankle_height_ms=jnp.full(2, 0.1),
         climb=jnp.ones(2),
     )
-    level = fragment(Hit, normal=jnp.broadcast_to(UP, (2, 3)))
-    now = moment(started, foothold=foothold, ground=fragment(GroundHits, ankle=level))
-    state = TargetState(jnp.array([0.0, 0.3]), jnp.zeros(2), jnp.asarray(ZEROS))
-    rule = SlopeTarget(rise_half_life=rise, fall_half_life=fall)
-    actual = jax.jit(lambda rule: rule.advance(now, state)[1], compiler_options=QUICK)(rule)
-    np.testing.assert_allclose(actual, moved, rtol=0, atol=1e-12)
+    level = fragment(GroundHits, ankle=fragment(Hit, normal=jnp.broadcast_to(UP, (2, 3))))
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def moved(rise: jax.Array, fall: jax.Array, started: jax.Array) -> jax.Array:
+        state = TargetState(jnp.array([0.0, 0.3]), jnp.zeros(2), jnp.asarray(ZEROS))
+        rule = SlopeTarget(rise_half_life=rise, fall_half_life=fall)
+        return rule.advance(moment(started, foothold=foothold, ground=level), state)[1]
+
+    for case, expected in {
+        (DT, DT, True): [-0.1, 0.1],
+        (DT, DT / 2, True): [-0.1, 0.05],
+        (0.5, 0.5, False): [0.0, 0.0],
+    }.items():
+        np.testing.assert_allclose(moved(*case), expected, rtol=0, atol=1e-12, err_msg=f"{case}")
 
 
 # Locks.
@@ -99,7 +169,7 @@ def test_a_lock_takes_as_much_from_a_turn_as_it_holds():
     always = {"release_distance": 9.0, "release_cone": 1.5, "release_max_angle": np.pi}
     rule = OffsetLock(**always, release_min_angle=0.0, hold_ball=True, lock_half_life=DT)
     ankle, ball = np.array([[0.1, 0.08, 0.0], [-0.1, 0.08, 0.0]]), ZEROS + 0.12 * AHEAD
-    hip = ankle + 0.8 * UP
+    hip = jnp.asarray(ankle + 0.8 * UP)
     now = moment(
         weight=BOTH,
         hip_ws=hip,
@@ -112,21 +182,17 @@ def test_a_lock_takes_as_much_from_a_turn_as_it_holds():
         contact=fragment(Contact, planted=jnp.ones(2), lifted=jnp.zeros(2)),
         foothold=fragment(Foothold, lift=jnp.full(2, 0.08), found=jnp.ones(2)),
     )
-    foothold = ankle - 0.08 * UP
+    foothold = jnp.asarray(ankle - 0.08 * UP)
     memory = (BOTH, 0.4 * BOTH, ZEROS, np.array([0.02, 0.0]), foothold, ball, ZEROS + AHEAD)
     before = LockState(*map(jnp.asarray, memory))
-
-    def advance() -> LockState:
-        return rule.advance(now, jnp.asarray(foothold), now.sensed.hip_ws, before)[0]
-
-    after = jax.jit(advance, compiler_options=QUICK)()
+    after = jax.jit(lambda: rule.advance(now, foothold, hip, before)[0], compiler_options=QUICK)()
     np.testing.assert_array_equal(after.locked, 1.0)
     np.testing.assert_allclose(after.factor, 0.7, rtol=0, atol=1e-12)
     np.testing.assert_allclose(after.turn, [0.02, 0.0] - 0.7 * turned, rtol=0, atol=1e-12)
 
 
 def test_no_foot_is_planted_or_turned_before_the_first_frame():
-    state = PlantLock().init(to_rig(make_rig()))
+    state = PlantLock().init(to_rig(RIG))
     np.testing.assert_array_equal(state.locked, [0.0, 0.0])
     np.testing.assert_array_equal(state.rot, [[1.0, 0.0, 0.0, 0.0]] * 2)
 
