@@ -1,0 +1,458 @@
+"""The preset `stride`: nothing moves on a flat floor, and the ground never jumps.
+
+Also soles with too little ground, which slide along themselves to where more of them has some;
+feet that swing over uneven ground, later, higher, and with the toes pointed down; and heels.
+"""
+
+import dataclasses
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize_scalar
+
+import jaxik
+from jaxik.maths import quat
+from jaxik.stages import effector
+from jaxik.stages.probe.swing import bump
+from jaxik.world.frame import GroundHits
+from reference import characters, maths, sample_poses
+from reference.stages import swing as reference
+from reference.terrain import Terrain as PlainTerrain
+from support.cases import RIG
+from support.clips import FRAMES, animate, assert_close, at, to_frames, to_ik, to_rig, to_terrain
+from support.gradients import finite_jacobian
+from support.probing import BLOCKS, ground_under, level_blocks, quad
+from support.strides import blocks, walk
+
+# As many triangles as the uneven blocks: both share a program.
+FLAT = to_terrain(blocks(np.random.default_rng(0), max_height=0.0, tilt=0.0, irregular=False))
+START = (0.0, 0.0, -2.0)
+
+
+# Flat floor.
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
+def test_nothing_changes_on_a_flat_floor(known: bool):
+    frames = to_frames(walk(RIG, FRAMES, known=known, heading=0.1, start=START))
+    legs = np.linalg.norm(frames.pose.ankle.pos - frames.pose.hip.pos, axis=-1)
+    assert legs.max() > 0.99 * (sample_poses.THIGH + sample_poses.SHIN), "knees are straight"
+    ik = to_ik({"lock.enabled": True}, "stride")
+    result = jaxik.run(ik, to_rig(RIG), FLAT, frames)
+    assert 0.3 < np.asarray(result.trace.advanced.state.lock.locked).mean() < 0.9
+    sensed, effector = result.trace.sensed, result.trace.advanced.effector
+    assert_close(effector.target_ws, sensed.ankle_ws, 1e-9)
+    assert_close(effector.rot_ws, sensed.ankle_rot_ws, 1e-9)
+    assert np.abs(result.body.pos).max() < 1e-9
+    for joint in ("hip", "knee", "ankle", "toe"):
+        actual, expected = (getattr(pose, joint) for pose in (result.pose, frames.pose))
+        assert_close(actual.pos, expected.pos, 1e-9)
+        rots = np.asarray(actual.rot), np.asarray(expected.rot)
+        assert sample_poses.rotation_angle(*rots) < 1e-7, joint
+
+
+# The ground under a swinging foot.
+
+
+def sensed_ground(ik: jaxik.FootIK, ground: PlainTerrain, frames: jaxik.Frame) -> GroundHits:
+    """What the probe finds; strides that go straight say so, to share a program with the others."""
+    stride = frames.stride
+    if stride.aside_ws is None:
+        stride = dataclasses.replace(stride, aside_ws=jnp.zeros_like(stride.last_ws))
+    return ground_under(ik, to_terrain(ground), dataclasses.replace(frames, stride=stride))
+
+
+def swing(fractions: np.ndarray, last: Any = 0.0, following: Any = 0.8) -> jaxik.Frame:
+    """Feet that swing from `last` to `following`, m forward, each one value or one per frame."""
+    frame = animate(RIG, count=1)[0]
+    frames = []
+    for fraction, start, end in np.broadcast(fractions, last, following):
+        sideways = frame.toe.pos * [1.0, 0.0, 0.0]
+        stride = characters.Stride(
+            standing=np.zeros(2),
+            last_ws=sideways + start * maths.Z,
+            next_ws=sideways + end * maths.Z,
+            fraction=np.full(2, fraction),
+            known=np.ones(2),
+        )
+        ahead = maths.lerp(start, end, maths.smooth01(fraction)) - frame.toe.pos[0, 2]
+        root = frame.world_from_model._replace(pos=ahead * maths.Z)
+        frames.append(dataclasses.replace(frame, stride=stride, world_from_model=root))
+    return to_frames(frames)
+
+
+def heights(ground: PlainTerrain, frames: jaxik.Frame) -> np.ndarray:
+    """Ground height under the left ankle by the probe of `stride`, m (frames).
+
+    Feet swing as animated, so that edges on the way have to be cleared.
+    """
+    ik = to_ik({"probe.swing_as_animated": True}, "stride")
+    return np.asarray(sensed_ground(ik, ground, frames).ankle.point)[:, 0, 1]
+
+
+def step_up(height: float) -> PlainTerrain:
+    return level_blocks((-3.0, 0.3, 0.0), (0.3, 3.0, height))
+
+
+STEP_UP, FLOOR = step_up(0.25), level_blocks((-3.0, 3.0, 0.0))
+STEP_DOWN = level_blocks((-3.0, 0.5, 0.25), (0.5, 3.0, 0.0))
+HURDLE = level_blocks((-3.0, 0.35, 0.0), (0.35, 0.45, 0.2), (0.45, 3.0, 0.0))
+CLIFF = level_blocks((-3.0, 0.5, 0.0), (0.5, 3.0, -0.8))
+FINE = np.linspace(0.0, 1.0, 801)
+
+
+@pytest.mark.parametrize(
+    ("ground", "end", "highest"),
+    [(STEP_UP, 0.25, 0.25), (STEP_DOWN, 0.0, 0.25), (HURDLE, 0.0, 0.2)],
+    ids=["up", "down", "over a hurdle"],
+)
+def test_the_ground_of_a_swing_does_not_jump_and_leads_to_the_next_foothold(ground, end, highest):
+    height = heights(ground, swing(FINE))
+    assert height[-1] == pytest.approx(end, abs=1e-12)
+    assert 0.1 < height.max() <= highest + 1e-12
+    coarse, fine = (np.abs(np.diff(height[::step])).max() for step in (8, 1))
+    assert coarse < 0.02 and fine < coarse / 6, "at a jump both would be equally large"
+
+
+def test_a_cliff_and_its_edge_do_not_change_the_ground():
+    assert np.abs(heights(CLIFF, swing(FINE))).max() == 0.0
+    along_edge = swing(np.full(801, 0.6), following=np.linspace(0.4, 0.6, 801))
+    assert np.abs(heights(CLIFF, along_edge)).max() == 0.0
+
+
+def test_a_step_fades_out_gradually_as_it_becomes_too_high():
+    """Between 0.6 and 0.7 m down, the foot returns to the height of its last foothold."""
+    drops, arrived = np.linspace(0.5, 0.8, 31), swing(np.full(801, 1.0))
+    grounds = [level_blocks((-3.0, 0.5, 0.0), (0.5, 3.0, -drop)) for drop in drops]
+    height = np.array([heights(ground, arrived)[0] for ground in grounds])
+    followed, ignored = drops < 0.6, drops > 0.7 + 1e-9
+    assert_close(height[followed], -drops[followed], 1e-12)
+    assert_close(height[ignored], 0.0, 1e-12)
+    # 0.6 m within 0.1 m, at no more than 1.5 times the mean slope.
+    assert np.abs(np.diff(height)).max() < 0.12
+
+
+def test_stairs_are_climbed_that_are_as_high_as_a_ledge_that_is_refused():
+    frames = swing(FINE, following=1.4)
+    path = 0.5 * frames.world_from_model.pos[:, 2]  # the game has the root on the stairs
+    frames = frames.translated(path[:, None] * np.array([0.0, 1.0, 0.0]))
+    # Both footholds lie in the middle of a tread.
+    treads = [(0.3 * n - 0.15, 0.3 * n + 0.15, 0.15 * n) for n in range(1, 6)]
+    climbed = heights(level_blocks((-3.0, 0.15, 0.0), *treads), frames)
+    assert climbed[-1] == pytest.approx(0.75, abs=1e-12)
+    assert np.abs(np.diff(climbed)).max() < 0.01
+    ledge = level_blocks((-3.0, 0.9, 0.0), (0.9, 3.0, 0.75))
+    assert np.abs(heights(ledge, frames)[: len(FINE) // 2]).max() < 0.2
+
+
+# Feet that stand.
+
+
+def test_a_locked_ball_does_not_slide_while_the_heel_rises():
+    """On a walk whose standing feet slip sideways."""
+    plain, slips = walk(RIG, FRAMES, start=START), []
+    for index, frame in enumerate(plain):
+        pos = frame.world_from_model.pos + 0.08 * index / 60 * maths.X
+        root = frame.world_from_model._replace(pos=pos)
+        plain[index] = dataclasses.replace(frame, world_from_model=root)
+    frames = to_frames(sample_poses.with_speeds(plain))
+    for hold_ball in (True, False):
+        values = {"lock.enabled": True, "lock.hold_ball": hold_ball, "lock.lock_half_life": 0.0}
+        result = jaxik.run(to_ik(values, "stride"), to_rig(RIG), FLAT, frames)
+        ball = jax.vmap(jaxik.Transform.apply)(frames.world_from_model, result.pose.toe.pos)
+        locked = np.asarray(result.trace.advanced.state.lock.locked) > 0
+        locked_twice = locked[1:] & locked[:-1] & (np.asarray(result.reached) > 0)[1:]
+        assert locked_twice.mean() > 0.3
+        slip = np.linalg.norm(np.diff(ball, axis=0)[..., [0, 2]], axis=-1)
+        slips.append(slip[locked_twice].max())
+    assert slips[0] < 1e-9 and slips[1] > 1e-3, "a locked ankle lets the ball slide"
+
+
+# Soles with too little ground.
+
+HEEL, TOE = 0.07, 0.04  # m, of the soles behind the ankle and ahead of the ball
+PLACES = np.linspace(-0.3, 0.3, 801)  # m, forward
+
+
+@functools.cache
+def standing() -> jaxik.Frame:
+    """The left foot standing flat with its ball at each of the places `PLACES`."""
+    frames = swing(np.zeros(801), PLACES, PLACES)
+    stride = dataclasses.replace(frames.stride, standing=jnp.ones((801, 2)))
+    return dataclasses.replace(frames, stride=stride)
+
+
+def slides(ground: PlainTerrain, frames: Any = None, **values: float) -> tuple[np.ndarray, ...]:
+    """The slide of the left foot, m, its support and the height of its ground, m (frames)."""
+    frames = frames or standing()
+    ik = to_ik({f"probe.{name}": value for name, value in values.items()}, "stride")
+    hits = sensed_ground(ik, ground, frames)
+    ankles = frames.world_from_model.pos[:, None] + frames.pose.ankle.pos
+    found = (hits.ankle.point - ankles)[..., 2], hits.support, hits.ankle.point[..., 1]
+    return tuple(np.asarray(x)[:, 0] for x in found)
+
+
+DROP_AHEAD = level_blocks((-3.0, 0.0, 0.0), (0.0, 3.0, -0.25))
+DROP_BEHIND = level_blocks((-3.0, 0.0, -0.25), (0.0, 3.0, 0.0))
+WALL_BEHIND = level_blocks((-3.0, 0.0, 0.25), (0.0, 3.0, 0.0))
+
+
+@pytest.mark.parametrize("slope", [(0, 0, 0), (0.4, 0, 0), (-0.3, 0.2, 0.1)])
+def test_a_plane_supports_the_whole_sole_and_moves_no_foot(slope):
+    forward, left, height = slope
+    corners = ((-4, -4), (-4, 4), (4, 4), (4, -4))
+    plane = quad(*((x, left * x + forward * z + height, z) for x, z in corners)) * BLOCKS
+    slide, support, _ = slides(PlainTerrain(maths.Y, triangles=np.array(plane)))
+    assert_close([slide, support], [0.0 * slide, 1.0 + 0.0 * slide], 1e-9)
+
+
+def test_toes_may_hang_over_an_edge():
+    slide, support, height = slides(DROP_AHEAD)
+    on_top = (PLACES < 0) & (height > -0.1)
+    assert (slide[on_top] == 0).all()
+    assert_close([support[on_top].min(), support[on_top].max()], [5 / 6, 1.0], 1e-9)
+
+
+@pytest.mark.parametrize("ground", [DROP_BEHIND, WALL_BEHIND], ids=["over a drop", "in a wall"])
+def test_a_heel_without_support_slides_onto_the_block_of_its_ball(ground):
+    slide, support, height = slides(ground)
+    on_block = (PLACES > 0.005) & (np.abs(height) < 0.1)
+    pose = at(standing().pose, (0, 0))
+    length = HEEL + float(pose.toe.pos[2] - pose.ankle.pos[2]) + TOE
+    # Shares of the sole on ground ahead of 0 m.
+    before, after = (np.clip((x + TOE) / length, 0.0, 1.0) for x in (PLACES, PLACES + slide))
+    assert (slide[on_block & (before > 0.85)] == 0).all()
+    lacking = on_block & (before < 0.4)
+    assert lacking.sum() > 20 and (slide[lacking] > 0.04).all()
+    assert (after[lacking] > before[lacking] + 0.1).all()
+    # Points lie along the sole in fifths, so that the shares of both differ by a point at most.
+    assert np.abs(support - after)[on_block].max() < 0.25
+
+
+def test_a_lower_limit_makes_slides_shorter():
+    """They go in fifths of a sole, of 0.05 m, and may pass their limit by a part of one."""
+    longest = [np.abs(slides(DROP_BEHIND, max_slide=x)[0]).max() for x in (0.0, 0.06, 0.1)]
+    np.testing.assert_allclose(longest, [0.0, 0.052, 0.104], rtol=0, atol=2e-3)
+
+
+def test_a_swinging_foot_slides_gradually_from_one_foothold_to_the_next():
+    frames = swing(np.linspace(0.0, 1.0, 801), last=-0.6, following=0.03)
+    slide, *_ = slides(WALL_BEHIND, frames)
+    assert slide[0] == 0 and slide[-1] > 0.09
+    assert (np.diff(slide) >= 0).all() and np.diff(slide).max() < 0.001
+
+
+def test_predicted_footholds_and_feet_without_ground_do_not_slide():
+    slide, support, _ = slides(WALL_BEHIND, use_strides=False)
+    assert (slide == 0).all() and support.min() < 0.6
+    for ground, values in ((level_blocks((50.0, 51.0, 0.0)), {}), (WALL_BEHIND, {"layers": 0})):
+        slide, support, _ = slides(ground, **values)
+        assert (slide == 0).all() and (support == 0).all()
+
+
+# Swings.
+
+
+@functools.cache
+def walked() -> jaxik.Frame:
+    """A walk of 90 frames, the last repeated so often that it shares a program with the rest."""
+    frames = to_frames(walk(RIG, 90, start=(0.0, 0.0, -0.5)))
+    return jax.tree.map(lambda x: x[np.minimum(np.arange(len(FINE)), 89)], frames)
+
+
+def hits(ground: PlainTerrain, stride: dict | None = None, **values: float) -> Any:
+    """What feet find with strides changed, and with these numbers of the probe."""
+    frames, ik = walked(), to_ik({f"probe.{name}": x for name, x in values.items()}, "stride")
+    frames = dataclasses.replace(frames, stride=dataclasses.replace(frames.stride, **stride or {}))
+    return jax.tree.map(np.asarray, sensed_ground(ik, ground, frames))
+
+
+def test_a_bump_is_one_at_its_peak_and_nothing_at_both_ends():
+    peaks = np.array([0.23, 0.5, 0.75])
+    x = np.union1d(np.linspace(0.0, 1.0, 41), peaks)
+    of_all = jax.vmap(jax.vmap(jax.value_and_grad(bump), (0, None)), (None, 0))
+    values, slopes = jax.jit(of_all)(jnp.asarray(x), jnp.asarray(peaks))
+    expected = [[reference.bump(fraction, peak) for fraction in x] for peak in peaks]
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(values[:, np.searchsorted(x, peaks)].diagonal(), 1.0, atol=1e-6)
+    assert np.isfinite(slopes).all()
+    np.testing.assert_array_equal(slopes[:, [0, -1]], 0.0)
+
+
+def test_only_swinging_feet_are_lifted_and_pitched_and_only_onto_a_step():
+    for swing in (hits(FLOOR), hits(STEP_UP, swing_as_animated=True)):
+        assert np.abs(swing.lift).max() == np.abs(swing.pitch).max() == 0.0
+    swing = hits(STEP_UP, held_lift=0.0)
+    assert np.abs(swing.lift[np.asarray(walked().stride.fraction) == 0.0]).max() == 0.0
+    assert swing.lift.max() > 0.1 and swing.pitch.min() < -0.2
+
+
+def test_strides_that_are_not_used_are_as_if_unknown():
+    predicted = hits(STEP_UP, {"known": jnp.zeros_like(walked().stride.known)})
+    unused, used = (hits(STEP_UP, use_strides=use) for use in (False, True))
+    for name in ("lift", "pitch"):
+        np.testing.assert_array_equal(getattr(unused, name), getattr(predicted, name))
+    np.testing.assert_array_equal(unused.ankle.point, predicted.ankle.point)
+    assert np.abs(unused.ankle.point - used.ankle.point).max() > 0.1
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["up", "down"])
+def test_steps_higher_than_captured_ones_change_a_swing_no_more(way: float):
+    low, high, higher = (hits(step_up(way * height)) for height in (0.2, 0.35, 0.5))
+    for name in ("lift", "pitch"):
+        assert_close(getattr(higher, name), getattr(high, name), 1e-9)
+        assert np.abs(getattr(low, name) - getattr(high, name)).max() > 0.02
+
+
+def test_a_foot_that_goes_round_a_hurdle_does_not_step_over_it():
+    stride = walked().stride
+    last, following, fraction = (
+        np.asarray(x)[:, 0] for x in (stride.last_ws, stride.next_ws, stride.fraction)
+    )
+    middle = int(np.argmax(fraction > 0.4))
+    same = np.all(last == last[middle], axis=-1)  # the frames of one swing of the left foot
+    x, _, z = 0.5 * (last[middle] + following[middle])
+    hurdle = level_blocks((-3.0, 3.0, 0.0), (z - 0.06, z + 0.06, 0.2, x - 0.5, x + 0.5))
+    aside = jnp.broadcast_to(jnp.asarray([1.0, 0.0, 0.0]), stride.last_ws.shape)
+    straight, round_it = (
+        hits(hurdle, {"aside_ws": way * aside}, held_lift=0.0).lift[same, 0] for way in (0.0, 1.0)
+    )
+    assert straight.max() > 0.2
+    assert np.abs(round_it).max() < 0.01
+
+
+# Heels that rise about the ball, compared with a numerical search and along a walk.
+
+RISES, STAYS = 0.2, 0.4  # sine of a leg's angle ahead of its hip
+VALUES = {"effector.extension": 0.97, "effector.max_lift": 0.1, "probe.swing_as_animated": True}
+
+
+def search_angle(to_ball: np.ndarray, arm: np.ndarray, axis: np.ndarray, length: float) -> float:
+    """The smallest angle, rad, that brings the ankle within `length`, m, or as near as possible.
+
+    It is 0 for a leg that is short enough, or that a small rise of the heel would lengthen.
+    """
+
+    def distance(angle: float) -> float:
+        return maths.length(to_ball + maths.rotate(maths.from_axis_angle(axis, -angle), arm))
+
+    if distance(0.0) <= length or distance(1e-5) > distance(0.0):
+        return 0.0
+    best: Any = minimize_scalar(
+        distance, bounds=(0.0, np.pi), method="bounded", options={"xatol": 1e-9}
+    )
+    if distance(best.x) >= length:
+        return float(best.x)
+    root = brentq(lambda angle: distance(angle) - length, 0.0, best.x, xtol=1e-12)
+    return root  # pyright: ignore[reportReturnType]  # a float without `full_output`
+
+
+def test_the_angle_of_the_heel_is_the_one_that_a_search_finds():
+    """Of random balls, ankles behind and above them, and expected lengths, some too short."""
+    rng = np.random.default_rng(2)
+    legs = []
+    for _ in range(60):
+        axis = maths.unit(np.array([-1.0, *rng.normal(0.0, 0.3, 2)]), maths.X)
+        to_ball = np.array([rng.normal(0.0, 0.1), -0.9, rng.uniform(-0.6, 0.6)])
+        arm = np.array([rng.normal(0.0, 0.02), rng.uniform(0.0, 0.1), rng.uniform(-0.18, -0.1)])
+        excess = rng.choice([-0.02, 0.01, 0.05, 0.3])
+        legs.append((to_ball, arm, axis, maths.length(to_ball + arm) - excess))
+    expected = np.array([search_angle(*each) for each in legs])
+    columns = map(np.stack, zip(*legs, strict=True))
+    actual = jax.jit(effector.heel_angle)(*columns)
+    assert 0.2 < (expected > 0).mean() < 0.9
+    # Where the length cannot be reached, the search is only as precise as a minimum.
+    np.testing.assert_allclose(np.maximum(actual, 0.0), expected, rtol=0, atol=1e-6)
+
+
+def test_the_angle_has_finite_gradients_where_there_is_no_solution():
+    to_ball, arm, length = zip(
+        ([0.0, -0.9, 0.0], [0.0, 0.0, 0.0], 0.8),  # ankle on the ball
+        ([0.0, 0.0, 0.0], [0.0, 0.1, -0.1], 0.8),  # ball on the hip
+        ([0.0, -0.9, -0.9], [0.0, 0.1, 0.1], 0.8),  # cannot become so short
+        ([0.0, -0.9, 0.2], [0.0, 0.0, -0.1], 0.0),  # a leg of no length
+        ([0.0, -0.9, 0.0], [0.1, 0.0, 0.0], 0.8),  # along the axis
+        strict=True,
+    )
+    axis = np.tile(-maths.X, (len(length), 1))
+    finite_jacobian(effector.heel_angle, np.array(to_ball), np.array(arm), axis, np.array(length))
+
+
+@functools.cache
+def over_blocks() -> SimpleNamespace:
+    """Heels on a walk across uneven blocks; (frames, legs), but for the clip and its result."""
+    frames = to_frames(walk(RIG, FRAMES, start=(0.0, 0.0, -2.5), heading=0.1))
+    ground = blocks(np.random.default_rng(5), max_height=0.2, irregular=False)
+    result = jaxik.run(to_ik(VALUES, "stride"), to_rig(RIG), to_terrain(ground), frames)
+    sensed, advanced = result.trace.sensed, result.trace.advanced
+    hip = sensed.hip_ws + advanced.state.pelvis.offset_ws[:, None]
+    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
+    before = advanced.foothold_ws + advanced.hold.offset_ws + lift - hip
+    animated = np.linalg.norm(sensed.ankle_ws - sensed.hip_ws, axis=-1)
+    extension = VALUES["effector.extension"] * (sample_poses.THIGH + sample_poses.SHIN)
+    longest = np.maximum(extension, animated)
+
+    normal = sensed.ground.ankle.normal
+    up = jnp.broadcast_to(jnp.asarray(maths.Y), normal.shape)
+    tilt = quat.shortest_arc(up, normal, sensed.ahead_ws)
+    arm = quat.rotate(tilt, sensed.ankle_ws - sensed.ball_ws)
+    level_axis = -quat.rotate(frames.world_from_model.rot, jnp.asarray(maths.X))
+    axis = quat.rotate(tilt, jnp.broadcast_to(level_axis[:, None], arm.shape))
+    columns = [np.reshape(x, (-1, 3)) for x in (before - arm, arm, axis)]
+    searched = [search_angle(*leg) for leg in zip(*columns, longest.ravel(), strict=True)]
+    cosine = np.abs(np.sum(advanced.effector.rot_ws * sensed.ankle_rot_ws, axis=-1))
+    length = np.linalg.norm(before, axis=-1)
+    return SimpleNamespace(
+        frames=frames,
+        result=result,
+        lift=2.0 * np.arccos(np.minimum(cosine, 1.0)),  # rad
+        searched=np.reshape(searched, longest.shape),  # rad
+        ahead=np.sum(before * sensed.ahead_ws, -1) / length,  # sine of the leg's angle
+        before=length,  # m, of the leg, with its heel down
+        after=np.linalg.norm(advanced.effector.target_ws - hip, axis=-1),
+        longest=longest,
+        to_ball_ws=np.asarray(-arm),  # m, from the ankle, of a level sole laid on the ground
+    )
+
+
+def test_on_a_walk_a_heel_rises_as_far_as_a_search_finds_within_its_limit():
+    """But less, the further its leg points ahead."""
+    walk, max_lift = over_blocks(), VALUES["effector.max_lift"]
+    trailing = walk.searched[walk.ahead <= RISES]
+    assert 0.02 < (trailing > 0.0).mean() < 0.9 and (trailing > max_lift).any()
+    too_long = np.minimum(walk.searched, max_lift)
+    share = [1.0 - maths.smooth01((x - RISES) / (STAYS - RISES)) for x in walk.ahead.ravel()]
+    expected = too_long * np.reshape(share, too_long.shape)
+    assert (too_long - expected).max() > 0.02
+    np.testing.assert_allclose(walk.lift, expected, rtol=0, atol=1e-6)
+
+
+def test_a_rising_heel_keeps_the_leg_at_its_longest_and_stays_down_where_it_is_shorter():
+    walk, max_lift = over_blocks(), VALUES["effector.max_lift"]
+    rises = (walk.lift > 1e-6) & (walk.searched < max_lift) & (walk.ahead <= RISES)
+    assert rises.mean() > 0.02
+    np.testing.assert_allclose(walk.after[rises], walk.longest[rises], rtol=0, atol=1e-9)
+    short = walk.before < walk.longest - 1e-9
+    assert short.mean() > 0.1
+    assert walk.lift[short].max() < 1e-7
+    np.testing.assert_allclose(walk.after[short], walk.before[short], rtol=0, atol=1e-12)
+
+
+def test_the_ball_stays_in_place_while_the_heel_rises():
+    walk = over_blocks()
+    sensed, advanced = walk.result.trace.sensed, walk.result.trace.advanced
+    world = walk.frames.world_from_model
+    ball = jax.vmap(jaxik.Transform.apply)(world, walk.result.pose.toe.pos)
+    lift = np.asarray(sensed.foothold.lift)[..., None] * sensed.leg_up_ws[:, None]
+    moved = np.asarray(ball - (advanced.foothold_ws + lift + walk.to_ball_ws))
+    arrived = (np.asarray(walk.result.reached) > 0) & (np.asarray(walk.result.aimed) > 0)
+    assert (walk.lift[arrived] > 0.02).any()
+    along = np.sum(moved * sensed.ground.ankle.normal, axis=-1)
+    assert np.abs(along)[arrived].max() < 1e-8
+    # Pitch and roll turn the foot a little about the normal, and so the ball along the ground.
+    assert np.abs(moved)[arrived].max() < 0.002
