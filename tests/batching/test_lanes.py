@@ -1,8 +1,5 @@
 """`lanes` gives the results of `jax.vmap`, with the batch axis last in all it computes."""
 
-import dataclasses
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,12 +7,8 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxprs_in_params
 
-import jaxik
-from fitting.bench import workloads
-from jaxik import Smooth, lanes, presets
+from jaxik import lanes
 from jaxik.maths import quat, vec
-from jaxik.world.terrain import plane
-from support.cases import QUICK
 
 BATCH = 5
 
@@ -209,16 +202,13 @@ def test_an_elementwise_function_gets_the_batch_without_moved_axes():
     assert_same(*(transform(lambda x: weighted(x, x, x[0]))(x) for transform in (lanes, jax.vmap)))
 
 
-@pytest.mark.parametrize("block", [1, 2, 3, 5, 9])
-def test_blocks_give_the_same_results(block):
+def test_blocks_give_the_same_results_and_keep_shared_ones():
     x, case = numbers(BATCH, 3), CASES["a scan"]
-    for way in (lanes, batch_last):
-        assert_same(jax.jit(way(case, block=block))(x), jax.vmap(case)(x))
-
-
-def test_blocks_keep_shared_results():
+    for block in (1, 2, 3, 5, 9):
+        for way in (lanes, batch_last):
+            assert_same(jax.jit(way(case, block=block))(x), jax.vmap(case)(x))
     function = lanes(lambda x: (x[0], jnp.arange(3)), out_axes=(0, None), block=2)
-    first, shared = function(numbers(BATCH, 3))
+    first, shared = function(x)
     assert first.shape == (BATCH,) and shared.tolist() == [0, 1, 2]
 
 
@@ -232,19 +222,12 @@ def test_reverse_mode_stores_one_block_at_a_time():
         return jnp.sum(lanes(waves, block=block)(x) ** 2)
 
     x = numbers(5000, 3)
-    memory = {}
-    for block in (None, 100):
-        compiled = jax.jit(jax.grad(loss), static_argnums=1).lower(x, block).compile()
-        memory[block] = compiled.memory_analysis().temp_size_in_bytes
-        assert_same(compiled(x), jax.grad(loss)(x, None), 1e-10)
-    assert memory[None] > 20 * x.nbytes
-    assert memory[100] < 5 * x.nbytes  # arguments, results and their gradients, transposed
-
-
-@pytest.mark.parametrize("block", [0, -1])
-def test_a_block_below_one_is_rejected(block):
-    with pytest.raises(ValueError, match=f"block is {block}, wanted 1 or more"):
-        lanes(jnp.sin, block=block)
+    gradient = jax.jit(jax.grad(loss), static_argnums=1)
+    whole, in_blocks = (gradient.lower(x, block).compile() for block in (None, 100))
+    assert_same(in_blocks(x), whole(x), 1e-10)
+    most, least = (each.memory_analysis().temp_size_in_bytes for each in (whole, in_blocks))
+    # The least is for arguments, results and their gradients, transposed.
+    assert most > 20 * x.nbytes and least < 5 * x.nbytes
 
 
 def test_axes_are_given_as_to_vmap():
@@ -255,10 +238,8 @@ def test_axes_are_given_as_to_vmap():
     args = (numbers(3), tree, numbers(BATCH))
     axes = {"in_axes": (None, {"a": 1, "b": None}, 0), "out_axes": {"sum": 1, "b": None}}
     assert_same(lanes(function, **axes)(*args), jax.vmap(function, **axes)(*args))
-    assert_same(
-        lanes(function, (None, {"a": -1, "b": None}, 0))(*args)["b"],
-        jnp.tile(tree["b"], (BATCH, 1)),
-    )
+    result = lanes(function, (None, {"a": -1, "b": None}, 0))(*args)
+    assert_same(result["b"], jnp.tile(tree["b"], (BATCH, 1)))
 
 
 def test_lanes_can_be_mapped_and_scanned():
@@ -289,40 +270,16 @@ def test_the_batch_axis_is_last_in_all_that_is_computed(name):
     assert all(BATCH not in shape[:-1] for shape in computed)
 
 
-@pytest.mark.parametrize(
-    ("axes", "args", "message"),
-    [
-        (0, (numbers(3), numbers(4)), r"batch sizes differ between arguments: \[3, 4\]"),
-        (None, (numbers(3), numbers(3)), "no argument has a batch axis"),
-        ((0, 1), (numbers(3), numbers(3)), r"shape \(3,\) has no batch axis 1"),
-    ],
-)
-def test_arguments_that_do_not_fit_are_rejected(axes, args, message):
-    with pytest.raises(ValueError, match=message):
-        lanes(jnp.add, in_axes=axes)(*args)
-
-
-def test_a_batched_result_needs_an_output_axis():
-    with pytest.raises(ValueError, match=r"shape \(3,\) depends on the example; out_axes has None"):
-        lanes(lambda x: x, out_axes=None)(numbers(BATCH, 3))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("preset", "ground", "gate"),
-    [
-        ("record", "mesh", jaxik.HARD),
-        ("mec", "plane", workloads.single(Smooth(0.1))),
-    ],
-)
-def test_a_crowd_moves_as_its_members_do_alone(preset, ground, gate):
-    crowd = dataclasses.replace(workloads.crowd(3, 8), drawn={})
-    flat = workloads.single(plane(normal=(0.1, 1.0, 0.05)))
-    terrain = flat if ground == "plane" else workloads.ground(workloads.mesh_field(30))
-    ik = workloads.single(getattr(presets, preset)())
-
-    def run(member):
-        return jaxik.run(ik, crowd.rig, terrain, crowd.character(member)[1], gate, block=4)
-
-    quick = functools.partial(jax.jit, compiler_options=QUICK)
-    assert_same(quick(lanes(run))(crowd.members), quick(jax.vmap(run))(crowd.members), 2e-5)
+def test_what_does_not_fit_is_refused():
+    three, four, batch = jnp.zeros(3), jnp.zeros(4), jnp.zeros((BATCH, 3))
+    for mapped, args, message in (
+        (lanes(jnp.add), (three, four), r"batch sizes differ between arguments: \[3, 4\]"),
+        (lanes(jnp.add, in_axes=None), (three, three), "no argument has a batch axis"),
+        (lanes(jnp.add, in_axes=(0, 1)), (three, three), r"shape \(3,\) has no batch axis 1"),
+        (lanes(jnp.sin, out_axes=None), (batch,), r"\(3,\) depends on the example; out_axes has N"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mapped(*args)
+    for block in (0, -1):
+        with pytest.raises(ValueError, match=f"block is {block}, wanted 1 or more"):
+            lanes(jnp.sin, block=block)
