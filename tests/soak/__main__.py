@@ -55,15 +55,12 @@ def main() -> int:
         begin = time.process_time()
         findings, growth = soak(preset, options.frames // len(options.only), options.seed)
         jax.clear_caches()
-        frames, faulty, not_finite = (sum(x[i] for x in findings) for i in range(3))
-        error = max(x.bone_error for x in findings)
-        failed |= bool(not_finite) or error > BONE_ERROR or growth > GROWTH
+        *counts, errors = zip(*findings, strict=True)
+        frames, faulty, not_finite = map(sum, counts)
+        failed |= bool(not_finite) or max(errors) > BONE_ERROR or growth > GROWTH
         seconds = time.process_time() - begin
-        print(
-            f"| {preset} | {frames} | {faulty} | {not_finite} | {error:.1g} | "
-            f"{growth:.1f} MiB | {seconds:.0f} s |",
-            flush=True,
-        )
+        row = f"{preset} | {frames} | {faulty} | {not_finite} | {max(errors):.1g}"
+        print(f"| {row} | {growth:.1f} MiB | {seconds:.0f} s |", flush=True)
     return int(failed)
 
 

@@ -80,11 +80,11 @@ def newborn(ik: jaxik.FootIK, count: int, seed: int) -> Life:
     keys = jax.random.split(jax.random.key(seed, impl="unsafe_rbg"), count)
     state = jaxik.init(ik, rig)
 
-    def one(key: Array) -> Life:
+    def born(key: Array) -> Life:
         start = jax.random.randint(key, (), 0, frames.dt.shape[0])
         return Life(state, key, start, jnp.zeros(3, frames.dt.dtype), jnp.ones_like(rig.present))
 
-    return jax.vmap(one)(keys)
+    return jax.vmap(born)(keys)
 
 
 def living(ik: jaxik.FootIK, steps: int) -> Callable[[Life, Terrain], tuple]:
@@ -116,11 +116,11 @@ def summarised(shown: tuple[Array, ...]) -> Findings:
 def _next_frame(life: Life, frames: jaxik.Frame) -> tuple[Life, jaxik.Frame]:
     """The next frame of the clip, after whatever has happened to it on its way."""
     key, *keys = jax.random.split(life.key, 9)
-    lost = jnp.where(_happens(keys[0], OFTEN), jax.random.randint(keys[1], (), 1, 30), 0)
+    lost = jax.random.bernoulli(keys[0], OFTEN) * jax.random.randint(keys[1], (), 1, 30)
     index = (life.index + 1 + lost) % frames.dt.shape[0]
     frame = jax.tree.map(lambda x: x[index], frames)
 
-    teleported = _happens(keys[2], RARELY)
+    teleported = jax.random.bernoulli(keys[2], RARELY)
     distance = jax.random.choice(keys[3], jnp.asarray(DISTANCES))
     place = distance * jax.random.uniform(keys[4], (3,), minval=-1.0, maxval=1.0)
     offset_ws = jnp.where(teleported, place, life.offset_ws)
@@ -139,7 +139,7 @@ def _damaged(key: Array, frame: jaxik.Frame) -> jaxik.Frame:
     """The frame, now and then with numbers or a time that no frame should have."""
     first, second, third, *keys = jax.random.split(key, 3 + len(jax.tree.leaves(frame)))
     strange = jax.random.choice(first, jnp.asarray(STRANGE, frame.dt.dtype))
-    happens = _happens(second, OFTEN)
+    happens = jax.random.bernoulli(second, OFTEN)
 
     def damage(leaf: Array, key: Array) -> Array:
         if leaf.dtype == bool or not leaf.size:
@@ -150,25 +150,15 @@ def _damaged(key: Array, frame: jaxik.Frame) -> jaxik.Frame:
     frame = jax.tree.unflatten(structure, list(map(damage, leaves, keys)))
     at, which = jax.random.split(third)
     dt = jax.random.choice(which, jnp.asarray(STRANGE_DT, frame.dt.dtype))
-    return dataclasses.replace(frame, dt=jnp.where(_happens(at, OFTEN), dt, frame.dt))
-
-
-def _happens(key: Array, rate: float) -> Array:
-    return jax.random.bernoulli(key, rate)
+    return dataclasses.replace(frame, dt=jnp.where(jax.random.bernoulli(at, OFTEN), dt, frame.dt))
 
 
 def _bone_error(solved: jaxik.LegPose, animated: jaxik.LegPose) -> Array:
     """How much bones of each leg differ in length from the animation's; see `Findings`."""
-    errors = [
-        jnp.abs(
-            vec.length(getattr(solved, end).pos - getattr(solved, start).pos)
-            - vec.length(getattr(animated, end).pos - getattr(animated, start).pos)
-        )
-        for start, end in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe"))
-    ]
-    far = jnp.abs(jnp.stack([joint.pos for joint in _joints(solved)])).max(axis=(0, 2))
-    return jnp.stack(errors).max(axis=0) / jnp.maximum(far, 1.0)
-
-
-def _joints(pose: jaxik.LegPose) -> tuple[jaxik.Transform, ...]:
-    return pose.hip, pose.knee, pose.ankle, pose.toe
+    after, before = (
+        jnp.stack([pose.hip.pos, pose.knee.pos, pose.ankle.pos, pose.toe.pos])
+        for pose in (solved, animated)
+    )
+    lengths, expected = (vec.length(joints[1:] - joints[:-1]) for joints in (after, before))
+    far = jnp.abs(after).max(axis=(0, 2))
+    return jnp.abs(lengths - expected).max(axis=0) / jnp.maximum(far, 1.0)
