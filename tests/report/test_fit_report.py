@@ -1,14 +1,16 @@
 """Reports of fits and posteriors: numbers in texts and tables, and the plots that they link."""
 
+import base64
 import json
+import math
 import re
+import sys
 import tomllib
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from xml.etree import ElementTree
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,41 +19,42 @@ from PIL import Image
 
 from fitting.analysis import limit_activity, playback
 from fitting.datasets.synthetic import walker
-from fitting.experiments import known_values
+from fitting.experiments import experiment_files, known_values
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling import inference_data
+from fitting.inference.sampling.islands import Island
 from fitting.inference.sampling.posterior import Posterior
 from fitting.problem import residuals
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
-from fitting.problem.space import make_space
+from fitting.problem.space import Space, make_space
 from fitting.report import fit_report, posterior_report
+from fitting.report.formatting import markdown
 from fitting.report.goodness import goodness_report
-from fitting.report.uncertainty import priors
+from fitting.report.plots import posterior_plots
+from fitting.report.uncertainty import islands, priors
+from fitting.runtime.display import notebook
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
 from fitting.studies.sample import SampledFit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
-from support.problems import posterior_of
+from support import toy
+from support.experiments import write
+from support.problems import posterior_of, problem_of
 from support.profiles import parabolas
 
 VALUES = {"contact.planted_height": 0.11, "pelvis.on_gain": 0.3, "leg.soften": 0.95}
 TRUTH = """
 preset = "record"
 faithful = true
-[contact]
-planted_height = 0.10
-[pelvis]
-on_gain = 0.5
-vertical_only = true
-[probe]
-toe_ls = [0.0, -0.07, 0.2]
-[noise]
-ankle = 0.01
+contact.planted_height = 0.10
+pelvis = { on_gain = 0.5, vertical_only = true }
+probe.toe_ls = [0.0, -0.07, 0.2]
+noise.ankle = 0.01
 """
 CLIP_PLOTS = ("motion", "side_view", "knees", "residuals", "locks", "noise")
 SIGMAS = {"ankle": 0.02, "pelvis": 0.03, "foot": 0.1, "contact": 0.5, "smooth": 20.0}
@@ -112,19 +115,7 @@ def fitted(experiment) -> Fit:
 
 @pytest.fixture(scope="module")
 def twice(fitted) -> Fit:
-    """Of the same clip and again."""
-    problem = replace(fitted.problem, data=fitted.problem.data * 2)
-    return replace(fitted, problem=problem)
-
-
-def invented_posterior(stuck: list[int] | None = None) -> Posterior:
-    """Normal draws around known values."""
-    u = np.random.default_rng(0).normal(size=(120, 12, 3))
-    values = np.array([0.105, 0.3, 0.9]) + u * np.array([0.005, 0.01, 0.02])
-    chain = {"thin_by": 2, "burn_in": 20, "autocorrelation_time": np.array([2.0, 3.0, 4.0])}
-    acceptance = np.full(12, 0.25)
-    posterior = posterior_of(tuple(VALUES), u, values, stuck=stuck or [], **chain)
-    return replace(posterior, acceptance=acceptance, message="Converged: the chain is long enough.")
+    return replace(fitted, problem=replace(fitted.problem, data=fitted.problem.data * 2))
 
 
 def line_of(text: str, name: str) -> str:
@@ -157,6 +148,14 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     assert "at least 0.85" in soften and "at its upper bound" in soften
     assert "unknown" in soften
     assert text.endswith("1 of 2 determined parameters within 5 % of their range")
+    text = fit_report.fit_text(replace(fitted, known_values=None))
+    assert "truth" not in text and "determined parameters within" not in text
+    # A gain is shown as half-life, s, and at 30 and 60 Hz.
+    name, half_life, *_, gain, gain_at_60 = text.split("gain at 60 Hz")[1].split()[-5:]
+    assert name == "pelvis.on_gain"
+    shown = [float(number) for number in (half_life, gain, gain_at_60)]
+    expected = [np.log(0.5) / np.log(0.7) / 30.0, 0.3, 1 - np.sqrt(0.7)]
+    np.testing.assert_allclose(shown, expected, rtol=1e-3)
 
 
 def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
@@ -181,17 +180,6 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
 
 
-def test_a_gain_is_shown_as_half_life_and_at_30_and_60_hz(fitted):
-    text = fit_report.fit_text(replace(fitted, known_values=None))
-    cells = text.split("gain at 60 Hz")[1].split()[-5:]
-    half_life = np.log(0.5) / np.log(0.7) / 30.0
-    assert cells[0] == "pelvis.on_gain"
-    np.testing.assert_allclose(float(cells[1]), half_life, rtol=1e-3)
-    np.testing.assert_allclose(float(cells[3]), 0.3, rtol=1e-3)
-    np.testing.assert_allclose(float(cells[4]), 1 - np.sqrt(0.7), rtol=1e-3)
-    assert "truth" not in text and "determined parameters within" not in text
-
-
 def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, monkeypatch):
     sizes = []
 
@@ -200,8 +188,10 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
         path.write_bytes(b"")
 
     monkeypatch.setattr(Figure, "savefig", savefig)
-    fit_report.write_fit(tmp_path, fitted)
+    fit_report.write_fit(tmp_path, fitted, ["before its goodness"], ["before its pictures"])
     text = (tmp_path / run_folder.SUMMARY).read_text()
+    for following in ("goodness\n\n## Goodness of fit\n", "pictures\n\n## Pictures\n"):
+        assert f"\nbefore its {following}" in text
     names = [line.rpartition("(")[2].rstrip(")") for line in text.splitlines() if line[:2] == "!["]
     plots = {*CLIP_PLOTS, "cost", "worst", "profiles"}
     assert set(names) == {f"{plot}.png" for plot in plots}
@@ -239,9 +229,7 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
     by_kind = {row["kind"]: row for row in goodness["groups"]}
     assert set(by_kind) == set(playback.RESIDUAL_KINDS)
     assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
-
-
-def test_what_a_translation_leaves_is_measured_in_tolerances(fitted):
+    # What a translation leaves is measured in tolerances.
     (_, sentence, *texts) = goodness_report.section(replace(fitted, has_noise=False))
     assert sentence.startswith(("**Not the same motion: ", "**The same motion"))
     assert "tolerance | error, rms |" in texts[1] and len(texts) == 2
@@ -257,29 +245,25 @@ def test_the_second_of_two_clips_has_its_own_plots(fitted, twice, tmp_path, undr
         assert plot == f"![hill, clip {number}: the worst 1.9 seconds](worst_{number}.png)"
 
 
-def test_a_playback_has_the_residuals_of_the_fit(fitted):
-    (played,) = fitted.playbacks
+def test_a_playback_has_the_residuals_of_the_fit_and_rebuilds_captured_joints(fitted):
+    (scene,), (played,) = fitted.problem.data, fitted.playbacks
     assert played.fitted_kinds == list(playback.RESIDUAL_KINDS)
     shown = np.concatenate([np.ravel(played.residuals[kind]) for kind in playback.RESIDUAL_KINDS])
-    expected = eqx.filter_jit(residuals.residuals_of_scenes)(fitted.ik, fitted.problem.data)
+    expected = fitted.problem.residuals(jnp.asarray(fitted.solution.u))[:-3]  # without priors
     np.testing.assert_allclose(shown, expected, atol=1e-9)
-
-
-def test_a_playback_rebuilds_captured_hips_toes_and_knee_angles(fitted):
-    (scene,), captured = fitted.problem.data, fitted.playbacks[0].captured
     legs = walker.walk(seconds=2.0, fps=15.0).leg_pose_ws()
-    np.testing.assert_allclose(captured.hip, legs.hip.pos, atol=1e-6)
-    np.testing.assert_allclose(captured.toe, legs.toe.pos, atol=1e-6)
+    np.testing.assert_allclose(played.captured.hip, legs.hip.pos, atol=1e-6)
+    np.testing.assert_allclose(played.captured.toe, legs.toe.pos, atol=1e-6)
     span = np.linalg.norm(np.asarray(legs.hip.pos - legs.ankle.pos), axis=-1)
     thigh, shin = np.asarray(scene.rig.thigh), np.asarray(scene.rig.shin)
     cosine = (thigh**2 + shin**2 - span**2) / (2 * thigh * shin)
-    np.testing.assert_allclose(np.cos(captured.knee_angle), cosine, atol=1e-6)
+    np.testing.assert_allclose(np.cos(played.captured.knee_angle), cosine, atol=1e-6)
 
 
-def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitted):
+def test_activity_counts_locks_releases_ground_and_limits_where_they_are_tight(fitted):
     (scene,) = fitted.problem.data
 
-    def active(changed: dict[str, float]) -> Mapping[str, float]:
+    def active(changed):
         ik = parameter_tree.replace(fitted.ik, changed)
         return limit_activity.active_limits(ik, (scene,), (playback.run(ik, scene),))[0]
 
@@ -290,9 +274,6 @@ def test_limits_act_where_they_are_tight_and_not_at_the_end_of_their_range(fitte
     assert tight["pelvis.limit"] > 0.7
     assert set(tight) >= {"foot.max_pitch", "foot.min_roll", "target.max_ankle_height"}
     assert not {"lock.max_speed", "pelvis.on_gain"} & set(tight)
-
-
-def test_activity_counts_locks_releases_and_ground(fitted):
     (activity,) = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
     (result,) = fitted.results
     locked = np.asarray(playback.stage_outputs(result).advanced.state.lock.locked)
@@ -323,7 +304,20 @@ def test_decisions_flip_where_ankles_are_between_the_thresholds(fitted):
     assert down.rise == pytest.approx(wanted, rel=1e-5)
 
 
-def sampled_fit(fitted: Fit, posterior: Posterior, known: Mapping[str, float] | None) -> SampledFit:
+# Posteriors
+
+
+def invented_posterior(stuck: list[int] | None = None) -> Posterior:
+    """Normal draws around known values."""
+    u = np.random.default_rng(0).normal(size=(120, 12, 3))
+    values = np.array([0.105, 0.3, 0.9]) + u * np.array([0.005, 0.01, 0.02])
+    chain = {"thin_by": 2, "burn_in": 20, "autocorrelation_time": np.array([2.0, 3.0, 4.0])}
+    acceptance = np.full(12, 0.25)
+    posterior = posterior_of(tuple(VALUES), u, values, stuck=stuck or [], **chain)
+    return replace(posterior, acceptance=acceptance, message="Converged: the chain is long enough.")
+
+
+def sampled_fit(fitted: Fit, posterior: Posterior, known: dict[str, float] | None) -> SampledFit:
     rows, space = fitted.summary["parameters"], fitted.problem.space
     return SampledFit(fitted.experiment, space, rows, posterior, known)
 
@@ -412,3 +406,148 @@ def test_parameters_of_which_chain_and_fit_disagree_are_named(fitted, tmp_path):
     for name in ("corner.png", "chain.png"):
         with Image.open(tmp_path / name) as picture:
             assert min(picture.size) > 400
+
+
+NAMES = ("foot.share", "foot.idle")
+
+
+def space_of(names: tuple[str, ...]) -> Space:
+    return problem_of(toy.Toy(), names, None, toy.residuals).space
+
+
+def toy_posterior(names: tuple[str, ...] = NAMES, **other: Any) -> Posterior:
+    u = 0.3 * np.random.default_rng(0).normal(size=(100, 8, len(names)))
+    return replace(posterior_of(names, u, 0.6 + 0.2 * u, burn_in=10), **other)
+
+
+def around_fit(posterior: Posterior) -> SampledFit:
+    """As far as texts need it: a posterior around a fit with these rows."""
+    row = {"kind": "smooth", "value": 0.6, "interval": [0.5, 0.7]}
+    rows: Any = [{"name": name} | row for name in posterior.names]
+    return SampledFit(cast(Any, None), space_of(posterior.names), rows, posterior)
+
+
+def text_of(**other: Any) -> str:
+    return posterior_report.posterior_text(around_fit(toy_posterior(**other)))
+
+
+def island(weight: float, exchanges: int, u: float) -> Island:
+    error = 0.012 if exchanges >= 20 else math.nan
+    return Island(np.full(2, u), weight, error, exchanges, 4, -12.5)
+
+
+def first_coordinates(axes) -> tuple[set[float], set[float]]:
+    """x and y of where the lines of a panel begin."""
+    starts = [np.asarray(line.get_data(), float)[:, 0] for line in axes.lines]
+    return {float(x) for x, _ in starts}, {float(y) for _, y in starts}
+
+
+def test_the_lines_of_known_values_cross_in_every_panel_of_their_parameters_or_in_the_only_one():
+    values, known = {"foot.share": 0.61, "foot.idle": 0.5}, {"foot.idle": 0.4}
+    figure = posterior_plots.corner(toy_posterior(), NAMES, values, known, "two")
+    marks = [first_coordinates(axes) for axes in figure.axes]
+    assert 0.61 in marks[0][0] and 0.61 in marks[2][0]
+    assert {0.5, 0.4} <= marks[2][1] and {0.5, 0.4} <= marks[3][0]
+    (name,) = names = NAMES[:1]
+    figure = posterior_plots.corner(
+        toy_posterior(names), names, {name: 0.61}, {name: 0.55}, "one", space_of(names)
+    )
+    (axes,) = figure.axes
+    assert {0.61, 0.55} <= first_coordinates(axes)[0]
+
+
+def test_islands_are_shown_with_weights_exchanges_and_medians():
+    found = (island(0.81, 250, 0.0), island(0.19, 250, 1.5))
+    assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text_of(islands=found)
+    space = space_of(NAMES)
+    section = islands.island_section(toy_posterior(islands=found), space, dict.fromkeys(NAMES, "1"))
+    text = "\n".join(section)
+    assert "| 1 | 81.0 % ± 1.2 % | 250 | 4 | -12.5 |" in text
+    first, second = (np.asarray(space.values(jnp.full(2, u))) for u in (0.0, 1.5))
+    assert f"| foot.share | 1 | {first[0]:.4g} | {second[0]:.4g} |" in text
+    assert "out of reach" not in text
+    found = (island(0.75, 3, 0.0), island(0.25, 3, 1.5))  # hardly any exchanges
+    text = text_of(islands=found)
+    assert "out of reach (75.0 % of the draws), out of reach (25.0 % of the draws)" in text
+    table = markdown(islands.island_table(found))
+    assert "| 2 | out of reach (25.0 % of the draws) | 3 |" in table
+
+
+def test_walkers_left_out_a_better_point_and_an_interval_that_contradicts_the_fit_are_said():
+    text = text_of(isolated=[2, 5], isolated_mass=0.0071)
+    assert "Left out are walkers 2, 5" in text and "about 0.71 % of the posterior" in text
+    top = float(toy_posterior().log_probability.max())
+    text = text_of(start_log_probability=top - 3.25)
+    assert "log-probability is 3.25 higher" in text and "`Posterior.best_values`" in text
+    assert "contradicts" not in text_of(start_log_probability=top - 0.05)
+    for value, width, kind, reason in (
+        (0.6, 0.2, "smooth", None),
+        (0.75, 0.2, "smooth", "leaves out the fit"),
+        (0.6, 0.08, "smooth", "narrower"),
+        (0.6, 0.08, "threshold", None),
+        (0.6, 0.03, "threshold", "narrower"),
+        (0.6, 0.5, "threshold", "wider"),
+    ):
+        draws = toy_posterior(NAMES[:1])  # of which 95 % shall lie in an interval of this width
+        draws = replace(draws, values=value + width / 3.92 * draws.u / draws.u.std())
+        sampled = around_fit(draws)
+        sampled.parameters[0]["kind"] = kind
+        reasons = [row["reason"] for row in sampled.disagreements]
+        assert reasons == ([] if reason is None else [reason]), (value, width, kind)
+        text = posterior_report.posterior_text(sampled)
+        assert ("The chain contradicts its fit" in text) == (reason is not None)
+        assert around_fit(replace(draws, converged=False)).disagreements == []
+
+
+# What notebooks show of results, and the tables that pandas takes
+
+
+def tables(text: str) -> list[list[list[str]]]:
+    """The cells of all tables of a page."""
+    page = ElementTree.fromstring(re.sub(r"(<img [^>]*)>", r"\1/>", text))
+    rows_of = [list(table.iter("tr")) for table in page.iter("table")]
+    return [[[cell.text or "" for cell in row] for row in rows] for rows in rows_of]
+
+
+def pictures(text: str) -> list[bytes]:
+    sources = re.findall(r'src="data:image/png;base64,([^"]+)"', text)
+    return [base64.b64decode(source) for source in sources]
+
+
+def test_a_notebook_shows_the_clips_and_the_free_parameters_of_an_experiment(tmp_path):
+    experiment = experiment_files.load_experiment(write(tmp_path, top='name = "a <b> & c"'))
+    text = experiment._repr_html_()
+    clips, free = tables(text)
+    assert "a &lt;b&gt; &amp; c" in text and "Numbers are for an adult" in text
+    files = ["uneven_walk.npz", "uneven_walk_base.npz", "uneven_walk.ply"]
+    assert clips[1] == [*files, "1 s", "2 s"]
+    assert [row[0] for row in free[1:]] == ["pelvis.on_gain", "foot.max_pitch"]
+    assert free[2][3] == "0.1 to 1.4"
+    assert notebook.html("a < b") == "<pre>&#x27;a &lt; b&#x27;</pre>", "as is anything else"
+
+
+def test_a_fit_is_shown_as_a_table_and_a_picture_and_is_a_table_of_pandas(fitted):
+    text = fitted._repr_html_()
+    (parameters,) = tables(text)
+    assert [row[0] for row in parameters[1:]] == list(VALUES)
+    (picture,) = pictures(text)
+    assert picture.startswith(b"\x89PNG") and len(picture) > 10_000
+    table = fitted.table()
+    kinds = ["threshold", "smooth", "smooth"]
+    assert list(table.index) == list(VALUES) and list(table["kind"]) == kinds
+    np.testing.assert_array_equal(table["value"], fitted.solution.values)
+    intervals = [row["interval"] for row in fitted.parameters]
+    np.testing.assert_array_equal(table[["low95", "high95"]], intervals)
+
+
+def test_a_posterior_is_shown_and_is_a_table_if_there_is_pandas(monkeypatch):
+    posterior = toy_posterior()
+    text = posterior._repr_html_()
+    assert "Converged." in text and len(pictures(text)) == 1
+    assert [row[0] for row in tables(text)[0][1:]] == list(NAMES)
+    table = posterior.table()
+    assert list(table.index) == list(NAMES)
+    np.testing.assert_allclose(table["mean"], posterior.values[10:].mean(axis=(0, 1)))
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r'this needs pandas: pip install "jaxik\[tables\]"'):
+        posterior.table()

@@ -1,0 +1,505 @@
+"""Pages, words and pictures of fits and comparisons: whole, safe, with the motion as solved."""
+
+import base64
+import dataclasses
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from fitting.analysis import worst_window
+from fitting.analysis.accuracy import Accuracy
+from fitting.analysis.difference import QUANTITIES
+from fitting.analysis.measures import Measures
+from fitting.analysis.misplacement import Cause
+from fitting.analysis.placement import Extreme, Placement
+from fitting.analysis.playback import RESIDUAL_KINDS
+from fitting.analysis.worst_window import find_worst_window
+from fitting.datasets import ground_patch
+from fitting.datasets.clips import load_clip
+from fitting.problem.scene import legs_ws
+from fitting.report import comparison_report, labels, placement_report, worst_window_report
+from fitting.report.page import (
+    fit_page,
+    motion_data,
+    pictures,
+    posterior_section,
+    rendering,
+    sentences,
+)
+from fitting.report.page.comparisons import compare_page, compare_sentences, runs_page
+from fitting.report.page.study_page import Finding, Grid, Section, StudyPage, Text
+from fitting.report.plots import worst_window_plots
+from fitting.report.plots.style import save
+from fitting.studies import run_folder
+from fitting.studies.motions import comparison_motions, fit_motions
+from fitting.studies.posterior.run_comparison import ComparedRun
+from support import comparisons, runs
+from support.comparisons import DEEP
+from support.experiments import ROOT
+from support.pages import Page
+from support.playbacks import FRAMES, LEGS, error, playback
+
+
+def test_every_figure_has_a_label_in_the_same_order_and_is_shown_in_its_unit():
+    for figures, columns in ((Accuracy, labels.ACCURACY), (Measures, labels.MEASURES)):
+        assert list(columns) == [field.name for field in dataclasses.fields(figures)]
+    assert list(labels.RESIDUALS) == list(RESIDUAL_KINDS)
+    assert list(labels.DIFFERENCES) == list(QUANTITIES)
+    factors = {"%": 100, "cm": 100, "mm": 1000, "°": math.degrees(1), "degrees": math.degrees(1)}
+    for table in (labels.ACCURACY, labels.MEASURES, labels.RESIDUALS, labels.DIFFERENCES):
+        for column in table.values():
+            assert column.factor == factors.get(column.unit.split()[0], 1), column
+    for name, value, shown in (
+        ("penetration_mean", 0.01234, "1.23"),
+        ("reached", 0.875, "87.5"),
+        ("pops", 12.0, "12"),
+        ("slide", math.nan, "–"),
+    ):
+        assert labels.MEASURES[name].format(value) == shown
+
+
+# How feet are placed on their ground
+
+GOOD = Placement(
+    sunk=0.01,
+    floating=0.02,
+    sunk_swing=0.03,
+    sunk_frames=0.04,
+    groundless=0.05,
+    deepest=Extreme(0.031, 7, "left"),
+    highest=Extreme(0.022, 8, "right"),
+    slide=0.011,
+    largest_slide=Extreme(0.044, 9, "left"),
+    pop=Extreme(0.033, 10, "right"),
+)
+NAN, NOTHING = math.nan, Extreme(math.nan, 0, "left")
+UNKNOWN = Placement(NAN, NAN, NAN, NAN, 1.0, NOTHING, NOTHING, NAN, NOTHING, NOTHING)
+
+
+def test_the_table_says_how_often_how_far_and_where_and_what_is_unknown_is_null_in_json():
+    heading, _, *rows = placement_report.text(GOOD).splitlines()
+    assert heading == "feet and ground, 2 cm or more   frames  largest"
+    assert rows == [
+        "standing feet in the ground     1.0 %   3.1 cm, left, frame 7",
+        "standing feet above the ground  2.0 %   2.2 cm, right, frame 8",
+        "moving feet in the ground       3.0 %",
+        "any foot in the ground          4.0 %",
+        "no ground under the sole        5.0 %",
+        "slide in a stance, median       1.1 cm  4.4 cm, left, frame 9",
+        "pop in 1/60 s                           3.3 cm, right, frame 10",
+    ]
+    assert "nan" not in placement_report.text(UNKNOWN)
+    numbers = json.loads(json.dumps(placement_report.numbers(UNKNOWN)))
+    assert numbers["sunk"] is None and numbers["groundless"] == 1.0
+    assert numbers["deepest"] == {"value": None, "frame": 0, "leg": "left"}
+    assert placement_report.numbers(GOOD)["pop"]["value"] == pytest.approx(0.033)
+
+
+def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cause():
+    sunk = dataclasses.replace(GOOD, sunk=0.62)
+    floor = "the root stays on the animation's floor where the ground rises (use --root"
+    unit = "the terrain is in another unit of length: one of its units is 0.01 m"
+    for cause, words in (
+        (Cause("root"), floor),
+        (Cause("units", 0.01), unit),
+        (Cause("offset", -0.12), "all feet are 12 cm too low: check the clip's floor (--floor)"),
+        (Cause("offset", 0.5), "all feet are 50 cm too high"),
+        (Cause("missing"), "the terrain does not lie below the path"),
+        (Cause("unknown"), "none of missing ground, units, root, floor and offset"),
+    ):
+        (text,) = placement_report.warning_texts(sunk, cause)
+        assert "in the ground in 62.0 % of their frames (deepest: 3.1 cm, left, frame 7)" in text
+        assert "above it in 2.0 % (highest: 2.2 cm, right, frame 8)" in text
+        assert f"likely cause: {words}" in text
+    assert placement_report.warning_texts(GOOD, None) == []
+    (text,) = placement_report.warning_texts(UNKNOWN, Cause("missing"))
+    assert text.startswith("there is no ground under 100.0 % of the soles; likely cause: ")
+    bad = dataclasses.replace(GOOD, slide=0.05, pop=Extreme(0.124, 3, "left"))
+    assert placement_report.warning_texts(bad, None) == [
+        "standing feet slide by 5.0 cm a stance more than animated (most: 4.4 cm, left, frame 9)",
+        "feet pop in 1/60 s (most: 12.4 cm, left, frame 3)",
+    ]
+    with pytest.warns(placement_report.PlacementWarning, match="^mec: feet pop in 1/60 s"):
+        placement_report.warn(dataclasses.replace(bad, slide=0.0), None, "mec")
+
+
+# The worst two seconds
+
+
+def describe(play) -> str:
+    return " ".join(worst_window_report.describe(play, find_worst_window(play), LEGS))
+
+
+def test_the_text_gives_direction_size_and_time_of_the_largest_error():
+    for offset, direction in (
+        ((0.01, 0.09, 0.02), "9.3 cm off, mostly too high (9.0 cm)"),
+        ((0.01, -0.09, 0.02), "9.3 cm off, mostly too low (9.0 cm)"),
+        ((0.0, 0.01, 0.05), "mostly too far ahead (5.0 cm)"),
+        ((0.0, 0.01, -0.05), "mostly too far behind (5.0 cm)"),
+        ((0.05, 0.01, 0.0), "mostly too far to the left (5.0 cm)"),
+        ((-0.05, 0.01, 0.0), "mostly too far to the right (5.0 cm)"),
+    ):
+        text = describe(playback(error("ankle", 123, *offset, leg=1)))
+        assert "The ankle position of the right leg is worst at 4.10 s: " in text
+        assert direction in text
+        assert "Ankle position makes up 100 % of their squares; knee position 0 %" in text
+        assert "The right leg makes up 100 % of the squares of the legs." in text
+
+
+def test_the_text_says_whether_the_foot_stands_and_whether_its_target_was_in_reach():
+    bent = error("knee", 123, 0.0, 0.1, 0.0, leg=0)
+    for weight, state, reach, part in (
+        (1.0, "stands", "within reach", "0 %"),
+        (0.0, "swings", "out of reach", "5 %"),
+    ):
+        stance, reached = np.ones((FRAMES, 2)), np.ones((FRAMES, 2))
+        stance[123, 0] = weight
+        reached[123:129, 0] = weight
+        text = describe(playback(bent, stance=stance, reached=reached))
+        assert f"The foot {state} at that time, according to the captured contact labels." in text
+        assert f"target of its ankle is {reach} then; targets are out of reach in {part} of" in text
+
+
+def test_the_text_about_the_body_names_standing_feet_and_a_perfect_fit_has_a_text_too():
+    contact = np.ones((FRAMES, 2))
+    contact[:, 1] = 0.0
+    unlabelled, unreached = np.zeros((FRAMES, 2)), np.zeros((FRAMES, 2))
+    sunk = error("pelvis", slice(0, FRAMES), 0.0, 0.03, 0.0)
+    text = describe(playback(sunk, stance=unlabelled, contact=contact, reached=unreached))
+    assert "stand at that time, according to the system's contact weights: left." in text
+    assert "The ankle's target is out of reach in 100 % of" in text
+    assert "The pelvis is 3.0 cm too high on average." in text
+    assert "No captured foot stands above known ground" in text
+    errors = np.zeros((FRAMES - 2, 2, 3))
+    errors[149, 1] = [0.0, 30.0, 0.0]
+    assert "30.0 m/s² off." in describe(playback({"smooth": errors}, sigmas={"smooth": 10.0}))
+    assert "the residuals are 0.00 sigmas (rms)" in describe(playback())
+
+
+def test_the_text_says_how_far_captured_soles_are_from_the_ground():
+    stance = np.zeros((FRAMES, 2))
+    stance[100:140, 1] = 1.0
+    play = playback(error("ankle", 120, 0.0, 0.1, 0.0, leg=0), stance=stance)
+    for height, side in ((0.02, "in"), (-0.02, "above")):
+        ground = play.ball_ground_ws + np.array([0.0, height, 0.0])
+        ground[110, 1, 1] += height
+        text = describe(dataclasses.replace(play, ball_ground_ws=ground))
+        assert f"stand are 2.1 cm {side} the ground on average (2.1 cm rms; the right one" in text
+        assert f"the right one 4.0 cm {side} it at 3.67 s)" in text
+
+
+def test_the_picture_shows_the_window_with_its_stances(tmp_path):
+    stance, seen = np.zeros((FRAMES, 2)), np.ones(FRAMES, bool)
+    stance[100:140, 1] = 1.0
+    seen[130:133] = False
+    play = playback(error("ankle", 120, 0.0, 0.1, 0.0, leg=0), seen=seen, stance=stance)
+    window = find_worst_window(play)
+    figure = worst_window_plots.worst_window(play, LEGS, window, "hill: the worst two seconds")
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    names = ["Left ankle", "Right ankle", "Pelvis", "Left knee", "Right knee"]
+    assert [title.partition(",")[0].partition(" (")[0] for title in titles] == names
+    assert figure.axes[0].get_xlim() == (play.time[window.start], play.time[window.end])
+    heights = [line.get_ydata() for line in figure.axes[0].lines[:2]]
+    assert np.ptp(np.asarray(heights[1])) == pytest.approx(10.0), "the fitted ankle, cm"
+    bands = [len(axes.patches) for axes in figure.axes]
+    assert bands == [1, 2, 1, 1, 2], "frames that were not seen, and the right foot's stance"
+    save(tmp_path / "worst.png", figure)
+    with Image.open(tmp_path / "worst.png") as picture:
+        assert 1000 < picture.width < 2000 and 1000 < picture.height < 2500
+
+
+HOSTILE = "</script><script>alert(1)</script>"
+BESIDE = {"summary.md", "fit.json", "parameters.toml"}  # files that the page names
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """An invented fit, whose names try to be HTML."""
+    fitted = runs.with_clips(runs.invented_fit(tmp_path_factory.mktemp("experiment")))
+    (scene,) = fitted.problem.data
+    reference = dataclasses.replace(scene.reference, label=HOSTILE)
+    scene = dataclasses.replace(scene, reference=reference)
+    problem = dataclasses.replace(fitted.problem, data=(scene,))
+    experiment = dataclasses.replace(fitted.experiment, name=f"walk {HOSTILE} & $x^$")
+    return dataclasses.replace(fitted, experiment=experiment, problem=problem)
+
+
+@pytest.fixture(scope="module")
+def run(fitted, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    runs.write_run(folder, fitted)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run) -> Page:
+    return Page(run / run_folder.PAGE)
+
+
+@pytest.fixture(scope="module")
+def motions(fitted) -> fit_motions.ClipMotions:
+    (data,), (result,) = fitted.clips, fitted.results
+    return fit_motions.clip_motions(data, result, result)
+
+
+def array(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def points(clip: dict, skeleton: dict) -> np.ndarray:
+    """Positions as the page's scripts have them, m: (frames, points, 3)."""
+    root = array(skeleton["root"], "<f4").reshape(-1, 1, 3)
+    offsets = array(skeleton["offsets"], "<i2").reshape(clip["frames"], skeleton["points"], 3)
+    return root + skeleton["quantum"] * offsets
+
+
+def test_the_page_is_one_small_file_that_loads_nothing_and_in_which_names_of_users_stay_text(page):
+    assert len(page.html.encode()) < 1_000_000
+    assert set(page.loads) == {"data:,", *BESIDE}
+    addresses = set(re.findall(r"\w+://[^\s\"']+", page.html))
+    assert addresses <= {"http://www.w3.org/2000/svg"}  # a name, which nothing loads
+    assert not re.search(r"@import|url\(|\bfetch\(|\bimport\(|XMLHttpRequest", page.html)
+    assert page.elements.count("script") == 2  # data and scripts of its own
+    assert f"walk {HOSTILE} & $x^$" in page.text
+    (clip,) = page.data["clips"]
+    labels = {skeleton["key"]: skeleton["label"] for skeleton in clip["skeletons"]}
+    assert labels["captured"] == HOSTILE
+    levels = [int(heading[1]) for heading in page.headings]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in zip(levels, levels[1:], strict=False))
+    assert {"h2 The motion", "h2 Parameters", "h2 Limits of the data"} <= set(page.headings)
+
+
+def test_the_page_says_what_was_found(page, fitted):
+    for row in fitted.summary["parameters"]:
+        assert row["name"] in page.text
+        assert f"{row['value']:.4g}" in page.text
+        assert "{:.4g} to {:.4g}".format(*row["interval"]) in page.text
+    assert "The clips determine 1 of 2 parameters; foot.max_pitch stays open." in page.text
+    assert fitted.verdict.sentence.replace("`", "") in page.text
+    (play,) = fitted.playbacks
+    window = worst_window.find_worst_window(play)
+    for line in worst_window_report.describe(play, window, ("left", "right")):
+        assert line in page.text
+    assert "leg.max_knee_angle 50.0 %" in page.text
+    assert "never act in these clips: pelvis.limit." in page.text
+
+
+def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
+    page = (run / run_folder.PAGE).read_text()
+    (tmp_path / run_folder.PAGE).write_text(page)
+    for count in (1, 2):
+        lines = [f"chain {count} <b>"]
+        first = ["`jaxik fit` <i>: **run** it"]
+        posterior_section.insert(tmp_path, first, lines, [["parameter"], ["x"]])
+    sampled = Page(tmp_path / run_folder.PAGE)
+    assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
+    assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
+    assert sampled.headings.count("h2 Posterior") == 1
+    assert sampled.data == Page(run / run_folder.PAGE).data
+    (tmp_path / run_folder.PAGE).write_text("of another kind")
+    posterior_section.insert(tmp_path, [], [], [["parameter"]])
+    assert (tmp_path / run_folder.PAGE).read_text() == "of another kind"
+
+
+def test_positions_and_soles_on_the_page_are_those_of_the_motions(page, fitted, motions):
+    (clip,) = page.data["clips"]
+    (scene,), (data,) = fitted.problem.data, fitted.clips
+    ankles = np.asarray(legs_ws(scene, fitted.results[0]).ankle.pos)
+    captured = data.reference.positions_ws
+    corner = captured[0, 0] - points(clip, clip["skeletons"][2])[0, 0]
+    for number, expected in ((3, ankles), (2, data.reference.joints_ws(2))):
+        skeleton = clip["skeletons"][number]
+        shown = points(clip, skeleton)[:, [legs[2] for legs in skeleton["legs"]]] + corner
+        np.testing.assert_allclose(shown, expected, atol=1e-4)  # 0.1 mm
+    assert motions.animated.in_ground.any()
+    for name, skeleton in zip(("animated", "fitted"), clip["skeletons"][::3], strict=True):
+        marks = array(skeleton["inGround"], "u1").reshape(clip["frames"], -1)
+        placement = getattr(motions, name).placement
+        assert marks.any(axis=1).mean() == pytest.approx(placement.sunk_frames)
+
+
+def test_the_ground_on_the_page_is_that_of_the_mesh(page, fitted):
+    (clip,) = page.data["clips"]
+    ground, (data,) = clip["ground"], fitted.clips
+    patch = ground_patch.around_path(data.reference, data.terrain)
+    steps = array(ground["heights"], "<u2").reshape(ground["rows"], ground["columns"])
+    known = steps != motion_data.HOLE
+    heights = ground["low"] + ground["quantum"] * steps
+    mesh = trimesh.load_mesh(ROOT / "data/terrains/uneven_walk.ply", process=False)
+    random = np.random.default_rng(0)
+    rows, columns = np.argwhere(known)[random.choice(known.sum(), 60, replace=False)].T
+    across = patch.corner + ground["spacing"] * np.stack([columns, rows], axis=-1)
+    origins = np.stack([across[:, 0], np.full(60, 50.0), across[:, 1]], axis=-1)
+    hits, rays, _ = mesh.ray.intersects_location(origins, np.tile([0.0, -1.0, 0.0], (60, 1)))
+    highest = np.full(60, -np.inf)
+    np.maximum.at(highest, rays, hits[:, 1])
+    lowest = np.nanmin(patch.heights)
+    near = np.abs(heights[rows, columns] + lowest - highest) < 1e-3
+    assert near.mean() > 0.95  # the other rays meet the edge of a step
+
+
+def test_a_long_clip_has_fewer_frames_and_many_grounds_are_coarser(fitted, motions, monkeypatch):
+    (play,) = fitted.playbacks
+    shown = fit_page.shown(motions, "captured", worst_window.find_worst_window(play))
+    (whole,) = motion_data.pack([shown])
+    assert motion_data.steps_between_frames([shown]) == [1]  # 30 Hz
+    assert motion_data.steps_between_frames([shown], -1) == [8]  # one frame of seven is left
+    monkeypatch.setattr(motion_data, "MAX_RATE", 15.0)
+    assert motion_data.steps_between_frames([shown]) == [2]
+    ground = 2 * motions.ground.heights.size
+    spent = motion_data.MAX_BYTES - ground - 600  # by pictures
+    (packed,) = motion_data.pack([shown], spent)
+    step = -(-whole["frames"] // packed["frames"])
+    assert step > 2, "grounds and pictures count"
+    few, every = ((clip, clip["skeletons"][3]) for clip in (packed, whole))
+    np.testing.assert_allclose(points(*few), points(*every)[::step], atol=1e-4)
+    marks = [array(skeleton["inGround"], "u1").any() for _, skeleton in (few, every)]
+    assert marks[0] == marks[1]  # what happens between two frames is kept
+    heights = np.arange(60_000.0).reshape(200, 300)
+    patch = ground_patch.GroundPatch(np.zeros(2), 0.1, heights)
+    (alone,) = motion_data.coarse_grounds([patch])
+    assert alone.heights.shape == heights.shape and alone.spacing == patch.spacing
+    coarse = motion_data.coarse_grounds([patch] * 40)
+    assert sum(2 * each.heights.size for each in coarse) < 1.02 * motion_data.MAX_GROUND_BYTES
+    assert coarse[0].heights[3, 4] == heights[9, 12] and coarse[0].spacing == pytest.approx(0.3)
+
+
+def test_a_run_keeps_its_flat_animation_and_its_fitted_motion(run, fitted):
+    (scene,), (data,) = fitted.problem.data, fitted.clips
+    base, solved = (load_clip(run / name) for name in ("base.npz", "fitted.npz"))
+    np.testing.assert_array_equal(base.positions_ws, data.base.positions_ws)
+    ankles = np.asarray(legs_ws(scene, fitted.results[0]).ankle.pos)
+    np.testing.assert_allclose(solved.joints_ws(2), ankles, atol=1e-9)
+    problem = dataclasses.replace(fitted.problem, data=fitted.problem.data * 2)
+    several = dataclasses.replace(fitted, clips=fitted.clips * 2, problem=problem)
+    names = {"base_1.npz", "base_2.npz", "fitted_1.npz", "fitted_2.npz"}
+    assert set(fit_motions.saved_clips(several)) == names
+
+
+def test_many_names_become_a_number_and_data_cannot_end_its_script_element():
+    texts = [sentences.listed(list("abcd"[:count])) for count in (1, 2, 3, 4)]
+    assert texts == ["a", "a and b", "a, b and c", "a, b and 2 others"]
+    assert "<" not in rendering.as_json({"a": "</script><!--"})
+    with pytest.raises(ValueError, match="JSON"):
+        rendering.as_json({"a": float("nan")})
+
+
+# Comparisons and other studies
+
+
+@pytest.fixture(scope="module")
+def compared():
+    return comparisons.invented_comparison(comparisons.walk(), title=f"walk {HOSTILE}")
+
+
+@pytest.fixture(scope="module")
+def compared_motions(compared):
+    return comparison_motions.of_comparison(compared)
+
+
+def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
+    compared, compared_motions, tmp_path
+):
+    Image.new("RGB", (1700, 900), "white").save(tmp_path / comparison_report.FIGURE)
+    compare_page.write(tmp_path, compared)
+    page = Page(tmp_path / run_folder.PAGE)
+    assert page.text.startswith(
+        f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "
+        "1 of 2 beyond a limit ◐ Worst is deep: its standing feet are 2 cm or more off the "
+        "ground in 100.0 % of their frames"
+    )
+    assert "close places standing feet best" in page.text
+    assert (
+        f"Closest to the captured motion is close, whose ankles are 0.0 cm away (rms), furthest "
+        f"is deep with {100 * DEEP:.1f} cm; without foot IK" in page.text
+    )
+    (clip,) = page.data["clips"]
+    labels = [skeleton["label"] for skeleton in clip["skeletons"]]
+    assert labels == ["flat animation", "close", "deep", "captured"]
+    assert clip["watched"] == "motion deep"
+    assert [skeleton["worst"] is None for skeleton in clip["skeletons"]] == [False] * 3 + [True]
+    assert page.elements.count("img") == 1 and len(page.html) < 1_000_000
+    assert page.elements.count("script") == 2
+    loads = {load for load in page.loads if not load.startswith("data:")}
+    assert loads == {"compare.md", "compare.json", "compare.png"}
+    assert {"h2 Limits of the data", "h2 What was asked"} <= set(page.headings)
+    assert compared_motions.accuracy["deep"].ankle == pytest.approx(DEEP)
+
+
+def test_where_feet_are_furthest_off_is_the_worst_window(compared):
+    feet, _ = compared.animation.place(compared.clips["close"])
+    gap = np.zeros((400, 2))
+    gap[150:160, 0] = -0.3
+    gap[30:60, 1] = 9.0  # a moving foot, which may be above the ground
+    stance = np.zeros((400, 2), bool)
+    height = np.repeat(gap[..., None], 2, axis=-1)
+    feet = dataclasses.replace(feet, height=height, stance=stance)
+    start, end = comparison_motions.worst_seconds(feet, 60.0)
+    assert start <= 150 and end >= 159 and end - start == 120
+    assert comparison_motions.worst_seconds(feet, 600.0) == (0, 399)
+
+
+def test_the_worst_fault_is_named_and_no_system_praised_that_is_worse_than_the_animation(
+    compared, compared_motions
+):
+    placed = compared_motions.motions["close"].placement
+    pop = dataclasses.replace(placed.pop, value=0.0)
+    still = dataclasses.replace(placed, sunk=0.0, floating=0.0, slide=-0.01, pop=pop)
+    popping = dataclasses.replace(still, pop=dataclasses.replace(placed.pop, value=0.1))
+    excess, words = compare_sentences.faults(popping)[0]
+    assert excess == pytest.approx(2.0 / placed.size) and words.startswith("its feet pop by up to")
+    assert compare_sentences.beyond({"a": still, "b": popping}) == ["b"]
+    unknown = dataclasses.replace(still, sunk=math.nan, groundless=1.0)
+    assert "no ground under 100.0 %" in compare_sentences.faults(unknown)[0].words
+    accuracy = compared_motions.accuracy
+    worse = {**accuracy, "as animated": accuracy["close"]}
+    far = dataclasses.replace(compared_motions, accuracy=worse)
+    last = compare_sentences.findings(compared, far)[2]
+    assert last.bad and last.text.startswith("No system comes closer to the captured motion")
+
+
+def test_what_went_badly_comes_first_and_marks_are_not_html(tmp_path):
+    StudyPage(
+        kind="a test",
+        title=HOSTILE,
+        verdict="bad",
+        good=False,
+        findings=[Finding("good `a` **b**"), Finding("bad <i>", bad=True), Finding("good too")],
+        sections=[Section("Table", [Grid([["x", "y"], ["1!", "2!"]], "numbers"), Text("`t`")])],
+        asked=[["What", HOSTILE]],
+    ).write(tmp_path)
+    page = Page(tmp_path / run_folder.PAGE)
+    assert "bad ◐ bad <i> good a b good too" in page.text
+    assert "<li>good <code>a</code> <strong>b</strong></li>" in page.html
+    assert '<td class="miss">2!</td>' in page.html and page.elements.count("script") == 2
+    assert page.elements.count("canvas") == 0 and page.data == {"clips": []}
+
+
+def test_pictures_become_small_enough_and_missing_ones_are_left_out(tmp_path, monkeypatch):
+    noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "noise.png")
+    (picture,) = pictures.embed(tmp_path, {"noise.png": "noise", "no.png": "none"})
+    assert (picture.width, picture.height) == (60, 40)
+    monkeypatch.setattr(pictures, "MAX_BYTES", 1_000)
+    (picture,) = pictures.embed(tmp_path, {"noise.png": "noise"})
+    assert picture.size <= 1_000 and picture.width < 40
+    assert picture.width / picture.height == pytest.approx(1.5, abs=0.2)
+
+
+def test_runs_that_cannot_be_told_apart_are_said_so():
+    for behind, unreliable, first, bad in (
+        (5.0, 0, "`a` predicts best; `b` is 5.0 ± 1.0 below.", False),
+        (1.5, 0, "The motion does not tell `a`, which predicts best, from `b`", True),
+        (5.0, 2, "The figures are not fully reliable", True),
+    ):
+        other = ComparedRun("b", -10.0 - behind, 2.0, behind, 1.0, 4.0, unreliable, {1: -9.0})
+        runs = [ComparedRun("a", -10.0, 2.0, 0.0, 0.0, 3.0, 0, {1: -10.0}), other]
+        findings = runs_page.findings(runs)
+        found = [finding.bad for finding in findings if finding.text.startswith(first)]
+        assert len(findings) == 3 and found == [bad], first
