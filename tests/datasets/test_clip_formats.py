@@ -370,7 +370,7 @@ def assert_same(clip, expected):
             assert np.asarray(leaf).dtype == np.asarray(other).dtype, field.name
 
 
-def test_a_saved_clip_is_loaded_exactly_and_its_arrays_are_read_only(walk, path):
+def test_a_clip_is_loaded_as_it_was_saved_or_not_saved_at_all(walk, path, monkeypatch):
     bare = replace(walk, measured_rig=None, stance=None, mask=None, dialect=None, remarks=())
     climber = multi_limb.climb(0.5)  # on four limbs
     sliding = walker.walk(3.0, 10.0, events=[speed_profile.Slide(0.5, 2.5)])
@@ -384,9 +384,7 @@ def test_a_saved_clip_is_loaded_exactly_and_its_arrays_are_read_only(walk, path)
     save_clip(path, walk)
     write(path, dict(np.load(path)) | {"rig_ankle_height": None, "rig_ball_height": None})
     assert_same(load_clip(path), walk)
-
-
-def test_a_save_that_fails_leaves_the_old_file_and_nothing_else(walk, path, monkeypatch):
+    # A save that fails leaves the old file and nothing else.
     save_clip(path, walk)
     before = path.read_bytes()
 

@@ -93,7 +93,7 @@ def test_a_bvh_goes_back_into_its_own_hierarchy(mocap, tmp_path, name):
     np.testing.assert_allclose(back.offsets_ls, clip.offsets_ls, atol=1e-6)
 
 
-def test_joints_come_back_where_they_were(bvh_file, tmp_path):
+def test_joints_come_back_where_they_were_also_from_clips_that_were_no_bvh(bvh_file, tmp_path):
     for up in "yz":
         clip = moved(load_clip(bvh_file, up=up))
         for suffix in (".bvh", ".glb", ".npz"):
@@ -104,6 +104,17 @@ def test_joints_come_back_where_they_were(bvh_file, tmp_path):
             assert error(clip, back) < TOLERANCE, (up, suffix)
             turn = np.abs(np.sum(back.rotations_ws * clip.rotations_ws, axis=-1))
             np.testing.assert_allclose(turn, 1.0, atol=1e-6)
+    # Other clips get a standard BVH in centimetres.
+    (tmp_path / "walk.asf").write_text(ASF)
+    (tmp_path / "walk.amc").write_text(AMC)
+    for clip in (load_clip(tmp_path / "walk.amc"), stair_walk()):
+        save_clip(tmp_path / "out.bvh", clip)
+        text = (tmp_path / "out.bvh").read_text()
+        assert "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in text
+        back = load_clip(tmp_path / "out.bvh", scale=0.01, up="y")
+        assert error(clip, back) < TOLERANCE and back.fps == clip.fps
+        ends = set(range(len(back.parents))) - set(back.parents)
+        assert text.count("End Site") == len(ends)
 
 
 def test_numbers_of_a_bvh_are_its_own_and_do_not_jump_over_whole_turns(bvh_file, tmp_path):
@@ -150,19 +161,6 @@ def test_a_joint_gets_the_channels_that_its_motion_needs_and_a_warning_says_so(t
     with pytest.warns(UserWarning, match="LeftLeg, LeftFoot$"):
         save_clip(tmp_path / "long.bvh", clip.with_motion(stretched, clip.rotations_ws))
     assert np.abs(reloaded(tmp_path / "long.bvh", clip).positions_ws - stretched).max() < TOLERANCE
-
-
-def test_other_clips_get_a_standard_bvh_in_centimetres(tmp_path):
-    (tmp_path / "walk.asf").write_text(ASF)
-    (tmp_path / "walk.amc").write_text(AMC)
-    for clip in (load_clip(tmp_path / "walk.amc"), stair_walk()):
-        save_clip(tmp_path / "out.bvh", clip)
-        text = (tmp_path / "out.bvh").read_text()
-        assert "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation" in text
-        back = load_clip(tmp_path / "out.bvh", scale=0.01, up="y")
-        assert error(clip, back) < TOLERANCE and back.fps == clip.fps
-        ends = set(range(len(back.parents))) - set(back.parents)
-        assert text.count("End Site") == len(ends)
 
 
 def test_channels_and_rest_pose_outlive_an_archive_a_mirror_and_a_glb(bvh_file, tmp_path):
@@ -218,7 +216,7 @@ def test_bones_lead_from_joint_to_joint_and_are_closed_outwards():
     assert np.ptp(lonely[:, 1]) == pytest.approx(0.1) and set(owners) == {0}
 
 
-def test_the_ground_lies_beside_the_motion(tmp_path):
+def test_the_ground_lies_beside_the_motion_a_heightfield_as_triangles_without_holes(tmp_path):
     hill = Mesh(np.array([[0.0, 0, 0], [0, 1, 2], [3, 0, 0]]), np.array([[0, 1, 2]]))
     save_clip(tmp_path / "out.glb", stair_walk(), ground=hill)
     save_clip(tmp_path / "bare.glb", stair_walk())
@@ -232,9 +230,6 @@ def test_the_ground_lies_beside_the_motion(tmp_path):
     np.testing.assert_allclose(read.vertices[read.faces[0]], hill.vertices)
     with pytest.raises(ValueError, match="bare.glb"):
         load_terrain(tmp_path / "bare.glb")
-
-
-def test_the_cells_of_a_heightfield_become_triangles_but_its_holes_do_not():
     heights = np.array([[0.0, 0.1, np.nan], [0.3, 0.4, 0.5]])
     field = terrain.heightfield(heights, (0.5, 2.0), (1.0, 2.0, 3.0))
     mesh = mesh_of(field.moved(jnp.array([0.0, 1.0, 0.0])))

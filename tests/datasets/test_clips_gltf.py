@@ -1,6 +1,6 @@
 """glTF files made by hand: trees, curves, choices, and what is refused.
 
-Files that Blender wrote are in `test_blender`.
+Files that Blender wrote are in `test_clip_writers`.
 """
 
 import json
