@@ -70,18 +70,7 @@ def test_a_path_is_the_ground_below_the_pelvis_under_ceilings_and_next_to_the_fl
     np.testing.assert_allclose(path_of(short, slab(40.0)), 40.0)
 
 
-def test_a_path_crosses_a_gap_near_the_height_of_its_edges_and_is_none_without_half(short):
-    z = pelvis_z(short)
-    for bottom in ([], [slab(-30.0)]):
-        heights = path_of(short, terrain.combine(slab(0.0, z1=2.0), slab(0.2, z0=2.4), *bottom))
-        np.testing.assert_allclose(heights[z < 2.0], 0.0, atol=1e-12)
-        np.testing.assert_allclose(heights[z > 2.4], 0.2, atol=1e-12)
-        assert heights.min() > -0.7
-    assert ground_path.path_heights(short, slab(0.0, z1=0.4 * z[-1]), 0.0) is None
-    path_of(short, slab(0.0, z1=0.6 * z[-1]))
-
-
-def test_a_path_falls_off_a_cliff_at_a_speed_that_is_limited_by_the_size_of_the_body(short):
+def test_a_path_crosses_gaps_and_falls_off_cliffs_at_a_speed_limited_by_the_size_of_the_body(short):
     for size in (1.0, 0.5):
         cliff = terrain.combine(slab(0.0, z1=2.0 * size), slab(-3.0 * size, z0=2.0 * size))
         heights = path_of(bodies.scaled(short, size), cliff)
@@ -89,6 +78,16 @@ def test_a_path_falls_off_a_cliff_at_a_speed_that_is_limited_by_the_size_of_the_
         falling = heights[(heights < -0.01) & (heights > -1.9 * size)]
         speed = ground_path.FALL * size**0.5
         np.testing.assert_allclose(np.diff(falling), -speed / 60.0, rtol=1e-6)
+    # Near the height of its edges it crosses a gap, with or without a bottom.
+    z = pelvis_z(short)
+    for bottom in ([], [slab(-30.0)]):
+        heights = path_of(short, terrain.combine(slab(0.0, z1=2.0), slab(0.2, z0=2.4), *bottom))
+        np.testing.assert_allclose(heights[z < 2.0], 0.0, atol=1e-12)
+        np.testing.assert_allclose(heights[z > 2.4], 0.2, atol=1e-12)
+        assert heights.min() > -0.7
+    # With less than half of its ground there is none.
+    assert ground_path.path_heights(short, slab(0.0, z1=0.4 * z[-1]), 0.0) is None
+    path_of(short, slab(0.0, z1=0.6 * z[-1]))
 
 
 def test_smoothing_keeps_a_ramp_and_spreads_a_step_over_a_window_ahead_and_back(clip):
