@@ -108,7 +108,7 @@ def test_clips_are_flattened_over_a_heightfield_as_over_its_mesh(tmp_path):
     np.testing.assert_allclose(found, height_function(mesh)(points), atol=1e-6)
 
 
-def test_pictures_of_16_bits_and_arrays_have_metres_per_level_and_cell_and_holes(tmp_path):
+def test_pictures_and_arrays_have_metres_per_level_and_cell_under_any_number_of_points(tmp_path):
     Image.fromarray(LEVELS).save(tmp_path / "hill.png")
     ground = load_terrain(tmp_path / "hill.png", cell=0.5, scale=0.001, offset=(10.0, 1.0, -2.0))
     points = [(10 + 0.5 * column, -2 + 0.5 * row) for row in range(4) for column in range(6)]
@@ -117,9 +117,6 @@ def test_pictures_of_16_bits_and_arrays_have_metres_per_level_and_cell_and_holes
     np.save(tmp_path / "hill.npy", np.where(LEVELS == 2030, np.nan, LEVELS / 1000))
     ground = load_terrain(tmp_path / "hill.npy", cell=2.0)
     np.testing.assert_allclose(heights(ground, (1.0, 3.0), (5.5, 3.5)), [1.505, np.nan], atol=1e-5)
-
-
-def test_any_number_of_points_has_heights(tmp_path):
     x, z = np.meshgrid(np.arange(40), np.arange(30))
     np.save(tmp_path / "slope.npy", 0.1 * x - 0.2 * z)
     ground = load_terrain(tmp_path / "slope.npy", cell=1.0)
@@ -377,7 +374,7 @@ def tilted_blocks() -> surfaces.LevelBlocks:
     return surfaces.fit_blocks(ranked, block_footprints(TILTED))
 
 
-def test_a_mesh_has_the_heights_of_its_surface(tmp_path):
+def test_a_mesh_has_the_heights_of_its_surface_and_a_bounded_number_of_cells(tmp_path):
     plane, plate = surfaces.fit_plane(hill_footprints()), surfaces.fit_thin_plate(hill_footprints())
     low, high = np.array([-2.0, -1.5]), np.array([2.0, 2.5])
     for surface, suffix in ((plane, "ply"), (plate, "obj"), (tilted_blocks(), "stl")):
@@ -390,6 +387,12 @@ def test_a_mesh_has_the_heights_of_its_surface(tmp_path):
         found = heights_under(load_terrain(path), np.insert(points, 1, 0.0, axis=1), 9.0)
         tolerance = 0.005 if surface is plate else 1e-4
         np.testing.assert_allclose(found, surface.heights(points), atol=tolerance)
+    # Too many cells are refused with their number.
+    for surface in (tilted_blocks(), surfaces.fit_thin_plate(hill_footprints())):
+        surface.mesh(np.zeros(2), np.full(2, 9.0))
+        for size in (1e3, 1e6):
+            with pytest.raises(ValueError, match="[0-9]{7,} cells; wanted at most 2000000"):
+                surface.mesh(np.zeros(2), np.full(2, size))
 
 
 def test_the_mesh_of_blocks_has_vertical_risers_between_blocks():
@@ -407,14 +410,6 @@ def test_the_mesh_of_blocks_has_vertical_risers_between_blocks():
     upper = surface.heights((middle - 0.01 * away)[:, [0, 2]])
     np.testing.assert_allclose(lower, corners[~flat, :, 1].min(axis=1), atol=1e-5)
     np.testing.assert_allclose(upper, corners[~flat, :, 1].max(axis=1), atol=1e-5)
-
-
-def test_a_mesh_of_too_many_cells_is_refused_with_their_number():
-    for surface in (tilted_blocks(), surfaces.fit_thin_plate(hill_footprints())):
-        surface.mesh(np.zeros(2), np.full(2, 9.0))
-        for size in (1e3, 1e6):
-            with pytest.raises(ValueError, match="[0-9]{7,} cells; wanted at most 2000000"):
-                surface.mesh(np.zeros(2), np.full(2, size))
 
 
 def test_the_simplest_kind_that_is_not_clearly_worse_is_chosen():
