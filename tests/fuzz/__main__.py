@@ -13,24 +13,10 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
-from .formats import FORMATS, Format
+from .formats import FORMATS
 from .trial import OUTCOMES, run_trials
 
 KEPT = Path("build") / "fuzz"
-
-
-def run_format(name: str, form: Format, seed: int, count: int) -> Counter[str]:
-    """The outcomes of one format, each finding printed once and its file kept."""
-    outcomes: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for number, outcome in run_trials(form, Path(folder), seed, count):
-            if outcome not in OUTCOMES:
-                if not outcomes[outcome]:
-                    kept = KEPT / f"{seed}_{number}_{Path(form.file).name}"
-                    shutil.copy(Path(folder) / form.file, kept)
-                    print(f"{name}, {kept}: {outcome}", flush=True)
-            outcomes[outcome] += 1
-    return outcomes
 
 
 def main() -> int:
@@ -42,14 +28,21 @@ def main() -> int:
     options = parser.parse_args()
     KEPT.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("error")
-    rows, wrong = [], 0
+    wrong = 0
     for name in options.only:
-        begin = time.process_time()
-        outcomes = run_format(name, FORMATS[name], options.seed, options.count)
-        wrong += (others := outcomes.total() - sum(outcomes[key] for key in OUTCOMES))
+        begin, form = time.process_time(), FORMATS[name]
+        outcomes: Counter[str] = Counter()
+        with tempfile.TemporaryDirectory() as folder:
+            for number, outcome in run_trials(form, Path(folder), options.seed, options.count):
+                if outcome not in OUTCOMES and not outcomes[outcome]:  # each once
+                    kept = KEPT / f"{options.seed}_{number}_{Path(form.file).name}"
+                    shutil.copy(Path(folder) / form.file, kept)
+                    print(f"{name}, {kept}: {outcome}", flush=True)
+                outcomes[outcome] += 1
         counts = [outcomes[key] for key in OUTCOMES]
-        rows.append((name, *counts, others, f"{time.process_time() - begin:.0f} s"))
-        print("| " + " | ".join(map(str, rows[-1])) + " |", flush=True)
+        wrong += (others := outcomes.total() - sum(counts))
+        row = name, *counts, others, f"{time.process_time() - begin:.0f} s"
+        print("| " + " | ".join(map(str, row)) + " |", flush=True)
     return int(wrong > 0)
 
 

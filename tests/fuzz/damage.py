@@ -7,7 +7,7 @@ import io
 import json
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -178,50 +178,35 @@ def damage_glb(random: Random, content: bytes) -> bytes:
     return glb_of(head, damage_bytes(random, numbers))
 
 
-def change_value(random: Random, array: np.ndarray) -> np.ndarray:
-    """The array with one odd number in it."""
-    if array.dtype.kind not in "fiu" or not array.size:
-        return array.ravel()[:0]
-    changed = array.copy()
+def damage_array(random: Random, array: np.ndarray) -> np.ndarray:
+    """The array with an odd number, of another type, shape or size, or in another order."""
     with np.errstate(all="ignore"):
-        value = np.asarray(random.choice(VALUES)).astype(array.dtype)
-    changed.flat[random.integers(array.size)] = value
-    return changed
-
-
-def change_dtype(random: Random, array: np.ndarray) -> np.ndarray:
-    """The array as other things than it should hold."""
-    with np.errstate(all="ignore"):
-        try:
-            return array.astype(random.choice(DTYPES))
-        except (TypeError, ValueError):
-            return np.array("text")
-
-
-def change_shape(random: Random, array: np.ndarray) -> np.ndarray:
-    """The array, or parts of it, in another shape."""
-    changes = [array[None], array.ravel()[:0], array.ravel(), np.concatenate([array.ravel()] * 2)]
-    if array.ndim:
-        changes += [array[:1], array[..., :1], array[::-1], np.concatenate([array, array])]
-    return changes[random.integers(len(changes))]
-
-
-def swap_rows(random: Random, array: np.ndarray) -> np.ndarray:
-    """The array with its rows in another order."""
-    return random.permutation(array) if array.ndim else array[None]
-
-
-def scale(random: Random, array: np.ndarray) -> np.ndarray:
-    """The array many times as large or as small."""
-    if array.dtype.kind != "f":
-        return array[..., None]
-    with np.errstate(all="ignore"):
-        return array * 10.0 ** random.integers(-300, 300)
-
-
-ARRAY_DAMAGES: tuple[Callable[[Random, np.ndarray], np.ndarray], ...] = (
-    change_value, change_dtype, change_shape, swap_rows, scale,
-)  # fmt: skip
+        match random.integers(5):
+            case 0:
+                if array.dtype.kind not in "fiu" or not array.size:
+                    return array.ravel()[:0]
+                changed = array.copy()
+                value = np.asarray(random.choice(VALUES)).astype(array.dtype)
+                changed.flat[random.integers(array.size)] = value
+                return changed
+            case 1:
+                try:
+                    return array.astype(random.choice(DTYPES))
+                except (TypeError, ValueError):
+                    return np.array("text")
+            case 2:
+                flat = array.ravel()
+                changes = [array[None], flat[:0], flat, np.concatenate([flat, flat])]
+                if array.ndim:
+                    changes += [array[:1], array[..., :1], array[::-1]]
+                    changes.append(np.concatenate([array, array]))
+                return changes[random.integers(len(changes))]
+            case 3:
+                return random.permutation(array) if array.ndim else array[None]
+            case _:
+                if array.dtype.kind != "f":
+                    return array[..., None]
+                return array * 10.0 ** random.integers(-300, 300)
 
 
 def damage_arrays(random: Random, content: bytes) -> bytes:
@@ -235,12 +220,11 @@ def damage_arrays(random: Random, content: bytes) -> bytes:
     if way == 6:
         del arrays[name]
     else:
-        arrays[name] = choose(random, ARRAY_DAMAGES)(random, arrays[name])
+        arrays[name] = damage_array(random, arrays[name])
     return archive_of(arrays)
 
 
 def archive_of(arrays: Arrays) -> bytes:
-    """The bytes of an NPZ archive."""
     file = io.BytesIO()
     np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
     return file.getvalue()

@@ -97,10 +97,9 @@ FITTED = {"name": "lean.gain", "unit": "1", "u": 0.5, "start_sd": 0.1, "value": 
 RUN = {"parameters": [FITTED | {"determined": True}]}
 
 
-def system_as(suffix: str) -> bytes:
-    """All parameters of a system."""
-    write = {".toml": parameter_files.system_to_toml, ".json": parameter_files.system_to_json}
-    return write[suffix](presets.record()).encode()
+def system_as(kind: str) -> bytes:
+    write = {"toml": parameter_files.system_to_toml, "json": parameter_files.system_to_json}
+    return write[kind](presets.record()).encode()
 
 
 def load_system(path: Path) -> None:
@@ -117,7 +116,6 @@ def load_truth(path: Path) -> None:
 
 
 def settings_of_mec(suffix: str = ".toml") -> bytes:
-    """A table of settings."""
     values = conversion.to_settings(presets.mec(faithful=True), "mec")
     return settings_files.settings_text(values, "mec", suffix).encode()
 
@@ -162,17 +160,15 @@ def capture_bytes() -> bytes:
 
 def blocks_archive() -> bytes:
     """A file of the `blocks` benchmark, of a character that stands."""
-    frames, side = 12, np.array([0.1, -0.1])
+    frames, upright = 12, [1.0, 0.0, 0.0, 0.0]
     arrays: dict[str, np.ndarray] = {"fps": np.array(30.0), "stance": np.ones((frames, 2), int)}
-    identity = np.array([1.0, 0.0, 0.0, 0.0])
-    arrays |= {"pelvis_rot": np.tile(identity, (frames, 1))}
-    arrays |= {"foot_rot": np.tile(identity, (frames, 2, 1))}
+    arrays |= {"pelvis_rot": np.tile(upright, (frames, 1))}
+    arrays |= {"foot_rot": np.tile(upright, (frames, 2, 1))}
     places = {"hip": (0.9, 0.0), "knee": (0.5, 0.03), "ankle": (0.1, 0.0), "ball": (0.05, 0.12)}
     for prefix in ("", "base_"):
         arrays[f"{prefix}pelvis"] = np.tile([0.0, 1.0, 0.0], (frames, 1))
-        for joint, (y, z) in places.items():
-            leg = np.stack([side, np.full(2, y), np.full(2, z)], axis=-1)
-            arrays[f"{prefix}{joint}"] = np.tile(leg, (frames, 1, 1))
+        for joint, place in places.items():
+            arrays[prefix + joint] = np.tile([[0.1, *place], [-0.1, *place]], (frames, 1, 1))
     return archive_of(arrays)
 
 
@@ -184,18 +180,14 @@ def heightfield_archive() -> bytes:
     return archive_of(arrays | {"interpolation": np.array("triangulated")})
 
 
-def heights_array() -> bytes:
-    """The heights of that heightfield alone."""
+def heights_as(kind: str) -> bytes:
+    """Heights as an array of four rows and five columns, or as a picture of 16 bits."""
     file = io.BytesIO()
-    np.save(file, np.arange(20.0).reshape(4, 5) / 50)
-    return file.getvalue()
-
-
-def heights_picture() -> bytes:
-    """A heightfield of 16 rows and 12 columns as a picture of 16 bits."""
-    file = io.BytesIO()
-    levels = np.arange(192, dtype=np.uint16).reshape(16, 12) * 300
-    Image.fromarray(levels).save(file, format="PNG")
+    if kind == "npy":
+        np.save(file, np.arange(20.0).reshape(4, 5) / 50)
+    else:
+        levels = np.arange(192, dtype=np.uint16).reshape(16, 12) * 300
+        Image.fromarray(levels).save(file, format="PNG")
     return file.getvalue()
 
 
@@ -204,11 +196,6 @@ def load_ground(path: Path, **options: Any) -> None:
 
 
 load_heights = partial(load_ground, cell=0.5, scale=0.001)  # which the file does not say
-
-
-def load_with_map(path: Path) -> None:
-    """Reads a clip with a joint map."""
-    soundness.check_clip(load_clip(path.with_name("walk.bvh"), joints=path))
 
 
 def joint_map() -> bytes:
@@ -220,16 +207,13 @@ def joint_map() -> bytes:
     return template(clip.joint_names, clip.parents, clip.source).encode()
 
 
-def mesh_bytes(kind: str) -> bytes:
+def mesh_bytes(kind: str, **options: str) -> bytes:
     """A hill of 18 triangles as trimesh writes it."""
     x, z = (part.ravel() for part in np.meshgrid(np.arange(4.0), np.arange(4.0)))
     corner = (np.arange(3)[:, None] * 4 + np.arange(3)).ravel()
     faces = np.concatenate([corner[:, None] + [0, 4, 5], corner[:, None] + [0, 5, 1]])
     hill = trimesh.Trimesh(np.stack([x, 0.1 * x * z, z], -1), faces, process=False)
-    options = {"encoding": "ascii"} if kind == "ply_ascii" else {}
-    content = hill.export(file_type=kind.removesuffix("_ascii") if options else kind, **options)
-    if isinstance(content, dict):  # of a glTF, its files
-        content = content["model.gltf"]
+    content: Any = hill.export(file_type=kind, **options)
     return content.encode() if isinstance(content, str) else content
 
 
@@ -251,14 +235,12 @@ def flat_clip() -> Clip:
 
 
 def clip_format(name: str, whole: Callable[[], bytes], **options) -> Format:
-    """A kind of clip."""
     return Format(name, whole, lambda path: soundness.check_clip(load_clip(path)), **options)
 
 
-def mesh_format(kind: str, damage: Callable[[Random, bytes], bytes]) -> Format:
-    """A kind of mesh."""
-    suffix = kind.removesuffix("_ascii")
-    return Format(f"hill.{suffix}", lambda: mesh_bytes(kind), load_ground, damage)
+def mesh_format(kind: str, damage: Callable[[Random, bytes], bytes], **options: str) -> Format:
+    whole = partial(mesh_bytes, kind, **options)
+    return Format(f"hill.{kind.removesuffix('_ascii')}", whole, load_ground, damage)
 
 
 FORMATS: dict[str, Format] = {
@@ -276,12 +258,16 @@ FORMATS: dict[str, Format] = {
     "clip, NPZ": clip_format("walk.npz", lambda: clip_bytes(".npz"), damage=damage_arrays),
     "clip, blocks": clip_format("blocks.npz", blocks_archive, damage=damage_arrays),
     "heightfield": Format("hill.npz", heightfield_archive, load_ground, damage_arrays),
-    "heights, NPY": Format("hill.npy", heights_array, load_heights, damage_bytes),
-    "heights, PNG": Format("hill.png", heights_picture, load_heights, damage_bytes),
+    "heights, NPY": Format("hill.npy", partial(heights_as, "npy"), load_heights, damage_bytes),
+    "heights, PNG": Format("hill.png", partial(heights_as, "png"), load_heights, damage_bytes),
     "joint map": Format(
-        "map.toml", joint_map, load_with_map, damage_toml, beside={"walk.bvh": BVH.encode}
+        "map.toml",
+        joint_map,
+        lambda path: soundness.check_clip(load_clip(path.with_name("walk.bvh"), joints=path)),
+        damage_toml,
+        beside={"walk.bvh": BVH.encode},
     ),
-    "mesh, PLY text": mesh_format("ply_ascii", damage_text),
+    "mesh, PLY text": mesh_format("ply", damage_text, encoding="ascii"),
     "mesh, PLY": mesh_format("ply", damage_bytes),
     "mesh, OBJ": mesh_format("obj", damage_text),
     "mesh, STL text": mesh_format("stl_ascii", damage_text),
@@ -294,10 +280,8 @@ FORMATS: dict[str, Format] = {
         lambda path: soundness.check_experiment(load_experiment(path)),
         damage_toml,
     ),
-    "parameters": Format("footik.toml", partial(system_as, ".toml"), load_system, damage_toml),
-    "parameters, JSON": Format(
-        "footik.json", partial(system_as, ".json"), load_system, damage_json
-    ),
+    "parameters": Format("footik.toml", partial(system_as, "toml"), load_system, damage_toml),
+    "parameters, JSON": Format("footik.json", partial(system_as, "json"), load_system, damage_json),
     "settings": Format("mec.toml", settings_of_mec, load_settings, damage_toml),
     "settings, CSV": Format("mec.csv", partial(settings_of_mec, ".csv"), load_settings),
     "truth": Format("truth.toml", TRUTH.read_bytes, load_truth, damage_toml),

@@ -80,7 +80,6 @@ def load_search(path: Path) -> None:
 
 
 def found_text() -> bytes:
-    """The result of a search of a population."""
     return text_of({"name": "all clips", "u": [0.5, -0.25], "cost": 10.5, **ENDING})
 
 
@@ -91,7 +90,6 @@ def load_found(path: Path) -> None:
 
 
 def rows_text() -> bytes:
-    """The rows of an ablation."""
     names = [field.name for field in dataclasses.fields(Accuracy)]
     accuracy = Accuracy(**{name: 0.01 * place for place, name in enumerate(names)})
     row = Row("0123abcd", "locks", 1, accuracy, {"lean.gain": 0.2}, True, "Converged.", 1.5)

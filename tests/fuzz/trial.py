@@ -24,21 +24,6 @@ class TooSlowError(BaseException):
     """The time of a trial is up; no loader may catch it."""
 
 
-class _Listener(logging.Handler):
-    """Keeps what libraries would print."""
-
-    def __init__(self, level: int) -> None:
-        super().__init__(level)
-        self.messages: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.messages.append(record.getMessage())
-
-    def outcome(self, otherwise: str) -> str:
-        """What was printed, or else another outcome."""
-        return f"printed: {self.messages[0][:200]!r}" if self.messages else otherwise
-
-
 @contextmanager
 def bounds() -> Iterator[None]:
     """Ends what takes too much time or memory, where the system can: MemoryError, TooSlowError."""
@@ -72,23 +57,25 @@ def try_to_load(load: Callable[[Path], object], path: Path, names: tuple[str, ..
         path: the file.
         names: of this file and of those that belong to it; a message has to contain one of them.
     """
-    handler = _Listener(logging.WARNING)
+    messages: list[str] = []  # that libraries would print
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: messages.append(record.getMessage())
     logging.getLogger().addHandler(handler)
+    outcome = "loaded"
     try:
         with bounds():
             load(path)
     except (ValueError, OSError) as error:
-        message = in_one_line(error)
+        message, outcome = in_one_line(error), "refused"
         if not any(name in message for name in names):
             return f"a message without the name of the file: {message}"
-        return handler.outcome("refused")
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
         return f"{type(error).__name__}: {in_one_line(Exception(str(error)))[:300]}"
     finally:
         logging.getLogger().removeHandler(handler)
-    return handler.outcome("loaded")
+    return f"printed: {messages[0][:200]!r}" if messages else outcome
 
 
 def run_trials(form: Format, folder: Path, seed: int, count: int) -> Iterator[tuple[int, str]]:
