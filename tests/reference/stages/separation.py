@@ -1,4 +1,4 @@
 """A distance between feet."""
 
-from reference.stages.steps import Feet as Feet
-from reference.stages.steps import separate as separate
+from reference.stages.shifts import Feet as Feet
+from reference.stages.shifts import separate as separate

@@ -1,3 +1,3 @@
 """Strides of another length."""
 
-from reference.stages.steps import warp as moved  # noqa: F401
+from reference.stages.shifts import warp as moved  # noqa: F401
