@@ -1,8 +1,13 @@
-"""Clips in one world, run in a row: what a system makes of each is what it makes of it alone."""
+"""Clips in one world, stacked, and on several devices or in several processes: as each alone."""
 
 import dataclasses
+import os
+import socket
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +17,8 @@ from jax.extend.core import jaxprs_in_params
 
 import jaxik
 from fitting.experiments import experiment_files, problems
+from fitting.inference.sharding import over_devices
+from fitting.problem import stacking
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene
@@ -20,6 +27,7 @@ from fitting.runtime.program_cache import committed
 from jaxik.maths import parameter_tree
 from jaxik.pipeline import Result
 from jaxik.world.terrain import plane
+from support import on_devices
 from support.experiments import EVERY_KIND, ROOT, write
 
 DATA = ROOT / "data"
@@ -97,10 +105,7 @@ def alone(scene: Scene, ik: jaxik.FootIK, names: tuple[str, ...]) -> Scene:
     )
 
 
-Places = list[jax.Array]
-
-
-def positions(result: Result) -> Places:
+def positions(result: Result) -> list[jax.Array]:
     """Places of a result, in its world and in model space."""
     assert result.trace is not None
     sensed, advanced = result.trace.sensed, result.trace.advanced
@@ -109,23 +114,12 @@ def positions(result: Result) -> Places:
     return [*places, *poses, *jax.tree.leaves(advanced.state)]
 
 
-def places_of(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[Places]:
-    return [positions(result) for result in run_scenes(ik, scenes)]
-
-
 @jax.jit
 def evaluation(problem: Problem):
     """Residuals of the data, and places."""
     of_data = problem.residuals(problem.space.start)[: -problem.space.size]
-    return of_data, places_of(problem.space.system, problem.data)
-
-
-@jax.jit
-def slopes(problem: Problem):
-    """Derivatives of the residuals of the data, by both parameters at once."""
-    u = problem.space.start
-    of_all = jax.jvp(problem.residuals, (u,), (jnp.ones_like(u),))[1]
-    return of_all[: -problem.space.size]
+    results = run_scenes(problem.space.system, problem.data)
+    return of_data, [positions(result) for result in results]
 
 
 @pytest.fixture(scope="module")
@@ -153,45 +147,16 @@ def test_a_clip_more_needs_no_loop_and_hardly_an_operation_more(different, each)
     assert three.total() < 1.5 * one.total()
 
 
-def assert_joined(together: jax.Array, single: Sequence[jax.Array]) -> None:
-    expected = np.concatenate(single)
-    assert np.abs(expected).max() > 1
-    np.testing.assert_allclose(together, expected, atol=1e-7 * np.abs(expected).max())
-
-
 def test_residuals_and_places_of_clips_in_a_row_are_those_of_clips_alone(different, each):
     """Whatever the system remembers, tracks, sizes, sigmas and bodies included."""
     together, places = evaluation(committed(different))
-    single, expected_places = zip(*map(evaluation, committed(each)), strict=True)
-    assert_joined(together, single)
-    assert_alike(places, [of_one for (of_one,) in expected_places])
-
-
-@pytest.mark.slow
-def test_derivatives_of_clips_in_a_row_are_those_of_clips_alone(different, each):
-    assert_joined(slopes(committed(different)), [slopes(one) for one in committed(each)])
-
-
-def assert_alike(joined: Sequence[Places], single: Sequence[Places]) -> None:
-    for ours, theirs in zip(joined, single, strict=True):
+    single, places_alone = zip(*map(evaluation, committed(each)), strict=True)
+    expected = np.concatenate(single)
+    assert np.abs(expected).max() > 1
+    np.testing.assert_allclose(together, expected, atol=1e-7 * np.abs(expected).max())
+    for ours, (theirs,) in zip(places, places_alone, strict=True):
         for x, y in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(x, y, atol=1e-6)  # straight legs
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ("ozz", "unreal", "mec", "stride"))
-@pytest.mark.usefixtures("optimised")
-def test_other_systems_make_the_same_of_a_clip_in_a_row_and_alone(different, preset):
-    """Compiled as for users: without optimisations XLA 0.10.2 puts an ankle of `stride` in a row
-    9 cm off the plane onto which it is projected, though its height over that plane is right.
-    """
-    ik = getattr(jaxik.presets, preset)()
-    scenes = [
-        scene if preset != "unreal" else dataclasses.replace(scene, tracks={})
-        for scene in different.data
-    ]
-    run = jax.jit(places_of)
-    assert_alike(run(ik, tuple(scenes)), run(ik, apart(scenes)))
 
 
 def test_clips_on_the_same_ground_share_it_and_others_are_out_of_reach(problem):
@@ -201,22 +166,89 @@ def test_clips_on_the_same_ground_share_it_and_others_are_out_of_reach(problem):
     moved = second.offset_ws[0]
     edges = [np.asarray(scene.terrain.surfaces[0].vertices_ws)[:, 0] for scene in problem.data]
     assert moved % 16 == 0 and edges[1].min() + moved > edges[0].max() + 2 * MARGIN
+    elsewhere = dataclasses.replace(problem, data=apart(problem.data))
+    assert digest(problem) == digest(elsewhere), "no part of what a fit is of"
 
 
-def test_grounds_that_are_no_meshes_are_shared_only_by_clips_on_the_same(problem):
+def test_clips_share_grounds_that_are_no_meshes_only_if_equal_and_legs_of_the_same_number(problem):
     level, raised = plane(), plane((0.0, 0.3, 0.0))
     pairs = zip(problem.data, (level, level, raised), strict=True)
     first, second, third = placed([dataclasses.replace(s, terrain=ground) for s, ground in pairs])
     assert first.place.world == second.place.world and third.place is None
     assert not second.place.offset_ws.any()
-
-
-def test_a_clip_of_another_number_of_legs_runs_alone(problem):
     first, second, third = problem.data
     more = jax.tree.map(lambda x: jnp.concatenate([x, x[:1]]), second.rig)
     first, second, third = placed([first, dataclasses.replace(second, rig=more), third])
     assert second.place is None and first.place is not None is not third.place
 
 
-def test_what_shares_a_world_with_what_does_not_change_what_a_fit_is_of(problem):
-    assert digest(problem) == digest(dataclasses.replace(problem, data=apart(problem.data)))
+# On several devices
+
+
+@pytest.fixture(scope="module")
+def evaluations() -> dict[str, np.ndarray]:
+    """On one device."""
+    return on_devices.evaluations()
+
+
+def start(path: Path, devices: int, *process: str) -> subprocess.Popen:
+    """A process with simulated devices that writes its numbers to a file."""
+    paths = os.pathsep.join(map(str, [ROOT, ROOT / "tests"]))
+    return subprocess.Popen(
+        [sys.executable, "-m", "support.on_devices", str(path), str(devices), *process],
+        env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def assert_alike(path: Path, expected: dict[str, np.ndarray]) -> None:
+    with np.load(path) as archive:
+        assert set(archive) == set(expected)
+        for name, values in expected.items():
+            assert np.isfinite(values).all() and np.ptp(values) > 0
+            np.testing.assert_allclose(archive[name], values, rtol=1e-12, err_msg=name)
+
+
+def test_eight_devices_find_what_one_finds(evaluations, tmp_path):
+    process = start(tmp_path / "eight.npz", 8)
+    _, errors = process.communicate(timeout=500)
+    assert process.returncode == 0, errors[-2000:]
+    assert_alike(tmp_path / "eight.npz", evaluations | on_devices.log_probabilities())
+
+
+@pytest.mark.slow
+def test_two_processes_find_what_one_finds(evaluations, tmp_path):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+    paths = [tmp_path / f"{number}.npz" for number in range(2)]
+    processes = [start(path, 2, address, "2", str(number)) for number, path in enumerate(paths)]
+    errors = [process.communicate(timeout=500)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], errors
+    of_systems = {name: values for name, values in evaluations.items() if "systems" in name}
+    for path in paths:
+        assert_alike(path, of_systems)
+
+
+def test_one_device_changes_nothing():
+    problem = on_devices.make_problem()
+    assert over_devices(problem) is problem
+
+
+def test_clips_on_one_ground_are_one_stack_and_keep_their_order_and_none_is_made_shorter():
+    scenes = on_devices.make_problem().data
+    (stack,) = stacking.stack(scenes)
+    assert stack.members == (0, 1, 2) and stack.shares_terrain
+    for number, scene in enumerate(scenes):
+        observed = np.asarray(stack.one(number).reference.observed)
+        assert observed.sum() == np.asarray(scene.reference.observed).sum()
+    frames = stacking.frame_count(scenes[0])
+    with pytest.raises(ValueError, match=f"has {frames} frames; wanted at most 3"):
+        stacking.padded(scenes[0], 3)
+
+
+def test_lengths_are_rounded_up_to_a_few_by_a_quarter_at_most():
+    lengths = np.arange(1, 5000)
+    rounded = np.array([stacking.rounded_up(length) for length in lengths.tolist()])
+    assert (lengths <= rounded).all() and (np.diff(rounded) >= 0).all()
+    assert (rounded / np.maximum(lengths, 32)).max() <= 1.26
+    assert len(set(rounded.tolist())) < 30
