@@ -1,6 +1,8 @@
-"""Profiles against exact ones, verdicts, valleys and ridges."""
+"""How well the data determine parameters: profiles against exact ones, intervals, verdicts."""
 
+import dataclasses
 import functools
+import itertools
 
 import equinox as eqx
 import jax
@@ -8,17 +10,28 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+import scipy.stats
 
-from fitting.inference import identifiability
-from fitting.inference.identifiability import Identifiability
-from fitting.inference.optimisation import search
+from fitting.inference.identifiability import Identifiability, assess_identifiability
+from fitting.inference.optimisation import population, search
+from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.solution import Solution
-from fitting.inference.profiles import heights
-from fitting.problem.free_parameters import to_fractions
+from fitting.inference.profiles.conditional import Conditional, Targets
+from fitting.inference.profiles.heights import (
+    RISE_OF_SMOOTH,
+    RISE_OF_THRESHOLD,
+    level_of,
+    max_rise,
+)
+from fitting.inference.profiles.secants import slopes_of_thresholds
+from fitting.problem.free_parameters import free_parameter, from_fractions, to_fractions
+from fitting.problem.prior import SPREAD, ParameterPrior, Priors
 from fitting.problem.problem import Problem
+from fitting.problem.space import make_space
 from fitting.runtime import threads
 from support import toy
-from support.problems import parameter, problem_of
+from support.curves import curve_problem
+from support.problems import Fractions, parameter, problem_of, problem_of_fractions
 
 NOISE = 0.05
 TIME = jnp.linspace(0, 2, 400)
@@ -36,7 +49,7 @@ def assessed(kind: type, truth: dict[str, float], seed: int) -> Assessed:
     problem = problem_of(kind(), tuple(truth), jnp.asarray(data), residuals)
     first = np.asarray(problem.space.pack(truth))
     solution = search.find_best_fit(problem, starts=1, first=first)
-    return problem, solution, identifiability.assess_identifiability(problem, solution)
+    return problem, solution, assess_identifiability(problem, solution)
 
 
 # Exact profiles
@@ -50,56 +63,81 @@ def coupled() -> Assessed:
     """Smooth parameters only, so that SciPy finds the exact profile."""
     problem = toy.make_problem(names=COUPLED)
     solution = search.find_best_fit(problem)
-    return problem, solution, identifiability.assess_identifiability(problem, solution)
+    return problem, solution, assess_identifiability(problem, solution)
 
 
-@functools.cache
-def residuals_and_jacobian():
-    problem = coupled()[0]
-    return eqx.filter_jit(problem.residuals), eqx.filter_jit(problem.jacobian)
+@eqx.filter_jit
+def residuals_and_jacobian(problem: Problem, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return problem.residuals(u), problem.jacobian(u)
 
 
-def exact_rise(held: int, place: float) -> float:
-    """Of the lowest cost with one u held, by SciPy from the solution."""
-    _, solution, _ = coupled()
-    others = np.arange(len(solution.u)) != held
-    residuals, jacobian = residuals_and_jacobian()
+def exact_rise(name: str, value: float) -> float:
+    """Of the lowest cost with one parameter held, by SciPy from the solution."""
+    problem, solution, _ = coupled()
+    held = COUPLED.index(name)
+    others = np.arange(len(COUPLED)) != held
+    place = float(problem.space.pack({name: value})[held])
 
-    def full(rest: np.ndarray) -> np.ndarray:
-        u = np.full(len(others), place)
-        u[others] = rest
-        return u
+    def at(rest: np.ndarray, which: int) -> np.ndarray:
+        u = jnp.asarray(np.insert(rest, held, place))
+        return np.asarray(residuals_and_jacobian(problem, u)[which])
 
     found = scipy.optimize.least_squares(
-        lambda rest: np.asarray(residuals(full(rest))),
+        lambda rest: at(rest, 0),
         solution.u[others],
-        jac=lambda rest: np.asarray(jacobian(full(rest)))[:, others],  # type: ignore
+        jac=lambda rest: at(rest, 1)[:, others],  # type: ignore
         xtol=1e-12,
         ftol=1e-12,
     )
     return float(found.cost) - solution.cost
 
 
-def test_a_profile_is_the_exact_one_where_the_cost_is_low():
-    problem, _, report = coupled()
-    for i, name in enumerate(COUPLED):
-        curve = report.profiles[name]
-        near = np.flatnonzero(curve.rises < 3 * curve.max_rise)
-        assert len(near) >= 4
-        for k in near:
-            place = float(problem.space.pack(dict(zip(COUPLED, curve.path[k], strict=True)))[i])
-            exact = exact_rise(i, place)
-            assert curve.rises[k] == pytest.approx(exact, abs=0.05), (name, curve.values[k])
+@pytest.mark.parametrize("name", COUPLED)
+def test_a_profile_is_the_exact_one_where_the_cost_is_low_and_at_the_ends_of_its_interval(name):
+    """Which are where it has risen by half of chi-square."""
+    profile = coupled()[2].profiles[name]
+    near = np.flatnonzero(profile.rises < 3 * profile.max_rise)
+    assert len(near) >= 4
+    for k in near:
+        exact = exact_rise(name, profile.values[k])
+        assert profile.rises[k] == pytest.approx(exact, abs=0.05), profile.values[k]
+    assert profile.max_rise == pytest.approx(RISE_OF_SMOOTH, rel=0.1)
+    for end in profile.interval:
+        assert exact_rise(name, end) == pytest.approx(profile.max_rise, rel=0.05), end
 
 
-def test_the_ends_of_an_interval_are_where_the_exact_cost_has_risen_by_half_of_chi_square():
-    problem, _, report = coupled()
-    for i, name in enumerate(COUPLED):
-        profile = report.profiles[name]
-        assert profile.max_rise == pytest.approx(heights.RISE_OF_SMOOTH, rel=0.1)
-        for end in profile.interval:
-            exact = exact_rise(i, float(problem.space.pack({name: end})[i]))
-            assert exact == pytest.approx(profile.max_rise, rel=0.05), (name, end)
+# Heights of intervals: chi-square's, or higher beside a plateau that noise undercuts
+
+GAIN = free_parameter(toy.Toy(), "body.gain")
+U = np.unique(np.concatenate([np.linspace(-6, 6, 241), np.linspace(-0.02, 0.02, 21)]))
+
+
+def gains(u: np.ndarray) -> np.ndarray:
+    return from_fractions(GAIN, 1 / (1 + np.exp(-u)))
+
+
+def test_heights_and_levels_of_a_parabola_are_those_of_chi_square():
+    for sd, step in itertools.product((0.05, 0.3, 1.6), (0.3, 1.0)):
+        u = 0.4 + sd * np.arange(-5, 5.1, step)  # few points suffice
+        height = max_rise(GAIN, gains(u), 0.5 * ((u - 0.4) / sd) ** 2)
+        assert RISE_OF_SMOOTH <= height < 1.1 * RISE_OF_SMOOTH, (sd, step)
+    u = np.linspace(-3, 3, 31)
+    for rise in (0.1, 0.5, 1.92, 4.0):
+        level = level_of(GAIN, gains(u), 0.5 * (u / 0.5) ** 2, rise)
+        assert level == pytest.approx(scipy.stats.chi2(1).cdf(2 * rise), abs=0.02)
+    assert max_rise(GAIN, gains(np.zeros(1)), np.zeros(1)) == RISE_OF_SMOOTH
+
+
+def test_a_narrow_valley_does_not_exclude_a_wide_plateau_but_for_one_out_of_reach():
+    narrow, prior = 0.5 * (U / 0.005) ** 2, 0.5 * (U / 1.6) ** 2
+    height = max_rise(GAIN, gains(U), np.minimum(3.0 + prior, narrow))
+    share_of_plateau = np.exp(-3) * 1.6 / (np.exp(-3) * 1.6 + 0.005)
+    assert share_of_plateau > 0.9
+    inside = scipy.stats.norm(scale=1.6).cdf(np.sqrt(2 * (height - 3)) * 1.6)
+    level = share_of_plateau * (2 * inside - 1) + 1 - share_of_plateau
+    assert level == pytest.approx(0.95, abs=0.01)
+    height = max_rise(GAIN, gains(U), np.minimum(12.0 + prior, narrow))
+    assert height == pytest.approx(RISE_OF_SMOOTH, rel=0.1)
 
 
 # Verdicts
@@ -126,11 +164,11 @@ def bumps(limit: float = 1.2) -> Assessed:
     return assessed(Bumps, truth, 1)
 
 
-@pytest.mark.parametrize("cores", [1, 3])
-def test_profiles_are_the_same_on_any_number_of_cores(monkeypatch, cores):
-    monkeypatch.setattr(threads, "usable_cores", lambda: cores)
+def test_profiles_are_the_same_on_another_number_of_cores(monkeypatch):
     problem, solution, before = bumps()
-    again = identifiability.assess_identifiability(problem, solution)
+    cores = 3 if threads.usable_cores() == 1 else 1
+    monkeypatch.setattr(threads, "usable_cores", lambda: cores)
+    again = assess_identifiability(problem, solution)
     for name, profile in before.profiles.items():
         np.testing.assert_array_equal(again.profiles[name].values, profile.values)
         np.testing.assert_array_equal(again.profiles[name].rises, profile.rises)
@@ -146,28 +184,17 @@ def test_every_parameter_has_a_profile_over_its_whole_range():
         assert curve.rises.min() == 0
 
 
-def test_a_clamp_that_is_never_reached_is_one_sided():
+def test_a_clamp_is_two_sided_if_it_is_reached_and_one_sided_if_it_is_never():
     report = bumps()[2]
     limit = report.profiles["limit"]
     assert limit.verdict == "at least"
     assert limit.interval[0] == pytest.approx(1.0, abs=0.1)
     assert limit.interval[1] > 1.6  # the prior's doing
     assert "limit" in report.undetermined
-
-
-def test_a_clamp_that_is_always_reached_is_two_sided():
-    report = bumps(limit=0.6)[2]
-    assert report.profiles["limit"].verdict == "two-sided"
-    assert "limit" in report.determined
-    assert report.interval[-1] == pytest.approx([0.6, 0.6], abs=0.03)
-
-
-def test_a_parameter_without_effect_is_flat_and_has_the_interval_of_its_prior():
-    report = bumps()[2]
-    lonely = report.profiles["lonely"]
-    assert lonely.verdict == "flat"
-    assert report.contraction[2] == pytest.approx(0, abs=0.1)
-    assert lonely.data_rises == pytest.approx(0, abs=0.2)
+    reached = bumps(limit=0.6)[2]
+    assert reached.profiles["limit"].verdict == "two-sided"
+    assert "limit" in reached.determined
+    assert reached.interval[-1] == pytest.approx([0.6, 0.6], abs=0.03)
 
 
 def test_two_valleys_are_listed_with_their_intervals_and_heights():
@@ -177,18 +204,21 @@ def test_two_valleys_are_listed_with_their_intervals_and_heights():
     left, right = square.valleys
     assert left.value == pytest.approx(-0.6, abs=0.03)
     assert right.value == pytest.approx(0.6, abs=0.03)
-    assert right.rise == 0 < left.rise < heights.RISE_OF_SMOOTH
+    assert right.rise == 0 < left.rise < RISE_OF_SMOOTH
     for valley in square.valleys:
         assert valley.interval[0] < valley.value < valley.interval[1] < valley.interval[0] + 0.1
     assert "square" in report.undetermined
 
 
-def test_an_exact_ridge_of_two_thresholds_leaves_both_undetermined():
+def test_an_exact_ridge_leaves_two_thresholds_undetermined_and_one_without_effect_is_flat():
     problem, _, report = bumps()
+    lonely = report.profiles["lonely"]
+    assert lonely.verdict == "flat" and lonely.data_rises == pytest.approx(0, abs=0.2)
+    assert report.contraction[2] == pytest.approx(0, abs=0.1)
     for name in ("first", "second"):
         curve = report.profiles[name]
         assert name in report.undetermined
-        low = curve.data_rises < heights.RISE_OF_THRESHOLD
+        low = curve.data_rises < RISE_OF_THRESHOLD
         along = curve.path[low]
         assert np.ptp(curve.values[low]) > 0.7
         assert along[:, 0] + along[:, 1] == pytest.approx(1.1, abs=0.05)
@@ -226,8 +256,175 @@ def test_intervals_go_on_beyond_cliffs_along_which_parameters_move_together(seed
         [len(TIME) - np.searchsorted(row[::-1], releases, "right") for row in remaining]
     )
     exact = 0.5 * (of_fading[:, None] + of_holding[held]) / NOISE**2
-    low = exact - exact.min() < heights.RISE_OF_SMOOTH
+    low = exact - exact.min() < RISE_OF_SMOOTH
     alone = half_lives[low[:, np.argmin(exact.min(axis=0))]]
     ends = half_lives[low.any(axis=1)][[0, -1]]
     assert np.ptp(ends) > 1.5 * np.ptp(alone)  # along the cliff, the release has to follow
     assert report.profiles["half_life"].interval == pytest.approx(ends, abs=0.15 * np.ptp(ends))
+
+
+# Slopes of thresholds: of a gradual effect its derivative, of a sudden one none
+
+HEIGHT = jnp.linspace(0.0, 0.3, 300)  # m
+
+
+class Fade(eqx.Module):
+    """A weight that fades between two heights, and a jump."""
+
+    low: jax.Array = parameter(0.1, "m", 0.05, 0.15, kind="threshold")  # full weight below
+    high: jax.Array = parameter(0.2, "m", 0.15, 0.25, kind="threshold")  # no weight above
+    jump: jax.Array = parameter(0.15, "m", 0.0, 0.3, kind="threshold")
+    gain: jax.Array = parameter(1.0, "1", 0.5, 1.5)
+
+    def motion(self) -> jax.Array:
+        weight = jnp.clip((self.high - HEIGHT) / (self.high - self.low), 0.0, 1.0)
+        return jnp.stack([self.gain * weight, jnp.where(HEIGHT < self.jump, 1.0, 0.0)])
+
+
+@functools.cache
+def fade() -> Problem:
+    clean = Fade().motion()
+    data = clean + NOISE * np.random.default_rng(0).normal(size=clean.shape)
+    return problem_of(Fade(), ("low", "high", "jump", "gain"), data, residuals)
+
+
+def test_a_gradual_effect_has_its_derivative_and_a_sudden_one_none():
+    start = fade().space.start
+    slopes = slopes_of_thresholds(fade(), np.asarray(start))
+    exact = np.asarray(jax.jacfwd(fade().residuals)(start))
+    assert (slopes[:, 2:] == 0).all()
+    for i in (0, 1):
+        assert np.linalg.norm(slopes[:, i] - exact[:, i]) < 0.1 * np.linalg.norm(exact[:, i])
+
+
+def test_thresholds_that_fade_a_weight_follow_each_other():
+    """Along the ridge on which the middle of the fade stays, the cost rises much less."""
+    solution = search.find_best_fit(fade(), starts=1)
+    conditional = Conditional.around(fade(), solution)
+    start = conditional.points(np.asarray(solution.u)[None])
+    targets = Targets(np.asarray([0]), start.values[:, 0] - 0.004)
+    alone = conditional.points(
+        conditional.move(start, np.zeros((1, 4)), targets, np.zeros((1, 4), bool))
+    )
+    following = conditional.lowest(targets, [start])
+    assert following.cost[0] - start.cost[0] < 0.6 * (alone.cost[0] - start.cost[0])
+    assert following.values[0, 1] > start.values[0, 1] + 0.001
+
+
+# A report of a system like foot IK
+
+UNINFORMATIVE = 2  # seed of a clip in which the foot is always lifted before it is fast
+TRUTH = np.asarray([toy.TRUTH.get(name, np.nan) for name in toy.NAMES])
+
+
+@pytest.fixture(scope="module")
+def report() -> Identifiability:
+    return assess_identifiability(*toy.solved())
+
+
+def test_a_parameter_without_effect_is_undetermined_and_others_have_the_truth_inside(report):
+    assert report.undetermined == report.weakest == ("foot.idle",)
+    idle = report.names.index("foot.idle")
+    assert report.contraction[idle] == pytest.approx(0, abs=0.01)
+    assert report.sd[idle] == pytest.approx(SPREAD)
+    assert report.eigenvalues[0] == pytest.approx(0, abs=1e-6)
+    assert report.improvement < 0.5 and set(report.at_bound) == {""}
+    known, (low, high) = np.isfinite(TRUTH), report.interval.T
+    assert (low <= high).all()
+    assert ((low <= TRUTH) & (TRUTH <= high))[known].sum() >= known.sum() - 1, "nearly all"
+
+
+def test_a_threshold_has_the_interval_of_its_profile_and_others_the_sd_of_least_squares(report):
+    problem, solution = toy.solved()
+    thresholds = np.asarray(problem.space.thresholds)
+    np.testing.assert_array_equal(np.isnan(report.sd), thresholds)
+    for i, name in enumerate(report.names):
+        profile = report.profiles[name]
+        low, high = profile.interval
+        assert tuple(report.interval[i]) == (low, high)
+        assert low <= solution.values[i] <= high
+        if thresholds[i]:
+            assert 0 < high - low < 0.2 * float(problem.space.high[i] - problem.space.low[i])
+            outside = (profile.values < low) | (profile.values > high)
+            assert (profile.rises[outside] > profile.max_rise).all()
+    jacobian = solution.jacobian[:, ~thresholds]
+    expected = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    np.testing.assert_allclose(report.sd[~thresholds], expected, rtol=1e-6)
+    broken = dataclasses.replace(solution, jacobian=solution.jacobian * np.nan)
+    with pytest.raises(ValueError, match="the Jacobian at the solution is not finite"):
+        assess_identifiability(problem, broken)
+
+
+# Contraction, correlation and bounds
+
+
+def assess_quickly(problem: Problem) -> Identifiability:
+    solution = search.find_best_fit(problem, SearchSettings(max_steps=24), starts=1)
+    return assess_identifiability(problem, solution)
+
+
+def distances(ik: Fractions, effects: jax.Array) -> jax.Array:
+    return effects @ (ik.x - 0.4) / 0.02
+
+
+def of_two_fractions(*effects: float) -> Problem:
+    """A problem with one residual, on which two fractions have these effects."""
+    return problem_of_fractions(2, jnp.asarray([effects]), distances)
+
+
+@pytest.mark.parametrize("kind", ["smooth", "threshold"])
+def test_a_parameter_without_effect_has_contraction_0_whatever_its_prior(kind):
+    problem = of_two_fractions(0.0, 1.0)
+    ik = problem.space.system
+    space = make_space(ik, [free_parameter(ik, "x[0]", kind=kind), free_parameter(ik, "x[1]")])
+    for prior in (
+        ParameterPrior("uniform"),
+        ParameterPrior(),
+        ParameterPrior(centre=0.2, spread=0.3),
+        ParameterPrior(centre=0.9, spread=3.0),
+    ):
+        own = space.with_prior(Priors(named={"x[0]": prior}))
+        report = assess_quickly(dataclasses.replace(problem, space=own))
+        assert report.contraction[0] == pytest.approx(0, abs=0.01), prior
+        assert report.undetermined == ("x[0]",), prior
+        assert report.contraction[1] > 0.9, prior
+        # At 0.4 a fraction rises by 0.24 for each unit of `u`, whose prior has the usual spread.
+        information = (0.24 / 0.02 * SPREAD) ** 2
+        assert report.eigenvalues[-1] == pytest.approx(information, rel=0.01), prior
+
+
+def test_parameters_with_the_same_effect_are_named_as_a_pair(report):
+    ((first, second, correlation),) = assess_quickly(of_two_fractions(1.0, 1.0)).correlated
+    assert {first, second} == {"x[0]", "x[1]"} and -1 < correlation < -0.98
+    assert report.correlated == assess_quickly(of_two_fractions(0.0, 1.0)).correlated == ()
+
+
+def test_values_at_bounds_and_a_threshold_that_the_clip_never_reaches_are_flagged():
+    """The search takes a few steps since it starts at the truth."""
+    truth = toy.TRUTH | {"body.rise": 0.0, "foot.limit[1]": 0.1}
+    problem = toy.make_problem(UNINFORMATIVE, truth=truth)
+    start = np.clip(np.asarray(problem.space.pack(truth)), -5, 5)
+    solution = search.find_best_fit(problem, SearchSettings(max_steps=24), starts=1, first=start)
+    flagged = assess_identifiability(problem, solution)
+    named = {name: flag for name, flag in zip(toy.NAMES, flagged.at_bound, strict=True) if flag}
+    assert named == {"body.rise": "low", "foot.limit[1]": "low"}
+    low, high = flagged.profiles["lock.speed_off"].interval
+    assert high - low > 0.5 * 2.3
+    assert low <= truth["lock.speed_off"] <= high
+    assert "lock.speed_off" in flagged.undetermined
+
+
+def test_a_fit_off_its_minimum_gets_a_lower_point_from_its_profiles():
+    problem = curve_problem(("height", "rate", "turn"))
+    solution = search.find_best_fit(problem, starts=1)
+    values = dict(zip(solution.names, solution.values, strict=True)) | {"turn": 0.6}
+    u = np.asarray(problem.space.pack(values))
+    cost = float(population.evaluate(problem, u[None]).cost[0])
+    moved = dataclasses.replace(
+        solution, u=u, values=np.asarray(problem.space.values(jnp.asarray(u))), cost=cost
+    )
+    lower = assess_identifiability(problem, moved)
+    assert lower.improvement > 0.9 * (cost - solution.cost) > 100
+    assert lower.best_cost == pytest.approx(cost - lower.improvement)
+    again = population.evaluate(problem, lower.best_u[None]).cost[0]
+    assert again == pytest.approx(lower.best_cost)
