@@ -2,15 +2,14 @@
 
 import dataclasses
 import math
-from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import linalg, optimize, stats
+from scipy import integrate, linalg, optimize, stats
 
 import fitting
 import jaxik
@@ -19,9 +18,10 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise import marginal, model, series
+from fitting.inference.noise.density import NoiseDensity
 from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.noise.settings import NoiseOptions
-from fitting.problem.loss import apply_loss
+from fitting.problem.loss import CAUCHY, Loss, apply_loss
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_by_kind
 from fitting.problem.scene import Scene
@@ -35,21 +35,40 @@ OZZ = ROOT / "data" / "experiments" / "ozz.toml"
 KINDS = ("ankle", "knee", "pelvis", "foot", "body")
 
 
+# The density that a loss stands for
+
+DENSITIES: dict[Loss, Any] = {
+    "squares": stats.norm(),
+    "student": stats.t(3.5),
+    # exp(-c²/2 log(1 + r²/c²)) is a t distribution with c² - 1 degrees of freedom.
+    "cauchy": stats.t(CAUCHY**2 - 1, scale=CAUCHY / np.sqrt(CAUCHY**2 - 1)),
+}
+
+
+@pytest.mark.parametrize("loss", get_args(Loss))
+def test_the_log_density_is_that_of_a_known_distribution_and_draws_have_it(loss):
+    density = NoiseDensity(loss, 3.5)
+    r = np.array([-30.0, -2.0, 0.0, 0.7, 4.0, 100.0])
+    if loss in DENSITIES:
+        expected = DENSITIES[loss].logpdf(r)
+        np.testing.assert_allclose(density.log_density(r), expected, atol=1e-4)
+    draws = density.draw(np.random.default_rng(0), (4000, 5)).ravel()
+    for end in (-1.5, 0.4, 3.0, np.inf):
+        below = integrate.quad(lambda r: np.exp(density.log_density(np.array(r))), -np.inf, end)[0]
+        assert np.mean(draws < end) == pytest.approx(below, abs=4 * 0.5 / draws.size**0.5)
+    assert below == pytest.approx(1.0, abs=1e-4)
+
+
 # The errors of one kind
 
 
-@pytest.fixture
-def errors() -> series.Errors:
-    """Two columns of an autoregression, with a gap."""
+def test_sigma_and_correlation_are_those_of_the_exact_likelihood_unless_one_is_given():
+    """Of multivariate normal runs, whose covariance is `sigma² rho^|i - j|`, with a gap."""
     random = np.random.default_rng(0)
     values = 0.3 * autoregression(random.normal(size=(120, 2)), 0.8)
     active = np.ones((120, 2), bool)
     active[40:50] = False
-    return series.Errors(np.where(active, values, 0.0), active)
-
-
-def test_sigma_and_correlation_are_those_of_the_exact_likelihood(errors):
-    """Of multivariate normal runs, whose covariance is `sigma² rho^|i - j|`."""
+    errors = series.Errors(np.where(active, values, 0.0), active)
     runs = [part for column in errors.values.T for part in (column[:40], column[50:])]
 
     def minus_log_likelihood(x: np.ndarray) -> float:
@@ -65,36 +84,35 @@ def test_sigma_and_correlation_are_those_of_the_exact_likelihood(errors):
     found = series.likeliest([errors], "squares", 4.0, None)
     assert found.sigma == pytest.approx(math.exp(best[0]), rel=1e-3)
     assert found.correlation == pytest.approx(math.tanh(best[1]), abs=1e-3)
-
-
-def test_a_given_correlation_stays(errors):
-    found = series.likeliest([errors], "squares", 4.0, 0.5)
+    given = series.likeliest([errors], "squares", 4.0, 0.5)
     values = series.innovations(errors, 0.5)
-    assert found.correlation == 0.5 and values.size == errors.active.sum()
-    assert found.sigma == pytest.approx(np.sqrt(np.mean(values**2)))
+    assert given.correlation == 0.5 and values.size == errors.active.sum()
+    assert given.sigma == pytest.approx(np.sqrt(np.mean(values**2)))
 
 
-@pytest.mark.parametrize("nu", [2.5, 6.0])
-def test_scale_and_tails_are_those_of_scipys_t(nu):
-    values = 0.2 * np.asarray(stats.t.rvs(nu, size=4000, random_state=1))
-    tails, sigma = 4.0, 1.0
-    for _ in range(60):
-        sigma = series.scale(values, "student", tails)
-        tails = series.likeliest_tails(values / sigma)
-    expected = stats.t.fit(values, floc=0)
-    assert tails == pytest.approx(expected[0], rel=0.01)
-    assert sigma == pytest.approx(expected[2], rel=0.01)
+def test_scale_and_tails_are_those_of_scipys_t():
+    for nu in (2.5, 6.0):
+        values = 0.2 * np.asarray(stats.t.rvs(nu, size=4000, random_state=1))
+        tails, sigma = 4.0, 1.0
+        for _ in range(60):
+            sigma = series.scale(values, "student", tails)
+            tails = series.likeliest_tails(values / sigma)
+        expected = stats.t.fit(values, floc=0)
+        assert tails == pytest.approx(expected[0], rel=0.01)
+        assert sigma == pytest.approx(expected[2], rel=0.01)
 
 
-@pytest.mark.parametrize("nu", [2.0, 5.0])
-def test_students_slopes_tell_less_than_they_say(nu):
+def test_students_slopes_tell_less_than_they_say():
     """Against draws: the score's square, over the slope's of the transformed residual."""
-    draws = stats.t.rvs(nu, size=200_000, random_state=2)
-    score = (nu + 1) * draws / (nu + draws**2)
-    transformed = jax.vmap(jax.grad(lambda r: apply_loss(r[None], "student", nu)[0]))
-    ratio = np.mean(score**2) / np.mean(np.asarray(transformed(jnp.asarray(draws))) ** 2)
-    assert series.information_of_slopes("student", nu) == pytest.approx(ratio, rel=0.01)
-    assert series.information_of_slopes("squares", nu) == 1.0
+    slopes = jax.jit(
+        jax.vmap(jax.grad(lambda r, nu: apply_loss(r[None], "student", nu)[0]), (0, None))
+    )
+    for nu in (2.0, 5.0):
+        draws = stats.t.rvs(nu, size=200_000, random_state=2)
+        score = (nu + 1) * draws / (nu + draws**2)
+        ratio = np.mean(score**2) / np.mean(np.asarray(slopes(jnp.asarray(draws), nu)) ** 2)
+        assert series.information_of_slopes("student", nu) == pytest.approx(ratio, rel=0.01)
+    assert series.information_of_slopes("squares", 2.0) == 1.0
 
 
 # A problem without a pipeline: two parameters shift the errors of each frame
@@ -123,21 +141,18 @@ def simulated(
 ) -> FootProblem:
     """Whose errors at `u` are the noise, correlated, this fraction of it ten sigmas off."""
     random = np.random.default_rng(seed)
-    (scene,), frames = problem.data, problem.data[0].reference.observed.size
-
-    def noise(kind: str) -> np.ndarray:
-        shape = (frames, 3) if kind in ("pelvis", "body") else (frames, 2, 3)
+    (scene,), sigmas = problem.data, noise_of(problem).sigmas
+    noise = {}
+    for kind in KINDS:
+        legs = () if kind in ("pelvis", "body") else (2,)
+        shape = (scene.reference.observed.size, *legs, 3)
         far = 10 * random.normal(size=shape) * (random.random(shape) < outliers)
         errors = autoregression(random.normal(size=shape), rho) + far
-        return noise_of(problem).sigmas[kind] * errors
-
-    def with_tracks(tracks: dict[str, jax.Array]) -> Scene:
-        return dataclasses.replace(scene, tracks=tracks)
-
-    wanted = {kind: jnp.asarray(noise(kind)) for kind in KINDS}
-    (found,) = errors_by_kind(problem.space.unpack(jnp.asarray(u)), (with_tracks(wanted),))
-    tracks = {kind: 2 * wanted[kind] - found[kind] for kind in KINDS}
-    return dataclasses.replace(problem, data=(with_tracks(tracks),))
+        noise[kind] = jnp.asarray(sigmas[kind] * errors)
+    scene = dataclasses.replace(scene, tracks=noise)
+    (found,) = errors_by_kind(problem.space.unpack(jnp.asarray(u)), (scene,))
+    tracks = {kind: 2 * noise[kind] - found[kind] for kind in KINDS}
+    return dataclasses.replace(problem, data=(dataclasses.replace(scene, tracks=tracks),))
 
 
 def walk(options: NoiseOptions, loss: str = "squares") -> tuple[Experiment, FootProblem]:
@@ -182,12 +197,14 @@ def test_the_fit_with_noise_is_the_joint_optimum(correlated, no_pipeline):
     found = noise_of(problem)
     before = float(problem.cost(space.pack({})))  # with the noise that was estimated
     assert solution.cost_before == pytest.approx(before) and solution.cost < before
-    unpack = jax.jit(lambda u: (space.unpack(u), space.prior_residuals(u)))
+
+    @jax.jit
+    def errors_and_prior(u: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        return errors_by_kind(space.unpack(u), correlated.data)[0], space.prior_residuals(u)
 
     def objective(x: np.ndarray) -> float:
         sigmas, rhos = np.exp(x[2:7]), np.tanh(x[7:])
-        ik, of_prior = unpack(jnp.asarray(x[:2]))
-        (by_kind,) = errors_by_kind(ik, correlated.data)
+        by_kind, of_prior = errors_and_prior(jnp.asarray(x[:2]))
         errors = model._counted(correlated.data[0], by_kind)
         total = 0.5 * float(np.sum(np.asarray(of_prior) ** 2))
         for kind, sigma, rho in zip(KINDS, sigmas, rhos, strict=True):
@@ -264,6 +281,8 @@ def test_open_sigmas_are_integrated_out(correlated):
         expected.append(np.logaddexp.reduce(logs) - 0.5 * prior)
     ours = [float(opened.log_probability(jnp.asarray(u))) for u in points]
     assert ours[1] - ours[0] == pytest.approx(expected[1] - expected[0], rel=1e-6)
+    with pytest.raises(ValueError, match="loss is 'student'; only with squares"):
+        marginal.with_unknown_sigmas(dataclasses.replace(problem, loss="student"))
 
 
 def test_open_sigmas_are_drawn_around_the_residuals_own(correlated):
@@ -277,15 +296,6 @@ def test_open_sigmas_are_drawn_around_the_residuals_own(correlated):
         sigma = getattr(correlated.data[0].sigmas, kind) * np.sqrt(squares / count)
         assert np.median(draws[kind]) == pytest.approx(float(sigma), rel=0.02)
         assert np.std(draws[kind]) / sigma == pytest.approx(1 / np.sqrt(2 * count), rel=0.15)
-
-
-def test_a_robust_loss_leaves_no_sigma_open(correlated):
-    robust = dataclasses.replace(correlated, loss="student")
-    with pytest.raises(ValueError, match="loss is 'student'; only with squares"):
-        marginal.with_unknown_sigmas(robust)
-
-
-# A whole fit
 
 
 @pytest.mark.slow
@@ -307,6 +317,6 @@ def test_a_run_is_sampled_with_the_noise_that_its_fit_found(undrawn, tmp_path):
     assert NoiseModel(**summary["noise"]) == fitted.noise  # type: ignore[typeddict-item]
     continued = fitting.sample(tmp_path / "run", max_steps=30)
     assert (continued.u[:20] == first.u).all() and len(continued.u) == 30
-    text = (Path(tmp_path) / "run" / run_folder.SUMMARY).read_text()
+    text = (tmp_path / "run" / run_folder.SUMMARY).read_text()
     assert "### Noise, estimated with the parameters" in text
     assert "Sigmas of the noise, which were sampled along:" in text
