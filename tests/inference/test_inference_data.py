@@ -112,15 +112,14 @@ def test_the_log_likelihood_of_blocks_is_one_that_arviz_takes_and_a_file_gives_b
         np.testing.assert_array_equal(getattr(read, name), value, err_msg=name)
 
 
-def test_a_file_without_log_likelihood_is_refused(posterior, space, tmp_path):
+def test_a_file_without_log_likelihood_and_a_missing_package_are_said(
+    posterior, space, tmp_path, monkeypatch
+):
     inference_data.write_inference_data(tmp_path / "posterior.nc", posterior, space)
     (tmp_path / "text.nc").write_text("no draws")
     for name in ("posterior.nc", "text.nc"):
         with pytest.raises(ValueError, match=f"{name}: no log-likelihood in it"):
             inference_data.read_blocks(tmp_path / name)
-
-
-def test_without_arviz_the_error_says_how_to_install_it(posterior, space, monkeypatch):
     monkeypatch.setattr(inference_data, "PACKAGES", ("no_such_package",))
     with pytest.raises(ImportError, match=r'pip install "jaxik\[posterior\]"'):
         posterior.to_inference_data(space)
