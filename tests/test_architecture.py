@@ -62,17 +62,16 @@ def imported_packages(path: Path) -> set[str]:
     return {name.partition(".")[0] for name in imports(path)}
 
 
+def imported_below(path: Path, folder: str) -> set[str]:
+    """Names of what lies in a folder and is imported by a module."""
+    below = [name for name in imports(path) if name.startswith(f"{folder}.")]
+    return {name.removeprefix(f"{folder}.").partition(".")[0] for name in below}
+
+
 def package_and_wing(path: Path) -> tuple[str, str]:
     """The package of a file and its wing in it."""
-    home, *rest = path.relative_to(ROOT).with_suffix("").parts
-    return home, rest[0]
-
-
-def imported_wings(path: Path) -> set[str]:
-    """Wings of a file's own package that it imports, its own left out."""
-    home, own = package_and_wing(path)
-    parts = [name.split(".") for name in imports(path)]
-    return {names[1] for names in parts if names[0] == home and len(names) > 1} - {own}
+    home, wing, *_ = path.relative_to(ROOT).with_suffix("").parts
+    return home, wing
 
 
 @pytest.mark.parametrize("name", WINGS)
@@ -86,26 +85,22 @@ def test_a_wing_imports_only_wings_before_it():
     for path in trees():
         home, own = package_and_wing(path)
         if own != "__init__":
-            order = WINGS[home]
-            offenders[name_of(path)] = imported_wings(path) - set(order[: order.index(own)])
+            allowed = {own, *WINGS[home][: WINGS[home].index(own)]}
+            offenders[name_of(path)] = imported_below(path, home) - allowed
     assert not {path: sorted(later) for path, later in offenders.items() if later}, WINGS
 
 
-def stage_of(path: Path) -> str:
-    """The stage that a module of jaxik, or the package it lies in, belongs to; "" if to none."""
-    parts = path.relative_to(ROOT / "jaxik").with_suffix("").parts
-    return parts[1] if parts[0] == "stages" and parts[1] in STAGES else ""
-
-
 def test_a_stage_imports_only_stages_before_it():
-    staged = {path: stage_of(path) for path in package("jaxik").files if stage_of(path)}
-    assert set(staged.values()) == set(STAGES)
-    offenders = {}
-    for path, stage in staged.items():
-        names = [name.split(".") for name in imports(path) if name.startswith("jaxik.stages.")]
-        later = {parts[2] for parts in names} - {stage, *STAGES[: STAGES.index(stage)]}
-        offenders |= {name_of(path): sorted(later)} if later else {}
-    assert not offenders, STAGES
+    folder, offenders, met = ROOT / "jaxik" / "stages", {}, set()
+    for path in package("jaxik").files:
+        if folder in path.parents:
+            stage = path.relative_to(folder).with_suffix("").parts[0]
+            if stage in STAGES:
+                met.add(stage)
+                allowed = {stage, *STAGES[: STAGES.index(stage)]}
+                offenders[name_of(path)] = imported_below(path, "jaxik.stages") - allowed
+    assert met == set(STAGES)
+    assert not {path: sorted(later) for path, later in offenders.items() if later}, STAGES
 
 
 def test_jaxik_imports_nothing_but_its_libraries_and_touches_no_files():

@@ -35,12 +35,9 @@ PAGES = sorted([*ROOT.glob("*.md"), *(p for name in FOLDERS for p in (ROOT / nam
 PYTHON_FILES = sorted(path for name in FOLDERS for path in (ROOT / name).rglob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TOOLS = {"bash", "git", "pip", "pre-commit", "pyright", "pytest", "ruff"}
-WRITTEN_PAGES = set(
-    "summary.md table.md compare.md runs.md suite.md notes.md PATH.md".split()
-)  # by commands
+# By commands.
+WRITTEN_PAGES = {f"{name}.md" for name in "summary table compare runs suite notes PATH".split()}
 EXPERIMENT = ROOT / "data/experiments/uneven_walk.toml"
-
-
 TEXTS = {path: path.read_text(encoding="utf-8") for path in [*PAGES, *PYTHON_FILES, *NOTEBOOKS]}
 
 
@@ -61,9 +58,7 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def check_command(line: str) -> None:
     """Raises AssertionError where a tool, a sub-command, an option or a script does not exist."""
-    words = shlex.split(line, comments=True)
-    if ">" in words:
-        words = words[: words.index(">")]
+    words = shlex.split(line.partition(" > ")[0], comments=True)
     if not words:
         return
     tool = Path(words[0]).name
@@ -75,10 +70,9 @@ def check_command(line: str) -> None:
         except SystemExit as status:
             assert status.code == 0, f"{line}: {errors.getvalue()}"
     elif tool.startswith("python"):
-        if words[1] == "-m":
-            assert importlib.util.find_spec(words[2]), f"{line}: no module {words[2]}"
-        else:
-            assert (ROOT / words[1]).is_file(), f"{line}: no file {words[1]}"
+        is_module = words[1] == "-m"
+        known = importlib.util.find_spec(words[2]) if is_module else (ROOT / words[1]).is_file()
+        assert known, f"{line}: no such module or file"
     else:
         assert tool in TOOLS, f"{line}: unknown tool"
 
@@ -124,12 +118,14 @@ PAGE_PARSERS = [
 ]
 
 
-def page_parameter(path: Path) -> object:
-    marks = [pytest.mark.slow] * (name_of(path) == "jaxik/README.md")  # differentiates all stages
-    return pytest.param(path, id=name_of(path), marks=marks)
+LONG = "jaxik/README.md"  # it differentiates all stages
+CASES = [
+    pytest.param(path, id=name_of(path), marks=[pytest.mark.slow] * (name_of(path) == LONG))
+    for path in PAGES
+]
 
 
-@pytest.mark.parametrize("path", [page_parameter(path) for path in PAGES])
+@pytest.mark.parametrize("path", CASES)
 def test_the_snippets_of_a_page_run(path, scratch):
     for example in Sybil(PAGE_PARSERS).parse(path).examples():
         with contextlib.suppress(unittest.SkipTest):
@@ -139,10 +135,7 @@ def test_the_snippets_of_a_page_run(path, scratch):
 def test_the_examples_in_the_help_are_commands_that_exist():
     parser = make_parser()
     (commands,) = (action for action in parser._actions if action.dest == "command")
-    pages = [
-        parser.format_help(),
-        *(p.format_help() for p in dict(commands.choices or {}).values()),
-    ]
+    pages = [each.format_help() for each in (parser, *dict(commands.choices or {}).values())]
     lines = re.findall(r"^  (jaxik .*?)(?:  .*)?$", "\n".join(pages), re.MULTILINE)
     assert len(lines) > 20
     for line in lines:
@@ -171,9 +164,8 @@ def test_the_links_of_all_pages_lead_somewhere():
         for link in re.findall(r"\]\(([^)\s]+)\)", TEXTS[path]):
             file, _, anchor = link.partition("#")
             target = (path.parent / file).resolve() if file else path
-            if not re.match(r"[a-z]+:", link) and not (
-                target.exists() and (not anchor or anchor in anchors(target))
-            ):
+            leads = target.exists() and (not anchor or anchor in anchors(target))
+            if not leads and not re.match(r"[a-z]+:", link):
                 broken.append((name_of(path), link))
     assert not broken
 
