@@ -1,9 +1,11 @@
-"""What `import jaxik` and `import fitting` offer, to Python, to editors and to type checkers."""
+"""What the packages offer, to Python, editors, type checkers and readers, and what they need."""
 
 import ast
+import os
 import pydoc
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -12,9 +14,10 @@ import pytest
 from hatchling.builders.wheel import WheelBuilder
 
 import fitting
+import house
 import jaxik
 
-ROOT = Path(jaxik.__file__).parents[1]
+ROOT = house.ROOT
 
 
 def stub_names(package: ModuleType) -> list[str]:
@@ -25,7 +28,7 @@ def stub_names(package: ModuleType) -> list[str]:
     return [alias.asname or alias.name for node in imports for alias in node.names]
 
 
-@pytest.mark.parametrize("package", ["jaxik", "fitting"])
+@pytest.mark.parametrize("package", house.PACKAGES)
 def test_importing_a_package_does_not_import_jax(package):
     code = f"import sys, {package}; print('equinox' in sys.modules, 'jax' in sys.modules)"
     done = subprocess.run(
@@ -50,21 +53,15 @@ def test_an_unknown_name_is_an_error():
         from jaxik import wings  # type: ignore[attr-defined]  # noqa: F401
 
 
-def test_the_wheel_carries_stubs_its_types_and_the_files_of_pages(tmp_path):
+def test_the_wheel_carries_stubs_types_files_of_pages_and_examples_and_stays_small(tmp_path):
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    for package in ("jaxik", "fitting"):
+    for package in house.PACKAGES:
         assert {f"{package}/{name}" for name in ("py.typed", "__init__.pyi")} <= names
     page = ROOT / "fitting" / "report" / "page"
     files = [path for folder in ("templates", "assets") for path in (page / folder).iterdir()]
     assert files and {path.relative_to(ROOT).as_posix() for path in files} <= names
-
-
-def test_the_wheel_carries_the_examples_and_stays_small(tmp_path):
-    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
-    with zipfile.ZipFile(wheel) as archive:
-        names = set(archive.namelist())
     shipped = {"experiments/uneven_walk.toml", "clips/uneven_walk.npz", "terrains/uneven_walk.ply"}
     assert {f"fitting/examples/{name}" for name in shipped} <= names
     assert Path(wheel).stat().st_size < 3e6
@@ -86,3 +83,27 @@ def test_mypy_knows_the_type_of_every_public_name(tmp_path):
     assert len(revealed) == len(names)
     unknown = ('"Any"', "JitWrapped")  # a compiled function must keep its signature
     assert [line for line in revealed if any(word in line for word in unknown)] == []
+
+
+@pytest.mark.slow
+def test_the_api_reference_has_a_page_for_every_module(tmp_path):
+    command = [sys.executable, "-W", "error", "-m", "pdoc", "--docformat", "google"]
+    command += ["--output-directory", str(tmp_path), *house.PACKAGES]
+    # pdoc warns of a value that is also in the environment, where the tests put the flags.
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    assert (done.stdout, done.stderr) == ("", "")
+    files = [path for name in house.PACKAGES for path in house.Package(name).files]
+    names = [path.parent if path.stem == "__init__" else path.with_suffix("") for path in files]
+    pages = {path.relative_to(ROOT).with_suffix(".html").as_posix() for path in names}
+    assert not {page for page in pages if not (tmp_path / page).is_file()}
+    assert 'id="run"' in (tmp_path / "jaxik.html").read_text(encoding="utf-8")
+
+
+def test_the_lowest_version_of_jax_is_the_one_on_which_all_tests_run_and_there_is_no_highest():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8").split()
+    pinned = dict(line.split("==") for line in lines)
+    wanted = {f"{name}>={pinned[name]}" for name in ("jax", "equinox", "optimistix", "lineax")}
+    assert wanted <= set(project["dependencies"])
