@@ -175,10 +175,7 @@ def test_strides_go_from_stance_to_stance_and_are_unknown_where_a_foot_never_sta
     stride = clip_frames.frames_from_clip(hopping).stride
     np.testing.assert_array_equal(stride.known[:, 1], 0.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(stride))
-
-
-def test_strides_say_where_swings_bend():
-    """A ball on a parabola, 0.12 m beside the straight way in the middle."""
+    # They bend as a ball on a parabola does, 0.12 m beside the straight way in the middle.
     part = np.clip((np.arange(40) - 10) / 20, 0.0, 1.0)[:, None]
     arc = 4.0 * part * (1.0 - part)
     for up in np.eye(3)[1:]:
