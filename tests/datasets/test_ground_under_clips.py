@@ -138,7 +138,7 @@ def test_a_root_is_put_on_the_ground_relative_to_the_floor_unless_foot_ik_reache
         assert choice.reason.startswith("as animated: the ground is ") == (height < 0.4), height
 
 
-def test_the_ground_is_taken_out_from_under_a_clip_that_follows_it(clip):
+def test_a_root_stays_as_animated_where_it_follows_the_ground_or_there_is_none(clip, short):
     ground = terrain_of(hill())
     _, choice = ground_path.place_root(clip, ground)
     following = raised(clip, choice.rise)
@@ -146,9 +146,6 @@ def test_the_ground_is_taken_out_from_under_a_clip_that_follows_it(clip):
     assert again.reason == "as animated: the clip follows this terrain already"
     np.testing.assert_allclose(raised(flat, again.rise).positions_ws, following.positions_ws)
     np.testing.assert_allclose(flat.positions_ws, clip.positions_ws, atol=1e-9)
-
-
-def test_without_ground_below_its_path_a_root_stays_as_animated(short):
     aside = slab(0.0, -99.0, -90.0)
     flat, choice = ground_path.place_root(short, aside)
     assert flat is short and choice.rise is None and "no ground below" in choice.reason
@@ -182,6 +179,16 @@ def test_standing_feet_are_on_the_floor_and_the_pelvis_keeps_its_path_at_one_hei
     assert np.ptp(pelvis[:, 1]) < 1e-12
     assert np.allclose(pelvis[:, [0, 2]], walk.positions_ws[:, 0][:, [0, 2]])
     assert flatten_clip(walk, stairs, pelvis_height=0.8).positions_ws[0, 0, 1] == pytest.approx(0.8)
+    # A walk on a flat floor keeps its feet, and stances may be detected.
+    on_floor = stair_walk(flat_floor)
+    kept = flatten_clip(on_floor, flat_floor)
+    assert np.abs(kept.positions_ws - on_floor.positions_ws)[:, [3, 4, 7, 8]].max() < 1e-9
+    level = flatten_clip(on_floor, flat_floor, pelvis_height=0.8)
+    again = flatten_clip(level, flat_floor, pelvis_height=0.8)
+    assert np.abs(again.positions_ws - level.positions_ws).max() < 1e-9
+    detected = flatten_clip(replace(walk, stance=None), stairs)
+    assert (detected.stance == walk.stance).mean() > 0.9
+    assert np.abs(detected.joints_ws(3) - flat.joints_ws(3)).max() < 0.05
 
 
 def bone_errors(clip) -> np.ndarray:
@@ -201,18 +208,6 @@ def test_bones_keep_their_lengths_and_turn_with_their_joints_even_out_of_reach(w
             rot = Rotation.from_quat(flat.rotations_ws[:, joint], scalar_first=True)
             bone = flat.positions_ws[:, joint + 1] - flat.positions_ws[:, joint]
             assert np.allclose(rot.apply([0.0, -length, 0.0]), bone, atol=1e-9)
-
-
-def test_a_walk_on_a_flat_floor_keeps_its_feet_and_stances_may_be_detected(walk, flat):
-    on_floor = stair_walk(flat_floor)
-    kept = flatten_clip(on_floor, flat_floor)
-    assert np.abs(kept.positions_ws - on_floor.positions_ws)[:, [3, 4, 7, 8]].max() < 1e-9
-    level = flatten_clip(on_floor, flat_floor, pelvis_height=0.8)
-    again = flatten_clip(level, flat_floor, pelvis_height=0.8)
-    assert np.abs(again.positions_ws - level.positions_ws).max() < 1e-9
-    detected = flatten_clip(replace(walk, stance=None), stairs)
-    assert (detected.stance == walk.stance).mean() > 0.9
-    assert np.abs(detected.joints_ws(3) - flat.joints_ws(3)).max() < 0.05
 
 
 def test_the_ground_changes_smoothly_between_stances_and_is_refused_where_unknown(walk):
