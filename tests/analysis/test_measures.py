@@ -1,22 +1,26 @@
-"""Measures of simple motions for which the right values are known."""
+"""Measures of simple motions, and how feet are placed on their ground, and why."""
 
 import dataclasses
+import functools
+from itertools import product
+from unittest.mock import ANY
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.analysis import measures
+from fitting.analysis import measures, placement
 from fitting.analysis.measures import FootStates, Measures
+from fitting.analysis.misplacement import likely_cause
+from fitting.analysis.placement import Soles
 from fitting.analysis.playback import Motion
-from support.sample_clips import stair_walk
+from fitting.datasets.clip_frames import raised
+from fitting.datasets.clips.clip import Clip
+from fitting.datasets.synthetic import gait, walker
+from jaxik.world import terrain
+from support.grounds import flight, hill, terrain_of
 
 UP = np.array([0.0, 1.0, 0.0])
-
-
-def flat(points: np.ndarray) -> np.ndarray:
-    return np.zeros(len(points))
 
 
 def standing(frames: int, legs: int = 2, knee: float = np.pi / 2) -> Motion:
@@ -42,22 +46,7 @@ def measure(
     return measures.measure(motion, animated or motion, dataclasses.replace(states, **feet), fps)
 
 
-# Soles and ground
-
-
-def test_soles_rotate_with_the_foot():
-    walk = stair_walk(flat)
-    tilt = Rotation.from_rotvec([0.3, 0.0, 0.0])
-    rotations = walk.rotations_ws.copy()
-    for joints in walk.rig.joints:
-        foot = Rotation.from_quat(rotations[:, joints[2]], scalar_first=True)
-        rotations[:, joints[2]] = (tilt * foot).as_quat(scalar_first=True)
-    rig = dataclasses.replace(walk.rig, ball_height=jnp.full(2, 0.01))
-    walk = dataclasses.replace(walk, measured_rig=rig)
-    soles = measures.soles(walk.with_motion(walk.positions_ws, rotations))
-    up = tilt.apply(UP)
-    np.testing.assert_allclose(soles[:, :, 0], walk.joints_ws(2) - 0.05 * up, atol=1e-6)
-    np.testing.assert_allclose(soles[:, :, 1], walk.joints_ws(3) - 0.01 * up, atol=1e-6)
+# Ground
 
 
 def test_the_gap_of_a_sole_is_that_of_its_lower_point():
@@ -65,18 +54,6 @@ def test_the_gap_of_a_sole_is_that_of_its_lower_point():
     soles[..., 1] = [0.10, 0.30]
     ground = np.array([[[0.0, 0.0], [0.0, 0.35], [np.nan, 0.1], [np.nan, np.nan]]])
     np.testing.assert_allclose(measures.gaps(soles, ground), [[0.10, -0.05, 0.2, np.nan]])
-
-
-@pytest.mark.parametrize(
-    ("lift", "depth", "clearance"), [(0.0, 0.0, 0.0), (-0.02, 0.02, 0.0), (0.03, 0.0, 0.03)]
-)
-def test_a_raised_walk_has_clearance_and_a_lowered_one_penetrates(lift, depth, clearance):
-    walk = stair_walk(flat)
-    soles = measures.soles(walk.with_motion(walk.positions_ws + lift * UP, walk.rotations_ws))
-    gap = measures.gaps(soles, 0 * soles[..., 1])
-    result = measure(standing(walk.frame_count), gap=gap, stance=walk.stance_labels())
-    assert result.penetration_max == pytest.approx(depth, abs=1e-6)
-    assert result.clearance == pytest.approx(clearance, abs=1e-6)
 
 
 def test_penetration_counts_all_frames_and_clearance_those_of_stances():
@@ -96,6 +73,8 @@ def test_slide_is_the_length_of_the_horizontal_path_and_not_the_displacement():
     ball[:, 0, 0] = [0.0, 0.01, 0.0, 0.01, 0.0]  # back and forth
     ball[:, 0, 1] = [0.0, 0.3, 0.0, 0.3, 0.0]  # up and down does not count
     assert measures.slide_per_stance(ball, np.ones((5, 1), bool)) == pytest.approx(0.04)
+    single_frames = np.array([[True], [False], [True], [False], [False]])
+    assert np.isnan(measures.slide_per_stance(ball, single_frames))
 
 
 def test_slide_is_the_median_over_the_stances_of_all_feet():
@@ -107,32 +86,27 @@ def test_slide_is_the_median_over_the_stances_of_all_feet():
     assert measures.slide_per_stance(ball, stances) == pytest.approx((0.02 + 0.05) / 2)
 
 
-def test_a_stance_of_one_frame_has_no_slide():
-    stance = np.array([[True], [False], [True]])
-    assert np.isnan(measures.slide_per_stance(np.zeros((3, 1, 3)), stance))
-
-
 # Pops
 
 
-@pytest.mark.parametrize(("fps", "size"), [(60, 0.05), (120, 0.05), (240, 0.05), (30, 0.025)])
-def test_a_jump_is_one_pop_at_every_frame_rate(fps, size):
-    animated, jump = standing(fps, legs=3), np.zeros((fps, 3, 3))
-    jump[fps // 2 :, 1, 1] = 0.05
-    result = measure(shifted(animated, "ankle", jump), animated, float(fps))
-    assert result.pops == 1 and result.pop_max == pytest.approx(size)
+def test_a_jump_is_one_pop_at_every_frame_rate():
+    for fps, size in ((60, 0.05), (120, 0.05), (240, 0.05), (30, 0.025)):
+        animated, jump = standing(fps, legs=3), np.zeros((fps, 3, 3))
+        jump[fps // 2 :, 1, 1] = 0.05
+        result = measure(shifted(animated, "ankle", jump), animated, float(fps))
+        assert result.pops == 1 and result.pop_max == pytest.approx(size), fps
 
 
-@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0, 90.0, 120.0])
-@pytest.mark.parametrize(("speed", "pops"), [(1.5, 2), (1.0, 0)])
-def test_a_correction_that_changes_steadily_measures_the_same_at_every_frame_rate(fps, speed, pops):
-    animated = standing(frames := round(2 * fps))
-    back_and_forth = np.interp(np.arange(frames) / fps, [0.0, 0.5, 1.0, 1.5], [0.0, 1.0, 1.0, 0.0])
-    offset = np.zeros((frames, 2, 3))
-    offset[:, 0, 2] = 0.5 * speed * back_and_forth
-    result = measure(shifted(animated, "ankle", offset), animated, fps)
-    assert result.pop_max == pytest.approx(speed / 60.0)
-    assert result.pops == pops
+def test_a_correction_that_changes_steadily_measures_the_same_at_every_frame_rate():
+    for fps, (speed, pops) in product((24.0, 30.0, 60.0, 90.0, 120.0), ((1.5, 2), (1.0, 0))):
+        animated = standing(frames := round(2 * fps))
+        times = [0.0, 0.5, 1.0, 1.5]
+        back_and_forth = np.interp(np.arange(frames) / fps, times, [0.0, 1.0, 1.0, 0.0])
+        offset = np.zeros((frames, 2, 3))
+        offset[:, 0, 2] = 0.5 * speed * back_and_forth
+        result = measure(shifted(animated, "ankle", offset), animated, fps)
+        assert result.pop_max == pytest.approx(speed / 60.0), (fps, speed)
+        assert result.pops == pops, (fps, speed)
 
 
 def test_motion_of_the_animation_itself_is_no_pop():
@@ -145,27 +119,22 @@ def test_motion_of_the_animation_itself_is_no_pop():
 # Jerk
 
 
-@pytest.mark.parametrize("fps", [30.0, 120.0])
-def test_the_jerk_of_a_cubic_is_its_third_derivative(fps):
-    time = np.arange(20) / fps
-    assert measures.jerk(0.5 * time**3 - time**2 + 2.0, fps) == pytest.approx(3.0, rel=1e-4)
-    cubic_and_zero = np.stack([0.5 * time**3, 0 * time], axis=1)
-    assert measures.jerk(cubic_and_zero, fps) == pytest.approx(3.0 / np.sqrt(2.0), rel=1e-4)
+def test_the_jerk_of_a_cubic_is_its_third_derivative_and_of_three_frames_unknown():
+    for fps in (30.0, 120.0):
+        time = np.arange(20) / fps
+        assert measures.jerk(0.5 * time**3 - time**2 + 2.0, fps) == pytest.approx(3.0, rel=1e-4)
+        cubic_and_zero = np.stack([0.5 * time**3, 0 * time], axis=1)
+        jerk = measures.jerk(cubic_and_zero, fps)
+        assert jerk == pytest.approx(3.0 / np.sqrt(2.0), rel=1e-4)
+        assert np.isnan(measures.jerk(cubic_and_zero[:3], fps))
 
 
-def test_the_jerk_of_three_frames_is_unknown():
-    assert np.isnan(measures.jerk(np.zeros((3, 2)), 60.0))
-
-
-def test_pelvis_jerk_counts_its_height_only():
+def test_jerk_is_that_of_the_height_of_the_pelvis_and_of_the_angle_of_the_knee():
     time = np.arange(60) / 60.0
     offset = np.stack([time**4, 0.1 * time**3, -(time**4)], axis=1)
     result = measure(shifted(standing(60), "pelvis", offset))
     assert result.pelvis_jerk == pytest.approx(0.6, rel=1e-6)
     assert result.knee_jerk == pytest.approx(0.0, abs=1e-6)
-
-
-def test_knee_jerk_is_that_of_the_knee_angle():
     time = np.arange(600) / 600.0
     angle = 2.0 + 0.3 * np.sin(2 * np.pi * 2.0 * time)
     motion = standing(600)
@@ -178,32 +147,155 @@ def test_knee_jerk_is_that_of_the_knee_angle():
 # Reach
 
 
-def test_reached_is_the_fraction_of_known_targets():
+def test_targets_reached_and_knees_straighter_than_175_degrees_are_fractions():
     reached = np.array([[1.0, 0.0], [1.0, np.nan], [1.0, np.nan]])
     assert measure(standing(3), reached=reached).reached == pytest.approx(0.75)
-
-
-@pytest.mark.parametrize(("degrees", "fraction"), [(174.9, 0.0), (175.1, 1.0), (180.0, 1.0)])
-def test_a_knee_is_straight_above_175_degrees(degrees, fraction):
-    assert measure(standing(4, knee=np.radians(degrees))).straight == fraction
-
-
-def test_the_fraction_of_straight_knees_counts_all_legs_and_frames():
+    for degrees, fraction in ((174.9, 0.0), (175.1, 1.0), (180.0, 1.0)):
+        assert measure(standing(4, knee=np.radians(degrees))).straight == fraction, degrees
     bent, straight = (standing(4, legs=4, knee=knee) for knee in (2.0, np.pi))
     ankle = np.array(bent.ankle)
     ankle[:3, 2] = straight.ankle[:3, 2]
     assert measure(dataclasses.replace(bent, ankle=ankle)).straight == pytest.approx(3 / 16)
 
 
-# Nothing to measure
-
-
 def test_what_cannot_be_known_is_nan():
     nothing = np.full((1, 2), np.nan)
     result = measure(standing(1), gap=nothing, reached=nothing)
-    unknown = {key for key, value in dataclasses.asdict(result).items() if np.isnan(value)}
-    assert unknown == {
-        "penetration_mean", "penetration_max", "clearance", "slide", "pop_max",
-        "knee_jerk", "pelvis_jerk", "reached",
-    }  # fmt: skip
-    assert result.pops == 0.0 and result.straight == 0.0
+    known = {key: value for key, value in vars(result).items() if not np.isnan(value)}
+    assert known == {"pops": 0.0, "straight": 0.0}
+
+
+# How feet are placed
+
+FLOOR = terrain.plane()
+rotation = functools.partial(Rotation.from_quat, scalar_first=True)
+
+
+@pytest.fixture(scope="module")
+def walk() -> Clip:
+    return walker.walk(8.0, 60.0, style=walker.WalkStyle(bend=0.0))
+
+
+def moved(clip: Clip, joint: int, offset: np.ndarray) -> Clip:
+    """The clip with one joint of the left leg moved, m."""
+    positions = clip.positions_ws.copy()
+    positions[:, clip.rig.joints[0][joint]] += offset
+    return clip.with_motion(positions, clip.rotations_ws)
+
+
+def assess(gap: np.ndarray, stance: np.ndarray, clip: Clip) -> placement.Placement:
+    """Of the first frames of a clip, whose two points of each sole have the same height."""
+    height = np.repeat(np.asarray(gap, float)[..., None], 2, axis=-1)
+    cut = clip.select(slice(0, len(gap)))
+    return placement.assess(
+        Soles(height, np.where(np.isnan(height), np.nan, 0.0), stance), cut, cut
+    )
+
+
+def hill_height(z: np.ndarray) -> np.ndarray:
+    """Of the ground of `hill`, m."""
+    edges = np.linspace(-2.0, 30.0, 321)
+    inside = np.clip((edges - 1.0) / 14.0, 0.0, 1.0)
+    return np.interp(z, edges, 1.0 - np.cos(2.0 * np.pi * inside))
+
+
+def test_soles_are_as_high_as_a_reference_of_rotations_and_interpolation_says(walk):
+    """Points below ankle and ball along the foot's up; the ground by interpolation over z."""
+    lifted = raised(walk, np.linspace(0.0, 0.4, walk.frame_count))
+    feet = placement.soles(lifted, walk, terrain_of(hill()))
+    for leg in range(2):
+        ankle_rot = lifted.rotations_ws[:, lifted.rig.joints[leg][2]]
+        foot_rot = np.asarray(lifted.rig.ankle_from_foot)[leg]
+        up = rotation(ankle_rot).apply(rotation(foot_rot).apply([0.0, 1.0, 0.0]))
+        for point, depth in enumerate((gait.ANKLE_HEIGHT, gait.BALL_HEIGHT)):
+            sole = lifted.joints_ws(2 + point)[:, leg] - depth * up
+            ground = hill_height(sole[:, 2])
+            np.testing.assert_allclose(feet.ground[:, leg, point], ground, atol=1e-5)
+            np.testing.assert_allclose(feet.height[:, leg, point], sole[:, 1] - ground, atol=1e-5)
+
+
+def test_the_ground_is_found_above_a_sole_deep_in_it_and_below_a_roof(walk):
+    for height in (0.8, -0.5):
+        mesh = terrain.combine(terrain.plane((0.0, height, 0.0)), terrain.plane((0.0, 5.0, 0.0)))
+        np.testing.assert_allclose(placement.soles(walk, walk, mesh).ground, height)
+    stairs = placement.soles(walk, walk, terrain_of(flight([1.0, 2.0, 3.0], rise=0.5)))
+    assert stairs.height.min() == pytest.approx(-1.5, abs=0.05), "from the tread above"
+
+
+def test_shares_count_frames_of_standing_and_of_moving_feet_by_their_lower_point(walk):
+    gap = np.array([[-0.03, 0.0], [0.03, -0.05], [-0.01, 0.2], [np.nan, -0.021]])
+    stance = np.array([[True, True], [True, False], [True, False], [True, False]])
+    placed = assess(gap, stance, walk)
+    assert placed.sunk == pytest.approx(1 / 4)  # of the four standing feet over ground
+    assert placed.floating == pytest.approx(1 / 4)
+    assert placed.sunk_swing == pytest.approx(2 / 3)
+    assert placed.sunk_frames == pytest.approx(3 / 4)
+    assert placed.groundless == pytest.approx(1 / 8)
+    assert (placed.deepest.value, placed.deepest.frame, placed.deepest.leg) == (0.05, 1, "right")
+    assert (placed.highest.value, placed.highest.frame, placed.highest.leg) == (0.03, 1, "left")
+    height = np.array([[[0.10, -0.02], [np.nan, 0.03]], [[np.nan, np.nan], [0.2, 0.1]]])
+    lower = Soles(height, height, stance[:2]).gap
+    np.testing.assert_array_equal(lower, [[-0.02, 0.03], [np.nan, 0.1]])
+
+
+def test_feet_are_misplaced_where_over_five_per_cent_are_visibly_off_or_without_ground(walk):
+    stance = np.ones((100, 2), bool)
+    for gap, misplaced in ((0.0, False), (-0.019, False), (-0.021, True), (0.021, True)):
+        heights = np.zeros((100, 2))
+        heights[:6] = gap
+        assert assess(heights, stance, walk).misplaced == misplaced, gap
+        heights[:2] = 0.0
+        assert not assess(heights, stance, walk).misplaced, gap
+    placed = assess(np.full((100, 2), np.nan), stance, walk)
+    assert placed.misplaced and placed.groundless == 1.0
+    assert np.isnan([placed.sunk, placed.floating, placed.deepest.value]).all()
+
+
+def test_a_slide_is_the_path_of_the_ball_beyond_the_animated_one(walk):
+    x = 0.001 * np.arange(walk.frame_count)
+    sliding = moved(walk, 3, x[:, None] * [1.0, 0.0, 0.0])
+    placed = placement.assess(placement.soles(walk, walk, FLOOR), sliding, walk)
+    lengths = []
+    for stance, ball in zip(walk.stance_labels().T, sliding.joints_ws(3)[..., 0].T, strict=True):
+        cuts = np.flatnonzero(np.diff(stance)) + 1
+        parts = zip(np.split(stance, cuts), np.split(ball, cuts), strict=True)
+        lengths += [np.abs(np.diff(path)).sum() for stands, path in parts if stands[0]]
+    assert placed.largest_slide.leg == "left"
+    assert placed.largest_slide.value == pytest.approx(max(lengths))
+    assert placed.slide == pytest.approx(np.median(lengths), abs=1e-6)
+
+
+def test_a_walk_stands_on_its_floor_and_a_pop_is_a_jump_of_an_ankle_from_the_pelvis(walk):
+    soles = placement.soles(walk, walk, FLOOR)
+    placed = placement.assess(soles, walk, walk)
+    assert placed.slide == placed.largest_slide.value == placed.pop.value == 0.0
+    assert placed.sunk == placed.floating == placed.sunk_frames == placed.groundless == 0.0
+    assert not placed.misplaced
+    step = np.where(np.arange(walk.frame_count) >= 77, 0.06, 0.0)[:, None] * [0.0, 1.0, 0.0]
+    pop = placement.assess(soles, moved(walk, 2, step), walk).pop
+    assert (pop.value, pop.frame, pop.leg) == (pytest.approx(0.06), 77, "left")
+    whole = walk.with_motion(walk.positions_ws + step[:, None], walk.rotations_ws)
+    assert placement.assess(soles, whole, walk).pop.value == pytest.approx(0.0, abs=1e-12)
+    still = walk.select(slice(0, 1))
+    placed = placement.assess(placement.soles(still, still, FLOOR), still, still)
+    assert np.isnan([placed.slide, placed.pop.value]).all(), "of one frame"
+
+
+def test_the_cause_of_misplaced_feet_is_named_with_its_size(walk):
+    mesh = hill()
+    ground, aside = (terrain.mesh(mesh.vertices + [x, 0.0, 0.0], mesh.faces) for x in (0.0, 9e5))
+    heights = hill_height(walk.positions_ws[:, walk.rig.pelvis, 2])
+    rows = [
+        (0.0 * heights, ground, ("root", 0.0)),
+        (heights + 0.5, ground, ("offset", ANY)),
+        (0.0 * heights, aside, ("missing", 0.0)),
+        (0.0 * heights, FLOOR, ("unknown", 0.0)),
+    ]
+    for offset in (0.5, -0.3, 0.05):
+        expected = ("offset", pytest.approx(offset, abs=0.005))
+        rows.append((0.0 * heights + offset, FLOOR, expected))
+    for unit in (0.3048, 1 / 0.3048, 1 / 0.0254):
+        rows.append((unit * heights, ground, ("units", pytest.approx(unit))))
+    for height, below, expected in rows:
+        clip = raised(walk, height)
+        assert likely_cause(placement.soles(clip, walk, below), clip) == expected
