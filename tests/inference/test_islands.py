@@ -49,28 +49,28 @@ def sample(problem: Problem, start: WalkerStart, **settings) -> Posterior:
     return posterior.sample_posterior(problem, start, SamplerSettings(**settings))
 
 
-@pytest.mark.parametrize(("size", "weights"), [(1, (0.8, 0.2)), (6, (0.2, 0.8))])
-def test_islands_get_their_exact_weights_from_unbalanced_starts(size, weights):
-    lighter = int(np.argmin(weights))
+def test_islands_get_their_exact_weights_from_unbalanced_starts():
     settings = {"walkers": 24, "max_steps": 2000, "stop_at": 1e9}
-    sampled = sample(two_islands(size, weights), start_of(size, lighter), **settings)
+    sampled = sample(two_islands(6, (0.2, 0.8)), start_of(6, 0), **settings)
     heavy, light = sampled.islands
     assert heavy.exchanges > 200 and light.exchanges > 200
     assert heavy.error < 0.025
     assert abs(heavy.weight - 0.8) < 4 * heavy.error
     assert light.weight == pytest.approx(1 - heavy.weight)
     there = sampled.kept_u[..., 0] > 0
-    assert abs(there.mean() - weights[1]) < 5 * heavy.error
+    assert abs(there.mean() - 0.8) < 5 * heavy.error
     assert sampled.isolated == []
-    assert np.sign(heavy.median[0]) == np.sign(CENTRES[1 - lighter])
+    assert heavy.median[0] > 0
 
 
-def differential_evolution_only(chain):
-    return [(emcee.moves.DEMove(), 1.0)]
+@pytest.fixture
+def no_jumps(monkeypatch) -> None:
+    """Differential evolution alone."""
+    monkeypatch.setattr(sampler, "moves", lambda chain: [(emcee.moves.DEMove(), 1.0)])
 
 
-def test_without_jumps_weights_are_out_of_reach_and_nothing_is_left_out(monkeypatch):
-    monkeypatch.setattr(sampler, "moves", differential_evolution_only)
+@pytest.mark.usefixtures("no_jumps")
+def test_without_jumps_weights_are_out_of_reach_and_nothing_is_left_out():
     sampled = sample(two_islands(6, (0.8, 0.2)), start_of(6, 1), max_steps=600)
     assert not sampled.converged
     assert "the weights of islands are out of reach" in sampled.message
@@ -87,9 +87,8 @@ def test_walkers_on_a_negligible_island_come_home():
     assert sampled.isolated == [] and sampled.islands == ()
 
 
+@pytest.mark.usefixtures("no_jumps")
 def test_a_walker_that_cannot_come_home_is_named_with_what_is_left_out(monkeypatch):
-    monkeypatch.setattr(sampler, "moves", differential_evolution_only)
-    problem, start = two_islands(6, (1 - 1e-7, 1e-7)), start_of(6, 0)
     balls = posterior._balls
 
     def one_apart(start, walkers):
@@ -98,7 +97,7 @@ def test_a_walker_that_cannot_come_home_is_named_with_what_is_left_out(monkeypat
         return centres, widths
 
     monkeypatch.setattr(posterior, "_balls", one_apart)
-    sampled = sample(problem, start, stop_at=20.0)
+    sampled = sample(two_islands(6, (1 - 1e-7, 1e-7)), start_of(6, 0), stop_at=20.0)
     assert sampled.isolated == [3] and 3 in sampled.stuck
     assert "left out: 1 of 24 walkers" in sampled.message
     assert sampled.converged, sampled.message
@@ -126,43 +125,32 @@ def test_lessons_are_powers_of_two_times_the_first():
     assert sampler.lesson(33, 3) == 0 and sampler.lesson(34, 3) == 34
 
 
-SIZES = (1, 2, 6, 17)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_a_posterior_of_one_piece_has_one_island(size):
+@pytest.mark.parametrize("size", [1, 2, 6, 17])
+def test_a_posterior_of_one_piece_has_one_island_and_two_of_different_width_are_both_found(size):
     random = np.random.default_rng(size)
-    draws = (150, 4 * size, size)
-    common = 10 * random.normal(size=(*draws[:2], 1))
+    draws = (150, 4 * max(size, 2), size)
+    normal = random.normal(size=draws)
     for shape, u in {
-        "normal": random.normal(size=draws),
+        "normal": normal,
         "heavy tails": random.standard_t(3, size=draws),
-        "ridge": common + random.normal(size=draws),
+        "ridge": 10 * random.normal(size=(*draws[:2], 1)) + random.normal(size=draws),
         "plateau": random.uniform(size=draws) ** 3,
     }.items():
         assert len(islands.find_islands(u)) == 1, shape
-        assert islands.survey(u, np.zeros(u.shape[:2])) == (), shape
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_islands_of_different_width_are_both_found(size):
-    u = np.random.default_rng(size).normal(size=(150, 4 * max(size, 2), size))
-    few = u.shape[1] // 8
-    many = u.shape[1] - few
-    u[:, :few] = 0.2 * u[:, :few] + 15.0 * np.eye(size)[0]
-    labels = islands.find_islands(u).labels(u)
+        assert islands.survey(u, np.zeros(draws[:2])) == (), shape
+    few = draws[1] // 8
+    many = draws[1] - few
+    normal[:, :few] = 0.2 * normal[:, :few] + 15.0 * np.eye(size)[0]
+    labels = islands.find_islands(normal).labels(normal)
     assert np.sort(np.bincount(labels.ravel())).tolist() == sorted([150 * few, 150 * many])
-    small, large = islands.survey(u, np.zeros(u.shape[:2]))[::-1]
+    small, large = islands.survey(normal, np.zeros(draws[:2]))[::-1]
     assert (small.exchanges, small.walkers, large.walkers) == (0, few, many)
 
 
-def test_walkers_that_have_not_met_yet_are_no_islands():
+def test_walkers_that_have_not_met_yet_or_never_move_are_no_islands():
     random = np.random.default_rng(0)
     u = 0.1 * random.normal(size=(100, 24, 6)) + 10.0 * random.normal(size=(24, 6))
     assert len(islands.find_islands(u)) == 1
-
-
-def test_walkers_that_never_move_do_not_matter():
     assert len(islands.find_islands(np.ones((50, 8, 2)))) == 1
 
 
