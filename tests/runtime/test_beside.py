@@ -61,36 +61,31 @@ def test_without_it_and_on_one_core_calls_run_here_and_at_once(tmp_path, monkeyp
     assert MARK not in os.environ
 
 
-def draw_in_a_daemon(path: Path) -> None:
+def write_beside(path: Path) -> None:
     beside.cpu_count = lambda: 2
     with beside.calls_beside():
         beside.call(write_process, path)
 
 
-def test_processes_that_may_have_no_children_call_themselves(tmp_path):
-    """Such as workers of Dask."""
+def test_processes_that_may_have_no_children_such_as_workers_of_dask_call_themselves(tmp_path):
     context = multiprocessing.get_context("spawn")
-    process = context.Process(target=draw_in_a_daemon, args=(tmp_path / "file",), daemon=True)
+    process = context.Process(target=write_beside, args=(tmp_path / "file",), daemon=True)
     process.start()
     process.join()
     assert process_of(tmp_path / "file") == process.pid
 
 
-def test_errors_and_warnings_come_at_the_end():
+def test_errors_and_warnings_come_at_the_end_and_an_error_here_does_not_wait_for_calls(tmp_path):
     with pytest.raises(ValueError, match="no such colour"):
         with beside.calls_beside():
             beside.call(fail, "no such colour")
     with pytest.warns(RuntimeWarning, match="a glyph is missing"):
         with beside.calls_beside():
             beside.call(warn, "a glyph is missing")
-
-
-def test_an_error_here_does_not_wait_for_calls_and_spoils_nothing(tmp_path):
     with pytest.raises(KeyError, match="here"):
         with beside.calls_beside():
             for number in range(20):
                 beside.call(write_process, tmp_path / str(number))
             raise KeyError("here")
-    with beside.calls_beside():
-        beside.call(write_process, tmp_path / "afterwards")
+    write_beside(tmp_path / "afterwards")
     assert (tmp_path / "afterwards").exists()

@@ -1,27 +1,31 @@
-"""Programs kept between processes: they give the same output, and are traced once."""
+"""Programs kept between processes: the same output, traced once; JAX's own files are whole."""
 
+import errno
 import functools
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
+from unittest.mock import Mock
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src import compilation_cache
+from jax._src.lru_cache import LRUCache
 
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
 from fitting.runtime import activity, cache_folder, files, program_cache, program_key
+from fitting.runtime.storage import compiled_programs
 from jaxik.maths import vec
 from support.experiments import ROOT, write
 
+# Stand-ins for functions of the project count here how often they are traced.
 TRACED = []
-
-
-# Stand-ins for functions of the project, which count how often they are traced
 
 
 def stretch(scale, points, *, by=1.0):
@@ -39,7 +43,6 @@ def by_function(change, points):
 
 
 def stretch_known(points):
-    """Calls a cached function with constants."""
     return points + STRETCH_KNOWN(2.0, KNOWN)["longer"]
 
 
@@ -67,7 +70,6 @@ def points(count=4, dtype=float):
 
 
 def mine(points):
-    """A function of a user's module."""
     return 2 * points
 
 
@@ -90,27 +92,19 @@ def kept(folder):
     return list(folder.iterdir()) if folder.exists() else []
 
 
-# What is kept, and what is not
-
-
-def test_a_cached_function_gives_the_same_output_and_is_traced_once(folder):
+def test_a_cached_function_gives_the_same_output_and_each_kind_of_call_is_traced_once(folder):
     expected = eqx.filter_jit(stretch)(2.0, points(), by=3.0)
     TRACED.clear()
-    for _ in range(2):
-        assert_same(fresh()(2.0, points(), by=3.0), expected)
-    assert TRACED == [(4, 3)] and len(kept(folder)) == 1
-
-
-def test_each_shape_type_and_constant_gets_its_own_program(folder):
     calls = [
+        ((2.0, points()), {"by": 3.0}),
         ((2.0, points()), {}),
         ((2.0, points(5)), {}),
         ((2.0, points(dtype=jnp.float32)), {}),
         ((3.0, points()), {}),
-        ((2.0, points()), {"by": 2.0}),
         ((jnp.asarray(2.0), points()), {}),
     ]
     for times in (1, 2):
+        assert_same(fresh()(2.0, points(), by=3.0), expected)
         for args, named in calls:
             longer = fresh()(*args, **named)["longer"]
             length = float(args[0]) * named.get("by", 1.0)
@@ -119,26 +113,23 @@ def test_each_shape_type_and_constant_gets_its_own_program(folder):
         assert len(TRACED) == len(kept(folder)) == len(calls), times
 
 
-@pytest.mark.parametrize(
-    ("change", "programs"),
-    [
+def test_programs_with_functions_that_no_source_of_a_user_defines_are_kept(folder):
+    for change, programs in (
         (vec.sum_last, 1),
         (jnp.sort, 1),
         (lambda points: points + 1, 0),
         (functools.partial(vec.sum_last), 0),
         (mine, 0),
-    ],
-)
-def test_programs_with_functions_that_no_source_of_a_user_defines_are_kept(
-    folder, change, programs
-):
-    for _ in range(2):
-        output = program_cache.cached(by_function)(change, points())
-        np.testing.assert_array_equal(output, change(points()))
-    assert len(TRACED) == 2 - programs and len(kept(folder)) == programs
+    ):
+        TRACED.clear()
+        before = len(kept(folder))
+        for _ in range(2):
+            output = program_cache.cached(by_function)(change, points())
+            np.testing.assert_array_equal(output, change(points()))
+        assert len(TRACED) == 2 - programs and len(kept(folder)) - before == programs, change
 
 
-def test_inside_another_program_it_becomes_part_of_it(folder):
+def test_inside_another_program_it_becomes_part_of_it_and_constants_do_not_deadlock(folder):
     stretched = fresh()
 
     def whole(p):
@@ -148,9 +139,6 @@ def test_inside_another_program_it_becomes_part_of_it(folder):
     assert gradient.shape == (4, 3)
     assert np.isfinite(gradient).all() and np.any(gradient != 0)
     assert not kept(folder)
-
-
-def test_a_cached_call_with_constant_arguments_inside_a_trace_does_not_deadlock(folder):
     output = program_cache.cached(stretch_known)(points())
     np.testing.assert_allclose(output, points() + stretch(2.0, points())["longer"])
     assert len(kept(folder)) == 2
@@ -191,65 +179,53 @@ def test_another_process_has_the_same_keys_and_its_programs_are_not_traced_again
     assert program_cache.cached(vec.sum_last)(numbers).tolist() == output == [3.0, 12.0]
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [(cache_folder.ENABLED, False), (cache_folder.FOLDER, ""), (cache_folder.FOLDER, None)],
-)
-def test_nothing_is_kept_where_jax_keeps_nothing(folder, setting, value):
-    before = cache_folder.setting(setting)
-    jax.config.update(setting, value)
-    fresh()(2.0, points())
-    jax.config.update(setting, before)
-    assert not folder.exists()
-
-
-def test_a_mistake_in_a_call_raises_the_usual_error(folder):
+def test_nothing_is_kept_where_jax_keeps_nothing_or_of_a_call_that_fails(folder):
+    off = [(cache_folder.ENABLED, False), (cache_folder.FOLDER, ""), (cache_folder.FOLDER, None)]
+    for setting, value in off:
+        before = cache_folder.setting(setting)
+        jax.config.update(setting, value)
+        fresh()(2.0, points())
+        jax.config.update(setting, before)
+        assert not folder.exists(), (setting, value)
     with pytest.raises(ValueError, match="Incompatible shapes"):
         fresh()(jnp.zeros(2), points())
     assert not kept(folder)
 
 
-# Failures are said once, and the call goes on
-
-
 @pytest.mark.skipif(os.name != "posix", reason="no such permissions")
-@pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [
-        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "{file} is damaged: its sha256"),
-        (lambda file: file.chmod(0o666), "everybody may write to {file}"),
-    ],
-)
-def test_a_damaged_file_and_one_that_others_may_write_are_replaced(folder, spoil, reason):
+def test_a_damaged_file_and_one_that_others_may_write_are_replaced(folder):
     expected = fresh()(2.0, points())
     (file,) = kept(folder)
     intact = file.read_bytes()
-    spoil(file)
-    with pytest.warns(RuntimeWarning, match=f"traced anew: {reason.format(file=file)}"):
-        assert_same(fresh()(2.0, points()), expected)
-    assert len(TRACED) == 2 and file.read_bytes() == intact
-    assert not file.stat().st_mode & 0o002
+
+    def assert_replaced(reason: str) -> None:
+        TRACED.clear()
+        with pytest.warns(RuntimeWarning, match=f"traced anew: {reason}"):
+            assert_same(fresh()(2.0, points()), expected)
+        assert len(TRACED) == 1 and file.read_bytes() == intact
+        assert not file.stat().st_mode & 0o002
+        cache_folder.WARNED.clear()
+
+    file.write_bytes(intact[:-1])
+    assert_replaced(f"{file} is damaged: its sha256")
+    file.chmod(0o666)
+    assert_replaced(f"everybody may write to {file}")
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
-def test_a_folder_of_another_user_is_neither_read_nor_written(folder, monkeypatch):
+def test_a_folder_of_another_user_is_neither_read_nor_written_which_is_said_once(
+    folder, monkeypatch
+):
     fresh()(2.0, points())
     monkeypatch.setattr(os, "getuid", lambda: 1_000_001)
     with pytest.warns(RuntimeWarning, match="not kept: .*traced belongs to another user") as said:
         for count in (4, 5):
             fresh()(2.0, points(count))
-    assert len(said) == 1, "once, not for each program"
+    assert len(said) == 1
     assert len(TRACED) == 3 and len(kept(folder)) == 1
 
 
-def test_a_file_in_the_place_of_the_folder_stays(folder):
-    folder.write_text("a file in its place")
-    with pytest.warns(RuntimeWarning, match="traced programs are not kept: .*File exists"):
-        assert_same(fresh()(2.0, points()), fresh()(2.0, points()))
-    assert folder.read_text() == "a file in its place"
-
-
-def test_a_full_disk_is_said_once(folder, monkeypatch):
+def test_a_full_disk_and_a_file_in_the_place_of_the_folder_are_said_once(folder, monkeypatch):
     mkstemp = files.tempfile.mkstemp
 
     def fail(*, dir, **named):
@@ -258,34 +234,38 @@ def test_a_full_disk_is_said_once(folder, monkeypatch):
         return mkstemp(dir=dir, **named)  # JAX's own files
 
     expected = eqx.filter_jit(stretch)(2.0, points())
-    monkeypatch.setattr(files.tempfile, "mkstemp", fail)
-    with pytest.warns(RuntimeWarning, match="not kept: .*No space left on device") as said:
-        assert_same(fresh()(2.0, points()), expected)
-        fresh()(2.0, points(5))
+    with monkeypatch.context() as patch:
+        patch.setattr(files.tempfile, "mkstemp", fail)
+        with pytest.warns(RuntimeWarning, match="not kept: .*No space left on device") as said:
+            assert_same(fresh()(2.0, points()), expected)
+            fresh()(2.0, points(5))
     assert len(said) == 1 and not kept(folder)
+    folder.rmdir()
+    cache_folder.WARNED.clear()
+    folder.write_text("a file in its place")
+    with pytest.warns(RuntimeWarning, match="traced programs are not kept: .*File exists"):
+        assert_same(fresh()(2.0, points()), expected)
+    assert folder.read_text() == "a file in its place"
 
 
-def test_an_output_that_cannot_be_kept_is_returned_all_the_same(folder):
+def test_what_cannot_be_kept_or_exported_is_returned_all_the_same(folder, monkeypatch):
     with pytest.warns(RuntimeWarning, match="not kept: frozenset is neither"):
         output = program_cache.cached(as_set)(points())
     assert output[1] == {"one"} and TRACED == [(4, 3)] and not kept(folder)
-
-
-def test_a_program_that_jax_does_not_export_is_run_all_the_same(folder, monkeypatch):
-    def refuse(*_, **__):
-        raise ValueError("Cannot serialize\nthis call")
-
+    refuse = Mock(side_effect=ValueError("Cannot serialize\nthis call"))
     monkeypatch.setattr(program_cache.export, "export", refuse)
     with pytest.warns(RuntimeWarning, match="of stretch is not kept: Cannot serialize$"):
         output = fresh()(2.0, points())
     np.testing.assert_allclose(output["half"][0], points() / 2)
 
 
-# Arrays that are committed to a device
-
-
 def test_arrays_are_compiled_for_once_wherever_they_come_from(folder):
     """Those that come out of a kept program are committed to a device, unlike fresh ones."""
+    tree = {"points": jnp.ones(3), "name": "here", "count": 3, "host": np.ones(2)}
+    bound = program_cache.committed(tree)
+    assert bound["points"].committed and not tree["points"].committed
+    assert (bound["name"], bound["count"], bound["host"]) == ("here", 3, tree["host"])
+    assert program_cache.committed(bound) is bound
     compiled = []
 
     def count(event: str, duration_secs: float, **named: object) -> None:
@@ -304,14 +284,6 @@ def test_arrays_are_compiled_for_once_wherever_they_come_from(folder):
     assert len(compiled) == 1
 
 
-def test_what_is_committed_already_or_lies_on_no_device_stays_as_it_is():
-    tree = {"points": jnp.ones(3), "name": "here", "count": 3, "host": np.ones(2)}
-    bound = program_cache.committed(tree)
-    assert bound["points"].committed and not tree["points"].committed
-    assert (bound["name"], bound["count"], bound["host"]) == ("here", 3, tree["host"])
-    assert program_cache.committed(bound) is bound
-
-
 def test_work_says_what_is_compiled_for_it_and_for_how_long():
     said = []
 
@@ -328,3 +300,58 @@ def test_work_says_what_is_compiled_for_it_and_for_how_long():
     with pytest.raises(TypeError), activity.announced("Failing") as work:
         _long_sum("no numbers")  # type: ignore[arg-type]
     assert work.compiling == ""
+
+
+# JAX's own files of compiled programs
+
+KEY, PROGRAM = "jit_walk-" + "0123456789abcdef" * 4, b"the whole program"
+NAME = f"{KEY}-cache"
+
+
+def test_jax_writes_whole_files_or_none_unless_it_locks_their_folder(tmp_path, monkeypatch):
+    compiled_programs.write_complete_files()
+    bounded = LRUCache(str(tmp_path / "bounded"), max_size=1000)  # left to JAX
+    bounded.put(KEY, PROGRAM)
+    assert bounded.get(KEY) == PROGRAM and f"{KEY}-atime" in os.listdir(tmp_path / "bounded")
+    folder = tmp_path / "unbounded"
+    cache, whole, seen = LRUCache(str(folder), max_size=-1), Path.write_bytes, []
+
+    def fill_the_disk(path, content):
+        whole(path, content[:5])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def look_half_way(path, content):
+        whole(path, content[:5])
+        seen.append(cache.get(KEY))
+        whole(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", fill_the_disk)
+    with pytest.raises(ValueError, match=f"{NAME}: cannot be written: No space left on device"):
+        cache.put(KEY, PROGRAM)
+    assert not os.listdir(folder)
+    monkeypatch.setattr(Path, "write_bytes", look_half_way)
+    cache.put(KEY, PROGRAM)
+    assert seen == [None] and cache.get(KEY) == PROGRAM and os.listdir(folder) == [NAME]
+
+
+def test_a_damaged_program_is_compiled_once_more_and_replaced(tmp_path):
+    def compile_anew() -> None:
+        assert jax.jit(lambda x: x + 1)(1.0) == 2.0
+
+    before = cache_folder.setting(cache_folder.FOLDER)
+    compiled_programs.write_complete_files()
+    jax.config.update(cache_folder.FOLDER, str(tmp_path))
+    compilation_cache.reset_cache()
+    try:
+        compile_anew()
+        (file,) = tmp_path.glob("jit__lambda*-cache")
+        whole = file.read_bytes()
+        file.write_bytes(whole[:50])
+        with pytest.warns(UserWarning, match="Error reading persistent compilation cache entry"):
+            compile_anew()
+        assert len(file.read_bytes()) > 50
+        compile_anew()  # without a warning
+    finally:
+        jax.config.update(cache_folder.FOLDER, before)
+        compilation_cache.reset_cache()
+        jax.jit(lambda x: x - 1)(1.0)  # has JAX go back to it at once
