@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import h5py
@@ -49,52 +49,37 @@ NAME = r"../../elsewhere $\frac{$"  # no path, and no formula
 TOP = f"name = '{NAME}'"
 HALF_SECOND = f"start = 1.0\nend = 1.5\nlabel = '{NAME}'\nsubject = '{NAME}'"
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 1e9\nmax_steps = 20"
-READING, PREPARING = "Reading the clip and its ground", "Preparing what is compared"
-PLAYING = "Playing the clips with the "
-FIT_TITLES = [
-    READING,
-    PREPARING,
-    "Preparing the programs of the search",
-    "Searching from up to 6 starts",
-    "Following 2 parameters over their ranges",
-    "Writing the motions and numbers of the fit",
-    f"{PLAYING}fitted system",
-    f"{PLAYING}system before the fit",
-    "Drawing the curves of the parameters",
-    f"Drawing {NAME}",
-    "Measuring where limits are in effect",
-    "Finding what determines 2 parameters",
-    "Writing the page",
-    "Finishing the pictures",
+PLAY = (playback, "run")
+# What is announced, and the functions that take long while that is the innermost work going on.
+READ_AND_PREPARE = [
+    ("Reading the clip and its ground", (problems, "load_clip_data")),
+    ("Preparing what is compared", (problems, "make_scene")),
 ]
-SAMPLE_TITLES = [
-    READING,
-    PREPARING,
-    "Sampling up to 20 steps of 8 walkers",
-    "Placing 8 walkers",
-    "Summing up the chain",
-    "Playing 80 draws of the posterior",
-    "Writing the posterior",
-    "Drawing the posterior",
+FIT_WORK = [
+    *READ_AND_PREPARE,
+    ("Preparing the programs of the search", (search, "_begin")),
+    ("Searching from up to 6 starts", (search, "search_from")),
+    ("Following 2 parameters over their ranges", (profiling, "lowest")),
+    ("Writing the motions and numbers of the fit", (run_folder, "save_clip")),
+    ("Playing the clips with the fitted system", PLAY),
+    ("Playing the clips with the system before the fit", PLAY),
+    ("Drawing the curves of the parameters", (fit_report, "_draw_profiles")),
+    (f"Drawing {NAME}", (fit_report, "_draw_clip")),
+    ("Measuring where limits are in effect", (fit_report.limit_activity, "measure"), PLAY),
+    ("Finding what determines 2 parameters", (sections, "find_evidence"), PLAY),
+    ("Writing the page", (fit_report.fit_page, "write")),
+    ("Finishing the pictures",),
 ]
-LONG = {  # what takes long, and how the work is called that must be going on then
-    (problems, "load_clip_data"): READING,
-    (problems, "make_scene"): PREPARING,
-    (search, "_begin"): "Preparing the programs",
-    (search, "search_from"): "Searching",
-    (profiling, "lowest"): "Following",
-    (run_folder, "save_clip"): "Writing the motions",
-    (playback, "run"): ("Playing", "Measuring", "Finding"),
-    (fit_report, "_draw_clip"): f"Drawing {NAME}",
-    (fit_report, "_draw_profiles"): "Drawing the curves",
-    (fit_report.limit_activity, "measure"): "Measuring",
-    (sections, "find_evidence"): "Finding",
-    (fit_report.fit_page, "write"): "Writing the page",
-    (posterior, "_check"): "Sampling",
-    (posterior, "_posterior"): "Summing up",
-    (replay._Clip, "add"): "Playing",
-    (posterior_report.posterior_plots, "corner"): "Drawing the posterior",
-}
+SAMPLE_WORK = [
+    *READ_AND_PREPARE,
+    ("Sampling up to 20 steps of 8 walkers", (posterior, "_check")),
+    ("Placing 8 walkers",),
+    ("Summing up the chain", (posterior, "_posterior")),
+    ("Playing 80 draws of the posterior", (replay._Clip, "add"), PLAY),
+    ("Writing the posterior",),
+    ("Drawing the posterior", (posterior_report.posterior_plots, "corner")),
+]
+LONG = {function for _, *functions in FIT_WORK + SAMPLE_WORK for function in functions}
 
 
 class Watcher(Recorder):
@@ -113,16 +98,15 @@ class Watcher(Recorder):
         super().ended(work)
         assert self.going_on.pop() == work.title
 
-    def watch(self, patch: pytest.MonkeyPatch, place: ModuleType | type, name: str) -> None:
-        """Writes down each call of a function."""
-        function = getattr(place, name)
+    def noting(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, which also writes down that it is called."""
 
         def called(*arguments, **named):
             if threading.current_thread() is threading.main_thread():  # others keep nobody waiting
                 self.done.add((name, self.going_on[-1] if self.going_on else "nothing announced"))
             return function(*arguments, **named)
 
-        patch.setattr(place, name, called)
+        return called
 
 
 def watched(job: Callable[[], Any]) -> tuple[Any, Watcher]:
@@ -130,7 +114,7 @@ def watched(job: Callable[[], Any]) -> tuple[Any, Watcher]:
     watcher = Watcher()
     with pytest.MonkeyPatch.context() as patch, activity.watched_by(watcher):
         for place, name in LONG:
-            watcher.watch(patch, place, name)
+            patch.setattr(place, name, watcher.noting(name, getattr(place, name)))
         return job(), watcher
 
 
@@ -139,13 +123,10 @@ class Done(NamedTuple):
 
     experiment: Path
     fitted: fitting.Fit
-    run: Path
-    """Before the sampling."""
+    run: Path  # before the sampling
     posterior: Posterior
-    sampled: Path
-    """The run after the sampling."""
-    log: list[str]
-    """Of the fit."""
+    sampled: Path  # the run after the sampling
+    log: list[str]  # of the fit
     watchers: tuple[Watcher, Watcher]
 
 
@@ -200,6 +181,7 @@ def interrupt(*_, **__) -> Any:
 
 
 def test_a_fit_writes_numbers_tables_and_plots_and_says_where(done):
+    """The names in its experiment are no paths."""
     summary, page = done.run / run_folder.SUMMARY, done.run / run_folder.PAGE
     assert done.fitted.run == done.run
     assert done.log[0].startswith("fitting 2 parameters of record to 1 clip")
@@ -211,25 +193,19 @@ def test_a_fit_writes_numbers_tables_and_plots_and_says_where(done):
     assert numbers["converged"] and numbers["experiment"] == NAME
     values = {row["name"]: row["value"] for row in numbers["parameters"]}
     assert values == pytest.approx(quick.TARGETS, abs=0.003)
-
-
-def test_the_names_in_an_experiment_are_no_paths(done):
     assert {path.name for path in done.run.parent.iterdir()} == {"hill.toml", "run"}
-    assert f"# {NAME}" in (done.run / run_folder.SUMMARY).read_text()
+    assert f"# {NAME}" in summary.read_text()
 
 
-def test_everything_is_announced_in_its_order(done):
-    of_fit, of_sampling = done.watchers
-    assert list(dict.fromkeys(of_fit.titles)) == FIT_TITLES
-    assert list(dict.fromkeys(of_sampling.titles)) == SAMPLE_TITLES
-    assert not of_fit.going_on and not of_sampling.going_on
-
-
-def test_what_takes_long_is_done_within_its_announcement(done):
-    found = set.union(*(watcher.done for watcher in done.watchers))
-    assert {name for name, _ in found} == {name for _, name in LONG}
-    wanted = {name: title for (_, name), title in LONG.items()}
-    assert [pair for pair in found if not pair[1].startswith(wanted[pair[0]])] == []
+def test_everything_is_announced_in_its_order_while_it_is_done(done):
+    calls = set()
+    for watcher, work in zip(done.watchers, (FIT_WORK, SAMPLE_WORK), strict=True):
+        assert list(dict.fromkeys(watcher.titles)) == [title for title, *_ in work]
+        assert not watcher.going_on
+        announced = {(name, title) for title, *functions in work for _, name in functions}
+        assert watcher.done - announced == set()
+        calls |= watcher.done
+    assert {name for name, _ in calls} == {name for _, name in LONG}
 
 
 def test_a_fit_in_memory_continues_the_chain_that_is_in_its_folder(done, tmp_path):
@@ -323,7 +299,7 @@ def test_a_process_with_32_bits_gets_the_numbers_of_64_keeps_its_setting_and_wri
     assert not list(tmp_path.iterdir()) and tree(done.experiment.parent) == before
 
 
-def test_a_fit_can_be_used_where_jax_has_32_bits(done):
+def test_a_fit_can_be_used_and_systems_be_run_on_its_clips_where_jax_has_32_bits(done):
     problem, solution, ik = done.fitted.problem, done.fitted.solution, done.fitted.ik
     with jax.enable_x64(False):
         outputs = [
@@ -342,12 +318,8 @@ def test_a_fit_can_be_used_where_jax_has_32_bits(done):
         assert done.fitted.summary["parameters"][0]["value"] == solution.values[0]
         assert with_floats(ik, np.float32).leg.weight.dtype == np.float32
         assert jnp.ones(1).dtype == np.float32
-
-
-def test_a_system_made_in_32_bits_runs_in_those_of_the_clip(done):
-    with jax.enable_x64(False):
         single = jaxik.presets.record()
-        result = playback.run(single, done.fitted.problem.data[0])
+        result = playback.run(single, problem.data[0])
     assert single.leg.weight.dtype == np.float32 and result.body.pos.dtype == np.float64
 
 
