@@ -19,7 +19,7 @@ from .mutants import modules_of, mutants_of, sample
 from .report import OUTCOMES, Result, score, summary
 from .run import Run
 from .survey import DIGESTS, EVERYTHING, Survey, make
-from .workplace import Workplace
+from .trial import Workplace
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "build" / "mutation"
@@ -44,11 +44,6 @@ def print_progress(results: list[Result], seconds: float, last: Result) -> None:
     )
 
 
-def interrupt(number: int, frame: object) -> None:
-    """Ends a run that is asked to end as one that is interrupted from the keyboard."""
-    raise KeyboardInterrupt
-
-
 def main() -> int:
     """Tests a sample of mutants, or all of some modules; gives the exit status."""
     parser = argparse.ArgumentParser(prog="mutation", description="Changes code, and tests it.")
@@ -63,8 +58,8 @@ def main() -> int:
     options = parser.parse_args()
     KEPT.mkdir(parents=True, exist_ok=True)
     os.environ.update(ENVIRONMENT)
-    signal.signal(signal.SIGTERM, interrupt)
-    signal.signal(signal.SIGINT, interrupt)  # which shells have jobs in the background ignore
+    for number in (signal.SIGTERM, signal.SIGINT):  # shells have jobs in the background ignore it
+        signal.signal(number, signal.default_int_handler)
     modules = [path for folder in options.only for path in modules_of(ROOT, folder)]
     mutants = [mutant for path in modules for mutant in mutants_of(ROOT, path)]
     chosen = sample(mutants, options.count, options.seed)

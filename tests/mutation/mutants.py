@@ -30,8 +30,6 @@ OPERATORS = [
 ]
 UNMUTATED_DECORATORS = {"abstractmethod", "overload", "override"}  # for readers and type checkers
 
-Position = tuple[int, int]  # line from 1, column from 0
-
 
 @dataclass(frozen=True)
 class Mutant:
@@ -60,11 +58,7 @@ def diff(mutant: Mutant, root: Path) -> tuple[str, str]:
     pairs = zip(reversed(before[start:]), reversed(after[start:]), strict=False)
     end = next((i for i, pair in enumerate(pairs) if len({*pair}) > 1), len(after) - start)
     old, new = before[start : len(before) - end], after[start : len(after) - end]
-    return _joined(old), _joined(new)
-
-
-def _joined(lines: list[str]) -> str:
-    return " ".join(" ".join(lines).split())
+    return " ".join(" ".join(old).split()), " ".join(" ".join(new).split())
 
 
 @functools.cache
@@ -76,25 +70,21 @@ def _operators() -> dict[str, Any]:
 def mutants_of(root: Path, path: str) -> list[Mutant]:
     """All mutants of a module whose change can matter when it runs."""
     source = (root / path).read_text(encoding="utf-8")
-    tree, quiet = cosmic_ray.ast.get_ast(source), _unmutated_spans(ast.parse(source))
-    lines = source.splitlines()
+    tree, lines = cosmic_ray.ast.get_ast(source), source.splitlines()
+    unmutated = [
+        ((node.lineno, node.col_offset), (node.end_lineno or 0, node.end_col_offset or 0))
+        for node in _unmutated(ast.parse(source))
+    ]
     occurrences: dict[str, int] = defaultdict(int)
     mutants = []
     for node in cosmic_ray.ast.ast_nodes(tree):
         for name, operator in _operators().items():
             for begin, _ in operator.mutation_positions(node):
                 place = begin[0], len(lines[begin[0] - 1][: begin[1]].encode())
-                if not any(first <= place < last for first, last in quiet):
+                if not any(first <= place < last for first, last in unmutated):
                     mutants.append(Mutant(path, name, occurrences[name], begin[0]))
                 occurrences[name] += 1
     return mutants
-
-
-def _unmutated_spans(tree: ast.Module) -> list[tuple[Position, Position]]:
-    return [
-        ((node.lineno, node.col_offset), (node.end_lineno or 0, node.end_col_offset or 0))
-        for node in _unmutated(tree)
-    ]
 
 
 def _unmutated(tree: ast.Module) -> Iterator[ast.expr | ast.stmt]:
@@ -108,16 +98,12 @@ def _unmutated(tree: ast.Module) -> Iterator[ast.expr | ast.stmt]:
             yield from [node.returns] if node.returns else []
             for decorator in node.decorator_list:
                 if ast.unparse(decorator).rpartition(".")[2] in UNMUTATED_DECORATORS:
-                    yield _with_at_sign(decorator)
+                    decorator.col_offset -= 1  # with its at sign
+                    yield decorator
         if isinstance(node, ast.Raise):
             yield node
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             yield node
-
-
-def _with_at_sign(decorator: ast.expr) -> ast.expr:
-    decorator.col_offset -= 1
-    return decorator
 
 
 def modules_of(root: Path, folder: str) -> list[str]:

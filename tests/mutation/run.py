@@ -9,8 +9,7 @@ from .explained import reason_for
 from .mutants import Mutant, diff
 from .report import CAUGHT, EXPLAINED, SURVIVED, Key, Result, keep_result, load_results
 from .survey import Survey
-from .trial import OUTPUT, run_tests
-from .workplace import Workplace
+from .trial import OUTPUT, Workplace, run_tests
 
 # Of the results so far, the seconds that the round will still take, and the last result.
 Progress = Callable[[list[Result], float, Result], None]
@@ -20,13 +19,7 @@ class Run:
     """Tests mutants, keeping what becomes of each as soon as that is known."""
 
     def __init__(self, workplace: Workplace, survey: Survey, kept: Path) -> None:
-        """A run that goes on where an earlier one stopped.
-
-        Args:
-            workplace: where mutants are tested.
-            survey: of the tests that are asked.
-            kept: the file of results.
-        """
+        """A run that goes on where an earlier one with the same file of results stopped."""
         self.workplace, self.survey, self.kept = workplace, survey, kept
         self.results = {result.key: result for result in load_results(self.kept)}
 

@@ -1,7 +1,7 @@
-"""Runs tests on the copy of the checkout, in a process of its own.
+"""A throwaway copy of the checkout in which mutants are tested; the checkout stays as it is.
 
-The process is forked from one that has imported JAX but computed nothing with it, which saves
-two seconds each time.
+Tests run in processes that are forked from one that has imported JAX but computed nothing with it,
+which saves two seconds each time.
 """
 
 import contextlib
@@ -9,16 +9,22 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
+import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from .mutants import Mutant
 from .survey import EVERYTHING
 
+COPIED = ("data", "fitting", "jaxik", "tests", "pyproject.toml", "README.md", "CHANGELOG.md")
+SHARED = "shared"  # reference material beside the checkout
 PRELOADED = ["jax", "jax.numpy", "equinox", "scipy.stats", "scipy.spatial", "trimesh"]
 SECONDS = 180.0  # of CPU for one test, beyond which it hangs
 LONGEST = 3600.0  # seconds for all tests together, waiting included
@@ -29,16 +35,43 @@ NOTES = "notes.json"
 PASSED, NO_TESTS = 0, 5  # exit statuses of pytest
 
 
+class Workplace:
+    """The copy, in a folder that is deleted afterwards."""
+
+    def __init__(self, root: Path, folder: Path) -> None:
+        self.root = root
+        self.checkout = folder / "checkout"
+        self._written = 0
+        ignored = shutil.ignore_patterns("__pycache__", ".*")
+        for name in COPIED:
+            if (root / name).is_dir():
+                shutil.copytree(root / name, self.checkout / name, ignore=ignored)
+            elif (root / name).exists():
+                shutil.copy2(root / name, self.checkout / name)
+        if (root.parent / SHARED).exists():
+            (folder / SHARED).symlink_to((root.parent / SHARED).resolve())
+
+    @contextlib.contextmanager
+    def mutated(self, mutant: Mutant) -> Iterator[None]:
+        """With a mutant in place of its module."""
+        path = self.checkout / mutant.path
+        path.write_text(mutant.source(self.root), encoding="utf-8")
+        # Python recognises a changed module by its size and the second in which it was written.
+        self._written += 1
+        os.utime(path, (self._written, self._written))
+        try:
+            yield
+        finally:
+            shutil.copy2(self.root / mutant.path, path)
+
+
 @dataclass
 class Outcome:
     """What tests did."""
 
-    status: int = PASSED
-    """Of pytest, or minus the signal that ended the process."""
-    last: str = ""
-    """The test that failed, or the last that began; empty before the first."""
-    stopped: bool = False
-    """Whether there was no time for more tests."""
+    status: int = PASSED  # of pytest, or minus the signal that ended the process
+    last: str = ""  # the test that failed, or the last that began; empty before the first
+    stopped: bool = False  # whether there was no time for more tests
 
     @property
     def none_failed(self) -> bool:
@@ -56,13 +89,12 @@ class Watch:
         self.outcome = Outcome()
         self._restart_clock()
 
-    def pytest_sessionstart(self, session: pytest.Session) -> None:
-        """Takes hold of what can be stopped."""
-        self.session = session
-
     @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+    def pytest_collection_modifyitems(
+        self, session: pytest.Session, items: list[pytest.Item]
+    ) -> None:
         """Leaves the tests that are asked, in their order."""
+        self.session = session
         items[:] = [item for item in items if self._place(item) is not None]
         items.sort(key=self._place)  # pyright: ignore[reportArgumentType]
 
@@ -74,7 +106,7 @@ class Watch:
 
     def pytest_runtest_logfinish(self) -> None:
         """Ends the run where there is no time for more tests."""
-        if _cpu_seconds() > self.budget and self.session and not self.session.shouldfail:
+        if time.process_time() > self.budget and self.session and not self.session.shouldfail:
             self.session.shouldstop = "no time is left"
             self.outcome.stopped = True
             self._note()
@@ -91,13 +123,7 @@ class Watch:
 
 
 def run_tests(checkout: Path, asked: list[str], budget: float = math.inf) -> Outcome:
-    """Runs tests until one fails or hangs, or all took so many CPU seconds.
-
-    Args:
-        checkout: where.
-        asked: names of tests or of files of tests, in their order.
-        budget: CPU seconds.
-    """
+    """Runs tests, or whole files, in this order, until one fails or hangs or all took so long."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     notes = checkout.parent / NOTES
@@ -106,8 +132,10 @@ def run_tests(checkout: Path, asked: list[str], budget: float = math.inf) -> Out
     process.start()
     try:
         process.join(LONGEST)
-    finally:
-        _end(process)
+    finally:  # also what it started
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.join()
     known: dict[str, Any] = json.loads(notes.read_text()) if notes.exists() else {}
     return Outcome(**{**known, "status": process.exitcode or PASSED})
 
@@ -124,15 +152,3 @@ def _pytest(checkout: Path, asked: list[str], budget: float) -> None:
     watch = Watch(asked, checkout.parent / NOTES, budget)
     files = dict.fromkeys(name.partition("::")[0] for name in asked)
     sys.exit(pytest.main([*OPTIONS, *files], plugins=[watch]))
-
-
-def _end(process: Any) -> None:
-    """Ends a process and those that it started, if they still run."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.join()
-
-
-def _cpu_seconds() -> float:
-    times = os.times()
-    return times.user + times.system
