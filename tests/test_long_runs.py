@@ -19,11 +19,6 @@ COMMANDS = [
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split()[0])
 def test_a_long_run_meets_its_goal(command):
     """Its exit status says so."""
-    done = subprocess.run(
-        [sys.executable, "-m", *command.split()],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "tests")},
-        capture_output=True,
-        text=True,
-    )
+    words, path = [sys.executable, "-m", *command.split()], {"PYTHONPATH": str(ROOT / "tests")}
+    done = subprocess.run(words, cwd=ROOT, env=os.environ | path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -18,6 +18,10 @@ SMALLER = {
     "4_a_crowd": {"COUNT = 10_000": "COUNT = 1_000"},
     "6_a_rule_of_your_own": {"end=5.0,  # s": "end=2.0,  # s"},
 }
+CASES = [
+    pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
+    for path in NOTEBOOKS
+]
 CELL_TIMEOUT = 600  # s; on two idle cores a whole notebook takes less than a minute
 
 
@@ -39,12 +43,8 @@ def test_notebooks_are_stored_without_outputs():
             assert "execution" not in cell.metadata, (path, cell.source)
 
 
-def notebook_parameter(path: Path) -> object:
-    return pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG))
-
-
 @pytest.mark.filterwarnings("default")  # of nbclient; a notebook's own warnings are on stderr
-@pytest.mark.parametrize("path", [notebook_parameter(path) for path in NOTEBOOKS])
+@pytest.mark.parametrize("path", CASES)
 def test_a_notebook_runs_without_errors_or_warnings(path):
     notebook = nbformat.read(path, as_version=4)
     for full, smaller in SMALLER.get(path.stem, {}).items():
@@ -55,12 +55,8 @@ def test_a_notebook_runs_without_errors_or_warnings(path):
     ours = {"XLA_FLAGS"} | ({"JAX_DISABLE_MOST_OPTIMIZATIONS"} if path.stem in FITS else set())
     inherited = {name: value for name, value in os.environ.items() if name not in ours}
     environment = inherited | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
-    client = NotebookClient(
-        notebook,
-        timeout=CELL_TIMEOUT,
-        kernel_name="python3",
-        resources={"metadata": {"path": str(path.parent)}},
-    )
+    place = {"metadata": {"path": str(path.parent)}}
+    client = NotebookClient(notebook, timeout=CELL_TIMEOUT, kernel_name="python3", resources=place)
     client.execute(env=environment)  # raises CellExecutionError with the cell and its traceback
     shown = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     printed_errors = [output.text for output in shown if output.get("name") == "stderr"]
