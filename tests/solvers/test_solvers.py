@@ -18,7 +18,7 @@ from jaxik.solvers.reach import quartic_limit, soft_limit
 from jaxik.solvers.two_bone import Limb
 from reference import maths
 from reference.sample_poses import rotation_angle
-from reference.stages import pole as reference
+from reference.stages import limb as reference
 from reference.systems import ozz
 from support import gradients
 from support.cases import Either

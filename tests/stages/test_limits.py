@@ -24,7 +24,7 @@ from jaxik.world import terrain
 from jaxik.world.frame import GroundHits
 from jaxik.world.terrain import ALL_LAYERS
 from reference import maths
-from reference.characters import Parameters
+from reference.characters import Footing, Parameters
 from reference.stages import limits
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import RIG
@@ -120,7 +120,7 @@ def test_it_agrees_with_the_reference(check_support):
     heading = ahead if check_support else [None, None]
     expected = [
         [
-            limits.read(parameters, ground, leg, np.zeros(3), start, 2.4, ahead=heading[leg])
+            limits.read(Footing(leg, parameters, ground), start, 2.4, heading[leg])
             for leg, start in enumerate(row)
         ]
         for row in starts

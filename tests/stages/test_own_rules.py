@@ -31,7 +31,7 @@ from jaxik.world.skeleton import LegPose, Rig, Still, Transform
 from jaxik.world.terrain import Hit, Terrain
 from reference import maths
 from reference.characters import Parameters
-from reference.stages import separation, spine, warp
+from reference.stages import shifts, spine
 from support.cases import Either
 from support.clips import at, make_rig, to_frames, wandering
 from support.fragments import fragment
@@ -216,10 +216,10 @@ def test_feet_give_way_as_in_numpy(half_life):
     for animated, lock, locked, contact, weight, normals, yaw in zip(*clip, strict=True):
         left = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
         standing = 1.0 - (1.0 - locked) * (1.0 - contact)
-        feet = separation.Feet(
+        feet = shifts.Feet(
             SIDES, animated, animated + lock, standing, weight, normals, np.ones(LEGS), left, DT
         )
-        offsets, moved = separation.separate(parameters, feet, offsets)
+        offsets, moved = shifts.separate(parameters, feet, offsets)
         expected.append(moved)
     actual = moves_of(FootSeparation(distance=0.15, half_life=half_life), *clip)
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-12)
@@ -334,7 +334,7 @@ def test_strides_are_scaled_as_in_numpy(values):
     )
     parameters = Parameters(changes, defaults)
     expected = [
-        [warp.moved(parameters, frame, leg, velocity, scale, maths.Y) for leg in range(3)]
+        [shifts.warp(parameters, frame, leg, velocity, scale, maths.Y) for leg in range(3)]
         for frame, velocity, scale in zip(frames, *map(np.asarray, arrays[1:3]), strict=True)
     ]
     actual = offsets_of_all(StrideWarp(**values), *arrays)

@@ -21,7 +21,7 @@ from jaxik.stages import effector
 from jaxik.stages.probe.swing import bump
 from jaxik.world.frame import GroundHits
 from reference import characters, maths, sample_poses
-from reference.stages import swing as reference
+from reference.stages import stride_probe as reference
 from reference.terrain import Terrain as PlainTerrain
 from support.cases import RIG
 from support.clips import FRAMES, animate, assert_close, at, to_frames, to_ik, to_rig, to_terrain

@@ -16,7 +16,7 @@ import numpy as np
 from reference import maths
 from reference.characters import Leg
 from reference.maths import Array, across, clip, cross, length, lerp, rotate, smooth01, unit
-from reference.stages.acceptance import FADE, gentle, low_enough
+from reference.stages.limits import FADE, gentle, low_enough
 from reference.terrain import Hit
 
 PATH = (np.arange(8) + 0.5) / 8  # where ground is looked for, parts of the way between footholds

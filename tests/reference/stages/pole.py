@@ -1,3 +1,0 @@
-"""Solves legs towards a pole."""
-
-from reference.stages.limb import joint_rotations as joint_rotations

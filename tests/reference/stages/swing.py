@@ -1,3 +1,0 @@
-"""Swings over uneven ground."""
-
-from reference.stages.stride_probe import bump as bump
