@@ -57,8 +57,8 @@ class Row(NamedTuple):
         """The arguments of `jaxik.run`."""
         frames = self.frames
         if not frames.platforms.pos.size:
-            still = Transform(np.zeros((FRAMES, 1, 3)), np.tile(maths.IDENTITY, (FRAMES, 1, 1)))
-            frames = frames.with_platforms(still)
+            rot = jnp.asarray(np.tile(maths.IDENTITY, (FRAMES, 1, 1)))
+            frames = frames.with_platforms(Transform(jnp.zeros((FRAMES, 1, 3)), rot))
         ground = clips.to_terrain(dataclasses.replace(self.ground, platform=0))
         gate = Either(jnp.asarray(self.softness > 0.0), Smooth(self.softness or 1.0))
         return to_ik(self.values), self.rig, ground, frames, gate
@@ -383,7 +383,8 @@ def doubles(program):
 @pytest.mark.parametrize("system", ["record", "ozz", "unreal", "mec", "stride", "by speed"])
 def test_a_single_precision_program_contains_no_doubles(system: str):
     assert not list(doubles(traced(system).jaxpr))
-    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))(np.float32([1.0]))
+    leak = jax.make_jaxpr(lambda x: jax.lax.map(lambda y: y * jnp.ones(2), x))
+    leak = leak(np.ones(1, np.float32))
     assert list(doubles(leak.jaxpr)), "the check notices doubles"
 
 
