@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from reference.maths import Array, Transform, apply, rotate
 
-# Cosine between a surface's normal and up below which the ray runs along the surface.
-EDGE_ON = 1e-9
+EDGE_ON = 1e-9  # cosine between a surface's normal and up below which rays run along the surface
 ALL_LAYERS = 0xFFFFFFFF
-# Barycentric tolerance: a ray through a shared edge hits at least one of its triangles.
-SLACK = 1e-12
+SLACK = 1e-12  # barycentric: a ray through a shared edge hits at least one of its triangles
 
 
 class Hit(NamedTuple):
