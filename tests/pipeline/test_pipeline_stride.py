@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import jaxik
+from jaxik.maths import parameter_tree
+from jaxik.maths.parameter_tree import slots
 from reference import characters, maths, sample_poses
 from reference.systems import stride
 from reference.terrain import LegTerrains
@@ -136,11 +138,12 @@ def test_the_defaults_are_those_of_the_reference(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_clip_agrees_with_the_reference(name):
-    """Of `stride`, each leg has a terrain, in one case with its own up."""
+    """Of `stride`, each leg has its numbers and a terrain, in one case with its own up."""
     preset, values, *unlike = CASES[name]
-    plain, ours = UNEVEN, to_terrain(UNEVEN)
-    if preset == "stride":  # one number for both legs would be another program
-        values = {"leg.weight": [1.0, 1.0]} | values
+    ik, plain, ours = to_ik(values, preset), UNEVEN, to_terrain(UNEVEN)
+    if preset == "stride":
+        shared = {x.name: x.value for x in slots(ik) if x.per_leg and x.value.shape == x.shape}
+        ik = parameter_tree.replace(ik, {name: [value] * 2 for name, value in shared.items()})
         tilts = TILTS if "tilted" in unlike else [maths.IDENTITY] * 2
         feet = [dataclasses.replace(UNEVEN, up=maths.rotate(tilt, maths.Y)) for tilt in tilts]
         plain = LegTerrains(UNEVEN, feet)
@@ -149,7 +152,7 @@ def test_a_clip_agrees_with_the_reference(name):
     arrays = {key: np.asarray(x) if isinstance(x, list) else x for key, x in values.items()}
     parameters = characters.Parameters(arrays, defaults=stride.defaults(*rules))
     expected: dict[str, Any] = stride.run(parameters, RIG, plain, frames, *rules)
-    result = compiled(to_ik(values, preset), to_rig(RIG), ours, to_frames(frames))
+    result = compiled(ik, to_rig(RIG), ours, to_frames(frames))
     sensed, advanced = result.trace.sensed, result.trace.advanced
     after, hit, found = advanced.state, sensed.ground.ankle, expected["found"][..., None]
     outputs: dict[str, Any] = {
