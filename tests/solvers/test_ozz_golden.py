@@ -115,7 +115,7 @@ def solve_two_bone(rows: Table, dtype: DTypeLike = jnp.float64) -> Solution:
     target = points(to_start, rows.target), directions(to_start, rows.pole_vector)
     limb, aimed = [-knee, ankle - knee, hinge], [*target, rows.twist_angle]
     task = limb, aimed, rows.soften, rows.mid_axis, rows.weight
-    inputs: Any = jax.tree.map(lambda x: jnp.asarray(x, dtype), task)
+    inputs = jax.tree.map(lambda x: jnp.asarray(x, dtype), task)
     start, mid, ankle, reached = map(np.asarray, bend(*inputs))
     end = points(rows.start, ankle.astype(np.float64))
     return Solution(start, mid, end, (reached == 1) & (rows.weight >= 1))
@@ -123,7 +123,8 @@ def solve_two_bone(rows: Table, dtype: DTypeLike = jnp.float64) -> Solution:
 
 @jax.jit
 def aim_joint(target: list[Any], axes: list[Any], weight: Any) -> tuple[jax.Array, jax.Array]:
-    rot, reached = aim.aim_rotation(pole.PoleTarget(*target), *axes, HARD)
+    forward, offset, up = axes
+    rot, reached = aim.aim_rotation(pole.PoleTarget(*target), forward, offset, up, HARD)
     return weighted(rot, weight), reached == 1
 
 
