@@ -49,8 +49,7 @@ class Evaluated(NamedTuple):
         return whole | {"smooth": smooth.reshape(frames - 2, 6)}
 
 
-# Compiled without optimisation, also where other tests are not.
-@functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+@jax.jit
 def evaluation(problem: Problem, u: jax.Array):
     of_all, jacobian = problem.residuals_and_jacobian(u)
     (scene,), ik, prior = problem.data, problem.space.unpack(u), problem.space.size
@@ -149,9 +148,7 @@ def test_residuals_agree_with_numpy(problem, start):
         assert np.abs(part).max() > 0.01, kind
 
 
-def test_an_unobserved_frame_a_kind_switched_off_and_an_absent_leg_have_no_residuals(
-    problem, start
-):
+def test_frames_unobserved_kinds_switched_off_and_legs_absent_have_no_residuals(problem, start):
     """And affect no other."""
     masked = {kind: np.flatnonzero(~x.any(axis=1)).tolist() for kind, x in start.by_kind().items()}
     assert masked["ankle"] == [MASKED]
