@@ -7,6 +7,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,16 +31,13 @@ def doctor(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]
     return done
 
 
-def test_here_all_is_well(tmp_path):
+def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
     done = doctor(tmp_path)
     assert done.returncode == 0, done.stdout
     for subject in ("Python ", "jaxik ", "packages ", "devices ", "XLA flags ", "programs "):
         assert f"  {subject}" in done.stdout
     assert f"jax {metadata.version('jax')}," in done.stdout
     assert done.stdout.endswith("\nall is well\n")
-
-
-def test_it_runs_where_jax_cannot_be_imported(tmp_path):
     (tmp_path / "jax.py").write_text("raise RuntimeError('no AVX')\n", encoding="utf-8")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path))
     assert done.returncode == without_jax.PROBLEMS_FOUND
@@ -53,9 +51,6 @@ def test_a_flag_that_ends_the_process_is_a_line_with_a_remedy(tmp_path, monkeypa
     output = capsys.readouterr()
     assert "Unknown flag in XLA_FLAGS: --xla_nonsense=1" in output.out
     assert "do: unset XLA_FLAGS" in output.out and "Traceback" not in output.out + output.err
-
-
-# The self-test
 
 
 @pytest.mark.slow
@@ -97,46 +92,27 @@ def test_the_self_test_sees_wrong_numbers(cost, slope, errors, problem, monkeypa
     assert problem in found and bool(found) == bool(problem)
 
 
-# What hides packages, and what they lack
-
-
-def test_a_file_that_hides_a_package_is_named(tmp_path):
-    (tmp_path / "fitting.py").touch()
-    (finding,) = installation._names_in(tmp_path)
-    assert f"{tmp_path / 'fitting.py'} hides the package fitting" in finding.problem
+def test_a_file_that_hides_a_package_is_named_and_does_not_hide_it_from_the_command(tmp_path):
+    for name in ("fitting.py", "jaxik.py"):
+        (tmp_path / name).write_text("raise RuntimeError('of the folder')\n", encoding="utf-8")
+    problem = " ".join(finding.problem for finding in installation._names_in(tmp_path))
+    assert f"{tmp_path / 'fitting.py'} hides the package fitting" in problem
     assert not list(installation._names_in(ROOT))
-
-
-def test_the_command_itself_is_not_hidden_by_a_file_beside_it(tmp_path):
     command = Path(sys.executable).with_name("jaxik")
     if not command.is_file():
         pytest.skip("jaxik is not installed")
-    for name in ("fitting.py", "jaxik.py"):
-        (tmp_path / name).write_text("raise RuntimeError('of the folder')\n", encoding="utf-8")
     variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        [command, "--help"], env=variables, cwd=tmp_path, capture_output=True, text=True
-    )
-    assert done.returncode == 0 and "Fits the parameters" in done.stdout, done.stderr
+    said = subprocess.check_output([command, "--help"], env=variables, cwd=tmp_path, text=True)
+    assert "Fits the parameters" in said
 
 
-@pytest.fixture
-def requirements(monkeypatch) -> list[str]:
-    """What jaxik needs, as the tests say."""
-    texts: list[str] = []
-    monkeypatch.setattr(installation.metadata, "requires", lambda name: texts)
-    return texts
-
-
-def test_a_missing_and_an_old_package_are_problems(requirements):
-    requirements += ["numpy>=99", "surely-not-installed>=1"]
-    found = [finding.problem for finding in installation.examine() if finding.problem]
+def test_a_missing_and_an_old_package_are_problems_and_an_extra_only_if_it_is_broken(monkeypatch):
+    needed = ["numpy>=99", "surely-not-installed>=1"]
+    monkeypatch.setattr(installation.metadata, "requires", lambda name: needed)
+    said = [finding.problem for finding in installation.examine() if finding.problem]
     numpy = f"numpy is {metadata.version('numpy')}, wanted >=99"
-    assert found == [f"{numpy}; surely-not-installed is missing"]
-
-
-def test_an_extra_is_no_problem_unless_it_is_broken(requirements):
-    requirements += ["surely-not-installed; extra == 'dask'", "pdoc>=99; extra == 'posterior'"]
+    assert said == [f"{numpy}; surely-not-installed is missing"]
+    needed = ["surely-not-installed; extra == 'dask'", "pdoc>=99; extra == 'posterior'"]
     findings = {finding.subject: finding for finding in installation.examine()}
     assert 'surely-not-installed; pip install "jaxik[dask]"' in findings["extra dask"].fact
     assert not findings["extra dask"].problem
@@ -144,18 +120,14 @@ def test_an_extra_is_no_problem_unless_it_is_broken(requirements):
     assert findings["extra posterior"].remedy == 'pip install --upgrade "jaxik[posterior]"'
 
 
-def test_little_memory_is_a_problem(tmp_path, monkeypatch):
+def test_little_memory_and_an_examination_that_fails_itself_are_problems(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(machine, "MEMORY", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemTotal: 4000000 kB\nMemAvailable: 500000 kB\n")
     (*_, memory) = machine.examine()
     assert memory.fact == "4.0 GB, 0.5 GB of them free" and "only 0.5 GB" in memory.problem
-
-
-def test_an_examination_that_fails_itself_is_a_problem(monkeypatch, capsys):
-    def fail():
-        raise OSError("no such device")
-
-    monkeypatch.setattr(machine, "examine", fail)
+    monkeypatch.setattr(machine, "examine", Mock(side_effect=OSError("no such device")))
     monkeypatch.setattr(examination, "_in_other_process", lambda options: iter([Finding("a", "b")]))
     assert main.main(["doctor", "--quick"]) == without_jax.PROBLEMS_FOUND
     out = capsys.readouterr().out

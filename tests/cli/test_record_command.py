@@ -14,7 +14,6 @@ from support.refusals import refusal
 
 
 def record_command(*words: object) -> int:
-    """The exit status of the command."""
     return main.main(["record", *map(str, words)])
 
 
@@ -30,26 +29,17 @@ def binary(tmp_path) -> Path:
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize(
-    "more", [[], ["--knee", "flexion", "--lean-sign", "-1", "--tick-hz", "60"]]
-)
-def test_a_record_converted_to_toml_and_back_is_the_same_to_the_byte(binary, more, capsys):
+def test_a_record_goes_to_toml_and_back_to_the_byte_where_it_is_the_base(binary, capsys):
     toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
-    assert record_command("to-toml", binary, "-o", toml, *more) == 0
-    assert capsys.readouterr().err == (
-        "jaxik: kneeAxisType 4 (-Y), padding (bits 0x15, bytes 1234), a tail of 4 bytes: no "
-        f"parameters, so not in {toml}; `record to-bytes` takes them from --base {binary}\n"
-    )
-    assert record_command("to-bytes", toml, "--base", binary, "-o", back, *more) == 0
-    assert capsys.readouterr().err == ""
-    assert back.read_bytes() == binary.read_bytes()
-
-
-@pytest.mark.filterwarnings("default")
-def test_bytes_without_a_base_say_what_they_put_in_its_place(binary, capsys):
-    toml, back = binary.with_suffix(".toml"), binary.with_name("back.bin")
-    assert record_command("to-toml", binary, "-o", toml) == 0
-    capsys.readouterr()
+    for more in (["--knee", "flexion", "--lean-sign", "-1", "--tick-hz", "60"], []):
+        assert record_command("to-toml", binary, "-o", toml, *more) == 0
+        assert capsys.readouterr().err == (
+            "jaxik: kneeAxisType 4 (-Y), padding (bits 0x15, bytes 1234), a tail of 4 bytes: no "
+            f"parameters, so not in {toml}; `record to-bytes` takes them from --base {binary}\n"
+        )
+        assert record_command("to-bytes", toml, "--base", binary, "-o", back, *more) == 0
+        assert capsys.readouterr().err == ""
+        assert back.read_bytes() == binary.read_bytes()
     assert record_command("to-bytes", toml, "-o", back) == 0
     assert capsys.readouterr().err == (
         "jaxik: parameters do not tell the knee's axis: kneeAxisType 2 (+Z), zero padding and no "
@@ -83,16 +73,21 @@ def test_parameters_without_a_slot_in_the_record_are_named_when_written(binary, 
     assert back.stat().st_size == record.SIZE + len(b"tail")
 
 
-def test_show_prints_both_names_and_both_units(binary, capsys):
+@pytest.mark.filterwarnings("default")
+def test_show_prints_both_names_and_units_and_a_csv_which_is_the_same_to_the_byte(binary, capsys):
     assert record_command("show", binary) == 0
     text = capsys.readouterr().out
     assert re.search(r"kneeAxisType +4 \(-Y\)", text)
     assert re.search(r"useFootEndRay +off +probe.use_toe", text)
     assert re.search(r"lockedDisableMaxAngle +172 +lock.release_max_angle = 3.00197 rad", text)
     assert all(name in text for name in ADULT)
-
-
-def test_a_record_converted_to_csv_and_back_is_the_same_to_the_byte(binary, capsys):
+    path = binary.with_name("cm.bin")
+    content = packed(raycastDistanceUp=50.0, raycastDistanceDown=80.0)
+    path.write_bytes(record.to_bytes(content))
+    assert record_command("show", path) == 0
+    output = capsys.readouterr()
+    assert "jaxik: raycastDistanceUp = 50.0 is read as centimetres\n" in output.err
+    assert re.search(r"raycastDistanceUp +50 +probe.ray_up = 0.5 m", output.out)
     assert record_command("show", binary, "--csv") == 0
     path, back = binary.with_suffix(".csv"), binary.with_name("back.bin")
     path.write_text(capsys.readouterr().out)
@@ -100,44 +95,10 @@ def test_a_record_converted_to_csv_and_back_is_the_same_to_the_byte(binary, caps
     assert back.read_bytes() == binary.read_bytes()
 
 
-@pytest.mark.filterwarnings("default")
-def test_lengths_in_centimetres_are_mentioned_in_one_line(tmp_path, capsys):
-    path = tmp_path / "cm.bin"
-    content = packed(raycastDistanceUp=50.0, raycastDistanceDown=80.0)
-    path.write_bytes(record.to_bytes(content))
-    assert record_command("show", path) == 0
-    output = capsys.readouterr()
-    assert "jaxik: raycastDistanceUp = 50.0 is read as centimetres\n" in output.err
-    assert re.search(r"raycastDistanceUp +50 +probe.ray_up = 0.5 m", output.out)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("show no.bin", "no.bin: no such file, wanted a record"),
-        ("show .", "a folder, wanted a record"),
-        ("show short.bin", "short.bin: a foot-IK record has at least 128 bytes; these are 3"),
-        ("show bad.csv", "bad.csv: the CSV has no column"),
-        ("show binary.csv", "binary.csv: 'utf-8' codec can't decode"),
-        ("show none.csv", "none.csv: the CSV has no row"),
-        ("show no.toml", "no.toml: no such file, wanted a parameter file"),
-        ("show bad.toml", "bad.toml: unknown key 'lok'; nearest is 'lock'"),
-        ("show nan.bin", "nan.bin: originalGroundHeightMS is nan"),
-        ("show axis.bin", "axis.bin: kneeAxisType is 9"),
-        ("to-toml nan.bin -o a.toml", "nan.bin: originalGroundHeightMS is nan"),
-        ("to-toml two.csv -o a.toml", "two.csv has 2 rows"),
-        ("to-toml footik.bin -o no/a.toml", "there is no folder no"),
-        ("to-bytes one.toml --base footik.bin -o .", "cannot be written: it is a"),
-        ("to-bytes new.toml -o a.bin", "only those of 'record' with faithful = true"),
-        ("to-bytes ozz.toml -o a.bin", "parameters of 'ozz'; only those of 'record' make one"),
-        ("to-bytes one.toml --base no.bin -o a.bin", "no.bin: no such file"),
-        ("to-bytes two.csv --base footik.bin -o a.bin", "a base completes"),
-    ],
-)
-def test_a_wrong_record_is_reported_and_writes_nothing(line, message, binary, capsys, monkeypatch):
+def test_a_wrong_record_is_reported_and_writes_nothing(binary, capsys, monkeypatch):
     monkeypatch.chdir(binary.parent)
     rows = record.to_csv([packed(), packed()])
-    texts = {
+    for name, text in {
         "bad.csv": "a,b\n1,2\n",
         "none.csv": rows.splitlines()[0] + "\n",
         "two.csv": rows,
@@ -145,12 +106,26 @@ def test_a_wrong_record_is_reported_and_writes_nothing(line, message, binary, ca
         "one.toml": "faithful = true\nlock.enabled = false",
         "new.toml": "lock.enabled = false",
         "ozz.toml": 'preset = "ozz"\n',
-    }
-    for name, text in texts.items():
+    }.items():
         Path(name).write_text(text)
     Path("nan.bin").write_bytes(record.to_bytes(packed(originalGroundHeightMS=np.nan)))
     wrong_axis = dataclasses.replace(packed(), knee_axis_type=9)
     Path("axis.bin").write_bytes(record.to_bytes(wrong_axis))
     Path("short.bin").write_bytes(b"abc")
     Path("binary.csv").write_bytes(b"\xff\xfe")
-    assert message in refusal(["record", *line.split()], Path(), capsys)
+    for line, message in (
+        ("show short.bin", "short.bin: a foot-IK record has at least 128 bytes; these are 3"),
+        ("show bad.csv", "bad.csv: the CSV has no column"),
+        ("show binary.csv", "binary.csv: 'utf-8' codec can't decode"),
+        ("show none.csv", "none.csv: the CSV has no row"),
+        ("show bad.toml", "bad.toml: unknown key 'lok'; nearest is 'lock'"),
+        ("show nan.bin", "nan.bin: originalGroundHeightMS is nan"),
+        ("show axis.bin", "axis.bin: kneeAxisType is 9"),
+        ("to-toml nan.bin -o a.toml", "nan.bin: originalGroundHeightMS is nan"),
+        ("to-toml two.csv -o a.toml", "two.csv has 2 rows"),
+        ("to-bytes one.toml --base footik.bin -o .", "cannot be written: it is a"),
+        ("to-bytes new.toml -o a.bin", "only those of 'record' with faithful = true"),
+        ("to-bytes ozz.toml -o a.bin", "parameters of 'ozz'; only those of 'record' make one"),
+        ("to-bytes two.csv --base footik.bin -o a.bin", "a base completes"),
+    ):
+        assert message in refusal(["record", *line.split()], Path(), capsys)

@@ -1,5 +1,6 @@
 """What commands show on a terminal and in a pipe: tables, bars, and what they are busy with."""
 
+import contextlib
 import io
 import itertools
 import os
@@ -7,7 +8,6 @@ import pty
 import re
 import sys
 import threading
-from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -18,6 +18,7 @@ from fitting.jobs import examples
 from fitting.report.formatting import aligned, joined
 from fitting.report.guides.layout import wrapped
 from fitting.runtime import activity
+from support.watching import Recorder
 
 ESCAPE, RULE = "\x1b", "─"
 COLOUR = re.compile(r"\x1b\[[\d;]*3\d[\d;]*m")  # of the text
@@ -25,62 +26,36 @@ CODES = re.compile(r"\x1b\[[?\d;]*[A-Za-z]")
 TABLE = aligned([["situation", "record"], ["stairs up", "8.2!"], ["flat walk", "3.0"]])
 
 
-class Screen:
-    """A terminal, and what it got."""
-
-    def __init__(self) -> None:
-        self._reader, writer = pty.openpty()
-        self.stream = os.fdopen(writer, "w", encoding="utf-8")
-        self._parts: list[bytes] = []
-        self._thread = threading.Thread(target=self._read)
-        self._thread.start()
-
-    def _read(self) -> None:
-        while True:
-            try:
-                part = os.read(self._reader, 65536)
-            except OSError:  # so ends a terminal of Linux
-                return
-            if not part:  # and so one of macOS
-                return
-            self._parts.append(part)
-
-    def close(self) -> str:
-        """What the terminal got."""
-        self.stream.close()
-        self._thread.join()
-        os.close(self._reader)
-        return b"".join(self._parts).decode().replace("\r\n", "\n")
-
-
-def on_terminal(
-    monkeypatch,
-    act: Callable[[], object],
-    columns: int = 80,
-    environment: Mapping[str, str] = {},
-) -> str:
+def on_terminal(monkeypatch, act, columns: int = 80, **environment: str) -> str:
     """What an act prints on a terminal of these columns."""
-    screen = Screen()
+    reader, writer = pty.openpty()
+    parts: list[bytes] = []
+
+    def read() -> None:
+        with contextlib.suppress(OSError):  # so ends a terminal of Linux
+            while part := os.read(reader, 65536):  # and with nothing one of macOS
+                parts.append(part)
+
     for name in ("NO_COLOR", "FORCE_COLOR", "LINES"):
         monkeypatch.delenv(name, raising=False)
-    wanted = {"TERM": "xterm-256color", "COLUMNS": str(columns)} | dict(environment)
-    for name, value in wanted.items():
+    for name, value in ({"TERM": "xterm-256color", "COLUMNS": str(columns)} | environment).items():
         monkeypatch.setenv(name, value)
-    with monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", screen.stream)
-        patch.setattr(sys, "stderr", screen.stream)
+    thread = threading.Thread(target=read)
+    thread.start()
+    with monkeypatch.context() as patch, os.fdopen(writer, "w", encoding="utf-8") as stream:
+        patch.setattr(sys, "stdout", stream)
+        patch.setattr(sys, "stderr", stream)
         act()
-    return screen.close()
+    thread.join()
+    os.close(reader)
+    return b"".join(parts).decode().replace("\r\n", "\n")
 
 
 def lines_of(text: str) -> list[str]:
     return [line.rstrip() for line in CODES.sub("", text).splitlines()]
 
 
-# Results
-
-
-def test_a_terminal_gets_a_drawn_table_and_a_pipe_the_same_as_plain_text(monkeypatch, capsys):
+def test_a_terminal_gets_drawn_tables_that_fit_its_width_and_a_pipe_plain_text(monkeypatch, capsys):
     drawn = on_terminal(monkeypatch, lambda: main.main(["example"]))
     assert main.main(["example"]) == 0
     plain = capsys.readouterr()
@@ -88,29 +63,23 @@ def test_a_terminal_gets_a_drawn_table_and_a_pipe_the_same_as_plain_text(monkeyp
     assert plain.out == f"{aligned(rows)}\n" and plain.err == ""
     assert ESCAPE in drawn and RULE in drawn
     assert all(name in drawn and title[:20] in drawn for name, title in rows)
+    for columns in (50, 200):
+        for command in (["parameters", "stride"], ["schema"]):
+            drawn = on_terminal(monkeypatch, lambda words=command: main.main(words), columns)
+            assert main.main(command) == 0
+            pipe = capsys.readouterr().out.splitlines()  # whose cells without prose take 75
+            for lines, widest in ((lines_of(drawn), columns), (pipe, max(columns, 75))):
+                assert len(lines) > 80 and max(map(len, lines)) <= widest, (command, columns)
 
 
-@pytest.mark.parametrize("columns", [50, 80, 200])
-@pytest.mark.parametrize("command", [["parameters", "stride"], ["schema"]])
-def test_lists_fit_into_the_width_of_the_terminal(command, columns, monkeypatch, capsys):
-    drawn = on_terminal(monkeypatch, lambda: main.main(command), columns)
-    assert main.main(command) == 0
-    plain = capsys.readouterr().out.splitlines()  # whose cells without prose take 75
-    for lines, widest in ((lines_of(drawn), columns), (plain, max(columns, 75))):
-        assert len(lines) > 80 and max(map(len, lines)) <= widest
-
-
-def test_marks_are_red_and_without_colours_where_there_shall_be_none(monkeypatch):
+def test_marks_are_red_where_there_may_be_colours_and_paths_stay_whole(monkeypatch, capsys):
     coloured, colourless, dumb = (
-        on_terminal(monkeypatch, lambda: show(TABLE), environment=environment)
+        on_terminal(monkeypatch, lambda: show(TABLE), 80, **environment)
         for environment in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"})
     )
     assert f"{ESCAPE}[31m8.2!" in coloured and f"{ESCAPE}[31m3.0" not in coloured
     assert RULE in colourless and not COLOUR.search(colourless)
     assert dumb == f"{TABLE}\n"
-
-
-def test_tables_in_longer_text_are_drawn_and_paths_stay_whole(monkeypatch, capsys):
     path = "/a/long/path" * 10
     text = joined(["", "a sentence", joined([TABLE, "bounds"], apart=True), f"written to {path}"])
     assert text == f"\na sentence\n{TABLE}\n\nbounds\nwritten to {path}"
@@ -122,7 +91,7 @@ def test_tables_in_longer_text_are_drawn_and_paths_stay_whole(monkeypatch, capsy
     assert capsys.readouterr().out == f"{text}\n"
 
 
-def test_a_table_that_is_too_wide_becomes_two_which_begin_alike(monkeypatch):
+def test_what_is_too_wide_becomes_two_tables_which_begin_alike_or_prose_below(monkeypatch):
     rows = [["parameter", *(f"column {number}" for number in range(6))]]
     rows += [["leg.twist", *(f"{number} to {number + 10}.0" for number in range(6))]]
     lines = lines_of(on_terminal(monkeypatch, lambda: show(aligned(rows)), 50))
@@ -130,9 +99,6 @@ def test_a_table_that_is_too_wide_becomes_two_which_begin_alike(monkeypatch):
     assert max(map(len, lines)) <= 50 and len(cells) == 4
     assert [*cells[0], *cells[2][1:]] == rows[0] and cells[2][0] == "parameter"
     assert [*cells[1], *cells[3][1:]] == rows[1] and cells[3][0] == "leg.twist"
-
-
-def test_prose_stands_beside_its_columns_or_below_them(monkeypatch):
     prose = "Largest interior angle of the knee; pi is a straight leg."
     table = wrapped([["leg: TwoBone"], ["leg.max_knee_angle", prose]], 60)
     for columns, first in ((60, "leg.max_knee_angle  Largest"), (40, "leg.max_knee_angle")):
@@ -151,11 +117,48 @@ def test_help_has_colours_on_a_terminal_only(words, monkeypatch, capsys):
     ask()
     plain = capsys.readouterr().out
     assert ESCAPE in drawn and ESCAPE not in plain
-    undrawn = CODES.sub("", drawn).rpartition("example")[2]
-    assert undrawn.split() == plain.rpartition("example")[2].split()
+    examples_of = [text.rpartition("example")[2].split() for text in (CODES.sub("", drawn), plain)]
+    assert examples_of[0] == examples_of[1]
 
 
 # What a command is busy with
+
+
+def test_work_within_work_is_announced_in_order_and_what_fails_has_ended():
+    recorder = Recorder()
+    with activity.watched_by(recorder), activity.announced("outer", 2) as outer:
+        with outer.part("first"):
+            activity.note("in the first")
+        with outer.part("second"):
+            pass
+        activity.note("in the outer")
+    assert recorder.events == [
+        "began outer", "began first", "noted in the first", "ended first", "outer 1 of 2",
+        "began second", "ended second", "outer 2 of 2", "noted in the outer", "ended outer",
+    ]  # fmt: skip
+    recorder = Recorder()
+    with pytest.raises(KeyError), activity.watched_by(recorder), activity.announced("work") as work:
+        raise KeyError
+    assert recorder.events == ["began work", "ended work"] and work.failed
+    with activity.announced("work", 3) as work:
+        work.advance()
+        activity.note("a note")
+    activity.note("after everything")
+    assert (work.done, work.note) == (1, "a note")
+
+
+def test_time_left_follows_from_the_parts_after_the_first_one(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(activity.time, "monotonic", lambda: now)
+    with activity.announced("work", 50, done=30) as work:
+        now = 160.0
+        work.reach(31)
+        assert work.seconds_left is None
+        now = 178.0
+        work.reach(40)
+        assert work.seconds_each == 2.0 and work.seconds_left == 20.0
+        work.reach(50)
+        assert work.seconds_left is None
 
 
 def work_for_a_while() -> None:
@@ -182,14 +185,11 @@ def test_a_terminal_gets_bars_and_results_above_them(monkeypatch):
     assert "Searching from 4 starts: " in lines_of(drawn)[-1]
 
 
-def test_a_dumb_terminal_and_a_pipe_get_plain_lines_without_codes(monkeypatch, capsys):
-    dumb = on_terminal(monkeypatch, work_for_a_while, environment={"TERM": "dumb"})
+def test_a_pipe_and_dumb_strange_and_closed_terminals_get_plain_lines(monkeypatch, capsys):
+    dumb = on_terminal(monkeypatch, work_for_a_while, TERM="dumb")
     assert dumb == "a result meanwhile\n"
     work_for_a_while()
     assert capsys.readouterr() == ("a result meanwhile\n", "")
-
-
-def test_a_terminal_of_other_letters_and_a_closed_one_get_plain_lines(monkeypatch):
     monkeypatch.setenv("TERM", "xterm-256color")
     for encoding, wanted in (("utf-8", True), ("latin-1", False)):
         stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
@@ -236,23 +236,6 @@ def test_work_is_announced_within_two_seconds_and_what_is_short_not_at_all(monke
         assert clock.wait(5.0) == ["Failing: stopped after 2.0 s"]
 
 
-def test_progress_is_reported_every_ten_seconds_with_the_time_left(monkeypatch):
-    clock = Clock(monkeypatch)
-    with activity.watched_by(clock.lines), activity.announced("Fitting", 10) as fitting:
-        lines = clock.wait(2.0)
-        for second in range(30):
-            activity.note(f"cost {second}")
-            lines += clock.wait(1.0)
-            if second % 3 == 2:
-                fitting.advance()
-        lines += clock.wait(0.1)
-    assert lines == [
-        "Fitting ...",
-        "  12.0 s  Fitting, 3 of 10, 24 s left: cost 10",
-        "  22.0 s  Fitting, 6 of 10, 14 s left: cost 20",
-    ]
-
-
 def test_what_is_compiled_is_named_with_its_seconds(monkeypatch):
     clock = Clock(monkeypatch)
     with activity.watched_by(clock.lines), activity.announced("Preparing") as preparing:
@@ -267,7 +250,21 @@ def test_what_is_compiled_is_named_with_its_seconds(monkeypatch):
     assert clock.wait(0.0) == ["Preparing: 53.0 s"]
 
 
-def test_what_is_repeated_within_other_work_is_announced_once(monkeypatch):
+def test_progress_is_reported_every_ten_seconds_and_what_is_repeated_is_announced_once(monkeypatch):
+    clock = Clock(monkeypatch)
+    with activity.watched_by(clock.lines), activity.announced("Fitting", 10) as fitting:
+        lines = clock.wait(2.0)
+        for second in range(30):
+            activity.note(f"cost {second}")
+            lines += clock.wait(1.0)
+            if second % 3 == 2:
+                fitting.advance()
+        lines += clock.wait(0.1)
+    assert lines == [
+        "Fitting ...",
+        "  12.0 s  Fitting, 3 of 10, 24 s left: cost 10",
+        "  22.0 s  Fitting, 6 of 10, 14 s left: cost 20",
+    ]
     clock = Clock(monkeypatch)
     with activity.watched_by(clock.lines), activity.announced("Fitting 100 replicates", 100):
         lines = clock.wait(2.0)
