@@ -8,6 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +22,9 @@ from fitting.inference.sharding import over_devices
 from fitting.problem import stacking
 from fitting.problem.digest import digest
 from fitting.problem.problem import Problem
+from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
-from fitting.problem.shared_world import MARGIN, run_scenes, share_world
+from fitting.problem.shared_world import MARGIN, run_row, run_scenes, share_world
 from fitting.runtime.program_cache import committed
 from jaxik.maths import parameter_tree
 from jaxik.pipeline import Result
@@ -30,13 +32,12 @@ from jaxik.world.terrain import plane
 from support import on_devices
 from support.experiments import EVERY_KIND, ROOT, write
 
-DATA = ROOT / "data"
 CLIPS = "".join(
     f"""
 [[clips]]
-reference = "{DATA}/clips/{name}.npz"
-base = "{DATA}/clips/{base}_base.npz"
-terrain = "{DATA}/terrains/uneven_walk.ply"
+reference = "{ROOT}/data/clips/{name}.npz"
+base = "{ROOT}/data/clips/{base}_base.npz"
+terrain = "{ROOT}/data/terrains/uneven_walk.ply"
 start = {start}
 end = {start + seconds}
 """
@@ -46,7 +47,6 @@ end = {start + seconds}
         ("stop_and_go_ozz", "stop_and_go", 1.0, 0.2),  # at twice the rate
     )
 )
-RAISED = 0.05  # m, of the second clip's ground
 TRACKED = "leg.soften"
 
 
@@ -57,7 +57,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     problem = problems.make_problem(experiment_files.load_experiment(path))
     first, second, third = problem.data
     (mesh,) = second.terrain.surfaces
-    raised = mesh.with_vertices(mesh.vertices_ws + RAISED * second.terrain.up_ws)
+    raised = mesh.with_vertices(mesh.vertices_ws + 0.05 * second.terrain.up_ws)
     terrain = dataclasses.replace(second.terrain, surfaces=(raised,))
     scenes = placed([first, dataclasses.replace(second, terrain=terrain), third])
     return dataclasses.replace(problem, data=tuple(scenes))
@@ -116,10 +116,12 @@ def positions(result: Result) -> list[jax.Array]:
 
 @jax.jit
 def evaluation(problem: Problem):
-    """Residuals of the data, and places."""
-    of_data = problem.residuals(problem.space.start)[: -problem.space.size]
-    results = run_scenes(problem.space.system, problem.data)
-    return of_data, [positions(result) for result in results]
+    """Residuals of the data, and places, of one run: it takes long to compile."""
+    ik, scenes = problem.space.system, problem.data
+    result = run_row(ik, scenes)
+    with mock.patch.object(jaxik, "run", return_value=result):
+        places = [positions(result) for result in run_scenes(ik, scenes)]
+        return residuals_of_scenes(ik, scenes), places
 
 
 @pytest.fixture(scope="module")
@@ -229,13 +231,10 @@ def test_two_processes_find_what_one_finds(evaluations, tmp_path):
         assert_alike(path, of_systems)
 
 
-def test_one_device_changes_nothing():
-    problem = on_devices.make_problem()
-    assert over_devices(problem) is problem
-
-
 def test_clips_on_one_ground_are_one_stack_and_keep_their_order_and_none_is_made_shorter():
-    scenes = on_devices.make_problem().data
+    problem = on_devices.make_problem()
+    assert over_devices(problem) is problem, "on one device"
+    scenes = problem.data
     (stack,) = stacking.stack(scenes)
     assert stack.members == (0, 1, 2) and stack.shares_terrain
     for number, scene in enumerate(scenes):
