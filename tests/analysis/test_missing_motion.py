@@ -129,16 +129,23 @@ def cost(pelvis: Any, knee: np.ndarray, ankle: Any) -> np.ndarray:
     return 0.5 * (distances / POSITION**2 + angles / ROTATION**2)
 
 
+@functools.cache
+def moved(system: str, name: str, clip: str, ground: str) -> tuple[np.ndarray, Any]:
+    """Values of a parameter, the last of them true, and what systems with these make of a clip."""
+    ik = system_of(system)
+    own = from_fractions(free_parameter(ik, name), PLACES)
+    own = np.append(own, present_value(ik, name))
+    iks = [parameter_tree.replace(ik, {name: x}) for x in own]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *iks)
+    return own, jax.tree.map(np.asarray, motions(stacked, scene_of(clip, ground)))
+
+
 def profile_of(
     system: str, name: str, clip: str, ground: str, cost: Callable[..., np.ndarray] = cost
 ) -> Profile:
     """The profile of a parameter with all others at their truth, and without a prior."""
-    ik = system_of(system)
-    parameter = free_parameter(ik, name)
-    own = np.append(from_fractions(parameter, PLACES), present_value(ik, name))
-    iks = [parameter_tree.replace(ik, {name: x}) for x in own]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *iks)
-    costs = cost(*jax.tree.map(np.asarray, motions(stacked, scene_of(clip, ground))))
+    own, motion = moved(system, name, clip, ground)
+    parameter, costs = free_parameter(system_of(system), name), cost(*motion)
     return make_profile(parameter, own[:, None], own, costs, np.zeros_like(costs))
 
 
@@ -206,8 +213,8 @@ def test_the_evidence_of_a_limit_is_the_second_in_which_it_acts():
 
     profile = profile_of("record", "pelvis.limit", clip, ground, student)
     ik, scene = system_of("record"), scene_of(clip, ground)
-    single = motions(jax.tree.map(lambda x: x[None], ik), scene)
-    pelvis, knee_ws, ankle = jax.tree.map(lambda x: x[0], single)
+    _, motion = moved("record", "pelvis.limit", clip, ground)
+    pelvis, knee_ws, ankle = jax.tree.map(lambda x: jnp.asarray(x[-1]), motion)
     exact = dataclasses.replace(scene.reference, pelvis=pelvis, knee_ws=knee_ws, ankle=ankle)
     none = jnp.asarray(jnp.inf)
     sigmas = dataclasses.replace(scene.sigmas, foot=none, body=none)
