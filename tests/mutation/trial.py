@@ -128,7 +128,7 @@ def run_tests(checkout: Path, asked: list[str], budget: float = math.inf) -> Out
     context.set_forkserver_preload(PRELOADED)
     notes = checkout.parent / NOTES
     notes.unlink(missing_ok=True)
-    process = context.Process(target=_pytest, args=(checkout, asked, budget))
+    process: Any = context.Process(target=_pytest, args=(checkout, asked, budget))
     process.start()
     try:
         process.join(LONGEST)
