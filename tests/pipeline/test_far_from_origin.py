@@ -152,6 +152,7 @@ def test_the_centre_stays_in_a_bad_frame_and_moves_in_the_next():
     assert_close(result.pose, expected.pose, EXACT)
 
 
+@pytest.mark.slow
 def test_steps_far_away_are_the_run():
     ik, rig, ground, clip = far_walk("record", FURTHEST)
     result, step = compiled(ik, rig, ground, clip), jax.jit(jaxik.step, compiler_options=QUICK)
