@@ -130,6 +130,7 @@ def outputs_of(preset: str, result: jaxik.Result, expected: dict[str, Any]) -> d
 def moved(frame: Frame, by: maths.Transform) -> Frame:
     """The frame in a world that is moved as a whole."""
     root, stride = frame.world_from_model, frame.stride
+    assert stride is not None
     footholds = {
         name: np.array([maths.apply(by, foot) for foot in getattr(stride, name)])
         for name in ("last_ws", "next_ws")
