@@ -228,12 +228,12 @@ def test_joints_carry_their_bones_and_reached_ankles_are_on_their_targets(system
     assert 20 < output["reached"].sum() < output["reached"].size
     for index, leg in np.ndindex(*output["reached"].shape):
         frame = frames[index]
-        for one, other in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe")):
-            joint = Transform(*(part[leg] for part in getattr(frame, one)))
-            local = maths.unapply(joint, getattr(frame, other).pos[leg])
-            now = Transform(output[f"{one}_pos"][index, leg], output[f"{one}_rot"][index, leg])
+        for upper, lower in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe")):
+            joint = Transform(*(part[leg] for part in getattr(frame, upper)))
+            local = maths.unapply(joint, getattr(frame, lower).pos[leg])
+            now = Transform(output[f"{upper}_pos"][index, leg], output[f"{upper}_rot"][index, leg])
             carried = maths.apply(now, local)
-            assert np.allclose(carried, output[f"{other}_pos"][index, leg], atol=EXACT)
+            assert np.allclose(carried, output[f"{lower}_pos"][index, leg], atol=EXACT)
         ankle = maths.apply(frame.world_from_model, output["ankle_pos"][index, leg])
         if output["reached"][index, leg]:
             assert np.allclose(ankle, output["target_ws"][index, leg], atol=EXACT)
