@@ -29,7 +29,6 @@ from support import toy
 from support.curves import CURVE_TRUTH, Curve, curve_problem
 from support.problems import Fractions, compilations, problem_of_fractions
 
-OTHER_CLIP = 1  # seed of a toy clip
 TOLERANCE = 0.05  # fraction of the range within which a fit must recover the truth
 WITH_THRESHOLD = ("height", "rate", "turn")
 
@@ -72,7 +71,7 @@ def test_the_jacobian_of_a_solution_is_the_problems_and_thresholds_have_only_the
 def test_other_data_of_the_same_shape_compiles_nothing():
     settings = SearchSettings(max_steps=40)
     search.find_best_fit(toy.make_problem(), settings)
-    problem = toy.make_problem(OTHER_CLIP)
+    problem = toy.make_problem(seed=1)
     with compilations() as compiled:
         search.find_best_fit(problem, settings)
         assert not compiled
