@@ -247,18 +247,18 @@ class Case(NamedTuple):
 Inputs = tuple[jaxik.FootIK, terrain.Terrain, jaxik.Frame]
 
 
-def read(inputs: Inputs, started: jax.Array, blurred: jax.Array) -> dict[str, jax.Array]:
+def read(inputs: Inputs, started: jax.Array, gate: AbstractGate) -> dict[str, jax.Array]:
     """The measures of a clip on its ground."""
     ik, ground, frames = inputs
     state = dataclasses.replace(jaxik.init(ik, to_rig(RIG)), started=started)
-    result = jaxik.resume(ik, to_rig(RIG), ground, state, frames, Either(blurred))[1]
+    result = jaxik.resume(ik, to_rig(RIG), ground, state, frames, gate)[1]
     return measures(result, frames)
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
 @jax.vmap
-def valued(inputs: Inputs, started: jax.Array, blurred: jax.Array) -> dict[str, jax.Array]:
-    return read(inputs, started, blurred)
+def valued(inputs: Inputs, started: jax.Array) -> dict[str, jax.Array]:
+    return read(inputs, started, HARD)
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
@@ -269,7 +269,7 @@ def measured(
     """The measures of a clip on its ground, and their derivatives along `ways`."""
     floats, rest = eqx.partition(inputs, eqx.is_inexact_array)
     return jax.jvp(
-        lambda floats: read(eqx.combine(floats, rest), started, blurred),
+        lambda floats: read(eqx.combine(floats, rest), started, Either(blurred)),
         (floats,),
         (eqx.filter(ways, eqx.is_inexact_array),),
     )
@@ -350,7 +350,7 @@ def outcomes_of(cases: Sequence[Case], ik: jaxik.FootIK, sloped: bool = True) ->
         if sloped:
             tables = jax.device_get(measured(inputs, (ways, *zeros_like(clips)), started, blurred))
         else:
-            tables = jax.device_get((valued(inputs, started, blurred),))
+            tables = jax.device_get((valued(inputs, started),))
         numbers += [
             [table[case.change[2:]][index] for table in tables]
             for index, (case, *_) in enumerate(rows)
