@@ -151,7 +151,7 @@ def test_a_clip_agrees_with_the_reference(name):
     frames, rules = clip(*unlike), RULES[preset]
     arrays = {key: np.asarray(x) if isinstance(x, list) else x for key, x in values.items()}
     parameters = characters.Parameters(arrays, defaults=stride.defaults(*rules))
-    expected: dict[str, Any] = stride.run(parameters, RIG, plain, frames, *rules)
+    expected: dict[str, Any] = stride.run(parameters, RIG, plain, frames)
     result = compiled(ik, to_rig(RIG), ours, to_frames(frames))
     sensed, advanced = result.trace.sensed, result.trace.advanced
     after, hit, found = advanced.state, sensed.ground.ankle, expected["found"][..., None]

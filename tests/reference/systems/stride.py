@@ -1,5 +1,6 @@
 """The `stride` system: feet reach the ground where they will stand."""
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -153,8 +154,7 @@ def step(
     return State(standing, followed, holds, leaning, eased, goal, ahead, offset_ws), output
 
 
-def run(parameters, rig, terrain, frames, *_rules):
-    return characters.run(step, parameters, rig, terrain, frames)
+run = functools.partial(characters.run, step)
 
 
 def with_contact(
