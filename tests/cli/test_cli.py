@@ -33,7 +33,7 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.jobs import examples
 from fitting.runtime import activity
 from jaxik.maths import parameter_tree
-from support import gltf_files, grounds, runs
+from support import gltf_files, grounds
 from support.commands import commands
 from support.experiments import ROOT, write
 from support.refusals import refusal
@@ -214,7 +214,8 @@ def test_apply_says_how_far_it_puts_a_clip_that_follows_its_ground_from_the_capt
     along = np.clip((walk.positions_ws[:, 0, 2] - 1.0) / 14.0, 0.0, 1.0)  # the hill
     captured = raised(walk, 1.0 - np.cos(2.0 * np.pi * along))
     save_clip(tmp_path / "up.npz", captured)
-    runs.save(tmp_path / "run", runs.invented_fit(tmp_path))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "parameters.toml").write_text('preset = "record"\nlock.enabled = false\n')
     run("apply", tmp_path / "run", tmp_path / "up.npz", *on_hill[2:], out)
     figures = capsys.readouterr().out.partition("against the captured motion")[2]
     solved = load_clip(out)
