@@ -154,7 +154,7 @@ foot.max_pitch = { times = [0.0], values = [[0.5, 0.4]] }
 
 @pytest.fixture(scope="module")
 def clip() -> Clip:
-    return load_clip("data/clips/uneven_walk_base.npz").select(slice(0, 30))
+    return load_clip(BASE).select(slice(0, 30))
 
 
 def test_tracks_are_linear_or_stepped_between_their_times(clip, tmp_path):
@@ -222,12 +222,13 @@ def test_tracks_of_a_clip_survive_its_file_and_its_edits(clip, tmp_path):
     loaded = load_clip(path)
     np.testing.assert_array_equal(loaded.grounded, grounded)
     np.testing.assert_array_equal(loaded.select(slice(3, 9)).weight, weight[3:9])
-    whole: dict[str, Any] = dict(np.load(path))
+    whole = dict(np.load(path))
     for change, message in (
         ({"weight": weight[:, :1]}, r"is \(30, 1\); wanted \(frames, legs\), here \(30, 2"),
         ({"grounded": grounded + 0.1}, r"grounded has 1\.\d+ at \[\d+\]; wanted 0 to 1"),
     ):
-        np.savez(path, **whole | change)
+        changed: dict[str, Any] = whole | change
+        np.savez(path, **changed)
         with pytest.raises(ValueError, match=message):
             load_clip(path)
 

@@ -317,13 +317,12 @@ def invented_posterior(stuck: list[int] | None = None) -> Posterior:
     return replace(posterior, acceptance=acceptance, message="Converged: the chain is long enough.")
 
 
-def sampled_fit(fitted: Fit, posterior: Posterior, known: dict[str, float] | None) -> SampledFit:
+def sampled_fit(fitted: Fit, posterior: Posterior, known: Any) -> SampledFit:
     rows, space = fitted.summary["parameters"], fitted.problem.space
     return SampledFit(fitted.experiment, space, rows, posterior, known)
 
 
 def write_posterior(run: Path, fitted: Fit, posterior: Posterior) -> tuple[str, dict[str, Any]]:
-    """Writes it; returns the summary and the numbers."""
     sampled = sampled_fit(fitted, posterior, fitted.known_values)
     run_folder.save_posterior(run, sampled)
     posterior_report.write_posterior(run, sampled)
@@ -420,9 +419,9 @@ def toy_posterior(names: tuple[str, ...] = NAMES, **other: Any) -> Posterior:
     return replace(posterior_of(names, u, 0.6 + 0.2 * u, burn_in=10), **other)
 
 
-def around_fit(posterior: Posterior) -> SampledFit:
+def around_fit(posterior: Posterior, kind: str = "smooth") -> SampledFit:
     """As far as texts need it: a posterior around a fit with these rows."""
-    row = {"kind": "smooth", "value": 0.6, "interval": [0.5, 0.7]}
+    row = {"kind": kind, "value": 0.6, "interval": [0.5, 0.7]}
     rows: Any = [{"name": name} | row for name in posterior.names]
     return SampledFit(cast(Any, None), space_of(posterior.names), rows, posterior)
 
@@ -490,8 +489,7 @@ def test_walkers_left_out_a_better_point_and_an_interval_that_contradicts_the_fi
     ):
         draws = toy_posterior(NAMES[:1])  # of which 95 % shall lie in an interval of this width
         draws = replace(draws, values=value + width / 3.92 * draws.u / draws.u.std())
-        sampled = around_fit(draws)
-        sampled.parameters[0]["kind"] = kind
+        sampled = around_fit(draws, kind)
         reasons = [row["reason"] for row in sampled.disagreements]
         assert reasons == ([] if reason is None else [reason]), (value, width, kind)
         text = posterior_report.posterior_text(sampled)
