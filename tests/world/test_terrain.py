@@ -1,4 +1,4 @@
-"""Terrain: agreement with Embree, no leaks, gradients, layers, and batches."""
+"""Terrain: agreement with Embree, no leaks, gradients, layers, batches, merging, and platforms."""
 
 import functools
 
@@ -9,37 +9,33 @@ import numpy as np
 import pytest
 import trimesh
 from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
 
+import jaxik
 from jaxik import lanes
 from jaxik.world import cells, terrain
 from jaxik.world.surfaces import Mesh
+from support import meshes
 from support.clips import assert_close
 from support.gradients import unit
-from support.meshes import (
-    EMBREE,
-    UP,
-    against_embree,
-    arrays,
-    box,
-    cast,
-    every_kind,
-    lattice,
-    rough,
-    turned,
-)
+from support.meshes import EMBREE, UP, Arrays, against_embree, arrays, cast, lattice, rough, turned
 
 WALL = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 2, 0]])
 TRIANGLE = np.array([[0, 1, 2]])
+RAYS = 21_000
 
 
-def stepped() -> tuple[np.ndarray, np.ndarray]:
+def stepped() -> Arrays:
     """Boxes of different heights side by side: level tops and vertical walls."""
     heights = np.random.default_rng(1).uniform(0.1, 1.0, (8, 8))
-    places = np.ndenumerate(heights)
-    return arrays([box((1, high, 1), (x - 3.5, high / 2, z - 3.5)) for (x, z), high in places])
+    boxes = (
+        meshes.box((1, high, 1), (x - 3.5, high / 2, z - 3.5))
+        for (x, z), high in np.ndenumerate(heights)
+    )
+    return arrays(list(boxes))
 
 
-def overhanging() -> tuple[np.ndarray, np.ndarray]:
+def overhanging() -> Arrays:
     """Spheres and a ring above and inside each other: several surfaces over one point."""
     ring = trimesh.creation.torus(2.5, 0.6)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.5)
@@ -48,7 +44,7 @@ def overhanging() -> tuple[np.ndarray, np.ndarray]:
     return arrays([ring, ball, small])
 
 
-def degenerate() -> tuple[np.ndarray, np.ndarray]:
+def degenerate() -> Arrays:
     """Rough ground with points, lines, needles, walls and duplicate triangles mixed in."""
     vertices, triangles = rough(20, seed=2)
     rng = np.random.default_rng(3)
@@ -57,13 +53,10 @@ def degenerate() -> tuple[np.ndarray, np.ndarray]:
     needle = np.array([[-4.0, 2.0, -4.0], [4.0, 2.0, 4.0], [4.0, 2.0, 4.0 + 1e-9]])
     wall = np.array([[-4.0, 0.0, 0.1], [4.0, 0.0, 0.1], [0.0, 3.0, 0.1]])
     corners = len(vertices) + np.arange(6).reshape(2, 3)
-    return (
-        np.concatenate([vertices, needle, wall]),
-        np.concatenate([points, triangles, lines, chosen[40:], corners]),
-    )
+    added = points, triangles, lines, chosen[40:], corners
+    return np.concatenate([vertices, needle, wall]), np.concatenate(added)
 
 
-RAYS = 21_000
 MESHES = {
     "rough": (rough, (0.3, 0.9, -0.2)),
     "stepped": (stepped, (0.3, 0.9, -0.2)),
@@ -151,27 +144,38 @@ def test_a_miss_has_the_end_of_the_ray_as_point_and_up_as_normal():
         np.testing.assert_array_equal(hit.normal, np.tile(UP, (4, 1)))
 
 
-def test_reach_limits_a_ray_and_broadcasts():
-    origins = jnp.broadcast_to(jnp.array([0.0, 1.0, 0.0]), (2, 3, 3))
-    hit = terrain.cast(terrain.plane(), origins, jnp.array([0.5, 1.0, 2.0]))
-    np.testing.assert_array_equal(hit.found, [[0.0, 1.0, 1.0]] * 2)
-    np.testing.assert_array_equal(hit.distance, [[0.5, 1.0, 1.0]] * 2)
-
-
-def test_a_plane_is_hit_from_both_sides_but_never_edge_on():
+def test_a_plane_is_hit_from_both_sides_and_from_itself_within_reach_but_never_edge_on():
     origin = jnp.array([1.0, 2.0, 0.0])
     for sign in (1.0, -1.0):
         hit = terrain.cast(terrain.plane(normal=(-sign, sign, 0.0)), origin, 9.0)
         np.testing.assert_allclose(hit.point, [1.0, 1.0, 0.0], atol=1e-15)
         np.testing.assert_allclose(hit.normal, np.array([-1.0, 1.0, 0.0]) / np.sqrt(2), atol=1e-15)
     assert terrain.cast(terrain.plane(normal=(1.0, 0.0, 0.0)), origin, 9.0).found == 0.0
+    origins = jnp.broadcast_to(jnp.asarray(UP), (2, 3, 3))
+    hit = terrain.cast(terrain.plane(), origins, jnp.array([0.5, 1.0, 2.0]))
+    np.testing.assert_array_equal(hit.found, [[0.0, 1.0, 1.0]] * 2)
+    np.testing.assert_array_equal(hit.distance, [[0.5, 1.0, 1.0]] * 2)
+    # A ray that starts on it hits it, whatever is rounded.
+    rng = np.random.default_rng(3)
+    for rise in (0.9, 0.02):  # slanted, and steep
+        normal = unit(np.array([0.3, rise, -0.2]))
+        for distance in (1.0, 1e2, 1e4):
+            point = distance * rng.normal(size=3)
+            offsets = distance * rng.normal(size=(2000, 3))
+            origins = point + offsets - (offsets @ normal)[:, None] * normal  # on it, but rounded
+            ground = terrain.plane(np.float32(point), np.float32(normal))
+            above = np.sign(origins.astype(np.float32) @ normal - point.astype(np.float32) @ normal)
+            assert (above < 0).mean() > 0.1, "no ray starts a little below"
+            for starts, found in ((origins, 1.0), (origins - 1e-5 * distance * normal, 0.0)):
+                hit = terrain.cast(ground, jnp.asarray(starts, jnp.float32), 1.0)
+                assert np.all(hit.found == found), (rise, distance)
 
 
 def test_a_ray_hits_the_nearest_surface_on_the_layers_of_its_mask():
     origins = jnp.asarray(np.random.default_rng(7).uniform(-2.2, 2.2, (300, 3))).at[:, 1].set(9.0)
     subsets = [(0,), (1,), (2,), (3,), (4,), (0, 1), (1, 3), (2, 4), (0, 1, 2, 3, 4), (7, 31), ()]
     masks = jnp.asarray([terrain.layer_mask(*layers) for layers in subsets], jnp.uint32)
-    hit = terrain.cast(every_kind(layered=True), origins, 99.0, masks[:, None])
+    hit = terrain.cast(meshes.every_kind(layered=True), origins, 99.0, masks[:, None])
     heights = np.where(hit.found > 0, hit.point[..., 1], -np.inf)
     for layers, actual in zip(subsets, heights, strict=True):
         there = [layer for layer in layers if layer < 5]
@@ -181,9 +185,7 @@ def test_a_ray_hits_the_nearest_surface_on_the_layers_of_its_mask():
     x, _, z = np.asarray(origins).T
     np.testing.assert_allclose(heights[3], 0.3 * np.sin(3 * x) * np.cos(2 * z), atol=1e-12)
     np.testing.assert_allclose(heights[4], -0.4 - 0.1 * (x + z), atol=1e-12)
-
-
-def test_each_triangle_of_a_mesh_has_its_layer():
+    # Each triangle of a mesh has its own.
     vertices, triangles = rough(4)
     corners = np.concatenate([vertices, vertices + [0.0, 3.0, 0.0]])
     both = np.concatenate([triangles, triangles + len(vertices)])
@@ -214,27 +216,24 @@ def test_gradients_in_the_origin_and_the_vertices_match_finite_differences():
 
 
 def test_gradients_are_finite_on_edges_corners_walls_and_misses():
-    vertices, triangles = degenerate()
-    steps, _ = stepped()
+    (vertices, triangles), (steps, sides) = degenerate(), stepped()
     ground = terrain.combine(
         terrain.mesh(vertices, triangles, slack=0.01),
-        terrain.mesh(*stepped()),
+        terrain.mesh(steps, sides),
         terrain.plane((0.0, -3.0, 0.0), (1.0, 0.0, 0.0)),
     )
     points = np.concatenate([vertices, steps])
     origins = jnp.asarray(np.concatenate([points, points + [0, 1, 0], points + [99, 0, 0]]))
 
-    def total(ground, origins, reach):
-        hit = terrain.cast(ground, origins, reach)
+    def total(inputs, scale=1.0):
+        ground, origins, reach = inputs
+        hit = terrain.cast(ground.with_vertices(vertices * scale), origins, reach)
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(hit))
 
     @eqx.filter_jit
-    def gradients(args):
-        backward = eqx.filter_grad(lambda args: total(*args))(args)
-        forward = jax.jacfwd(
-            lambda scale: total(ground.with_vertices(vertices * scale), origins, args[2])
-        )(jnp.ones(()))
-        return backward, forward
+    def gradients(inputs):
+        forward = jax.jacfwd(functools.partial(total, inputs))(jnp.ones(()))
+        return eqx.filter_grad(total)(inputs), forward
 
     leaves = jax.tree.leaves(gradients((ground, origins, jnp.array(50.0))))
     assert len(leaves) > 8
@@ -250,9 +249,7 @@ def test_a_mesh_with_moved_vertices_equals_a_mesh_built_there():
     rebuilt = terrain.mesh(moved, triangles)
     origins = rng.uniform(-4.2, 4.2, (RAYS, 3)) * [1, 0, 1] + [0, 5, 0]
     assert_close(cast(updated, origins), cast(rebuilt, origins), 1e-9)
-
-
-def test_a_wall_that_is_moved_within_the_slack_to_lean_over_is_hit():
+    # A wall leans over within the slack.
     ground = terrain.mesh(WALL, TRIANGLE, slack=0.1)
     origin = jnp.array([0.0, 5.0, 0.05])
     assert terrain.cast(ground, origin, 9.0).found == 0.0
@@ -261,55 +258,35 @@ def test_a_wall_that_is_moved_within_the_slack_to_lean_over_is_hit():
     np.testing.assert_allclose(hit.point, [0.0, 1.0, 0.05], atol=1e-12)
 
 
-def test_jit_vmap_scan_lanes_and_a_loop_agree():
-    ground = every_kind()
-    origins = jnp.asarray(np.random.default_rng(11).uniform(-2.3, 2.3, (24, 2, 3)))
-
-    def of(origins):
-        return cast(ground, origins)
-
-    whole = jax.jit(of)(origins)
-    assert 0.2 < np.mean(whole.found) < 1.0
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(of, origins))
-    scanned = jax.lax.scan(lambda _, o: (None, of(o)), None, origins)[1]
-    mapped = [jax.vmap(jax.vmap(of)), lanes(of), lanes(of, block=7)]
-    for other in (*(batch(origins) for batch in mapped), scanned, stacked):
-        assert_close(other, whole, 1e-12)
-
-
-def test_vmap_over_terrains_masks_and_rays_equals_single_casts():
+def test_batches_over_terrains_masks_and_rays_equal_single_casts():
     vertices, triangles = rough(6)
     mesh = terrain.mesh(vertices, triangles, layer=np.arange(len(triangles)) % 3)
+    others = meshes.every_kind()
     origins = jnp.asarray(np.random.default_rng(15).uniform(-3, 3, (3, 5, 3))).at[..., 1].set(5.0)
-    masks, lifts = jnp.array([1, 3, 7], jnp.uint32), jnp.array([0.0, 0.5, 2.0])
+    lifts, masks = jnp.array([0.0, 0.5, 2.0]), jnp.array([1, 3, 7], jnp.uint32)
 
-    @jax.jit
-    def height(lift, mask, origins):
-        ground = mesh.with_vertices(jnp.asarray(vertices) + lift * UP)
-        ground = terrain.combine(ground, terrain.plane(lift * UP - 3.0 * UP))
-        return terrain.cast(ground, origins, 9.0, mask).point[..., 1]
+    def hits(lift, mask, origins):
+        raised = mesh.with_vertices(jnp.asarray(vertices) + lift * UP)
+        ground = terrain.combine(raised, others.moved(lift * UP))
+        return terrain.cast(ground, origins, 9.0, mask)
 
-    single = np.array([[[height(a, b, c) for c in origins] for b in masks] for a in lifts])
-    together = jax.vmap(height)(lifts, masks, origins)
-    diagonal = np.arange(3)
-    np.testing.assert_allclose(together, single[diagonal, diagonal, diagonal], atol=1e-12)
-    of_masks = jax.vmap(height, (None, 0, None))(lifts[0], masks, origins[0])
-    np.testing.assert_allclose(of_masks, single[0, :, 0], atol=1e-12)
-    rays_of_masks = jax.vmap(jax.vmap(height, (None, None, 0)), (None, 0, None))
-    np.testing.assert_allclose(rays_of_masks(lifts[0], masks, origins), single[0], atol=1e-12)
-    np.testing.assert_allclose(single.T - lifts, np.stack([single[0].T] * 3, -1), atol=1e-12)
-    assert len(np.unique(single[0, :, 0, 0])) > 1
+    alone = map(jax.jit(hits), lifts, masks, origins)
+    expected = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
+    assert len(np.unique(np.round(expected.point[..., 1], 3))) > 10
+    for batched in (jax.vmap(hits), lanes(hits, block=2)):
+        assert_close(jax.jit(batched)(lifts, masks, origins), expected, 1e-12)
 
 
-def test_float32_stays_float32_under_strict_promotion():
+def test_float32_stays_float32_and_has_accurate_normals_far_from_the_origin():
     with jax.numpy_dtype_promotion("strict"):
-        ground = every_kind(dtype=jnp.float32)
+        ground = meshes.every_kind(dtype=jnp.float32)
         hit = terrain.cast(ground, jnp.zeros((4, 3), jnp.float32), 3.0)
     assert {leaf.dtype for leaf in jax.tree.leaves(hit)} == {jnp.dtype(jnp.float32)}
-
-
-def test_an_empty_batch_of_rays_gives_an_empty_batch_of_hits():
-    assert terrain.cast(terrain.mesh(*rough(3)), jnp.zeros((0, 3)), 1.0).point.shape == (0, 3)
+    assert terrain.cast(ground, jnp.zeros((0, 3), jnp.float32), 1.0).point.shape == (0, 3)
+    small = np.array([[0.0, 0, 0], [0, 0, 1], [1, 1, 0]]) * 1e-2 + [64.0, 0.0, 64.0]
+    ground = terrain.mesh(small.astype(np.float32), TRIANGLE)
+    hit = cast(ground, np.float32(small.mean(axis=0) + UP))
+    np.testing.assert_allclose(hit.normal, np.array([-1.0, 1.0, 0.0]) / np.sqrt(2), atol=2e-3)
 
 
 def test_an_uneven_mesh_keeps_its_lists_short():
@@ -331,6 +308,10 @@ def test_an_uneven_mesh_keeps_its_lists_short():
     hit = cast(ground, origins)
     assert np.all(hit.found == 1.0)
     assert (against_embree(hit, vertices, triangles, origins).off < EMBREE).mean() > 0.998
+    # So does one whose triangles all lie on each other.
+    lying = np.tile([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]], (300, 1, 1))
+    lists = cells.build(lying, np.ones(300, bool), 0.0)
+    assert 300 <= len(lists.members) < 2 * cells.ENTRIES * 300
 
 
 def test_stacked_triangles_and_triangles_around_one_corner_are_found():
@@ -352,29 +333,16 @@ def test_stacked_triangles_and_triangles_around_one_corner_are_found():
     np.testing.assert_allclose(cast(ground, inside).point[:, 1], 2.5 - 0.5 * radius, atol=1e-4)
 
 
-def test_lists_stay_short_where_all_triangles_lie_on_each_other():
-    count = 300
-    corners = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]])
-    lists = cells.build(np.tile(corners, (count, 1, 1)), np.ones(count, bool), 0.0)
-    assert count <= len(lists.members) < 2 * cells.ENTRIES * count
-
-
-def test_a_tiny_mesh_far_from_the_origin_has_accurate_normals_in_float32():
-    small = np.array([[0.0, 0, 0], [0, 0, 1], [1, 1, 0]]) * 1e-2 + [64.0, 0.0, 64.0]
-    ground = terrain.mesh(small.astype(np.float32), TRIANGLE)
-    hit = cast(ground, np.float32(small.mean(axis=0) + UP))
-    np.testing.assert_allclose(hit.normal, np.array([-1.0, 1.0, 0.0]) / np.sqrt(2), atol=2e-3)
-
-
-def bumps(seed: int, layer: int = 0) -> terrain.Terrain:
-    """A square metre of triangles of random heights."""
-    heights = np.random.default_rng(seed).uniform(0, 0.2, (5, 5))
+def bumps(seed: int, shape: tuple[int, int] = (5, 5), layer: int = 0) -> terrain.Terrain:
+    """Triangles of random heights, a square metre or more."""
+    heights = np.random.default_rng(seed).uniform(0, 0.2, shape)
     return terrain.mesh(*lattice(heights, 0.25), layer=layer)
 
 
-def test_rays_meet_each_of_several_merged_terrains_where_it_was_put():
-    grounds = bumps(1), bumps(2, layer=3).moved(jnp.array([0.0, 1.0, 0.0]))
-    offsets = np.array([[0.0, 0.0, 0.0], [40.0, 0.5, -8.0]])
+def test_rays_meet_each_of_several_merged_terrains_of_any_shape_where_it_was_put():
+    raised = bumps(2, (7, 6), layer=3).moved(jnp.array([0.0, 1.0, 0.0]))
+    grounds = bumps(1), raised, terrain.combine(bumps(3), bumps(4, (5, 9)))
+    offsets = np.array([[0.0, 0.0, 0.0], [40.0, 0.5, -8.0], [-20.0, -0.3, 4.0]])
     merged = terrain.merge(grounds, offsets)
     points = np.random.default_rng(0).uniform([0, 3, 0], [1, 3, 1], (200, 3))
     for ground, offset in zip(grounds, offsets, strict=True):
@@ -387,58 +355,113 @@ def test_rays_meet_each_of_several_merged_terrains_where_it_was_put():
     assert not terrain.cast(merged, over_second, 9.0, terrain.layer_mask(0)).found.any()
 
 
-def test_what_cannot_be_merged_is_refused():
-    one, plane = bumps(1), terrain.plane()
-    for grounds, count, message in (
-        ((one,), 2, "1 terrains and 2 offsets"),
-        ((), 0, "at least one terrain"),
-        ((one, plane), 2, "only static meshes merge; got a Plane"),
-        ((terrain.moving(one, 0),), 1, "got a MovingSurface"),
-        ((one, terrain.plane(up=(0, 0, 1))), 2, "share one up direction"),
+def pose(pos: tuple[float, ...], turn: tuple[float, ...] = (0.0, 0.0, 0.0)) -> jaxik.Transform:
+    """One platform, shifted by m and turned by a rotation vector, rad."""
+    rot = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
+    return jaxik.Transform(jnp.asarray([pos], float), jnp.asarray(rot)[None])
+
+
+SHIFTED, TURNED = pose((0.7, 1.5, -0.4)), pose((-1.0, 0.3, 2.0), (0.0, 0.8, 0.0))
+
+
+TILTED = pose((0.5, 1.0, -0.3), (0.12, 0.6, -0.1))
+
+
+ORIGINS = np.random.default_rng(7).uniform((-5.0, 4.0, -5.0), (5.0, 5.0, 5.0), (3000, 3))
+
+
+def test_rays_hit_a_moved_mesh_where_embree_hits_its_copy():
+    vertices, triangles = rough()
+    for platform in (SHIFTED, TURNED, TILTED):
+        tilts = platform is TILTED
+        ground = terrain.moving(terrain.mesh(vertices, triangles), 0, tilts=tilts)
+        hit = cast(ground.at(platform), ORIGINS)
+        moved = np.asarray(platform.apply(jnp.asarray(vertices)))
+        compared = against_embree(hit, moved, triangles, ORIGINS)
+        np.testing.assert_array_equal(hit.platform, np.where(compared.hits, 0, -1))
+        assert compared.both.mean() > 0.4
+        off = compared.off[compared.both]
+        if tilts:
+            assert compared.both.sum() > 0.97 * compared.hits.sum()
+            assert (off < EMBREE).mean() > 0.99 and np.median(off) < 1e-6
+        else:
+            assert compared.agree.mean() > 0.999 and off.max() < EMBREE
+
+
+def test_a_tilted_heightfield_or_plane_is_hit_where_its_surface_is():
+    rng = np.random.default_rng(4)
+    field = terrain.heightfield(rng.uniform(0.0, 0.1, (20, 20)), 0.5, (-5.0, 0.0, -5.0))
+    hit = cast(terrain.moving(field, 0, tilts=True).at(TILTED), ORIGINS)
+    found = np.asarray(hit.found) > 0
+    on_platform = TILTED.inverse().apply(hit.point)[found]
+    below = cast(field, on_platform + UP)
+    np.testing.assert_allclose(below.point, on_platform, atol=1e-6)
+    # Rays stay on their lines, and normals turn with the platform.
+    np.testing.assert_array_equal(hit.point[:, [0, 2]], ORIGINS[:, [0, 2]])
+    np.testing.assert_allclose(hit.normal[found], TILTED.turn(below.normal), atol=1e-5)
+    platform = pose((0.0, 1.0, 0.0), (0.3, 0.2, -0.25))
+    still = terrain.plane(platform.pos[0], platform.turn(jnp.asarray(UP))[0])
+    hit, expected = (
+        cast(terrain.moving(terrain.plane(), 0).at(platform), ORIGINS),
+        cast(still, ORIGINS),
+    )
+    np.testing.assert_allclose(hit.point, expected.point, atol=1e-12)
+    np.testing.assert_allclose(hit.normal, expected.normal, atol=1e-12)
+
+
+def test_a_ray_hits_the_nearest_of_platforms_and_static_ground_and_says_which():
+    floor, cabin = terrain.plane(), terrain.heightfield(jnp.zeros((3, 3)), 1.0)
+    both = terrain.combine(floor, *(terrain.moving(cabin, number) for number in (0, 1)))
+    poses = jax.tree.map(lambda *x: jnp.concatenate(x), pose((0, 0.5, 0)), pose((1.5, 0.7, 0)))
+    points = jnp.array([[-0.5, 2.0, 0.5], [0.5, 2.0, 0.5], [1.7, 2.0, 0.5], [3.0, 2.0, 0.5]])
+    hit = cast(both.at(poses), points)
+    assert hit.platform is not None and hit.platform.tolist() == [-1, 0, 1, 1]
+    np.testing.assert_allclose(hit.point[:, 1], [0.0, 0.5, 0.7, 0.7])
+    assert cast(floor, points).platform is None, "what nobody needs costs nothing"
+
+
+def test_the_hit_is_differentiable_in_the_pose_of_its_platform():
+    ground = terrain.moving(terrain.mesh(*rough(10)), 0)
+
+    def heights(platform: jaxik.Transform) -> jax.Array:
+        hit = cast(ground.at(platform), ORIGINS[:20])
+        return jnp.where(hit.found > 0, hit.point[:, 1], 0.0)
+
+    slope, backward = jax.jit(lambda p: (jax.jacfwd(heights)(p), jax.jacrev(heights)(p)))(TURNED)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    np.testing.assert_allclose(slope.pos[:, 0, 1], heights(TURNED) != 0, atol=1e-9)
+    np.testing.assert_allclose(backward.pos, slope.pos, atol=1e-9)
+
+
+def test_what_is_no_terrain_is_refused_with_what_was_expected():
+    v, t = rough(3)
+    mesh, plane, merge, moving = terrain.mesh, terrain.plane, terrain.merge, terrain.moving
+    ground, none = bumps(1), np.zeros((0, 3))
+    moved = moving(plane(), 1)
+    assert moved.platform_count == 2
+    for make, message in (
+        (lambda: mesh(v[:, :2], t), "vertices must have the shape"),
+        (lambda: mesh(v, t[:0]), "triangles must have the shape"),
+        (lambda: mesh(v, t * 1.0), "integer indices"),
+        (lambda: mesh(v, t + 99), "index vertices 0 to 15; got 99 to 114"),
+        (lambda: mesh(v, t - 1), "index vertices 0 to 15; got -1 to 14"),
+        (lambda: mesh(v * np.where(v == v[5], np.nan, 1), t), "not finite"),
+        (lambda: mesh(v + np.where(v == v[5], 1e308, 0), t), "vertices are too far "),
+        (lambda: mesh(v, t, up=(0.0, 0.0, 0.0)), "up is a direction"),
+        (lambda: mesh(v, t, layer=32), "from 0 to 31; got 32"),
+        (lambda: plane(normal=(0.0, 0.0, 0.0)), "normal is a direction"),
+        (lambda: plane(layer=-1), "from 0 to 31; got -1"),
+        (lambda: plane().with_vertices(jnp.asarray(v)), "surface 0 is a Plane"),
+        (lambda: terrain.layer_mask(40), "from 0 to 31; got 40"),
+        (lambda: terrain.combine(), "at least one"),
+        (lambda: terrain.combine(plane(), mesh(v, t, up=(1.0, 0.0, 0.0))), "must share one up"),
+        (lambda: merge((ground,), np.zeros((2, 3))), "1 terrains and 2 offsets"),
+        (lambda: merge((), none), "at least one terrain"),
+        (lambda: merge((ground, plane()), np.zeros((2, 3))), "static meshes merge; got a Plane"),
+        (lambda: merge((moving(ground, 0),), np.zeros((1, 3))), "got a MovingSurface"),
+        (lambda: merge((ground, plane(up=(0, 0, 1))), np.zeros((2, 3))), "share one up direction"),
+        (lambda: moving(terrain.combine(plane(), moved), 0), "moves with a platform already"),
+        (lambda: moving(plane(), -1), "numbered from 0; got -1"),
     ):
         with pytest.raises(ValueError, match=message):
-            terrain.merge(grounds, np.zeros((count, 3)))
-
-
-@pytest.mark.parametrize("distance", [1.0, 1e2, 1e4])
-@pytest.mark.parametrize("rise", [0.9, 0.02], ids=["slanted", "steep"])
-def test_a_ray_that_starts_on_a_plane_hits_it_whatever_is_rounded(distance, rise):
-    rng = np.random.default_rng(3)
-    normal = unit(np.array([0.3, rise, -0.2]))
-    point = distance * rng.normal(size=3)
-    offsets = distance * rng.normal(size=(2000, 3))
-    origins = point + offsets - (offsets @ normal)[:, None] * normal  # on it, but for rounding
-    ground = terrain.plane(np.float32(point), np.float32(normal))
-    above = np.sign(origins.astype(np.float32) @ normal - point.astype(np.float32) @ normal)
-    assert (above < 0).mean() > 0.1, "no ray starts a little below"
-    below = origins - 1e-5 * distance * normal
-    for starts, found in ((origins, 1.0), (below, 0.0)):
-        assert np.all(terrain.cast(ground, jnp.asarray(starts, jnp.float32), 1.0).found == found)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda v, t: terrain.mesh(v[:, :2], t), "vertices must have the shape"),
-        (lambda v, t: terrain.mesh(v, t[:0]), "triangles must have the shape"),
-        (lambda v, t: terrain.mesh(v, t * 1.0), "integer indices"),
-        (lambda v, t: terrain.mesh(v, t + 99), "index vertices 0 to 15; got 99 to 114"),
-        (lambda v, t: terrain.mesh(v, t - 1), "index vertices 0 to 15; got -1 to 14"),
-        (lambda v, t: terrain.mesh(v * np.where(v == v[5], np.nan, 1), t), "not finite"),
-        (lambda v, t: terrain.mesh(v + np.where(v == v[5], 1e308, 0), t), "vertices are too far "),
-        (lambda v, t: terrain.mesh(v, t, up=(0.0, 0.0, 0.0)), "up is a direction"),
-        (lambda v, t: terrain.mesh(v, t, layer=32), "from 0 to 31; got 32"),
-        (lambda v, t: terrain.plane(normal=(0.0, 0.0, 0.0)), "normal is a direction"),
-        (lambda v, t: terrain.plane(layer=-1), "from 0 to 31; got -1"),
-        (lambda v, t: terrain.layer_mask(40), "from 0 to 31; got 40"),
-        (lambda v, t: terrain.combine(), "at least one"),
-        (
-            lambda v, t: terrain.combine(terrain.plane(), terrain.mesh(v, t, up=(1.0, 0.0, 0.0))),
-            "must share one up",
-        ),
-        (lambda v, t: terrain.plane().with_vertices(jnp.asarray(v)), "surface 0 is a Plane"),
-    ],
-)
-def test_invalid_terrain_is_rejected_with_what_was_expected(make, message):
-    with pytest.raises(ValueError, match=message):
-        make(*rough(3))
+            make()
