@@ -1,4 +1,4 @@
-"""Systems whose numbers follow a body: lengths, speeds, times, and heights over the sole."""
+"""Transforms, skeletons, and bodies of other sizes: their numbers, and similar motion."""
 
 import dataclasses
 from typing import Any
@@ -8,17 +8,152 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import jaxik
+from fitting.datasets.clip_frames import frames_from_clip
+from fitting.datasets.clips import edit, load_clip
 from jaxik import presets
 from jaxik.maths import parameter_tree
-from jaxik.maths.parameter_tree import Leaf, Rule, half_life_parameter, parameter
+from jaxik.maths.parameter_tree import Leaf, Rule, constant, half_life_parameter, parameter, switch
 from jaxik.pipeline.shapes import check_system
 from jaxik.stages.contact import HeightContact, SpeedContact
-from jaxik.world import body
-from support.clips import make_rig, to_rig
+from jaxik.world import body, skeleton, terrain
+from jaxik.world.frame import rise_of
+from jaxik.world.similarity import exponent, similar
+from jaxik.world.skeleton import LegPose, Skeleton, Still, Transform, bone_lengths
+from support.bodies import scaled
+from support.clips import assert_close, make_rig, to_rig
+from support.experiments import ROOT
+from support.gradients import ROWS, TINY, assert_all_gradients_match, quaternions, unit, vectors
+
+RNG = np.random.default_rng(2)
+FORK = (-1, 0, 0)
+OFFSETS = RNG.normal(size=(6, 3))
+
+
+def transforms() -> Transform:
+    return Transform(jnp.asarray(vectors(RNG, 1.0, TINY, 0.0)), jnp.asarray(quaternions(RNG)))
+
+
+def matrices(transform: Transform) -> np.ndarray:
+    """4 x 4."""
+    result = np.tile(np.eye(4), (*transform.pos.shape[:-1], 1, 1))
+    rotations = Rotation.from_quat(np.asarray(transform.rot), scalar_first=True)
+    result[..., :3, :3], result[..., :3, 3] = rotations.as_matrix(), transform.pos
+    return result
+
+
+def pose(parents: tuple[int, ...], offsets, rotations, positions=None) -> Transform:
+    """World transforms of the joints of a skeleton."""
+    names = tuple(f"joint{joint}" for joint in range(len(parents)))
+    bones = Skeleton(jnp.asarray(offsets), names, parents)
+    return skeleton.forward_kinematics(bones, jnp.asarray(rotations), positions)
+
+
+def pose_of_fork(offsets, rotations):
+    return pose(FORK, offsets, rotations)
+
+
+def test_transforms_agree_with_matrices_from_scipy():
+    a, b, points = transforms(), transforms(), vectors(RNG, 1.0, TINY, 0.0)
+    assert_allclose(matrices(a @ b), matrices(a) @ matrices(b), atol=1e-14)
+    assert_allclose(matrices(a.inverse()), np.linalg.inv(matrices(a)), atol=1e-14)
+    assert_allclose(a.apply_rot(b.rot), (a @ b).rot, atol=0)
+    assert_close(a @ Transform.identity(a.pos.dtype), a, 1e-13)
+    moved = matrices(a) @ np.concatenate([points, np.ones((ROWS, 1))], axis=1)[..., None]
+    assert_allclose(a.apply(jnp.asarray(points)), moved[:, :3, 0], atol=1e-14)
+
+
+def test_a_place_rises_as_the_platform_that_carries_it():
+    before = np.array([[0.3, 0.1, -0.2], [-0.4, 0.2, 0.5]])
+    shift, up = np.array([0.2, 0.35, -0.1]), jnp.array([0.0, 1.0, 0.0])
+    for angles in ([0, 0, 0], [20, -30, 15]):
+        turn = Rotation.from_euler("xyz", angles, degrees=True)
+        after = turn.apply(before) + shift
+        carry = Transform(jnp.asarray(shift), jnp.asarray(turn.as_quat(scalar_first=True)))
+        rise = rise_of(carry.repeat(2), jnp.asarray(after), up)
+        assert_allclose(rise, (after - before)[:, 1], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(rise_of(Still(), jnp.asarray(before), up), 0.0)
+
+
+def test_forward_kinematics_multiplies_the_matrices_from_the_root_down_in_derivatives_too():
+    for parents in (
+        (-1, 0, 1, 2, 3, 4), (-1, 0, 0, 0, 0, 0), (-1, 0, 1, 0, 3, 1), (-1, -1, 0, 1, -1, 4)
+    ):  # fmt: skip
+        offsets, translated = RNG.normal(size=(2, 6, 3))
+        offsets[RNG.integers(6)] = 0.0  # a bone of length zero
+        rotations = unit(RNG.normal(size=(6, 4)))
+        for positions, argument in ((offsets, None), (translated, jnp.asarray(translated))):
+            local = matrices(Transform(jnp.asarray(positions), jnp.asarray(rotations)))
+            expected = []
+            for joint, parent in enumerate(parents):
+                expected.append(local[joint] if parent < 0 else expected[parent] @ local[joint])
+            world = pose(parents, offsets, rotations, argument)
+            assert_allclose(matrices(world), expected, atol=1e-13, err_msg=str(parents))
+    rotations = np.stack([quaternions(RNG) for _ in FORK], axis=1)
+    assert_all_gradients_match(pose_of_fork, np.tile(OFFSETS[:3], (ROWS, 1, 1)), rotations)
+
+
+def test_a_batch_of_poses_equals_single_poses_in_either_precision():
+    rotations, positions = unit(RNG.normal(size=(2, 3, 3, 4))), RNG.normal(size=(2, 3, 3, 3))
+    args = [jnp.asarray(x) for x in (OFFSETS[:3], rotations, positions)]
+
+    def posed(offsets, rotations, positions):
+        return pose((-1, 0, 1), offsets, rotations, positions)
+
+    single = jax.vmap(jax.vmap(posed, (None, 0, 0)), (None, 0, 0))
+    clip = jax.jit(posed)(*args)
+    assert clip.pos.shape == (2, 3, 3, 3) and clip.rot.shape == (2, 3, 3, 4)
+    assert_close(clip, jax.jit(single)(*args), 1e-14)
+    for dtype in (jnp.float32, jnp.float64):
+        leaves = jax.tree.leaves(jax.eval_shape(posed, *(x.astype(dtype) for x in args)))
+        leaves += jax.tree.leaves(Transform.identity(dtype))
+        assert {leaf.dtype for leaf in leaves} == {jnp.dtype(dtype)}
+
+
+def test_a_skeleton_that_is_not_a_tree_is_refused_with_the_faulty_joint():
+    for names, parents, offsets, message in (
+        ("a", (-1, 0), 2, "1 names, 2 parents, 2 offsets"),
+        ("ab", (-1, 0), 3, "2 names, 2 parents, 3 offsets"),
+        ("ab", (1, -1), 2, r"joint 0 \(a\) has parent 1"),
+        ("ab", (-1, 1), 2, r"joint 1 \(b\) has parent 1"),
+        ("ab", (-1, -2), 2, r"joint 1 \(b\) has parent -2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Skeleton(jnp.zeros((offsets, 3)), tuple(names), parents)
+
+
+def test_a_transformed_pose_keeps_its_bone_lengths():
+    # Two hanging legs: thighs of 0.4 and 0.5 m, shins of 0.3 and 0.45 m.
+    joints = np.zeros((4, 2, 3))
+    joints[..., 1] = [[1.0, 1.1], [0.6, 0.6], [0.3, 0.15], [0.3, 0.15]]
+    joints[3, :, 2] = 0.12
+    rot = jnp.asarray(np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+    legs = LegPose(*(Transform(jnp.asarray(pos), rot) for pos in joints))
+    by = jax.tree.map(lambda x: x[:, None], transforms())
+    moved = legs.transformed(by)
+    thigh, shin = bone_lengths(moved)
+    assert_allclose(thigh, np.tile([0.4, 0.5], (ROWS, 1)), atol=1e-14)
+    assert_allclose(shin, np.tile([0.3, 0.45], (ROWS, 1)), atol=1e-14)
+    back = by.inverse().apply(moved.toe.pos)
+    assert_allclose(back, np.tile(joints[3], (ROWS, 1, 1)), atol=1e-14)
+    assert_allclose(moved.ankle.rot, np.repeat(by.rot, 2, axis=1), atol=1e-15)
+
+
+def test_repeating_a_transform_adds_up_the_gradients_of_its_copies():
+    transform = Transform(jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([0.5, 0.5, -0.5, 0.5]))
+    copies = transform.repeat(3)
+    assert_allclose(copies.pos, np.tile(transform.pos, (3, 1)), atol=0)
+    assert_allclose(copies.rot, np.tile(transform.rot, (3, 1)), atol=0)
+    weights = jnp.asarray([[1.0], [10.0], [100.0]])
+    gradient = jax.grad(lambda transform: jnp.sum(weights * transform.repeat(3).pos))(transform)
+    assert_allclose(gradient.pos, [111.0] * 3, atol=0)
+
 
 PRESETS = ["record", "ozz", "unreal", "mec", "stride"]
+SIZE = 1.3
 
 
 class Kick(Rule):
@@ -26,6 +161,7 @@ class Kick(Rule):
 
     reach: Leaf = parameter((0.1, 0.2), unit="m", low=0.0, high=1.0, doc="How far it goes.")
     speed: Leaf = parameter(1.0, unit="m/s", low=0.0, high=4.0, doc="How fast it is.")
+    pull: Leaf = parameter(8.0, unit="m/s²", low=0.0, high=20.0, doc="How hard it pulls.")
     pause: Leaf = parameter(1.0, unit="s", low=0.0, high=4.0, follows="time", doc="How long.")
     height: Leaf = parameter(
         0.115, unit="m", low=0.0, high=0.4, follows="over ankle height", doc="How high it is."
@@ -33,6 +169,8 @@ class Kick(Rule):
     free: Leaf = parameter(float("inf"), unit="m", low=0.0, high=1.0, doc="How far it may go.")
     angle: Leaf = parameter(1.0, unit="rad", low=0.0, high=2.0, doc="How far it turns.")
     half_life: Leaf = half_life_parameter(0.1, doc="How smooth it is.")
+    tick_hz: Leaf = constant(30.0, unit="Hz", doc="Ticks per second.")
+    on: Leaf = switch(True, doc="Whether it does anything.")
 
 
 def make_body(
@@ -57,24 +195,39 @@ def ray_up(system: eqx.Module) -> jax.Array:
     return number(system, "probe.ray_up")
 
 
-def test_numbers_of_any_rule_follow_what_they_declare():
-    scaled = body.scale(Kick(), make_body(4 * body.LEG, 0.3))
-    np.testing.assert_allclose(scaled.reach, [0.4, 0.8], rtol=1e-6)
-    assert float(scaled.speed) == pytest.approx(2.0) and float(scaled.pause) == pytest.approx(2.0)
-    assert float(scaled.height) == pytest.approx(0.3 + 4 * 0.03)
-    assert np.isinf(scaled.free)
-    assert float(scaled.angle) == 1.0 and float(scaled.half_life) == pytest.approx(0.1)
+def test_numbers_and_ranges_of_any_rule_follow_what_they_declare():
+    rig = make_body(4 * body.LEG, 0.3)
+    kick = body.scale(Kick(), rig)
+    np.testing.assert_allclose(kick.reach, [0.4, 0.8], rtol=1e-6)
+    assert float(kick.speed) == pytest.approx(2.0) and float(kick.pause) == pytest.approx(2.0)
+    assert float(kick.height) == pytest.approx(0.3 + 4 * 0.03)
+    assert np.isinf(kick.free)
+    assert float(kick.angle) == 1.0 and float(kick.half_life) == pytest.approx(0.1)
+    declared = body.scaled_declarations(Kick(), rig)
+    assert (declared["speed"].high, declared["angle"].high) == (8.0, 2.0)
+    assert body.scaled_declarations(Kick(), None)["speed"].high == 4.0
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_the_adult_differs_from_a_preset_only_in_the_height_of_its_own_ankle(name):
-    adult, preset = values(getattr(presets, name)(make_body())), values(getattr(presets, name)())
-    for parameter_name, value in preset.items():
-        expected = body.ANKLE if parameter_name == "target.foot_height" else value
-        np.testing.assert_allclose(adult[parameter_name], expected, rtol=1e-6, atol=1e-7)
+def test_an_adult_has_the_numbers_of_a_preset_and_ranges_contain_those_of_any_body():
+    bodies = make_body(2.1, 0.25, 0.14), make_body(0.46, 0.04, 0.02), make_body(0.84, 0.3)
+    for preset in PRESETS:
+        make = getattr(presets, preset)
+        defaults, declared, adult = values(make()), parameter_tree.declarations(make()), make_body()
+        for name, value in values(make(adult)).items():
+            expected = body.ANKLE if name == "target.foot_height" else defaults[name]
+            np.testing.assert_allclose(value, expected, rtol=1e-6, atol=1e-7)
+        for rig in bodies:
+            ik = make(rig)
+            ranges = body.scaled_declarations(ik, rig)
+            for name, value in values(ik).items():
+                low, high = ranges[name].low, ranges[name].high
+                assert low < high, (preset, name)
+                default, of_adult = defaults[name], declared[name]
+                if (of_adult.low <= default).all() and (default <= of_adult.high).all():
+                    assert (low <= value).all() and (value <= high).all(), (preset, name)
 
 
-def test_heights_of_soles_are_those_of_the_rig():
+def test_heights_of_soles_are_those_of_the_rig_and_over_them_follow_the_length_of_the_foot():
     rig = make_body(2.1, 0.31, 0.12)
     for name in ("record", "ozz", "mec", "stride"):
         ik = getattr(presets, name)(rig)
@@ -82,9 +235,7 @@ def test_heights_of_soles_are_those_of_the_rig():
     assert float(number(presets.stride(rig), "probe.ball_height")) == pytest.approx(0.12)
     contact = body.scale(SpeedContact(), rig)
     assert float(contact.planted_height) == pytest.approx(0.12 + 2.5 * 0.02)
-
-
-def test_heights_over_a_flat_foot_follow_its_length_within_twice_that_of_the_leg():
+    # Within twice the length of the leg.
     for foot, ratio in ((0.18, 1.5), (0.06, 0.5), (0.5, 2.0), (0.0, 0.5)):
         rig = make_body(body.LEG, 0.1, 0.06, foot)
         planted = body.scale(HeightContact(), rig).planted_height
@@ -92,7 +243,7 @@ def test_heights_over_a_flat_foot_follow_its_length_within_twice_that_of_the_leg
         assert float(ray_up(presets.record(rig))) == pytest.approx(0.5)
 
 
-def test_legs_share_a_number_unless_they_differ_noticeably_and_may_have_their_own():
+def test_legs_share_a_number_unless_they_differ_noticeably_and_absent_ones_do_not_count():
     alike = presets.mec(make_body(jnp.array([0.80, 0.82])))
     assert ray_up(alike).shape == number(alike, "pelvis.max_length").shape == ()
     legs = np.array([0.8, 0.4])
@@ -104,9 +255,7 @@ def test_legs_share_a_number_unless_they_differ_noticeably_and_may_have_their_ow
     np.testing.assert_allclose(toe[0], 2.0 * toe[1], rtol=1e-6)
     for name in PRESETS:
         check_system(getattr(presets, name)(make_body(jnp.asarray(legs))), make_body())
-
-
-def test_values_per_leg_stay_so_and_legs_that_are_absent_or_without_length_do_not_count():
+    # Values per leg stay so.
     ik = parameter_tree.replace(presets.record(), {"probe.ray_up": [0.5, 0.6]})
     scaled = body.scale(ik, make_body(2 * body.LEG))
     np.testing.assert_allclose(ray_up(scaled), [1.0, 1.2], rtol=1e-6)
@@ -121,30 +270,6 @@ def test_values_per_leg_stay_so_and_legs_that_are_absent_or_without_length_do_no
     lengths, present = jnp.array([1.0, 3.0, 9.0]) * body.LEG, jnp.array([True, True, False])
     rig = dataclasses.replace(rig, thigh=0.5 * lengths, shin=0.5 * lengths, present=present)
     assert body.ratio(rig) == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_ranges_of_a_fit_follow_the_body_and_contain_its_values(name):
-    adult = getattr(presets, name)()
-    of_adult, before = values(adult), parameter_tree.declarations(adult)
-    for rig in (make_body(2.1, 0.25, 0.14), make_body(0.46, 0.04, 0.02), make_body(0.84, 0.3)):
-        ik = getattr(presets, name)(rig)
-        ranges = body.scaled_declarations(ik, rig)
-        for parameter_name, value in values(ik).items():
-            (low, high), (adult_low, adult_high) = (
-                (declared[parameter_name].low, declared[parameter_name].high)
-                for declared in (ranges, before)
-            )
-            assert low < high
-            inside = (adult_low <= of_adult[parameter_name]).all()
-            if inside and (of_adult[parameter_name] <= adult_high).all():
-                assert (low <= value).all() and (value <= high).all(), parameter_name
-
-
-def test_ranges_of_any_rule_follow_what_it_declares():
-    declared = body.scaled_declarations(Kick(), make_body(4 * body.LEG, 0.3))
-    assert (declared["speed"].high, declared["angle"].high) == (8.0, 2.0)
-    assert body.scaled_declarations(Kick(), None)["speed"].high == 4.0
 
 
 def test_a_batch_of_bodies_has_the_numbers_of_each_alone():
@@ -164,3 +289,50 @@ def test_a_batch_of_bodies_has_the_numbers_of_each_alone():
 
     slopes = jax.jit(jax.jacobian(ray_down))(jnp.ones(2))
     assert np.isfinite(slopes).all()  # the ray is endless
+
+
+def test_numbers_of_a_similar_body_change_by_their_units_and_nothing_else_does():
+    powers = {
+        "m": 1.0, "m/s": 0.5, "s": 0.5, "1/s": -0.5, "Hz": -0.5, "m/s²": 0.0, "m²": 2.0,
+        "1/m": -1.0, "rad/s": -0.5, "rad": 0.0, "1": 0.0, "1/tick": 0.0,
+    }  # fmt: skip
+    assert {name: exponent(name) for name in powers} == powers
+    for name in ("kg", "m/kg", "m s", ""):
+        with pytest.raises(ValueError, match=r"is not made of \['m', 's', 'Hz'"):
+            exponent(name)
+    for name in PRESETS:
+        for slot in parameter_tree.slots(getattr(presets, name)()):
+            exponent(slot.unit)
+    larger = similar(Kick(), 4.0)
+    np.testing.assert_allclose(larger.reach, [0.4, 0.8], rtol=1e-6)
+    assert float(larger.tick_hz) == pytest.approx(15.0) and float(larger.angle) == 1.0
+    assert float(larger.pull) == 8.0 and np.isinf(larger.free) and bool(larger.on)
+    back = similar(larger, jnp.asarray(0.25))
+    np.testing.assert_allclose(back.reach, Kick().reach, rtol=1e-6)
+    slope = jax.jit(jax.grad(lambda r: jnp.sum(similar(Kick(), r).reach)))(jnp.asarray(1.0))
+    assert float(slope) == pytest.approx(0.3, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ozz", pytest.param("stride", marks=pytest.mark.slow)])
+def test_two_bodies_of_equal_shape_move_alike(name):
+    """The larger one 1.3 times as far in the root of 1.3 times the time."""
+    heights = 0.04 * np.random.default_rng(0).normal(size=(40, 40))
+    walk = load_clip(ROOT / "data" / "clips" / "uneven_walk_base.npz")
+    clip, run = edit.trim(walk, 0.0, 1.5), jax.jit(jaxik.run)
+
+    def solve(ik: jaxik.FootIK, size: float) -> jaxik.Result:
+        character = scaled(clip, size, froude=True)
+        ground = terrain.heightfield(size * heights, size * 0.25, origin=(-5.0 * size, 0.0, -size))
+        return run(ik, character.rig, ground, frames_from_clip(character))
+
+    ik = getattr(presets, name)()
+    small, large, unscaled = solve(ik, 1.0), solve(similar(ik, SIZE), SIZE), solve(ik, SIZE)
+
+    def difference(result: jaxik.Result) -> float:  # m, of the small body
+        legs = np.abs(result.pose.ankle.pos / SIZE - small.pose.ankle.pos).max()
+        return float(max(legs, np.abs(result.body.pos / SIZE - small.body.pos).max()))
+
+    # The probe of `stride` rounds distances of a micrometre, whatever the body.
+    assert difference(large) < (1e-5 if name == "stride" else 1e-8)
+    assert difference(unscaled) > 3e-3
+    assert np.abs(small.body.pos).max() > 0.02, "there was something to do"
