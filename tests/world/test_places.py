@@ -63,14 +63,11 @@ def test_a_slanted_plane_whose_point_is_far_away_is_rounded_in_the_same_way_for_
     assert np.ptp(errors) < 2 * ROUNDING
 
 
-def test_a_function_is_asked_where_it_is_in_the_world():
+def test_moved_functions_and_meshes_with_moved_vertices_stay_moved():
     ground = terrain.function(lambda x, z: 0.1 * x - 0.2 * z, dtype=np.float32)
     by = jnp.asarray((16.0, 32.0, -48.0), jnp.float32)
     here, moved = cast(ground, STARTS + by), cast(ground.moved(-by), STARTS)
     np.testing.assert_allclose(moved.point, here.point - by, rtol=0, atol=2e-5)
-
-
-def test_a_moved_mesh_with_moved_vertices_stays_moved():
     ground = GROUNDS["mesh"](np.zeros(3)).moved(jnp.float32(UP))
     raised = ground.with_vertices(jnp.asarray(VERTICES + UP, jnp.float32))
     low, high = (cast(x, STARTS + 2 * jnp.float32(UP)).point for x in (ground, raised))
@@ -93,24 +90,14 @@ def test_platforms_and_grounds_of_legs_are_moved_where_they_are():
     np.testing.assert_allclose(cast(legs.body, starts).point, near.point, rtol=0, atol=ROUNDING)
 
 
-def test_the_grid_of_a_mesh_far_away_is_the_one_at_the_origin():
-    near, far = (GROUNDS["mesh"](by).surfaces[0].grid for by in (np.zeros(3), FAR))  # type: ignore[attr-defined]
-    assert far.shape == near.shape
-    for name in ("first", "children", "members", "corners", "corner", "pitch"):
-        np.testing.assert_array_equal(getattr(far, name), getattr(near, name), err_msg=name)
-
-
-def test_the_centre_is_on_a_lattice_near_the_character_and_absent_with_64_bits():
+def test_the_centre_is_on_a_lattice_absent_with_64_bits_and_no_way_of_derivatives():
     pos = RNG.uniform(-1e5, 1e5, (100, 3)).astype(np.float32)
     centre = np.asarray(places.centre_about(jnp.asarray(pos)))
     assert (np.abs(pos - centre) <= places.LATTICE / 2).all()
     np.testing.assert_array_equal(centre % places.LATTICE, 0.0)
     assert places.centre_about(jnp.asarray(pos, jnp.float64)) is None
 
-
-def test_derivatives_do_not_pass_through_the_centre():
-    """The height of slanted ground rises with the place as the ground does, about any centre."""
-
+    # The height of slanted ground rises with the place as the ground does, about any centre.
     def height(pos: jax.Array, tilt: jax.Array) -> jax.Array:
         ground = terrain.plane(normal=jnp.stack([tilt, 1.0, 0.0]), dtype=np.float32)
         centre = places.centre_about(pos)
@@ -125,8 +112,6 @@ def test_derivatives_do_not_pass_through_the_centre():
 
 @struct
 class Memory:
-    """One field of each kind."""
-
     point: Any = place("point")
     height: Any = place("height")
     heights: Any = place("leg height")
