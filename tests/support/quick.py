@@ -1,13 +1,9 @@
 """Residuals that compile at once, for tests of commands that need no real fit."""
 
-import sys
 from collections.abc import Iterable
 
 import equinox as eqx
 import jax.numpy as jnp
-
-from fitting.cli import main
-from fitting.experiments import problems
 
 TARGETS = {"pelvis.on_gain": 0.3, "foot.max_pitch": 0.4}
 SIGMA = 0.02  # of what stands in a reference
@@ -41,11 +37,3 @@ def with_measured(problem, measured: Iterable):
         pos.at[0, :2].set(jnp.asarray(pair)) for pos, pair in zip(positions, measured, strict=True)
     ]
     return eqx.tree_at(lambda p: [s.reference.pelvis.pos for s in p.data], problem, written)
-
-
-if __name__ == "__main__":
-    # Imported, and not taken from __main__: a chain remembers the name of its residuals.
-    from support.quick import residuals_of_scenes as imported
-
-    problems.residuals_of_scenes = imported
-    sys.exit(main.main(sys.argv[1:]))

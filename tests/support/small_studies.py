@@ -162,12 +162,8 @@ TIMES = {"seconds", "search_seconds", "effort"}
 def kept(folder: Path) -> dict[str, Any]:
     """The content of all JSON files of a folder, without how long anything took."""
     paths = sorted(folder.rglob("*.json"))
-    return {path.relative_to(folder).as_posix(): content(path) for path in paths}
-
-
-def content(path: Path) -> Any:
-    """A JSON file without how long anything took."""
-    return _timeless(json.loads(path.read_text()))
+    contents = {path: json.loads(path.read_text()) for path in paths}
+    return {path.relative_to(folder).as_posix(): _timeless(contents[path]) for path in paths}
 
 
 def _timeless(value: Any) -> Any:
