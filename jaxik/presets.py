@@ -109,7 +109,7 @@ def ozz(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
 
     Two inaccuracies of ozz 0.16 are not reproduced: with a weight below 1 its aim goes the longer
     way round in 10 to 14 % of cases, and it treats directions within 1.4 mrad of opposed as
-    opposed, so that its aim misses by as much. `tests/solvers/test_golden.py` shows both.
+    opposed, so that its aim misses by as much. `tests/solvers/test_ozz_golden.py` shows both.
 
     Args:
         faithful: put the root on the ground at once, as the sample does: nothing has memory then.
