@@ -414,7 +414,7 @@ def test_a_chain_with_a_few_other_bytes_is_named_before_hdf5_reads_it(chain_file
         assert "is not a chain of this sampler: its bytes are not those that" in reason
 
 
-# What studies keep; `tests/runtime/test_declared_types.py` damages any such file
+# What studies keep; `tests/runtime/test_files.py` damages any such file
 
 KEPT = {
     "contribution.json": (kept_files.rows_text(), kept_files.load_rows, "ablate"),
