@@ -38,12 +38,10 @@ def curve_residuals(ik: Curve, data: tuple[jax.Array, jax.Array]) -> jax.Array:
 def curve_problem(
     names: tuple[str, ...] = ("height", "rate"),
     walls: tuple[float, float] = (-1.0, 9.0),
-    outliers: float = 0.0,
     **options,
 ) -> Problem:
     base = Curve(turn=jnp.asarray(0.7 if "turn" in names else CURVE_TRUTH["turn"]))
     random = np.random.default_rng(3)
     clean = curve(Curve(**{name: jnp.asarray(value) for name, value in CURVE_TRUTH.items()}))
-    outlier = (random.random(TIME.size) < outliers) * random.uniform(1, 3, TIME.size)
-    data = clean + random.normal(0, 0.02, TIME.size) + outlier
+    data = clean + random.normal(0, 0.02, TIME.size)
     return problem_of(base, names, (data, jnp.asarray(walls)), curve_residuals, **options)

@@ -5,7 +5,6 @@ import numpy as np
 from fitting.datasets.terrain.block_grids import Footprints, Grid
 
 TILTED = Grid(0.45, np.radians(20.0), (0.1, 0.3))
-WIDE = Grid(0.8, np.radians(-35.0), (0.2, 0.5))
 
 
 def block_heights(grid: Grid, points: np.ndarray) -> np.ndarray:
