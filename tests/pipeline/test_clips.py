@@ -234,7 +234,9 @@ def test_packing_keeps_types_and_leaves_large_arrays_as_they_are():
 # Gradients.
 
 
-SLOW = [pytest.param(preset, marks=pytest.mark.slow) for preset in ("record", "ozz", "mec", "stride")]
+SLOW = [
+    pytest.param(preset, marks=pytest.mark.slow) for preset in ("record", "ozz", "mec", "stride")
+]
 
 
 @functools.partial(jax.jit, compiler_options=QUICK)
