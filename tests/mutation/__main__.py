@@ -3,8 +3,8 @@
 Changes a line of the source, in a copy of the checkout, and runs the tests that execute it until
 one fails; then the next. Which tests do is shown by a run of the suite, the first time. Prints how
 many changes the tests caught and lists those that survived. Results are kept in `build/mutation`:
-the same command goes on where it was interrupted. The exit status is 1 if less than 95 % were
-caught.
+the same command goes on where it was interrupted. The exit status is 1 if less than the goal,
+95 %, was caught.
 """
 
 import argparse
@@ -24,7 +24,6 @@ from .trial import Workplace
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "build" / "mutation"
 PACKAGES = ("jaxik", "fitting")
-GOAL = 0.95
 BUDGET = 45.0  # CPU seconds of tests for each mutant in the first round; the second has no limit
 # A changed program is another program, so that mutants may share what is compiled.
 ENVIRONMENT = {
@@ -50,6 +49,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=200, help="mutants, of all modules together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=[*PACKAGES], help="folders or modules")
+    parser.add_argument("--goal", type=float, default=0.95, help="the part to be caught, 0..1")
     parser.add_argument("--report", type=Path, help="a file for what is printed at the end")
     parser.add_argument("--retry", action="store_true", help="test survivors again")
     parser.add_argument("--budget", type=float, help="only so many CPU seconds of tests for each")
@@ -82,7 +82,7 @@ def main() -> int:
     print(text)
     if options.report:
         options.report.write_text(text + "\n", encoding="utf-8")
-    return int(score(results)[0] < GOAL)
+    return int(score(results)[0] < options.goal)
 
 
 if __name__ == "__main__":
