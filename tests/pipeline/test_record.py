@@ -252,7 +252,7 @@ def test_a_parameter_without_a_slot_is_named_with_what_a_reader_assumes(name, va
         record.from_ik(ik, Record())
     with pytest.warns(UserWarning) as caught:
         written = record.from_ik(ik, Record(), drop=True)
-    assert [str(warning.message) for warning in caught] == [lost]
+    assert [(str(said.message), said.filename) for said in caught] == [(lost, __file__)]
     assert list(record.dropped(ik)) == [name] and record.dropped(to_ik(written)) == {}
 
 
