@@ -293,6 +293,8 @@ def test_a_bone_rotates_by_c_m_c_inverse_about_its_start(pair):
     # Carriage returns, radians and a missing last newline change nothing.
     crlf = read_asfamc(*pair(ASF.replace("\n", "\r\n"), AMC.replace("\n", "\r\n").rstrip()))
     assert np.array_equal(recording.rotations_ls, crlf.rotations_ls)
+    again = read_asfamc(*pair(ASF.replace("angle deg", "angle deg degrees")))
+    assert np.array_equal(recording.rotations_ls, again.rotations_ls), "only the first word counts"
     radians = AMC.replace(":DEGREES", ":RADIANS")
     for degrees in ("10 20 30", "5 6 7", "5 6 8", "40", "50"):
         words = " ".join(str(np.radians(float(word))) for word in degrees.split())
