@@ -136,6 +136,11 @@ def test_a_root_is_put_on_the_ground_relative_to_the_floor_unless_foot_ik_reache
         flat, choice = ground_path.place_root(short, slab(height))
         assert flat is short and choice.root == ("ground" if height > 0.4 else "animation"), height
         assert choice.reason.startswith("as animated: the ground is ") == (height < 0.4), height
+    # The ground is that below the balls of standing feet, not below their ankles.
+    ball = short.joints_ws(3)[short.stance_labels()][0, 2]
+    strip = terrain.combine(slab(0.0), slab(0.1, ball - 0.05, ball + 0.05))
+    reason = ground_path.place_root(short, strip)[1].reason
+    assert reason == "as animated: the ground is 0 to 10 cm above its floor"
 
 
 def test_a_root_stays_as_animated_where_it_follows_the_ground_or_there_is_none(clip, short):
