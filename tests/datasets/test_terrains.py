@@ -24,7 +24,7 @@ from fitting.datasets.terrain.block_grids import Footprints, Grid
 from fitting.datasets.terrain.mesh_files import height_function, load_terrain, save_mesh
 from fitting.datasets.terrain.reconstruction import Prediction
 from fitting.report import terrain_report
-from fitting.report.plots import style
+from fitting.report.plots import style, terrain_plots
 from jaxik.world import terrain
 from jaxik.world.heightfield import Heightfield
 from jaxik.world.surfaces import Mesh
@@ -118,7 +118,8 @@ def test_pictures_and_arrays_have_metres_per_level_and_cell_under_any_number_of_
     ground = load_terrain(tmp_path / "hill.npy", cell=2.0)
     np.testing.assert_allclose(heights(ground, (1.0, 3.0), (5.5, 3.5)), [1.505, np.nan], atol=1e-5)
     x, z = np.meshgrid(np.arange(40), np.arange(30))
-    np.save(tmp_path / "slope.npy", 0.1 * x - 0.2 * z)
+    with (tmp_path / "slope.npy").open("wb") as file:  # with a header of the second version
+        np.lib.format.write_array(file, 0.1 * x - 0.2 * z, (2, 0))
     ground = load_terrain(tmp_path / "slope.npy", cell=1.0)
     for shape in ((0,), (1,), (RAYS,), (3, RAYS - 1)):
         points = np.random.default_rng(1).uniform([-5, 0, 1], [38, 0, 28], (*shape, 3))
@@ -455,6 +456,11 @@ def test_a_synthetic_slope_is_a_plane_also_of_a_bounded_number_of_stances(
     assert len(ground.predictions["plane"].errors) == 5
     text = terrain_report.count_stances(ground)
     assert text == f"{count} stances; surfaces are fitted to 5 of all, evenly chosen"
+    figure = terrain_plots.plan(ground, 0.5, walk.rig.names, "title")
+    (panel,) = [axes for axes in figure.axes if axes.get_ylabel() == "error, cm"]
+    for kind, prediction in ground.predictions.items():
+        drawn = [np.allclose(line.get_ydata(), 100 * prediction.errors) for line in panel.lines[:-1]]
+        assert any(drawn), kind
 
 
 def test_the_terrain_of_the_uneven_walk_is_reconstructed_as_smooth(coarse_search):
