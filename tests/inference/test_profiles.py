@@ -14,16 +14,20 @@ import scipy.stats
 
 from fitting.inference.identifiability import Identifiability, assess_identifiability
 from fitting.inference.optimisation import population, search
+from fitting.inference.optimisation.population import Slopes
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.solution import Solution
-from fitting.inference.profiles.conditional import Conditional, Targets
+from fitting.inference.profiles.conditional import Conditional, Points, Targets
+from fitting.inference.profiles.curves import Curves
 from fitting.inference.profiles.heights import (
     RISE_OF_SMOOTH,
     RISE_OF_THRESHOLD,
     level_of,
     max_rise,
 )
+from fitting.inference.profiles.profiling import cross_cliffs
 from fitting.inference.profiles.secants import slopes_of_thresholds
+from fitting.inference.profiles.state import Profiling
 from fitting.problem.free_parameters import free_parameter, from_fractions, to_fractions
 from fitting.problem.prior import SPREAD, ParameterPrior, Priors
 from fitting.problem.problem import Problem
@@ -261,6 +265,29 @@ def test_intervals_go_on_beyond_cliffs_along_which_parameters_move_together(seed
     ends = half_lives[low.any(axis=1)][[0, -1]]
     assert np.ptp(ends) > 1.5 * np.ptp(alone)  # along the cliff, the release has to follow
     assert report.profiles["half_life"].interval == pytest.approx(ends, abs=0.15 * np.ptp(ends))
+
+
+def test_cliffs_on_either_side_of_a_valley_are_crossed_alike(monkeypatch):
+    """Of a curve that is the same from left to right and from right to left."""
+    problem = problem_of_fractions(1, None, distances)
+    tried: list[float] = []
+
+    def lowest(_: Conditional, targets: Targets, starts: list[Points]) -> Points:
+        tried.extend(targets.value)
+        return points[np.zeros(len(starts), int)]
+
+    monkeypatch.setattr(Conditional, "lowest", lowest)
+    matrix = np.zeros((1, 1))
+    conditional = Conditional(
+        problem, np.zeros(1), Slopes.of(matrix), matrix, np.random.default_rng(0)
+    )
+    values = np.linspace(0.05, 0.95, 19)[:, None]  # 0.4 to 0.6 is low
+    cost = np.where(np.abs(values[:, 0] - 0.5) < 0.11, 0.0, 500.0)
+    points = Points(problem.space.pack_values(values), values, cost)
+    curves = Curves(problem, points)
+    assert not cross_cliffs(Profiling(conditional, points[9:10], curves, points[:0]))
+    np.testing.assert_allclose(np.sort(tried), 1 - np.sort(tried)[::-1])
+    assert max(value for value in tried if value < 0.5) == pytest.approx(0.35)
 
 
 # Slopes of thresholds: of a gradual effect its derivative, of a sudden one none
