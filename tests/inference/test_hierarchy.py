@@ -149,6 +149,16 @@ def test_draws_have_the_moments_of_the_exact_distribution():
         assert draw.var() == pytest.approx(coarse @ (sds**2 + (means - mean) ** 2), rel=0.1)
 
 
+def test_the_density_of_a_spread_is_fine_where_its_prior_is_a_hundred_times_wider():
+    model = measured(np.array([0.0, 1.0, 2.5, 1.2]), 0.2, scale=100.0)
+    edges, probability = model.draw(np.random.default_rng(3), 1).spread_density[0]
+    found = np.interp([0.3, 0.6, 1.0, 3.0], edges[1:], np.cumsum(probability))
+    grid = np.linspace(0.005, 99.995, 10_000)
+    density = np.exp([model.log_marginal(np.array([spread])) for spread in grid])
+    exact = np.interp([0.3, 0.6, 1.0, 3.0], grid + 0.005, np.cumsum(density) / density.sum())
+    np.testing.assert_allclose(found, exact, atol=0.01)
+
+
 def test_the_shortest_interval_begins_at_0_where_the_density_is_high_there():
     edges = np.linspace(0.0, 12.0, 2401)
 
