@@ -263,6 +263,9 @@ def test_every_key_has_a_meaning_a_parameter_its_range_and_the_defaults_are_thos
     assert declared.doc in limit["description"] and "Unit: m." in limit["description"]
     assert f"Range: {declared.low:g} to {declared.high:g}." in limit["description"]
     assert "inf m in ozz" in limit["description"]
+    search = named(experiment_files.SEARCH_KEYS)["properties"]
+    assert search["agreement"]["description"].endswith(" Unit: cost.")
+    assert "Unit" not in search["min_step_gain"]["description"]
     tables = schema()["properties"]
     assert tables["preset"]["default"] == "record" and tables["loss"]["default"] == "squares"
     assert tables["clips"]["items"]["properties"]["file_up"]["default"] == "y"
