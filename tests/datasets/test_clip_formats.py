@@ -248,6 +248,7 @@ def test_frames_too_many_and_bodies_that_are_odd_get_a_remark(write_bvh):
         (BVH.replace("Frames: 3", "Frames: 2"), 2, True, "2 frames are declared and 3 found"),
         (head + "MOTION\nFrames: 1\nFrame Time: 0.01\n0 0 0\n", 1, False, "no bone has a length"),
         (lying, 3, True, "not above the feet"),
+        (BVH.replace("OFFSET 0 -42 0", "OFFSET 0 -94 0"), 3, True, "1.340 m; doubtful: give --sc"),
         (BVH.replace("OFFSET 0 -42 0", "OFFSET 0 0 0", 1), 3, False, "left thigh has no length"),
     ):
         clip = load_clip(write_bvh(text))
@@ -258,6 +259,7 @@ def test_frames_too_many_and_bodies_that_are_odd_get_a_remark(write_bvh):
         _ = clip.rig
     clip = load_clip(write_bvh(BVH.replace("OFFSET 0 -5 12", "OFFSET 0 0 0")))  # feet of no length
     assert np.allclose(clip.rig.foot, 0.0)
+    assert not any("doubtful" in said for said in clip.remarks)
     assert np.isfinite(np.asarray(clip.rig.ankle_from_foot)).all()
 
 
