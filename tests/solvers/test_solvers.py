@@ -417,8 +417,11 @@ def test_a_curve_starts_with_its_slope_and_rises_to_its_limit(curve, first_slope
         assert_allclose((y - x).max(), 0.028 * 0.5, rtol=0.02)
 
 
-def test_the_quartic_curve_has_right_gradients_and_limits_nothing_without_room():
+def test_the_quartic_curve_has_right_gradients_and_without_room_only_the_soft_one_limits():
     x, free, room = RNG.uniform(0.1, [[3.0], [1.0], [2.0]], (3, ROWS))
     x = np.where(np.abs(x - free) > 0.01, x, free + 0.02)
     gradients.assert_all_gradients_match(quartic_limit, x, free, free + room)
     assert_allclose(quartic_limit(x, free, free), x, atol=0)
+    assert_allclose(soft_limit(x, free, free), np.minimum(x, free), atol=0)
+    by_x, *by_limits = jax.vmap(jax.grad(soft_limit, (0, 1, 2)))(x, free, free)
+    assert_allclose([by_x, sum(by_limits)], [x < free, x > free], atol=0)
