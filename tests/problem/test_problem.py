@@ -28,7 +28,7 @@ from fitting.problem.prior_probability import prior_probability
 from fitting.problem.space import CENTRE_LIMIT, INTERVAL, OWN_CENTRE_LIMIT, Space, make_space
 from jaxik.maths import parameter_tree, smoothing
 from support import toy
-from support.problems import problem_of
+from support.problems import Fractions, problem_of
 
 TOLERANCE = 1e-9
 UNIFORM = ParameterPrior("uniform")
@@ -84,6 +84,8 @@ def test_one_leg_can_be_free_while_the_other_keeps_its_value_or_one_value_is_of_
         space = make(name)
         assert space.size == 1
         np.testing.assert_allclose(space.unpack(jnp.zeros(1)).foot.limit, limits, rtol=TOLERANCE)
+    space = problem_of(Fractions(jnp.full(12, 0.1)), ["x[11]"], None, min).space
+    np.testing.assert_allclose(space.unpack(jnp.zeros(1)).x, [0.1] * 11 + [0.5])
 
 
 def test_start_and_prior_are_at_the_present_values_or_where_they_are_put():
