@@ -214,6 +214,8 @@ def test_a_figure_has_a_panel_for_each_leg_the_pelvis_and_each_measure():
     assert [text.get_text() for text in lower.axes[0].texts] == ["–", "0.00", "0.00"]
     for axes, column in zip(lower.axes, MEASURES.values(), strict=True):
         assert axes.get_title(loc="left").endswith(f", {column.unit}")
+        lowest, highest = axes.get_ylim()
+        assert all(highest < bar.get_y() < lowest - bar.get_height() for bar in axes.patches)
     (legend,) = figure.legends
     names = [text.get_text() for text in legend.texts]
     assert names == [comparison.ANIMATED, "close", "deep", "ground"]
@@ -279,6 +281,7 @@ def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path
     assert row in " ".join(capsys.readouterr().out.split())
     text = (tmp_path / "out" / comparison_report.TABLE).read_text()
     assert "## At other frame rates" in text
+    assert "h2 At other frame rates" in Page(tmp_path / "out" / run_folder.PAGE).headings
     assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text
     half, quarter = json.loads((tmp_path / "out/compare.json").read_text())["rates"]
     assert (half["system"], half["fps"], quarter["fps"]) == ("ozz", 60.0, 30.0)
