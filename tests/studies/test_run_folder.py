@@ -13,6 +13,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import jax
@@ -148,16 +149,35 @@ def test_a_gain_has_a_half_life_and_gains_at_other_rates():
     assert 0.7 ** (30 * readings["half_life"]) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("interrupted", [False, True])
-def test_a_point_that_is_lower_with_32_bits_only_changes_nothing(
-    tmp_path, monkeypatch, interrupted
-):
+@pytest.fixture
+def solved(tmp_path, monkeypatch):
+    """An experiment, its problem and solution, and how well the data determine it."""
     small_studies.quick_fits(monkeypatch)
     experiment = experiment_files.load_experiment(write(tmp_path, clips=HALF_SECOND))
     with jax.enable_x64(True):
         problem = problems.make_problem(experiment)
         solution = search(problem, experiment)
         known = assess.assess_identifiability(problem, solution)
+    return experiment, problem, solution, known
+
+
+@pytest.mark.parametrize(("gain", "searches"), [(0.2, 0), (9000.0, 1)])
+def test_the_search_begins_anew_at_a_point_that_is_much_lower(solved, monkeypatch, gain, searches):
+    experiment, problem, solution, known = solved
+    reports = [dataclasses.replace(known, improvement=value) for value in (5.0, 0.0)]
+    near, far = (dataclasses.replace(solution, cost=solution.cost - x * gain) for x in (1, 2))
+    search_again = Mock(return_value=far)
+    monkeypatch.setattr(assess, "assess_identifiability", Mock(side_effect=reports))
+    monkeypatch.setattr(assess, "refine", lambda *_: near)
+    monkeypatch.setattr(assess, "search", search_again)
+    fitted = assess.assess_solution(experiment, problem, solution)
+    assert search_again.call_count == searches and fitted.left == (solution.cost,)
+    assert fitted.solution.cost == (far if searches else near).cost
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_a_point_that_is_lower_with_32_bits_only_changes_nothing(solved, monkeypatch, interrupted):
+    experiment, problem, solution, known = solved
     tempting = dataclasses.replace(known, improvement=5.0, best_u=solution.u + 1.0)
     behind = dataclasses.replace(
         solution, u=solution.u + 1.0, cost=solution.cost + 9000.0, interrupted=interrupted
