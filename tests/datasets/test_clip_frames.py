@@ -15,6 +15,7 @@ from fitting.datasets.clips import Clip, contacts
 from fitting.datasets.cut_off_swings import with_cut_off_swings
 from fitting.datasets.ground_path import place_root
 from fitting.datasets.synthetic import gait, speed_profile, walker
+from fitting.report import placement_report
 from fitting.studies.animations import Animation
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
@@ -124,6 +125,9 @@ def test_spine_and_head_lean_as_the_system_says(clip, result):
         np.testing.assert_allclose(leant.positions_ws[:, joint], expected, atol=1e-12)
     crown, before = (c.positions_ws[:, 13] - c.positions_ws[:, 12] for c in (leant, plain))
     np.testing.assert_allclose(crown, before, atol=1e-12)  # the head turned back
+    text = placement_report.trunk_text(leaning, taller)
+    most = np.degrees(bend.magnitude().max())
+    assert text == f"spine: leans by up to {most:.1f}°, applied to spine; head turns back"
     legs_only = clip_frames.clip_from_result(clip, leaning)
     np.testing.assert_array_equal(legs_only.positions_ws, plain.positions_ws[:, :9])
 
