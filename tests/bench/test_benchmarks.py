@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -203,6 +204,7 @@ def test_the_command_prints_a_table_with_the_hardware_and_its_json_is_complete(
     assert not content["quick"] and not content["interrupted"]
     assert set(content["machine"]) == {*host.Hardware.__annotations__, "load"}
     assert len(content["machine"]["load"]) == 2  # at the start and at the end
+    assert (None in content["machine"]["load"]) != hasattr(os, "getloadavg")
     (row,) = content["rows"]
     assert row["name"] == "quick" and row["floats"] == "float32"
     assert [figure["met"] for figure in row["figures"]] == [True, False]
@@ -438,6 +440,7 @@ def test_a_fit_is_measured_warm_and_in_processes_of_its_own_unless_it_is_interru
     assert empty_cache == full_cache and x64 == "1"
     assert sum("cost" in figure.note for figure in timings.figures) == 3
     assert timings.samples["its search, empty cache"] == [1.0]
+    assert set(measure("fit", cold=False).samples) == {"ours", "SciPy with our slopes"}
 
     def interrupted(problem, progress):
         return dataclasses.replace(find_best_fit(problem), interrupted=True)
