@@ -36,6 +36,7 @@ from fitting.report.page.study_page import Finding, Grid, Section, StudyPage, Te
 from fitting.report.plots import worst_window_plots
 from fitting.report.plots.style import save
 from fitting.studies import run_folder
+from fitting.studies.fit import Fit
 from fitting.studies.motions import comparison_motions, fit_motions
 from fitting.studies.posterior.run_comparison import ComparedRun
 from support import comparisons, runs
@@ -288,6 +289,12 @@ def test_the_page_says_what_was_found(page, fitted):
         assert line in page.text
     assert "leg.max_knee_angle 50.0 %" in page.text
     assert "never act in these clips: pelvis.limit." in page.text
+
+
+def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, monkeypatch):
+    monkeypatch.setattr(Fit, "playbacks", (playback(sigmas={"contact": 0.25}), playback()))
+    asked = dict(fit_page._asked(dataclasses.replace(fitted)))
+    assert asked["Noise, m and rad"] == "ankle 0.02, knee 0.03, pelvis 0.02, contact 0.25"
 
 
 def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
