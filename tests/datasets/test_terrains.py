@@ -457,10 +457,11 @@ def test_a_synthetic_slope_is_a_plane_also_of_a_bounded_number_of_stances(
     text = terrain_report.count_stances(ground)
     assert text == f"{count} stances; surfaces are fitted to 5 of all, evenly chosen"
     figure = terrain_plots.plan(ground, 0.5, walk.rig.names, "title")
-    (panel,) = [axes for axes in figure.axes if axes.get_ylabel() == "error, cm"]
-    for kind, prediction in ground.predictions.items():
-        drawn = [np.allclose(line.get_ydata(), 100 * prediction.errors) for line in panel.lines[:-1]]
-        assert any(drawn), kind
+    panels = {axes.get_ylabel(): axes.lines for axes in figure.axes}
+    drawn = {tuple(line.get_ydata()) for line in panels["error, cm"]}
+    assert drawn >= {tuple(100 * each.errors) for each in ground.predictions.values()}
+    shares = [list(line.get_ydata()) for line in panels["stances within this error, %"]]
+    assert shares == [pytest.approx([0, 20, 40, 60, 80, 100, 100])] * 3
 
 
 def test_the_terrain_of_the_uneven_walk_is_reconstructed_as_smooth(coarse_search):
