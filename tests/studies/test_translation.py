@@ -4,14 +4,18 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+import jaxik
 from fitting.analysis import difference
 from fitting.analysis.limit_activity import ClipActivity
 from fitting.cli import main
@@ -28,6 +32,7 @@ from fitting.studies import run_folder, translation
 from fitting.studies.animations import Animation
 from jaxik import presets
 from jaxik.maths import parameter_tree
+from jaxik.world.skeleton import Transform
 from support import quick, runs, small_studies
 from support.experiments import ROOT
 from support.refusals import refusal
@@ -162,6 +167,15 @@ def test_standing_and_moving_frames_are_counted_separately():
     )
     never = difference.Difference(half.legs, half.time, frames < 0, correction, correction)
     assert set(difference_report.numbers([never])) == {"all frames"}
+
+
+def test_a_character_stands_below_2_centimetres_a_second(run):
+    (scene,) = problems.make_problem(run_folder.load_fit(run)[0]).data
+    velocity = np.linspace([-0.03, 0.0, 0.0], [0.03, 0.0, 0.0], len(scene.frames.dt))
+    scene = replace(scene, frames=replace(scene.frames, velocity_ws=jnp.asarray(velocity)))
+    unmoved = Mock(spec=jaxik.Result, body=Transform.identity(), pose=scene.frames.pose)
+    slow = np.abs(velocity[:, 0]) < 0.02
+    np.testing.assert_array_equal(difference.measure(scene, unmoved).standing, slow)
 
 
 def test_a_quantity_that_the_source_does_not_correct_has_no_fraction():
