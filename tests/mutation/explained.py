@@ -28,6 +28,11 @@ NO_SIGN = "any negative number lets NumPy work out the length"
 REASONS = {
     "fitting/report/plots/calibration_plots.py": [("Line2D([], [], color=", "", LOOK)],
     "fitting/report/plots/fit_plots.py": [("(-5.0, 5.0, 41)", "(-5.0, 5.0, 40)", LOOK)],
+    "fitting/report/hierarchy/population_plots.py": [("columns=5", "columns= 4", LOOK)],
+    "fitting/bench/scaling_plot.py": [("figsize=(6.2", "figsize=( 7.2", LOOK)],
+    "fitting/cli/terminal/drawing.py": [
+        ("default=0", "default= 1", "the longest word counts only beyond a width of many characters")
+    ],
     "fitting/datasets/clips/formats/gltf/writer.py": [("GREY = [", "", LOOK)],
     "fitting/datasets/clips/assemble.py": [
         ("< PLAUSIBLE_RATIO", "<= PLAUSIBLE_RATIO", "rounding decides at exactly 1.5 times a leg")
@@ -37,6 +42,18 @@ REASONS = {
     ],
     "fitting/datasets/terrain/mesh_files.py": [
         ("hits: bool = True", "hits: bool = False", "a protocol's default is never taken")
+    ],
+    "fitting/inference/choice.py": [("scenes, u), strict=True", "scenes, u), strict=False", GUARD)],
+    "fitting/inference/noise/series.py": [
+        ("ITERATIONS = 100", f"ITERATIONS = {number}", "the last reweighting changes nothing")
+        for number in (99, 101)
+    ],
+    "fitting/inference/profiles/conditional.py": [
+        ("CANDIDATES = 12", f"CANDIDATES = {number}", "a random candidate more or less is as good")
+        for number in (11, 13)
+    ],
+    "fitting/inference/profiles/single_moves.py": [
+        ("GENERATIONS = 2", "GENERATIONS = 3", "more random combinations are as good")
     ],
     "fitting/inference/sampling/sampler.py": [
         ("length // 2", "length // 3", "two thirds of a chain teach as much as its last half")
