@@ -31,7 +31,7 @@ REASONS = {
     "fitting/report/hierarchy/population_plots.py": [("columns=5", "columns= 4", LOOK)],
     "fitting/bench/scaling_plot.py": [("figsize=(6.2", "figsize=( 7.2", LOOK)],
     "fitting/cli/terminal/drawing.py": [
-        ("default=0", "default= 1", "the longest word counts only beyond a width of many characters")
+        ("default=0", "default= 1", "the longest word counts only where it is long")
     ],
     "fitting/datasets/clips/formats/gltf/writer.py": [("GREY = [", "", LOOK)],
     "fitting/datasets/clips/assemble.py": [
