@@ -109,6 +109,8 @@ def test_an_outlier_is_found_out(problem):
     assert of_kinds["knee"][-1] == "largest residual" and of_kinds["ankle"] == []
     text = predictive.sentence(checks)
     assert text.startswith("The captured motion is unlike") and "knee position" in text
+    of_two = [*checks, *(dataclasses.replace(check, clip=1) for check in checks)]
+    assert "knee position of clip 2 (" in predictive.sentence(of_two) and " of clip " not in text
     heavy = dataclasses.replace(spoilt, loss="student", tails=jnp.asarray(4.0))
     assert "largest residual" not in surprises(heavy)["knee"]
 
