@@ -458,9 +458,9 @@ def test_a_synthetic_slope_is_a_plane_also_of_a_bounded_number_of_stances(
     assert text == f"{count} stances; surfaces are fitted to 5 of all, evenly chosen"
     figure = terrain_plots.plan(ground, 0.5, walk.rig.names, "title")
     panels = {axes.get_ylabel(): axes.lines for axes in figure.axes}
-    drawn = {tuple(line.get_ydata()) for line in panels["error, cm"]}
+    drawn = {tuple(np.asarray(line.get_ydata())) for line in panels["error, cm"]}
     assert drawn >= {tuple(100 * each.errors) for each in ground.predictions.values()}
-    shares = [list(line.get_ydata()) for line in panels["stances within this error, %"]]
+    shares = [list(np.asarray(line.get_ydata())) for line in panels["stances within this error, %"]]
     assert shares == [pytest.approx([0, 20, 40, 60, 80, 100, 100])] * 3
 
 
