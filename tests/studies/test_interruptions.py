@@ -170,8 +170,10 @@ def test_a_killed_fit_goes_on_after_its_search_and_after_the_last_stage_of_its_p
         patch.setattr(profiling, "STAGES", [*stages[:4], kill])
         fitting.fit(experiment_file, killed, log=lines.append)
     assert "a fit that was interrupted here goes on after 14 stages of its search" in lines
-    whole = killed.parent / "whole"
-    fitting.fit(experiment_file, whole)
+    whole, rehearsal = killed.parent / "whole", Mock()
+    monkeypatch.setattr(fits, "Rehearsal", rehearsal)
+    fitting.fit(experiment_file, whole, report=False)
+    rehearsal.assert_not_called()  # its motions are for the report
     monkeypatch.setattr(profiling, "STAGES", [kill] * 4 + stages[4:])
     fitting.fit(experiment_file, killed, log=lines.append)
     assert any(line.endswith(" of its search and 4 of its profiles") for line in lines)
