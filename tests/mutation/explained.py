@@ -109,6 +109,7 @@ REASONS = {
             "the grid begins below all corners",
         ),
         ("pitch + 0.37", "pitch + 1.37", "a grid with a row more finds the same"),
+        ("first_parts[level.cell] < 0", "first_parts[level.cell] <= 0", "no part has the number 0"),
     ],
     "jaxik/world/frame.py": [
         ("zeros_like(points_ws[..., 0]", "zeros_like(points_ws[..., 1]", "both have one shape")
