@@ -51,6 +51,7 @@ REASONS = {
         ("ITERATIONS = 100", f"ITERATIONS = {number}", "the last reweighting changes nothing")
         for number in (99, 101)
     ],
+    "fitting/inference/optimisation/kept_stages.py": [("(before.best, before.point)", "[]", SPEED)],
     "fitting/inference/profiles/conditional.py": [
         ("CANDIDATES = 12", f"CANDIDATES = {number}", "a random candidate more or less is as good")
         for number in (11, 13)
