@@ -9,7 +9,9 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.patches import StepPatch
 from PIL import Image
+from scipy import stats
 
 from fitting.analysis import worst_window
 from fitting.analysis.accuracy import Accuracy
@@ -33,7 +35,7 @@ from fitting.report.page import (
 )
 from fitting.report.page.comparisons import compare_page, compare_sentences, runs_page
 from fitting.report.page.study_page import Finding, Grid, Section, StudyPage, Text
-from fitting.report.plots import worst_window_plots
+from fitting.report.plots import goodness_plots, worst_window_plots
 from fitting.report.plots.style import save
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
@@ -212,6 +214,17 @@ def test_the_picture_shows_the_window_with_its_stances(tmp_path):
     save(tmp_path / "worst.png", figure)
     with Image.open(tmp_path / "worst.png") as picture:
         assert 1000 < picture.width < 2000 and 1000 < picture.height < 2500
+
+
+def test_normal_residuals_are_drawn_beside_the_density_of_the_normal_distribution():
+    knees = {"knee": np.random.default_rng(1).normal(0.0, 0.03, (FRAMES, 2, 3))}
+    _, _, _, axes, *_ = goodness_plots.noise(playback(knees), "are the residuals noise?").axes
+    across, density = map(np.asarray, axes.lines[0].get_data())
+    np.testing.assert_allclose(density, stats.norm.pdf(across))
+    (steps,) = axes.patches
+    assert isinstance(steps, StepPatch)
+    heights, edges, _ = steps.get_data()
+    np.testing.assert_allclose(heights, stats.norm.pdf((edges[1:] + edges[:-1]) / 2), atol=0.06)
 
 
 HOSTILE = "</script><script>alert(1)</script>"
