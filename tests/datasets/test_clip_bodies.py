@@ -312,8 +312,12 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_or_else_those_of_feet_
     higher, rotations = floor_walk.positions_ws + [0.0, 0.3, 0.0], floor_walk.rotations_ws
     raised = rigs.measure_soles(floor_walk.rig, higher, rotations, floor_walk.stance_labels(), 0.3)
     assert raised.measured.all() and np.allclose(raised.ankle, 0.05, atol=1e-12)
-    for stance in (walk.stance, np.zeros_like(walk.stance)):  # on stairs, and without a stance
-        soles = rigs.measure_soles(walk.measured_rig, walk.positions_ws, walk.rotations_ws, stance)
+    middle = np.median(walk.joints_ws(3)[walk.stance][:, 1])
+    unlabelled = replace(walk, stance=np.zeros_like(walk.stance))
+    # On stairs, without a stance, and far over the floor.
+    for clip, floor in ((walk, 0.0), (walk, middle), (unlabelled, 0.0), (floor_walk, -0.3)):
+        moved = clip.positions_ws, clip.rotations_ws, clip.stance
+        soles = rigs.measure_soles(clip.rig, *moved, floor)
         assert not soles.measured.any()
         assert np.allclose(soles.ball, 0.45 * np.hypot(0.1, 0.05))
         assert np.allclose(soles.ankle - soles.ball, 0.05)
