@@ -207,7 +207,8 @@ def test_a_run_gets_a_summary_and_every_plot_that_it_links(fitted, tmp_path, mon
     nudges = limit_activity.nudge_thresholds(fitted.problem, fitted.solution.u)
     down, up = nudges["contact.planted_height"]
     nudged = line_of(text.split("threshold moves")[1], "contact.planted_height")
-    assert f"{down.rise:+.1f}" in nudged and f"{up.rise:+.1f}" in nudged
+    for nudge in (down, up):
+        assert f"| {100 * nudge.flipped:.2f} % | {nudge.rise:+.1f} |" in nudged
     (activity,) = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
     fraction = f"{100 * activity.limits['pelvis.limit']:.1f} %"
     assert line_of(text, "pelvis.limit") == f"| pelvis.limit | {fraction} |"
