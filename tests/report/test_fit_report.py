@@ -456,6 +456,14 @@ def test_the_lines_of_known_values_cross_in_every_panel_of_their_parameters_or_i
     assert {0.61, 0.55} <= first_coordinates(axes)[0]
 
 
+def test_the_legend_of_a_chain_says_how_many_of_its_walkers_are_drawn():
+    figure = posterior_plots.chain(invented_posterior(), list(VALUES), None, "chain")
+    assert [len(axes.lines) for axes in figure.axes] == [12] * (1 + len(VALUES))
+    (legend,) = figure.legends
+    labels = [text.get_text() for text in legend.texts]
+    assert labels == ["walkers (12 of 12 shown)", "burn-in, discarded"]
+
+
 def test_islands_are_shown_with_weights_exchanges_and_medians():
     found = (island(0.81, 250, 0.0), island(0.19, 250, 1.5))
     assert "2 islands: 81.0 % ± 1.2 %, 19.0 % ± 1.2 %" in text_of(islands=found)
