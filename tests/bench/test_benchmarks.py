@@ -31,6 +31,7 @@ from fitting.bench.roofline import Work
 from fitting.bench.runner import Benchmark
 from fitting.bench.sizes import Sizes
 from fitting.cli import main
+from fitting.datasets.clip_frames import frames_from_clip
 from fitting.inference.optimisation.search import find_best_fit
 from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
@@ -345,6 +346,15 @@ def test_rays_are_compared_with_embree_where_it_is_installed(monkeypatch):
     monkeypatch.setattr(kernels.mesh_files, "embree_tracer", lambda vertices, faces: None)
     timings = measure("rays")
     assert list(timings.samples) == ["ours"] and "not installed" in timings.notes[0]
+
+
+def test_legs_of_a_character_are_repeated_in_its_rig_and_in_its_frames():
+    clip = workloads.walk(4)
+    rig, motion = workloads.with_legs(clip.rig, frames_from_clip(clip), 5)
+    assert rig.side.tolist() == [1.0, -1.0, 1.0, -1.0, 1.0] and len(set(rig.names)) == 5
+    ankles = np.asarray(motion.pose.ankle.pos)
+    assert ankles.shape == (4, 5, 3) and motion.dt.shape == (4,)
+    np.testing.assert_array_equal(ankles[:, 2:], ankles[:, :3])
 
 
 def test_a_crowd_in_chunks_is_the_whole_crowd():

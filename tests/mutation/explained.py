@@ -57,6 +57,13 @@ REASONS = {
         ("ITERATIONS = 100", f"ITERATIONS = {number}", "the last reweighting changes nothing")
         for number in (99, 101)
     ],
+    "fitting/viewer/overlays.py": [("(230, 159, 0)", "", LOOK)],
+    "fitting/studies/drafts/draft.py": [
+        ("rig = data[0]", "rig = data[ -1]", "either clip has a body to start from")
+    ],
+    "fitting/studies/calibration/replicates.py": [
+        ("noise_factor: float = 1.0", "", "the calibration always says which")
+    ],
     "fitting/inference/optimisation/kept_stages.py": [("(before.best, before.point)", "[]", SPEED)],
     "fitting/inference/profiles/conditional.py": [
         ("CANDIDATES = 12", f"CANDIDATES = {number}", "a random candidate more or less is as good")

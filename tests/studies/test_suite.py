@@ -14,6 +14,7 @@ from fitting.analysis.placement import Extreme
 from fitting.cli import main
 from fitting.datasets.synthetic import gait
 from fitting.experiments.systems import preset_names, preset_system
+from fitting.report.plots import suite_plots
 from fitting.report.suite import suite_report, suite_tables
 from fitting.runtime.precision import in_float64
 from fitting.studies.suite import bounds, grounds, situations
@@ -154,6 +155,8 @@ def test_what_is_beyond_its_bound_has_a_mark_and_is_red_in_the_page_and_the_tabl
     assert all(reason in text for reason in bounds.REASONS.values())
     assert "stairs up, still: in the ground" in text and "no motion: " in text
     assert (folder / suite_report.PAGE).read_bytes().startswith(b"\x89PNG")
+    low, high = suite_plots.page(suite).axes[0].get_ylim()
+    assert -0.3 < low < -0.2 and 1.0 < high < 1.2  # from below the soles to above the pelvis
 
 
 def test_misses_say_where_and_how_far():
