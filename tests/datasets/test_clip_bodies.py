@@ -316,7 +316,7 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_or_else_those_of_feet_
     unlabelled = replace(walk, stance=np.zeros_like(walk.stance))
     # On stairs, without a stance, and far over the floor.
     for clip, floor in ((walk, 0.0), (walk, middle), (unlabelled, 0.0), (floor_walk, -0.3)):
-        moved = clip.positions_ws, clip.rotations_ws, clip.stance
+        moved = clip.positions_ws, clip.rotations_ws, clip.stance_labels()
         soles = rigs.measure_soles(clip.rig, *moved, floor)
         assert not soles.measured.any()
         assert np.allclose(soles.ball, 0.45 * np.hypot(0.1, 0.05))
