@@ -421,6 +421,7 @@ def test_the_quartic_curve_has_right_gradients_and_without_room_only_the_soft_on
     x, free, room = RNG.uniform(0.1, [[3.0], [1.0], [2.0]], (3, ROWS))
     x = np.where(np.abs(x - free) > 0.01, x, free + 0.02)
     gradients.assert_all_gradients_match(quartic_limit, x, free, free + room)
+    x, free = jnp.asarray(x), jnp.asarray(free)
     assert_allclose(quartic_limit(x, free, free), x, atol=0)
     assert_allclose(soft_limit(x, free, free), np.minimum(x, free), atol=0)
     by_x, *by_limits = jax.vmap(jax.grad(soft_limit, (0, 1, 2)))(x, free, free)
