@@ -203,7 +203,11 @@ def test_errors_name_file_and_line(write_bvh, tmp_path):
         ("0 87 1 0 0 5", "0 87 1 0 0 5,0", 49, "could not convert.*5,0"),
         ("0 87 1 0 0 5", "0 87 1 0 0 nan", 49, "finite"),
         ("OFFSET 10 0 0", "OFFSET 10 0", 8, "wanted 3 numbers of OFFSET"),
+        ("OFFSET 10 0 0", "OFFSET 10 0 0\nOFFSET 9 0 0", 9, "wanted OFFSET of LeftUpLeg once"),
+        ("OFFSET 10 0 0", "", 24, "wanted OFFSET of LeftUpLeg before its end"),
         ("CHANNELS 3 Zrot", "CHANNELS 4 Zrot", 9, "a count and as many"),
+        ("3 Zrotation Xr", "3 Zrotation Zr", 9, "wanted each channel once"),
+        ("JOINT LeftLeg", "CHANNELS 0\nJOINT LeftLeg", 10, "wanted CHANNELS of LeftUpLeg once"),
         ("JOINT LeftLeg", "JONT LeftLeg", 10, "in LeftUpLeg.*JONT LeftLeg"),
         ("JOINT LeftLeg", "JOINT Hips", 10, "not taken yet"),
         ("ROOT Hips\n", "JOINT Hips\n", 2, "wanted one ROOT"),
@@ -295,8 +299,9 @@ def test_a_bone_rotates_by_c_m_c_inverse_about_its_start(pair):
     # Carriage returns, radians and a missing last newline change nothing.
     crlf = read_asfamc(*pair(ASF.replace("\n", "\r\n"), AMC.replace("\n", "\r\n").rstrip()))
     assert np.array_equal(recording.rotations_ls, crlf.rotations_ls)
-    again = read_asfamc(*pair(ASF.replace("angle deg", "angle deg degrees")))
-    assert np.array_equal(recording.rotations_ls, again.rotations_ls), "only the first word counts"
+    for words in ("deg degrees", "degrees", "DEG"):  # the first counts
+        again = read_asfamc(*pair(ASF.replace("angle deg", f"angle {words}")))
+        assert np.array_equal(recording.rotations_ls, again.rotations_ls), words
     radians = AMC.replace(":DEGREES", ":RADIANS")
     for degrees in ("10 20 30", "5 6 7", "5 6 8", "40", "50"):
         words = " ".join(str(np.radians(float(word))) for word in degrees.split())
@@ -321,6 +326,10 @@ def test_errors_in_a_skeleton_or_motion_name_file_and_line(pair):
         ("direction 0 -1 0", "direction 0 -1", "a.asf:15: wanted 3 finite numbers of direction"),
         ("length 7", "length long", "a.asf:16: wanted 1 numbers of length"),
         ("length 0.45", "length 0", "a.asf:4: wanted a length unit above 0"),
+        ("angle deg", "angle grad", "a.asf:5: wanted an angle out of ('deg', 'degrees', 'rad', '"),
+        ("    length 7\n", "", "a.asf:21: wanted length before its end; got 'lfemur'"),
+        ("length 7", "length 7\nlength 8", "a.asf:17: wanted length once in a bone"),
+        ("2\nroot", "4\nroot", "a_01.amc:8: wanted frame 2 after frame 1; got '4'"),
         ("dof rx ry rz", "dof rx ry l", "a.asf:18: wanted degrees of freedom"),
         ("axis 10 20 30 XYZ", "axis 10 20 30 XXZ", "a.asf:17: wanted an axis order"),
         ("name ltibia", "name lfemur", "a.asf:30: wanted a bone name that is not taken"),

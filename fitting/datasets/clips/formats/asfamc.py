@@ -18,6 +18,8 @@ from fitting.runtime.validation import check_file
 
 AMC_RATE = 120.0  # Hz, by convention of the CMU database
 ROTATIONS = ("rx", "ry", "rz")
+ANGLES = {"deg": True, "degrees": True, "rad": False, "radians": False}  # whether in degrees
+PLACE = ("direction", "length", "axis")  # what each bone must state
 DEGREES_OF_FREEDOM = (*ROTATIONS, "tx", "ty", "tz")  # "l", a changing bone length, is refused
 
 
@@ -29,6 +31,7 @@ class _Bone:
     axis: tuple[np.ndarray, str] = (np.zeros(3), "XYZ")  # angles and their order
     freedoms: list[str] = field(default_factory=list)
     parent: str | None = None
+    stated: set[str] = field(default_factory=set)  # the keys of its lines
 
 
 @dataclass
@@ -95,7 +98,8 @@ def read_asfamc(amc: Path, asf: Path | None = None) -> Recording:
 
     Raises:
         ValueError: with file and line, where the text is neither ASF nor AMC, the skeleton or a
-            frame lacks a bone, or a line has the wrong count of numbers.
+            frame lacks a bone, a bone lacks its place or states something twice, frames are not
+            numbered in turn, or a line has the wrong count of numbers.
     """
     asf = find_asf(amc) if asf is None else asf
     skeleton = _read_asf(asf)
@@ -119,7 +123,9 @@ def _read_asf(path: Path) -> _Skeleton:
             if unit <= 0:
                 raise lines.error(number, "wanted a length unit above 0", words)
         elif section == "units" and key == "angle":
-            degrees = rest[:1] == ["deg"]
+            if (word := rest[0].lower() if rest else "") not in ANGLES:
+                raise lines.error(number, f"wanted an angle out of {tuple(ANGLES)}", words)
+            degrees = ANGLES[word]
         elif section == "root" and key == "order":
             root.freedoms = [_freedom(lines, number, words, word) for word in rest]
         elif section == "root" and key == "axis":
@@ -153,8 +159,14 @@ def _bone_line(
     if key == "end":
         if not bone.name or bone.name in bones:
             raise lines.error(number, "wanted a bone name that is not taken yet", [bone.name])
+        if missing := [place for place in PLACE if place not in bone.stated]:
+            raise lines.error(number, f"wanted {' and '.join(missing)} before its end", [bone.name])
         bones[bone.name] = bone
         return None
+    if key in ("name", *PLACE, "dof"):
+        if key in bone.stated:
+            raise lines.error(number, f"wanted {key} once in a bone", words)
+        bone.stated.add(key)
     if key == "name":
         bone.name = " ".join(rest)
     elif key == "direction":
@@ -199,7 +211,7 @@ def _in_order(path: Path, bones: dict[str, _Bone]) -> dict[str, _Bone]:
 def _read_amc(path: Path, skeleton: _Skeleton, asf: Path) -> tuple[dict[str, np.ndarray], bool]:
     """Values by bone, (frames, its degrees of freedom), and whether angles are in degrees."""
     lines = _Lines(path)
-    degrees, frame, start = skeleton.degrees, 0, 0
+    degrees, frame, start, label = skeleton.degrees, 0, 0, 0
     counts = {name: len(bone.freedoms) for name, bone in skeleton.bones.items()}
     values: dict[str, list[list[float]]] = {name: [] for name, count in counts.items() if count}
     for number, words in lines.numbered:
@@ -208,7 +220,9 @@ def _read_amc(path: Path, skeleton: _Skeleton, asf: Path) -> tuple[dict[str, np.
             degrees = {":degrees": True, ":radians": False}.get(name.lower(), degrees)
         elif len(words) == 1 and name.isdecimal():
             _check_complete(lines, start, values, frame)
-            frame, start = frame + 1, number
+            if frame and int(name) != label + 1:
+                raise lines.error(number, f"wanted frame {label + 1} after frame {label}", words)
+            frame, start, label = frame + 1, number, int(name)
         elif name not in values or not frame:
             wanted = f"wanted a frame number, then bones of {asf.name} out of {list(values)}"
             raise lines.error(number, wanted, words)

@@ -28,7 +28,8 @@ def read_bvh(path: Path) -> Recording:
 
     Raises:
         ValueError: with file and line, where the text is not BVH, a number is missing, superfluous
-            or not finite, or there are fewer frames than declared.
+            or not finite, a joint has no offset or states something twice, or there are fewer
+            frames than declared.
     """
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return _Reader(path, lines).read()
@@ -44,6 +45,7 @@ class _Reader:
         self.offsets: list[list[float]] = []
         self.channels: list[list[tuple[str, str]]] = []  # per joint, of (axis, position | rotation)
         self.spellings: list[list[str]] = []  # the same, as in the file
+        self.stated: set[tuple[int, str]] = set()  # joints and what of them has been read
 
     def read(self) -> Recording:
         if self._next("HIERARCHY").upper() != "HIERARCHY":
@@ -94,12 +96,15 @@ class _Reader:
             if keyword in ("ROOT", "JOINT", "END"):
                 self._begin(keyword, words, open_joints)
             elif keyword == "OFFSET" and open_joints:
+                self._state(open_joints[-1], keyword)
                 self.offsets[open_joints[-1]] = self._numbers(words[1:], 3, "OFFSET")
             elif keyword == "CHANNELS" and open_joints:
+                self._state(open_joints[-1], keyword)
                 self.channels[open_joints[-1]] = self._channels(words)
                 self.spellings[open_joints[-1]] = words[2:]
             elif keyword == "}" and open_joints:
-                open_joints.pop()
+                if (joint := open_joints.pop(), "OFFSET") not in self.stated:
+                    raise self._error(f"wanted OFFSET of {self.names[joint]} before its end")
             elif keyword == "MOTION" and self.names and not open_joints:
                 return
             else:
@@ -107,6 +112,11 @@ class _Reader:
                 raise self._error(
                     f"wanted JOINT, End Site, OFFSET, CHANNELS, }} or MOTION ({where})"
                 )
+
+    def _state(self, joint: int, keyword: str) -> None:
+        if (joint, keyword) in self.stated:
+            raise self._error(f"wanted {keyword} of {self.names[joint]} once")
+        self.stated.add((joint, keyword))
 
     def _begin(self, keyword: str, words: list[str], open_joints: list[int]) -> None:
         if (keyword == "ROOT") != (not self.names) or (keyword != "ROOT" and not open_joints):
@@ -131,7 +141,10 @@ class _Reader:
         matches = [CHANNEL.fullmatch(word) for word in words[2:]]
         if len(words) < 2 or words[1] != str(len(matches)) or None in matches:
             raise self._error("wanted CHANNELS, a count and as many of [XYZ](position|rotation)")
-        return [(match[1].lower(), match[2].lower()) for match in matches if match]
+        channels = [(match[1].lower(), match[2].lower()) for match in matches if match]
+        if len(set(channels)) < len(channels):
+            raise self._error("wanted each channel once")
+        return channels
 
     def _header(self) -> tuple[int, float]:
         """The declared number of frames and the frame time, s."""
