@@ -28,8 +28,8 @@ from fitting.report.plots import style, terrain_plots
 from jaxik.world import terrain
 from jaxik.world.heightfield import Heightfield
 from jaxik.world.surfaces import Mesh
+from support.commands import refusal
 from support.experiments import ROOT
-from support.refusals import refusal
 from support.sample_clips import flat_floor, stair_walk
 
 LEVELS = (np.arange(5)[:, None] * 1000 + np.arange(7) * 10).astype(np.uint16)  # rows along z
@@ -154,6 +154,13 @@ WITHOUT_TERRAIN = {
     "text.obj": "v 0 0 0\nv 1 0 0\n",
     "text.stl": "solid nothing\nendsolid nothing\n",
     "text.off": "OFF\n3 1 0\n0 0 0\n1 0 nan\n0 0 1\n3 0 1 2\n",
+    "cut.ply": "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n",
+    "cut.off": "OFF  # of two triangles\n3 2 0\n0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n",
+    "short.off": "OFF\n3 2 0\n0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n3 1 2\n",
+    "cut.stl": "solid a\nfacet normal 0 1 0\nouter loop\nvertex 0 0 0\nvertex 0 0 1\n"
+    "vertex 1 0 0\nendloop\nendfacet\nfacet",
     **dict.fromkeys(("text.ply", "text.npz", "text.npy", "text.png", "text.fbx"), "x"),
 }
 
@@ -193,6 +200,10 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
         ("text.obj", {}, "text.obj: .*needs triangles; the file holds PointCloud"),
         ("text.stl", {}, "text.stl: .*needs triangles"),
         ("text.off", {}, "text.off: .*vertices are not finite"),
+        ("cut.ply", {}, "cut.ply: .*head announces 5 lines of vertices and faces, there are 4"),
+        ("cut.off", {}, "cut.off: .*head announces 5 lines of vertices and faces, there are 4"),
+        ("short.off", {}, "short.off: .*the file is cut off in line 5 after its head"),
+        ("cut.stl", {}, "cut.stl: .*cut off after 1 triangles: it has no endsolid"),
         ("nowhere.ply", {}, "nowhere.ply: no such file"),
         ("nowhere.npz", {}, "nowhere.npz: no such file"),
         (ROOT / "data" / "clips" / "uneven_walk_base.npz", {}, "the file has .*joint_names"),

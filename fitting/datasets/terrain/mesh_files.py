@@ -20,7 +20,7 @@ from fitting.datasets import gltf_checks
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
 
-from . import heightfield_files
+from . import cut_off_text, heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
 FAR = 512.0  # m; further from the origin, 32 bits do not hold a tenth of a millimetre
@@ -203,6 +203,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
     content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
+        cut_off_text.check_whole(kind, content)
         content = gltf_checks.checked(kind, content)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
