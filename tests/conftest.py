@@ -23,6 +23,7 @@ from fitting.cli.terminal import plain_lines
 from fitting.runtime import xla
 from fitting.runtime.parallel import beside
 from fitting.runtime.storage import compiled_programs
+from support.pages import save_pixel
 
 xla.configure_xla()  # as the commands do
 jax.config.update("jax_enable_x64", True)
@@ -118,8 +119,8 @@ def optimised() -> Iterator[None]:
 
 @pytest.fixture
 def undrawn(monkeypatch) -> None:
-    """Figures are made but files stay empty, for tests of something else: drawing takes long."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **look: Path(path).write_bytes(b""))
+    """Files hold a pixel of a figure, for tests of something else: drawing takes long."""
+    monkeypatch.setattr(Figure, "savefig", save_pixel)
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 import argparse
 import atexit
 import gc
-import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from fitting.runtime.validation import in_one_line
 
 from . import without_jax
 from .parser import make_parser
-from .terminal import watched
+from .terminal import unread, watched
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
 MISTAKE, INTERRUPTED = 2, 130  # exit statuses
@@ -31,27 +30,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return MISTAKE
     options = make_parser().parse_args(words)
     try:
-        with warnings.catch_warnings():
+        with unread.work_goes_on(), warnings.catch_warnings():
             warnings.showwarning = _show_warning
             with watched():
-                status = _function(options.command)(options)
-            _flush()
-            return status
-    except BrokenPipeError:  # the reader, such as `head`, has enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+                return _function(options.command)(options)
     except (ValueError, OSError) as error:
         print(f"jaxik {options.command}: {in_one_line(error)}", file=sys.stderr)
         return MISTAKE
     except KeyboardInterrupt:
         print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
         return INTERRUPTED
-
-
-def _flush() -> None:
-    """Passes on what was printed, unless stdout was closed."""
-    if sys.stdout is not None:
-        sys.stdout.flush()
 
 
 def _function(command: str) -> Callable[[argparse.Namespace], int]:

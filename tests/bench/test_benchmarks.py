@@ -37,9 +37,9 @@ from fitting.runtime import xla
 from fitting.runtime.threads import usable_cores
 from jaxik import presets
 from support.clips import assert_close
+from support.commands import refusal
 from support.problems import problem_of
 from support.quick import TARGETS, residuals_of_scenes
-from support.refusals import refusal
 
 
 @pytest.fixture(autouse=True)

@@ -34,9 +34,8 @@ from fitting.jobs import examples
 from fitting.runtime import activity
 from jaxik.maths import parameter_tree
 from support import gltf_files, grounds
-from support.commands import commands
+from support.commands import commands, refusal
 from support.experiments import ROOT, write
-from support.refusals import refusal
 from support.sample_clips import BVH
 
 DATA = ROOT / "data"
@@ -93,9 +92,7 @@ def test_wrong_words_are_rejected_and_an_old_one_still_works_and_says_the_new_on
     assert error.startswith("jaxik ablate: ") and "no such file" in error
 
 
-def test_an_interrupt_swallowed_by_a_hook_is_raised_later_and_a_closed_pipe_is_no_error(
-    monkeypatch,
-):
+def test_an_interrupt_swallowed_by_a_hook_is_raised_later(monkeypatch):
     def show(_) -> str:
         try:
             signal.raise_signal(signal.SIGINT)
@@ -110,11 +107,23 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_later_and_a_closed_pipe_is_n
         with pytest.raises(KeyboardInterrupt):
             line(report)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    reader, writer = os.pipe()
-    os.close(reader)
-    with os.fdopen(writer, "w") as stdout:
+
+
+def test_work_goes_on_when_nobody_reads_what_is_printed(monkeypatch, tmp_path):
+    def work(_) -> int:
+        for stream in 2 * (sys.stdout, sys.stderr):
+            print("a line", file=stream, flush=True)
+        (tmp_path / "result").touch()
+        return 3
+
+    monkeypatch.setattr(main, "_function", lambda command: work)
+    (reader, out), (other, err) = os.pipe(), os.pipe()
+    with os.fdopen(out, "w") as stdout, os.fdopen(err, "w") as stderr:
         monkeypatch.setattr(sys, "stdout", stdout)
-        run("inspect", BASE)
+        monkeypatch.setattr(sys, "stderr", stderr)
+        os.close(reader)
+        os.close(other)
+        assert main.main(["doctor"]) == 3 and (tmp_path / "result").exists()
 
 
 def test_a_mistake_is_reported_and_nothing_written(tmp_path, capsys, monkeypatch):

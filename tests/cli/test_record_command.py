@@ -9,8 +9,8 @@ import pytest
 
 from fitting.cli import main
 from jaxik import record
+from support.commands import refusal
 from support.records import ADULT, packed
-from support.refusals import refusal
 
 
 def record_command(*words: object) -> int:

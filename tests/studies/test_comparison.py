@@ -32,9 +32,9 @@ from fitting.studies.frame_rates import every_frame, measure
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
 from support import comparisons
+from support.commands import refusal
 from support.experiments import ROOT
 from support.pages import Page
-from support.refusals import refusal
 
 pytestmark = pytest.mark.filterwarnings("always::fitting.report.placement_report.PlacementWarning")
 

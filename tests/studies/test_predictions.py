@@ -30,10 +30,10 @@ from fitting.studies.posterior import likelihoods
 from fitting.studies.posterior.replay import Replay, replay
 from fitting.studies.posterior.replay_summary import summarise_replay
 from fitting.studies.posterior.run_comparison import compare_runs
+from support.commands import refusal
 from support.experiments import write
 from support.pages import Page
 from support.problems import posterior_of
-from support.refusals import refusal
 
 TRUTH = np.array([0.7, -1.2])
 KINDS = ("ankle", "knee", "pelvis", "foot")

@@ -10,8 +10,8 @@ import fitting
 from fitting.experiments import problems
 from fitting.runtime.storage.claimed_folder import claimed
 from support import quick, small_studies
+from support.commands import refusal
 from support.experiments import FREE, ROOT, write
-from support.refusals import refusal
 from support.small_studies import HALF_SECOND, VARYING
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"

@@ -32,8 +32,8 @@ from fitting.studies.sample import walker_start
 from fuzz import kept_files
 from jaxik.maths import parameter_tree
 from support import quick, small_studies
+from support.commands import refusal
 from support.experiments import ROOT, write
-from support.refusals import refusal
 from support.runs import NAMES, invented_fit, save
 from support.small_studies import HALF_SECOND
 

@@ -34,9 +34,9 @@ from jaxik import presets
 from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
 from support import quick, runs, small_studies
+from support.commands import refusal
 from support.experiments import ROOT
-from support.refusals import refusal
-from support.small_studies import save_pixel
+from support.pages import save_pixel
 
 GROUND = ROOT / "data" / "terrains" / "uneven_walk.ply"
 TRUTH = {"pelvis.on_gain": 0.45, "pelvis.limit": 0.17}

@@ -1,7 +1,10 @@
-"""The commands of `jaxik` as its parser knows them."""
+"""The commands of `jaxik`: all that its parser knows, and what they do when they refuse."""
 
 import argparse
+from collections.abc import Iterable
+from pathlib import Path
 
+from fitting.cli import main
 from fitting.cli.parser import make_parser
 
 
@@ -17,3 +20,25 @@ def _below(parser: argparse.ArgumentParser, words: str):
                 command = f"{words} {name}".strip()
                 yield command, child
                 yield from _below(child, command)
+
+
+def refusal(words: Iterable[object], folder: Path, capsys, *, silent: bool = True) -> str:
+    """The one line that a command prints of a mistake, while nothing in this folder changes.
+
+    Args:
+        words: of the command.
+        folder: what it must leave as it is.
+        capsys: pytest's.
+        silent: whether it prints nothing before.
+    """
+    before = _content(folder)
+    assert main.main([str(word) for word in words]) == main.MISTAKE
+    output = capsys.readouterr()
+    (line,) = output.err.splitlines()
+    assert not (silent and output.out) and _content(folder) == before
+    return line
+
+
+def _content(folder: Path) -> dict[Path, bytes]:
+    """All that is in a folder; of folders, that they are there."""
+    return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from PIL import Image
 from pytest import MonkeyPatch
 
 from fitting.experiments import problems
@@ -44,11 +42,6 @@ MEASURED = ((0.2, 0.41), (0.5, 0.39), (0.3, 0.4))  # in them, in the order of FR
 def quick_fits(patch: MonkeyPatch) -> None:
     """Fits take no time."""
     patch.setattr(problems, "residuals_of_scenes", quick.residuals_of_scenes)
-
-
-def save_pixel(figure: Figure, path: str | Path, **look: object) -> None:
-    """In place of `Figure.savefig`: a file that pages can embed."""
-    Image.new("RGB", (1, 1)).save(path, format="PNG")
 
 
 # Ablation

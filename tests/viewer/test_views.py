@@ -29,8 +29,8 @@ from fitting.viewer.tuning import PAUSE, Tuning
 from jaxik import presets, record
 from jaxik.maths import parameter_tree
 from support import runs
+from support.commands import refusal
 from support.experiments import ROOT
-from support.refusals import refusal
 
 FAITHFUL = Preset("record", faithful=True)
 
