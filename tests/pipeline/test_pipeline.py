@@ -8,6 +8,7 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -22,7 +23,6 @@ from support import clips
 from support.agreement import assert_agreement
 from support.cases import QUICK
 from support.clips import ODD, at, named, to_ik
-from support.padding import three_legged
 
 LEGS, HZ, FRAMES = 3, 20, 200
 STANDS = (0.05, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.95)  # start, end, ..., fractions of the clip
@@ -162,6 +162,30 @@ def with_numbers_a_leg(ik: Any) -> Any:
     """The system with a number a leg wherever it may have that: all cases share a program."""
     shared = {x.name: x.value for x in slots(ik) if x.per_leg and x.value.shape == x.shape}
     return parameter_tree.replace(ik, {name: [value] * LEGS for name, value in shared.items()})
+
+
+def padded_leg(tree, legs: int, axis: int):
+    """The tree with a padding leg: no position, no bones."""
+
+    def widen(leaf):
+        missing = legs - leaf.shape[axis]
+        return jnp.pad(leaf, [(0, missing if a == axis else 0) for a in range(leaf.ndim)])
+
+    return jax.tree.map(widen, tree)
+
+
+def three_legged(rig: jaxik.Rig, frames: jaxik.Frame) -> tuple[jaxik.Rig, jaxik.Frame]:
+    """A rig and its clip with one padding leg, whose weight is 1 all the same."""
+    wide = padded_leg(rig, 3, axis=0)
+    third = clips.to_rig(clips.make_rig(legs=3))
+    wide = dataclasses.replace(wide, names=third.names, joints=third.joints, pelvis=12)
+    pose = padded_leg(frames.pose, 3, axis=1)
+    weight = jnp.concatenate([frames.weight, jnp.ones((len(frames.weight), 1))], axis=1)
+    stride_and_speeds = {
+        name: padded_leg(getattr(frames, name), 3, axis=1)
+        for name in ("foot_speed", "toe_speed", "stride")
+    }
+    return wide, dataclasses.replace(frames, pose=pose, weight=weight, **stride_and_speeds)
 
 
 def compare(name: str, values: dict[str, Any], scene: Any, ups: Any = None) -> dict[str, Any]:
