@@ -1,16 +1,17 @@
 """Streams whose reader may go, as that of `jaxik fit … | head` does, while the work goes on."""
 
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 
 class _Stream:
     """A stream that falls silent when nobody reads it any more, instead of failing."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: io.TextIOBase) -> None:
         self._stream = stream
 
     def write(self, text: str, /) -> int:
