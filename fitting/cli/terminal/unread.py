@@ -20,6 +20,9 @@ class _Stream:
     def flush(self) -> None:
         self._try(self._stream.flush)
 
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
     def _try(self, call: Callable[[], int | None]) -> int | None:
         try:
             return call()
