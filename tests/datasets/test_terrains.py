@@ -57,6 +57,12 @@ def test_meshes_of_all_formats_are_turned_scaled_joined_and_moved(tmp_path):
         ramp().export(tmp_path / f"ramp.{suffix}")
         ground = load_terrain(tmp_path / f"ramp.{suffix}")
         np.testing.assert_allclose(heights(ground, (0.4, 0.3)), 0.2, atol=1e-6)
+    edges = (
+        "element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header"  # last, two a line
+    )
+    whole = WITHOUT_TERRAIN["cut.ply"].replace("face 2", "face 1").replace("end_header", edges)
+    (tmp_path / "edges.ply").write_text(whole + "2 0\n")
+    assert heights(load_terrain(tmp_path / "edges.ply"), (0.2, 0.2)) == 0.0
     scene = trimesh.Scene()
     for name, place in (("low", (0.0, 0.0, 0.0)), ("high", (3.0, 1.0, 0.0))):
         transform = trimesh.transformations.translation_matrix(place)
@@ -159,8 +165,7 @@ WITHOUT_TERRAIN = {
     "0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n",
     "cut.off": "OFF  # of two triangles\n3 2 0\n0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n",
     "short.off": "OFF\n3 2 0\n0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n3 1 2\n",
-    "cut.stl": "solid a\nfacet normal 0 1 0\nouter loop\nvertex 0 0 0\nvertex 0 0 1\n"
-    "vertex 1 0 0\nendloop\nendfacet\nfacet",
+    "cut.stl": "solid a\nfacet normal 0 1 0\nouter loop\nvertex 0 0 0\nvertex 0 0 1\n",
     **dict.fromkeys(("text.ply", "text.npz", "text.npy", "text.png", "text.fbx"), "x"),
 }
 
@@ -203,7 +208,7 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
         ("cut.ply", {}, "cut.ply: .*head announces 5 lines of vertices and faces, there are 4"),
         ("cut.off", {}, "cut.off: .*head announces 5 lines of vertices and faces, there are 4"),
         ("short.off", {}, "short.off: .*the file is cut off in line 5 after its head"),
-        ("cut.stl", {}, "cut.stl: .*cut off after 1 triangles: it has no endsolid"),
+        ("cut.stl", {}, "cut.stl: .*the file is cut off: it has no endsolid"),
         ("nowhere.ply", {}, "nowhere.ply: no such file"),
         ("nowhere.npz", {}, "nowhere.npz: no such file"),
         (ROOT / "data" / "clips" / "uneven_walk_base.npz", {}, "the file has .*joint_names"),

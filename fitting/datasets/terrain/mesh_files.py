@@ -20,7 +20,7 @@ from fitting.datasets import gltf_checks
 from fitting.runtime.validation import QUOTED, check_file, error_context, in_one_line
 from jaxik.world import terrain
 
-from . import cut_off_text, heightfield_files
+from . import heightfield_files
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
 FAR = 512.0  # m; further from the origin, 32 bits do not hold a tenth of a millimetre
@@ -203,7 +203,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     options: dict[str, Any] = {"skip_materials": True} if kind in WITH_MATERIALS else {}
     content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
-        cut_off_text.check_whole(kind, content)
+        _check_whole(kind, content)
         content = gltf_checks.checked(kind, content)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
@@ -225,6 +225,41 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     if vertices.shape[1:] != (3,):
         raise ValueError(f"{path}: its vertices have {vertices.shape[-1]} coordinates; wanted 3")
     return vertices, np.array(mesh.faces, np.int64)
+
+
+def _check_whole(kind: str, content: bytes) -> None:
+    """ValueError for a text that ends too early: trimesh would take the triangles that are there.
+
+    Binary files that do fail by themselves, and an OBJ does not say what it holds.
+    """
+    announced, rows, has_faces_last = 0, [], False
+    if kind == "ply" and b"format ascii" in (head := content.partition(b"end_header")[0]):
+        rows = content.partition(b"end_header")[2].splitlines()
+        elements = [part.split() for part in head.split(b"element ")[1:]]
+        counts = [int(words[1]) for words in elements]
+        announced, last = (
+            sum(counts),
+            [words for words, n in zip(elements, counts, strict=True) if n],
+        )
+        has_faces_last = bool(last) and last[-1][2:4] == [b"property", b"list"]
+    elif kind == "off":
+        lines = [line.partition(b"#")[0] for line in content.splitlines()]
+        head, *rows = b"\n".join(lines).partition(b"OFF")[2].strip().splitlines() or [b""]
+        counts = [int(word) for word in head.split()[:2]]
+        announced, has_faces_last = sum(counts), counts[1:] > [0]
+    elif kind == "stl" and content.lstrip()[:5].lower() == b"solid" and b"\0" not in content:
+        if b"endsolid" not in content.lower():
+            raise ValueError("the file is cut off: it has no endsolid")
+    rows = [row for row in rows if row.strip()]
+    if len(rows) < announced:
+        raise ValueError(
+            f"the file is cut off: its head announces {announced} lines of vertices and faces, "
+            f"there are {len(rows)}"
+        )
+    if has_faces_last:
+        corners = rows[announced - 1].split()
+        if len(corners) <= int(corners[0]):
+            raise ValueError(f"the file is cut off in line {announced} after its head")
 
 
 @contextmanager
