@@ -75,7 +75,7 @@ def _frame_costs_of_clip(
     problem: Problem[jaxik.FootIK], playback: Playback
 ) -> dict[str, np.ndarray]:
     frames, costs = len(playback.dt), {}
-    fraction, tails = float(problem.independent_fraction), float(problem.tails)
+    fraction, tails = float(problem.weight), float(problem.tails)
     for kind, residuals in playback.residuals.items():
         squares = np.asarray(residuals).reshape(len(residuals), -1) ** 2
         of_loss = rho(squares, problem.loss, tails, np)

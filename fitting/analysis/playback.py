@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxik
-from fitting.problem.residuals import errors_by_kind, residuals_by_kind
+from fitting.problem.residuals import errors_by_kind, errors_of_pose, residuals_by_kind
 from fitting.problem.scene import Scene, legs_ws, own_system, pelvis_ws
 from fitting.problem.shared_world import groups, run_scenes
 from fitting.runtime import program_cache
@@ -81,10 +81,14 @@ class Playback(eqx.Module):
     """Weight with which the character slides."""
     seen: Bool[Series, " frames"]
     """False in frames that the fit leaves out."""
+    held_out: Bool[Series, " frames"]
+    """True in those that it leaves out to show what it is worth."""
     present: Bool[Series, " legs"]
     """False for legs that the rig only has in name."""
     errors: Mapping[str, Float[Series, "frames_of_kind ..."]]
     """After - captured, m, rad, ..."""
+    animated_errors: Mapping[str, Float[Series, "frames ..."]]
+    """Before - captured, of kinds that measure something; m, rad."""
     residuals: Mapping[str, Float[Series, "frames_of_kind ..."]]
     """As the fit sees them, in sigmas."""
     sigmas: Mapping[str, Float[Series, ""]]
@@ -198,8 +202,10 @@ def _play(scene: Scene, result: jaxik.Result) -> Playback:
         stance=reference.contact,
         slide=scene.frames.slide,
         seen=reference.observed,
+        held_out=reference.held_out,
         present=scene.rig.present,
         errors=errors,
+        animated_errors=errors_of_pose(scene, animated, animated_pelvis),
         residuals=residuals_by_kind(scene, errors),
         sigmas={kind: getattr(scene.sigmas, kind) for kind in errors},
         label=reference.label,

@@ -18,6 +18,7 @@ from fitting.inference.sensitivity import FreeTable
 from fitting.problem.free_parameters import FreeParameter, check_inside, free_parameter
 from fitting.problem.loss import Loss
 from fitting.problem.prior import Priors
+from fitting.problem.scene import LEAST_SIGMAS
 from fitting.problem.space import Space, make_space
 from fitting.runtime import validation
 from fitting.runtime.display.notebook import Shown
@@ -70,6 +71,8 @@ class ClipEntry:
     """What plots call the reference."""
     mask_pops: bool = True
     """Ignores frames in which a captured marker jumps."""
+    held_out: bool = False
+    """Not fitted, but compared with; then no other clip has a part that is held out."""
     root: str = "auto"
     """Where the base's root is put: one of `ground_path.ROOTS`."""
     tracks: Path | None = None
@@ -153,9 +156,11 @@ class Experiment(Shown):
     name: str = ""
     fps: float | None = None
     """Clips are resampled to this rate."""
-    loss: Loss = "squares"
+    holdout: float = 1 / 3
+    """Fraction of each clip, its end, that is not fitted but compared with."""
+    loss: Loss = "huber"
     independent_every: float = 0.0
-    """s, spacing at which residuals are independent; 0: all are."""
+    """s, spacing at which residuals are independent; 0: as they themselves say."""
     seed: int = 0
     rules: Mapping[str, str] = field(default_factory=dict)
     """By stage, where not the preset's."""
@@ -188,12 +193,19 @@ class Experiment(Shown):
                 f"{self.path}: [noise] sigmas cannot be estimated under the loss {self.loss!r}, "
                 "which is not a distribution of noise; take squares, or student for outliers"
             )
-        if self.noise.correlation != "given" and self.independent_every:
+        if self.noise.correlation == "whitened" and self.independent_every:
             raise ValueError(
-                f"{self.path}: independent_every and [noise] correlation = "
-                f"{self.noise.correlation!r} would account for the same correlation twice; leave "
-                "one of them out"
+                f"{self.path}: independent_every and [noise] correlation = 'whitened' would account "
+                "for the same correlation twice; leave one of them out"
             )
+        if all(entry.held_out for entry in self.clips):
+            raise ValueError(f"{self.path}: all clips are held out; wanted one that is not")
+        for kind, least in LEAST_SIGMAS.items():
+            if not self.sigmas.get(kind, least) >= least:
+                raise ValueError(
+                    f"{self.path} [sigmas]: {kind} is {self.sigmas[kind]:g}; wanted {least:g} or "
+                    "more (m, rad), as no capture is known better"
+                )
 
     def preset_system(self, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
         """The preset with the experiment's rules, for a rig unless it is meant for the adult."""

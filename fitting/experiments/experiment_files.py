@@ -122,7 +122,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
         "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
     }
-    top = with_floats(content, ("fps", "independent_every"))
+    top = with_floats(content, ("fps", "holdout", "independent_every"))
     top.pop("written_in", None)  # another folder is named when it is written again
     experiment = Experiment(**{"path": path, "name": path.stem, **top, **tables})
     return restrict(experiment) if experiment.record_only else experiment

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 import jaxik
 from fitting.datasets import coverage
@@ -41,6 +42,8 @@ from jaxik.world.terrain import Terrain
 from . import track_files
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment
 from .systems import without_own_root
+
+SHORTEST_WITH_HOLDOUT = 3.0  # s: of a shorter clip, hardly a stride would be left to fit
 
 
 class ClipData(NamedTuple):
@@ -131,7 +134,8 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
     with activity.announced("Preparing what is compared"):
         for entry, clip in zip(experiment.clips, data, strict=True):
             clip = clip._replace(terrain=ik.probe.prepare(clip.terrain))
-            scene = make_scene(clip, experiment.sigmas, entry.label)
+            held_out = _held_out(clip.reference, experiment, entry)
+            scene = make_scene(clip, experiment.sigmas, entry.label, held_out)
             if (size := experiment.size(scene.rig, rig)) is not None:
                 scene = dataclasses.replace(scene, size=jax.device_put(np.float64(size)))
             with error_context(f"{experiment.path} [parameters]"):
@@ -139,8 +143,8 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
             scenes.append(scene)
         scenes = share_world(scenes, ik.probe)
     dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
-    independent = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
-    problem = Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, independent)
+    weight = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
+    problem = Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, weight)
     return program_cache.committed(problem)
 
 
@@ -220,8 +224,28 @@ def _cut(clip: Clip, path: Path, entry: ClipEntry, fps: float | None) -> Clip:
     return clip if fps is None else edit.resample(clip, fps)
 
 
-def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captured") -> Scene:
-    """One clip as residuals need it; `sigmas` override the defaults, plots show the label."""
+def _held_out(clip: Clip, experiment: Experiment, entry: ClipEntry) -> Bool[np.ndarray, " frames"]:
+    """Which frames are held out: all of a clip, or its end if it is long enough."""
+    if any(other.held_out for other in experiment.clips):
+        return np.full(clip.frame_count, entry.held_out)
+    share = experiment.holdout if clip.seconds >= SHORTEST_WITH_HOLDOUT else 0.0
+    return np.arange(clip.frame_count) >= round((1 - share) * clip.frame_count)
+
+
+def make_scene(
+    data: ClipData,
+    sigmas: Mapping[str, float],
+    label: str = "captured",
+    held_out: Bool[np.ndarray, " frames"] | None = None,
+) -> Scene:
+    """One clip as residuals need it.
+
+    Args:
+        data: the clip.
+        sigmas: override the defaults.
+        label: what plots call the reference.
+        held_out: frames that are not fitted; None are.
+    """
     reference, base, terrain, root, tracks = data
     frames = with_cut_off_swings(frames_from_clip(base, rise=root.rise), base, terrain)
     placed = raised(base, root.rise)
@@ -229,6 +253,7 @@ def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captur
     stance = reference.stance
     labels = np.zeros(legs.ankle.pos.shape[:2]) if stance is None else stance.astype(float)
     observed = np.ones(reference.frame_count, bool) if reference.mask is None else reference.mask
+    held_out = np.zeros_like(observed) if held_out is None else held_out
     all_sigmas = DEFAULT_SIGMAS | dict(sigmas)
     if stance is None:
         all_sigmas["contact"] = float("inf")
@@ -242,7 +267,8 @@ def make_scene(data: ClipData, sigmas: Mapping[str, float], label: str = "captur
             knee_ws=legs.knee.pos,
             ankle=legs.ankle,
             contact=jax.device_put(labels),
-            observed=jax.device_put(observed),
+            observed=jax.device_put(observed & ~held_out),
+            held_out=jax.device_put(observed & held_out),
             label=label,
         ),
         sigmas=_sigmas(all_sigmas),

@@ -153,7 +153,8 @@ class _Laplace:
     def around(cls, problem: Problem, solution: Solution) -> "_Laplace":
         space = problem.space
         smooth = np.flatnonzero(space.smooth)
-        prior_sd = 1 / np.diag(solution.jacobian[-space.size :])[smooth]
+        root = float(problem.weight) ** 0.5
+        prior_sd = root / np.diag(solution.jacobian[-space.size :])[smooth]
         scaled = solution.jacobian[: -space.size, smooth] * prior_sd
         information = scaled.T @ scaled
         information *= series.information_of_slopes(problem.loss, float(problem.tails))

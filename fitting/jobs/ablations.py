@@ -1,6 +1,7 @@
 """The job that fits an experiment without each of its rules."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
@@ -43,7 +44,7 @@ def ablate(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
-        experiment = with_files(experiment, folder)
+        experiment = replace(with_files(experiment, folder), holdout=0.0)
 
         def log_row(row: ablation.Row) -> None:
             log(ablation_report.row_text(row))

@@ -1,6 +1,7 @@
 """The job that asks whether what fits and posteriors say of an experiment is true."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
@@ -60,7 +61,7 @@ def calibrate(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
-        experiment = with_files(experiment, folder)
+        experiment = replace(with_files(experiment, folder), holdout=0.0)
         problem = make_problem(experiment)
         log(f"{replicates} truths of {problem.space.size} parameters of {experiment.preset}")
         observers = Observers(

@@ -37,11 +37,13 @@ from .output import Loaded, Log, log_output, output_folder, silent, unwatched
 
 
 class Shown(NamedTuple):
-    """What a fit only shows: nothing of it decides what is found."""
+    """What a fit shows and judges: nothing of it decides what is found."""
 
     clips: tuple[ClipData, ...]
     known_values: Mapping[str, float] | None = None
     """What made a synthetic reference."""
+    has_noise: bool = True
+    """False if the reference is the motion of another system."""
 
 
 @in_float64
@@ -200,12 +202,11 @@ def translate(
         start = translation.starting_point(problem)
         kept = kept_stages(run, experiment, problem, log)
         solution = search(problem, experiment, progress, start, kept)
-        shown = Shown(prepared.clips)
+        shown = Shown(prepared.clips, has_noise=False)
         if run is not None:
             translation.save_source(run, prepared)
-            shown = Shown(prepared.clips, load_known_values(experiment))
+            shown = shown._replace(known_values=load_known_values(experiment))
         fitted = _assess_and_save(run, experiment, problem, solution, shown, progress, kept)
-        fitted = dataclasses.replace(fitted, has_noise=False)
         differences = translation_report.differences(fitted)
         if run is not None:
             translation_report.write(run, prepared, fitted, differences)
@@ -298,9 +299,7 @@ def _assess_and_save(
             run_folder.save_solution(run, experiment, problem, solution)
 
     fitted = assess_solution(experiment, problem, solution, progress, save, kept)
-    fitted = dataclasses.replace(
-        fitted, known_values=shown.known_values, clips=shown.clips, run=run
-    )
+    fitted = dataclasses.replace(fitted, run=run, **shown._asdict())
     if run is not None:
         run_folder.save_fit(run, fitted)
     return fitted

@@ -1,6 +1,7 @@
 """The job that fits several clips and subjects as a population."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -50,7 +51,7 @@ def population(
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
     with output_folder(output) as folder:
-        experiment = with_files(experiment, folder)
+        experiment = replace(with_files(experiment, folder), holdout=0.0)
         problem = make_problem(experiment)
         log(
             f"fitting {problem.space.size} parameters of {experiment.preset} to "

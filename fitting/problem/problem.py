@@ -6,6 +6,7 @@ from typing import Generic
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from fitting.runtime.precision import in_float64
@@ -22,17 +23,17 @@ class Problem(eqx.Module, Generic[System]):
     masked. It is static, so it must be a function of a module: a new lambda per call would compile
     anew.
 
-    Residuals of neighbouring frames are correlated. `independent_fraction` scales their
-    log-likelihood by the fraction of them that carries new information, so that intervals get their
-    nominal coverage (the magnitude adjustment of composite likelihoods; Pauli, Racugno and Ventura
-    2011).
+    Residuals of neighbouring frames are correlated, and may be larger or smaller than their sigmas.
+    `weight` scales the cost as a whole so that intervals get their nominal coverage (the magnitude
+    adjustment of composite likelihoods; Pauli, Racugno and Ventura 2011). It does not move the
+    lowest point.
     """
 
     space: Space[System]
     data: PyTree
     residual_function: Callable[[System, PyTree], Array] = eqx.field(static=True)
     loss: Loss = eqx.field(static=True, default="squares")
-    independent_fraction: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
     tails: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=TAILS)
     """Degrees of freedom of Student's t, under this loss."""
     unknown_sigmas: Float[Array, "sigmas residuals"] | None = None
@@ -47,12 +48,20 @@ class Problem(eqx.Module, Generic[System]):
         """
         plain = self.residual_function(self.space.unpack(u), self.data)
         residuals = apply_loss(plain, self.loss, self.tails)
-        residuals *= jnp.sqrt(self.independent_fraction.astype(residuals.dtype))
-        return jnp.concatenate([residuals, self.space.prior_residuals(u)])
+        residuals = jnp.concatenate([residuals, self.space.prior_residuals(u)])
+        return residuals * jnp.sqrt(self.weight.astype(residuals.dtype))
+
+    def prior_costs(self, u: Float[np.ndarray, "*rows free"]) -> Float[np.ndarray, "*rows free"]:
+        """The part of the cost that the prior of each parameter contributes."""
+        return float(self.weight) * self.space.prior_costs(u)
+
+    def with_weight(self, weight: float) -> "Problem[System]":
+        """The same problem with another weight."""
+        return eqx.tree_at(lambda p: p.weight, self, jax.device_put(np.float64(weight)))
 
     @in_float64
     def cost(self, u: Vector) -> Float[Array, ""]:
-        """Minus the log-probability, up to a constant; not finite where a residual is not."""
+        """Half the sum of the squared residuals; not finite where one is not."""
         return 0.5 * jnp.sum(self.residuals(u) ** 2)
 
     @in_float64
@@ -83,24 +92,27 @@ class Problem(eqx.Module, Generic[System]):
     def log_probability(self, u: Vector) -> Float[Array, ""]:
         """Unnormalised log-density of the posterior in `u`; -inf where a residual is not finite.
 
-        Unknown sigmas are integrated out.
+        The weight scales the likelihood, and not the prior. Unknown sigmas are integrated out.
         """
+        squares = self.residuals(u) ** 2
+        squares, of_prior = jnp.split(squares, [squares.size - self.space.size])
+        of_prior = jnp.sum(of_prior) / self.weight.astype(squares.dtype)
         if self.unknown_sigmas is None:
-            log_probability = -self.cost(u)
+            of_data = jnp.sum(squares)
         else:
-            log_probability = self._log_marginal(self.residuals(u), self.unknown_sigmas)
+            of_data = self._marginal(squares, self.unknown_sigmas)
+        log_probability = -0.5 * (of_data + of_prior)
         return jnp.where(jnp.isfinite(log_probability), log_probability, -jnp.inf)
 
-    def _log_marginal(
-        self, residuals: Float[Array, " all"], unknown: Float[Array, "sigmas residuals"]
+    def _marginal(
+        self, squares: Float[Array, " residuals"], unknown: Float[Array, "sigmas residuals"]
     ) -> Float[Array, ""]:
-        """Log-probability with the unknown sigmas integrated out, under a flat prior of their logs.
+        """Minus twice the log-likelihood with the unknown sigmas integrated out.
 
-        With `n` normal residuals of squares `S`, in units of any fixed sigma, the integral of
-        `sigma^-n exp(-S / (2 sigma²))` over log sigma is proportional to `S^(-n / 2)`.
+        Their logarithms have a flat prior. With `n` normal residuals of squares `S`, in units of
+        any fixed sigma, the integral of `sigma^-n exp(-S / (2 sigma²))` over log sigma is
+        proportional to `S^(-n / 2)`.
         """
-        squares, of_prior = jnp.split(residuals**2, [residuals.size - self.space.size])
-        known = squares * (1 - jnp.sum(unknown, axis=0))
-        counts = self.independent_fraction * jnp.sum(unknown, axis=1)
-        marginal = jnp.sum(counts * jnp.log(unknown @ squares))
-        return -0.5 * (jnp.sum(known) + jnp.sum(of_prior) + marginal)
+        known = jnp.sum(squares * (1 - jnp.sum(unknown, axis=0)))
+        counts = self.weight * jnp.sum(unknown, axis=1)
+        return known + jnp.sum(counts * jnp.log(unknown @ squares))

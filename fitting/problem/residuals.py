@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxik
 from jaxik.maths import quat, vec
+from jaxik.world.skeleton import Transform
 
 from .scene import Scene, legs_ws, pelvis_ws
 from .shared_world import groups, run_row, run_scene, scene_in_a_row, split
@@ -52,19 +53,30 @@ def _begins(scenes: Sequence[Scene]) -> Bool[np.ndarray, " frames"]:
 def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     """Result minus reference, by kind of residual, in the unit of its sigma."""
     assert result.trace is not None  # `jaxik.run` always has one
+    errors = errors_of_pose(scene, legs_ws(scene, result), pelvis_ws(scene, result))
+    contact = result.trace.sensed.contact.weight - scene.reference.contact
+    ankle, dt = errors["ankle"], scene.frames.dt[1:-1, None, None]
+    return errors | {
+        "contact": contact * scene.rig.present,
+        "smooth": (ankle[2:] - 2.0 * ankle[1:-1] + ankle[:-2]) / dt**2,
+    }
+
+
+def errors_of_pose(scene: Scene, legs: jaxik.LegPose, pelvis: Transform) -> dict[str, Array]:
+    """A motion minus the reference, by kind of residual that measures something, m and rad.
+
+    Args:
+        scene: of the reference.
+        legs: (frames legs), world space.
+        pelvis: (frames), world space.
+    """
     reference, present = scene.reference, scene.rig.present[..., None]
-    legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
-    ankle = (legs.ankle.pos - reference.ankle.pos) * present
-    dt = scene.frames.dt[1:-1, None, None]
-    contact = result.trace.sensed.contact.weight - reference.contact
     return {
-        "ankle": ankle,
+        "ankle": (legs.ankle.pos - reference.ankle.pos) * present,
         "knee": (legs.knee.pos - reference.knee_ws) * present,
         "pelvis": pelvis.pos - reference.pelvis.pos,
         "foot": rotation_between(reference.ankle.rot, legs.ankle.rot) * present,
         "body": rotation_between(reference.pelvis.rot, pelvis.rot),
-        "contact": contact * scene.rig.present,
-        "smooth": (ankle[2:] - 2.0 * ankle[1:-1] + ankle[:-2]) / dt**2,
     }
 
 

@@ -11,6 +11,8 @@ from jaxik.world.terrain import Terrain
 
 MEASURED = ("ankle", "knee", "pelvis", "foot", "body")  # kinds that have a noise of their own
 WHITENED = (*MEASURED, "contact")  # kinds whose residuals have a correlation from frame to frame
+# No capture is known better than this: 1 mm, and 0.1 degrees.
+LEAST_SIGMAS = {"ankle": 1e-3, "knee": 1e-3, "pelvis": 1e-3, "foot": 0.00175, "body": 0.00175}
 
 
 class Sigmas(eqx.Module):
@@ -52,7 +54,9 @@ class Reference(eqx.Module):
     contact: Float[Array, "frames legs"]
     """0 or 1."""
     observed: Bool[Array, " frames"]
-    """False where a marker jumped or nothing was captured."""
+    """False where a marker jumped or nothing was captured, and in frames that are held out."""
+    held_out: Bool[Array, " frames"]
+    """True where the capture was observed, and is not fitted but shows what a fit is worth."""
     label: str = eqx.field(static=True, default="captured")
     """What plots call it."""
 

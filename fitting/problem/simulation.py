@@ -29,9 +29,9 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
     """The same problem with references that the system at `u` makes, plus the noise assumed.
 
     The noise is normal and has the scenes' sigmas and correlation; kinds with an infinite sigma
-    get none. Where only a fraction of the residuals counts as independent, they are correlated so
-    that it does: a first-order autoregression has `(1 - rho) / (1 + rho)` independent values for
-    each one. Frames that were not observed stay so. With a robust loss the noise has no outliers.
+    get none. A weight below 1 is taken for the fraction of the residuals that are independent: they
+    are correlated so that `(1 - rho) / (1 + rho)` of a first-order autoregression is. Frames that
+    were not observed stay so. With a robust loss the noise has no outliers.
 
     Args:
         problem: whose clips, sigmas and priors are used.
@@ -43,7 +43,7 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
             noise has independent ones of both kinds.
     """
     random = np.random.default_rng(seed)
-    fraction = float(problem.independent_fraction)
+    fraction = min(1.0, float(problem.weight))
     ik = problem.space.unpack(u)
     motions = zip(problem.data, _motions(ik, problem.data), strict=True)
     scenes = tuple(_simulated(scene, motion, fraction, random) for scene, motion in motions)
@@ -76,6 +76,7 @@ def _simulated(
         ankle=_displaced(ankle, noise("ankle", ankle.pos.shape), noise("foot", ankle.pos.shape)),
         contact=contact + noise("contact", contact.shape),
         observed=reference.observed,
+        held_out=reference.held_out,
         label="simulated",
     )
     return eqx.tree_at(lambda scene: scene.reference, scene, replaced)

@@ -16,7 +16,7 @@ from fitting.runtime import activity, files
 from fitting.runtime.parallel.beside import calls_beside
 from fitting.runtime.precision import in_float64
 from fitting.studies.assess import MIN_IMPROVEMENT
-from fitting.studies.fit import Fit, FitSummary
+from fitting.studies.fit import Fit
 from fitting.studies.run_folder import SUMMARY
 
 from . import fit_tables, worst_window_report
@@ -35,8 +35,8 @@ Plots: TypeAlias = dict[str, str]  # captions by file name
 def fit_text(fitted: Fit) -> str:
     """The result of a fit, for the terminal."""
     rows, truth = fitted.summary["parameters"], fitted.known_values
-    parts = [fitted.summary["message"], cost_sentence(fitted.summary), ""]
-    parts += [goodness_report.text(fitted), ""]
+    parts = [goodness_report.text(fitted), ""]
+    parts += [fitted.summary["message"], cost_sentence(fitted), ""]
     parts.append(aligned(fit_tables.parameter_table(rows, truth)))
     if any("half_life" in row for row in rows):
         parts += ["", aligned(fit_tables.gain_table(rows))]
@@ -112,9 +112,10 @@ def gallery(plots: Plots) -> str:
     return "\n\n".join(f"![{caption}]({name})" for name, caption in plots.items())
 
 
-def cost_sentence(summary: FitSummary) -> str:
+def cost_sentence(fitted: Fit) -> str:
     """Cost before and after, and the effort it took."""
-    noise = " (both with the noise estimated here)" if "noise" in summary else ""
+    summary, moved = fitted.summary, fitted.experiment.noise.moves_optimum
+    noise = " (both with the noise estimated here)" if moved else ""
     sentence = (
         f"Cost {summary['cost_before']:.6g} before, {summary['cost']:.6g} after{noise}: "
         f"{summary['steps']} steps in {summary['seconds']:.1f} s."
@@ -180,7 +181,7 @@ def _result(fitted: Fit) -> list[str]:
     original = ", faithful to its original" if experiment.faithful else ""
     return [
         f"# {experiment.name}",
-        f"{summary['message']} {summary['goodness']['sentence']} {cost_sentence(summary)}",
+        f"{summary['goodness']['sentence']} {summary['message']} {cost_sentence(fitted)}",
         f"Preset `{experiment.preset}`{original}{rules}, loss `{experiment.loss}`, "
         f"seed {experiment.seed}.",
     ]

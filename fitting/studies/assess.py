@@ -14,7 +14,7 @@ from fitting.inference.optimisation.search import refine
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
 
-from .fit import Fit, search
+from .fit import Fit, search, weighted
 
 MAX_RETURNS = 3  # to the search from lower points
 MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
@@ -44,7 +44,8 @@ def assess_solution(
     left: list[float] = []
     while True:
         on_solution(solution)
-        identifiability = assess_identifiability(problem, solution, kept)
+        of_weight = solution.weighted(float(problem.weight))
+        identifiability = assess_identifiability(problem, of_weight, kept)
         found_lower = identifiability.improvement > MIN_IMPROVEMENT
         fit = Fit(experiment, problem, solution, identifiability, left=tuple(left))
         if not found_lower or solution.interrupted or len(left) == MAX_RETURNS:
@@ -56,6 +57,7 @@ def assess_solution(
             return dataclasses.replace(fit, solution=unmoved)
         left.append(solution.cost)
         solution = lower
+        problem = weighted(problem, experiment, solution)
 
 
 def _search_lower(
@@ -79,7 +81,7 @@ def _search_lower(
         kept: the stages of searches that were killed.
     """
     settings = experiment.fit.search
-    after = refine(problem, before, lower_u, settings, progress, kept)
+    after = refine(problem.with_weight(1.0), before, lower_u, settings, progress, kept)
     if after.interrupted or before.cost - after.cost <= settings.agreement:
         return after
     return search(problem, experiment, progress, after.u, kept).following(after)

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxik
-from fitting.analysis import playback
+from fitting.analysis import distances, playback
+from fitting.analysis.distances import Distances
 from fitting.analysis.goodness import groups, verdict
 from fitting.analysis.goodness.groups import Assumed, Group
 from fitting.analysis.goodness.verdict import Verdict
@@ -20,7 +21,7 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.problems import ClipData
 from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.joint import fit_with_noise
-from fitting.inference.noise.model import NoiseModel, noise_of
+from fitting.inference.noise.model import NoiseModel, counted, noise_of
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.search import find_best_fit
 from fitting.inference.optimisation.solution import Progress, Solution
@@ -35,7 +36,7 @@ from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
-from .goodness import GoodnessSummary, summarise
+from .goodness import DistancesSummary, GoodnessSummary, summarise, summarise_distances
 from .prior_summary import PriorSummary, summarise_priors
 
 if TYPE_CHECKING:
@@ -103,6 +104,8 @@ class FitSummary(TypedDict):
     converged: bool
     message: str
     goodness: GoodnessSummary
+    distances: NotRequired[DistancesSummary]
+    """Fits by earlier versions lack them."""
     noise: NotRequired[Annotated[Content, NoiseModel]]
     """The noise that was estimated, as `NoiseModel` holds it."""
     cost_before: float
@@ -163,13 +166,13 @@ class Fit(Shown):
     @cached_property
     def assumed(self) -> Assumed:
         """What the fit assumes of its residuals."""
-        fraction = float(self.problem.independent_fraction)
         return Assumed(
             loss=self.problem.loss,
-            independent_fraction=fraction,
+            weight=float(self.problem.weight),
             tails=float(self.problem.tails),
             sigmas_estimated=self.experiment.noise.sigmas == "estimated",
             whitened=self.experiment.noise.correlation == "whitened",
+            counted=self.experiment.noise.correlation == "counted",
             parameters=float(self.identifiability.contraction.sum()),
         )
 
@@ -188,10 +191,30 @@ class Fit(Shown):
         return groups.measure_groups(self.playbacks, correlations, self.assumed)
 
     @cached_property
+    def before(self) -> tuple[jaxik.Result, ...]:
+        """What the system as it was before the fit makes of each clip."""
+        space = self.problem.space
+        return playback.run_all(space.unpack(space.pack({})), self.problem.data)
+
+    @cached_property
+    def distances(self) -> Distances:
+        """How far animation, system before the fit and fitted one are from the capture."""
+        scenes = zip(self.problem.data, self.before, strict=True)
+        before = [playback.play(scene, result) for scene, result in scenes]
+        return distances.measure(before, self.playbacks)
+
+    @property
+    def kept_system(self) -> jaxik.FootIK:
+        """The system that is worth keeping: the fitted one, unless the one before it is better."""
+        if self.distances.better == "fitted":
+            return self.ik
+        return self.problem.space.unpack(self.problem.space.pack({}))
+
+    @cached_property
     def verdict(self) -> Verdict:
         """Whether it fits."""
         if self.has_noise:
-            return verdict.judge(self.groups, self.assumed)
+            return verdict.judge(self.groups, self.assumed, self.distances)
         return verdict.judge_tolerances(self.groups)
 
     @property
@@ -230,6 +253,7 @@ class Fit(Shown):
             "converged": solution.converged,
             "message": solution.message,
             "goodness": summarise(self.verdict, self.groups),
+            "distances": summarise_distances(self.distances),
             "cost_before": solution.cost_before,
             "cost": solution.cost,
             "steps": solution.steps,
@@ -265,7 +289,7 @@ def search(
         kept: the stages of a search that was killed, which goes on after them.
     """
     return find_best_fit(
-        problem,
+        problem.with_weight(1.0),
         experiment.fit.search,
         starts=experiment.fit.starts,
         first=first,
@@ -283,6 +307,8 @@ def search_with_noise(
 ) -> tuple[Problem[jaxik.FootIK], Solution]:
     """The best fit with the noise that the experiment estimates, and the problem with this noise.
 
+    Unless the experiment asks for noise that moves the best point, it only gets a weight.
+
     Args:
         problem: the problem of the experiment.
         experiment: its settings of noise and search.
@@ -290,8 +316,19 @@ def search_with_noise(
         kept: as for `search`.
     """
     solution = search(problem, experiment, progress, kept=kept)
-    settings = experiment.fit.search
-    return fit_with_noise(problem, experiment.noise, solution, settings, progress, kept)
+    settings, noise = experiment.fit.search, experiment.noise
+    problem, solution = fit_with_noise(problem, noise, solution, settings, progress, kept)
+    return weighted(problem, experiment, solution), solution
+
+
+def weighted(
+    problem: Problem[jaxik.FootIK], experiment: Experiment, solution: Solution
+) -> Problem[jaxik.FootIK]:
+    """The problem with the weight by which the residuals at its solution count for intervals."""
+    if experiment.noise.correlation != "counted" or experiment.independent_every:
+        return problem
+    with activity.announced("Weighing the residuals"):
+        return counted(problem, solution.u)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:

@@ -1,10 +1,11 @@
 """Goodness of fit as `fit.json` holds it."""
 
 from collections.abc import Sequence
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
+from fitting.analysis.distances import Distances
 from fitting.analysis.goodness.groups import Group
-from fitting.analysis.goodness.verdict import Verdict
+from fitting.analysis.goodness.verdict import Verdict, describe_setback
 
 
 class GroupSummary(TypedDict):
@@ -46,6 +47,29 @@ class GoodnessSummary(TypedDict):
     fits: bool
     sentence: str
     groups: list[GroupSummary]
+
+
+class DistancesSummary(TypedDict):
+    """How far motions are from the captured one, as `fit.json` holds it."""
+
+    fitted: NotRequired[dict[str, dict[str, float]]]
+    """On fitted frames: m and rad, by motion (animation, before, fitted) and kind of joint."""
+    held_out: NotRequired[dict[str, dict[str, float]]]
+    """The same on frames that were held out."""
+    setbacks: list[str]
+    """Where the fit has made it visibly worse, in words."""
+    kept: str
+    """Whose parameters are in `parameters.toml`: fitted, or before."""
+
+
+def summarise_distances(distances: Distances) -> DistancesSummary:
+    """The distances, and what follows from them."""
+    parts = {
+        part: {motion: dict(kinds) for motion, kinds in motions.items()}
+        for part, motions in distances.parts.items()
+    }
+    setbacks = [describe_setback(setback) for setback in distances.setbacks]
+    return {**parts, "setbacks": setbacks, "kept": distances.better}  # type: ignore[typeddict-item]
 
 
 def summarise(verdict: Verdict, groups: Sequence[Group]) -> GoodnessSummary:

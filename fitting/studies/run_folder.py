@@ -2,7 +2,8 @@
 
 experiment.toml   what was fitted; paths are relative, and it says from where they led
 fit.json          the numbers of the fit
-parameters.toml   the fitted system
+parameters.toml   the fitted system, or the one before the fit where that is better
+parameters_fitted.toml   in that case, the fitted system
 base.npz          the flat animation, and fitted.npz the fitted motion; numbered for several clips
 chain.h5          the walkers; posterior.json is their summary
 posterior.nc      the kept draws for ArviZ, if it is installed
@@ -42,6 +43,7 @@ from .posterior.replay_summary import summarise_replay
 from .sample import SampledFit
 
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
+FITTED_PARAMETERS = "parameters_fitted.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
 PAGE = "report.html"
 INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
@@ -92,17 +94,30 @@ def save_solution(
     A `fit.json` of an earlier fit is deleted: a run is complete once it has one.
     """
     run.mkdir(parents=True, exist_ok=True)
-    (run / FIT).unlink(missing_ok=True)
-    ik = problem.space.unpack(solution.u)
+    for name in (FIT, FITTED_PARAMETERS):
+        (run / name).unlink(missing_ok=True)
     _write_toml(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
+    _write_system(run / PARAMETERS, experiment, problem, problem.space.unpack(solution.u))
+
+
+def _write_system(
+    path: Path, experiment: Experiment, problem: Problem[jaxik.FootIK], ik: jaxik.FootIK
+) -> None:
     preset = Preset(experiment.preset, experiment.faithful)
     leg_length = experiment.leg_length(problem.data[0].rig)
-    _write_toml(run / PARAMETERS, parameter_files.system_to_toml(ik, preset, leg_length))
+    _write_toml(path, parameter_files.system_to_toml(ik, preset, leg_length))
 
 
 def save_fit(run: Path, fitted: Fit) -> None:
-    """Completes a run's folder, after `save_solution`, with the motions and numbers of its fit."""
+    """Completes a run's folder, after `save_solution`, with the motions and numbers of its fit.
+
+    Where the system from before the fit is better, the run's parameters become that one's.
+    """
     with activity.announced("Writing the motions and numbers of the fit"):
+        if fitted.distances.better != "fitted":
+            system = fitted.experiment, fitted.problem
+            _write_system(run / FITTED_PARAMETERS, *system, fitted.ik)
+            _write_system(run / PARAMETERS, *system, fitted.kept_system)
         for name, clip in saved_clips(fitted).items():
             save_clip(run / name, clip)
         FIT_FILE.write(run / FIT, fitted.summary)

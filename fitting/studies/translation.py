@@ -25,6 +25,7 @@ from fitting.experiments import parameter_files, systems
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, problem_from_clips
 from fitting.inference import sensitivity
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.population import evaluate
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.optimisation.state import Search, SearchState
@@ -190,6 +191,9 @@ def prepare(request: TranslationRequest, run: Path) -> Translation:
         faithful=target.preset.faithful,
         name=f"{source.name} to {target.name}",
         fps=request.fps,
+        holdout=0.0,
+        loss="squares",  # another system's motion has neither outliers nor noise
+        noise=NoiseOptions(correlation="given"),
         rules=rules,
         parameters=systems.changed_values(target.ik, start),
         sigmas=TOLERANCES,

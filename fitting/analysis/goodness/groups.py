@@ -27,14 +27,17 @@ class Assumed:
     """What a fit assumes of its residuals, apart from their sigmas."""
 
     loss: Loss = "squares"
-    independent_fraction: float = 1.0
-    """Of the residuals, as `Problem.independent_fraction`."""
+    weight: float = 1.0
+    """Of the log-likelihood, as `Problem.weight`."""
     tails: float = TAILS
     """Degrees of freedom, under the loss `student`."""
     sigmas_estimated: bool = False
     """From the residuals themselves: then their size says nothing."""
     whitened: bool = False
     """Whether their correlation was estimated and taken out."""
+    counted: bool = False
+    """Whether intervals follow from size and correlation of the residuals: then sigmas are no
+    more than what a difference weighs."""
     parameters: float = 0.0
     """How many parameters the data determine: the degrees of freedom that the fit has used."""
 

@@ -6,8 +6,11 @@ them against simulated noise: no false alarm in 95 % of fits whose noise is as a
 violation found.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+from fitting.analysis.distances import CLOSE, Distances, Part, Setback
 
 from . import groups as kinds
 from . import noise
@@ -31,6 +34,7 @@ NAMES = {
     "foot": "orientation of the feet",
     "body": "orientation of the pelvis",
 }
+PARTS: Mapping[Part, str] = {"fitted": "fitted frames", "held_out": "held-out frames"}
 
 
 @dataclass(frozen=True)
@@ -41,26 +45,63 @@ class Verdict:
     sentence: str
 
 
-def judge(groups: Sequence[Group], assumed: Assumed) -> Verdict:
-    """Whether the residuals of a fit are noise, and noise as was assumed.
+def judge(groups: Sequence[Group], assumed: Assumed, distances: Distances) -> Verdict:
+    """Whether a fit is close to the capture, and no further off than its sigmas allow.
 
     Too small a sigma is told from a misfit by the autocorrelation: what a system cannot follow
     lasts for many frames.
     """
     measured = [group for group in groups if group.is_measured and group.left.count]
-    if not measured:
+    if not measured or not distances.parts:
         return Verdict(True, "Nothing was observed that could fit or not.")
+    if setbacks := distances.setbacks:
+        sentence = f"Worse: {describe_setback(setbacks[0])}"
+        if len(setbacks) > 1:
+            sentence += f", and in {len(setbacks) - 1} more of the distances below"
+        kept = "of the fit" if distances.better == "fitted" else "from before the fit"
+        return Verdict(False, f"{sentence}. The parameters {kept} are the better ones.")
+    if far := distances.far:
+        off = "; ".join(
+            f"{NAMES[kind]} {size(kind, distance)} off the capture in {PARTS[part]}, and "
+            f"{size(kind, CLOSE[kind])} would be seen"
+            for part, kind, distance in far
+        )
+        return Verdict(False, f"Does not fit: {off}.")
     level = SIGNIFICANT / len(measured)
     if misfits := [group for group in measured if _is_misfit(group, level)]:
         return Verdict(False, f"Does not fit: {_describe_misfits(misfits)}.")
     findings = _noise_findings(measured, assumed, level)
+    first, *others = [
+        f"{describe_distances(motions['fitted'])} off the capture in {PARTS[part]}"
+        for part, motions in distances.parts.items()
+    ]
+    off = "; ".join([first, *others])
     if findings:
-        return Verdict(True, f"Fits, but {findings}.")
+        return Verdict(True, f"Fits, but {findings}; {off}.")
     if assumed.sigmas_estimated:
-        return Verdict(True, "Fits: the residuals are noise; its size is estimated from them.")
-    size = noise.pooled([group.left for group in measured])
-    p = f"p {size.p:.2g}" if size.p >= SMALL else f"p below {SMALL:g}"
-    return Verdict(True, f"Fits: reduced chi-square {size.mean_square:.3f} ({p}).")
+        return Verdict(True, f"Fits: {off}; the size of the noise is estimated from it.")
+    chi_square = noise.pooled([group.left for group in measured]).mean_square
+    return Verdict(True, f"Fits: {off}; reduced chi-square {chi_square:.3g}.")
+
+
+def describe_setback(setback: Setback) -> str:
+    """Where the fit has made something worse, in words."""
+    other = {"animation": "without foot IK", "before": "before the fit"}[setback.other]
+    fitted, better = size(setback.kind, setback.fitted), size(setback.kind, setback.distance)
+    part = PARTS[setback.part]
+    return f"{NAMES[setback.kind]} {fitted} off the capture in {part}, {better} {other}"
+
+
+def describe_distances(kinds: Mapping[str, float]) -> str:
+    """Distances of all kinds of joints, in words."""
+    return ", ".join(f"{NAMES[kind]} {size(kind, distance)}" for kind, distance in kinds.items())
+
+
+def size(kind: str, distance: float) -> str:
+    """A distance with its unit, cm or degrees."""
+    if kind in ("foot", "body"):
+        return f"{math.degrees(distance):.1f}°"
+    return f"{100 * distance:.2g} cm" if distance < 0.1 else f"{100 * distance:.0f} cm"
 
 
 def judge_tolerances(groups: Sequence[Group]) -> Verdict:
@@ -114,12 +155,13 @@ def _describe_misfits(misfits: Sequence[Group], limit: str = "sigma") -> str:
 def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -> str:
     """What is wrong with the assumed noise, and what that does to intervals; "" if nothing is."""
     left = noise.pooled([group.left for group in measured])
-    frames = left.spacing * assumed.independent_fraction
+    frames = left.spacing * assumed.weight
     significant = any(group.left.autocorrelation_p < level for group in measured)
     correlated = significant and not SPARSE < frames < CROWDED
     width = left.mean_square * frames
+    correlated = correlated and not assumed.counted
     findings, remedies = [], []
-    if not assumed.sigmas_estimated and (
+    if not (assumed.sigmas_estimated or assumed.counted) and (
         off := _wrong_sigmas(measured, level, correlated=correlated)
     ):
         findings.append(off)
@@ -129,7 +171,7 @@ def _noise_findings(measured: Sequence[Group], assumed: Assumed, level: float) -
         plain = noise.pooled([group.plain for group in measured])
         found = plain.autocorrelation
         # Relative to the frames for each independent error at the correlation that was given.
-        width = plain.mean_square * plain.spacing * assumed.independent_fraction
+        width = plain.mean_square * plain.spacing * assumed.weight
         width *= (1 - given) / (1 + given)
         than = f", not by {given:.2f}" if given else ""
         size = f"{found:.2f} from one frame to the next{than}"

@@ -7,6 +7,7 @@ NOT_CONVERGED = 3  # the search of a fit
 DOES_NOT_FIT = 4  # a fit that has converged
 OUTSIDE = 5  # of its bounds, a calibration
 FAILED = 6  # at least one of many fits
+WORSE = 7  # a fit, than the animation without foot IK or the system before it
 
 
 def of_job(*, interrupted: bool) -> int:
@@ -19,6 +20,8 @@ def of_job(*, interrupted: bool) -> int:
 def of_fit(fitted: Fit) -> int:
     """The exit status of a search; what a translation leaves over is a result, and no failure."""
     of_job(interrupted=fitted.solution.interrupted)
+    if fitted.has_noise and fitted.distances.setbacks:
+        return WORSE
     if not fitted.solution.converged:
         return NOT_CONVERGED
     return DOES_NOT_FIT if fitted.has_noise and not fitted.verdict.fits else 0

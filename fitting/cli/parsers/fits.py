@@ -61,8 +61,9 @@ def add_fit(commands: Commands) -> None:
         jaxik fit data/experiments/uneven_walk.toml --record-only -o runs/game
         jaxik fit data/experiments/uneven_walk.toml --view -o runs/walk   best so far, in a browser
 
-        Status 0: converged, and fits. 3: not converged. 4: converged, but what is left is no noise
-        of the given sigmas; the summary says where. Ctrl-C ends the search; the best point so far
+        Status 0: converged, and fits. 3: not converged. 4: converged, but not close enough to the
+        capture; the summary says where. 7: further from the capture than without foot IK, or than
+        before the fit. Ctrl-C ends the search; the best point so far
         is written as any other fit, with status 130. The same command then goes on, as it does
         after a kill.
         """,

@@ -9,7 +9,7 @@ from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import Settings, describe
 from fitting.problem.loss import Loss
-from fitting.problem.scene import WHITENED
+from fitting.problem.scene import LEAST_SIGMAS, WHITENED
 from fitting.runtime import validation
 from fitting.runtime.validation import Constraint
 
@@ -62,6 +62,9 @@ CLIP_KEYS: dict[str, Constraint] = {
     "mask_pops": validation.BOOLEAN.meaning(
         "Whether frames in which a captured marker jumps are left out."
     ),
+    "held_out": validation.BOOLEAN.meaning(
+        "Whether the clip is not fitted, but shows what the fit is worth."
+    ),
     "root": validation.one_of(ROOTS).meaning(
         "Where the root is put: where the animation has it, on the ground below it, or on the"
         " ground only where foot IK does not reach it."
@@ -79,7 +82,7 @@ SIGMAS = {  # by kind: meaning and unit
 }
 KINDS = tuple(SIGMAS)
 SIGMA_KEYS = {
-    kind: validation.number(1e-9, 1e9, or_inf=True).meaning(
+    kind: validation.number(LEAST_SIGMAS.get(kind, 1e-9), 1e9, or_inf=True).meaning(
         f"{doc} Infinity leaves them out.", unit
     )
     for kind, (doc, unit) in SIGMAS.items()
@@ -113,11 +116,13 @@ SEARCH_KEYS = {
 SAMPLE_KEYS = _constraints(SamplerSettings)
 NOISE_KEYS = {
     "sigmas": validation.one_of(get_args(Sigmas)).meaning(
-        "Whether the standard deviations are as [sigmas] says, or are estimated from there on."
+        "Whether the standard deviations are as [sigmas] says, or are estimated from there on,"
+        " which moves the best point: right where a system can follow all but the noise."
     ),
     "correlation": validation.one_of(get_args(Correlation)).meaning(
-        "Whether the correlation is as [sigmas] says, or is estimated and taken out of the"
-        " residuals (whitened), or is estimated and lets residuals count as fewer (counted)."
+        "Whether intervals are as wide as size and correlation of the residuals say (counted), or"
+        " as [sigmas] says (given); or the correlation is taken out of the residuals (whitened),"
+        " which moves the best point: right where a system can follow all but the noise."
     ),
 }
 TABLES = {
@@ -127,7 +132,7 @@ TABLES = {
     "rules": "Rules that differ from the preset's, by stage.",
     "parameters": "Fixed values that differ from the preset's.",
     "sigmas": "Standard deviation of each kind of residual.",
-    "noise": "Which properties of the noise are estimated together with the parameters.",
+    "noise": "Which properties of the noise are estimated, and what for.",
     "fit": "How the best fit is searched for.",
     "sample": "How `jaxik sample` samples the posterior.",
     "hierarchy": "What several clips and subjects have in common; left out, everything.",
@@ -153,9 +158,13 @@ TOP_KEYS: dict[str, Constraint] = {
         "How residuals count; all but squares give a few wrong frames less influence."
     ),
     "fps": validation.RATE.meaning("Rate to which clips are resampled; left out, none.", "Hz"),
+    "holdout": validation.number(0.0, 0.9).meaning(
+        "Fraction of each clip, its end, that is not fitted but shows what the fit is worth; clips"
+        " of less than 3 s are fitted whole."
+    ),
     "seed": validation.SEED.meaning("Of all random numbers."),
     "independent_every": validation.SECONDS.meaning(
-        "Time between residuals that count as independent; at 0 all do.", "s"
+        "Time between residuals that count as independent; at 0 as [noise] says.", "s"
     ),
     **{name: validation.TABLE.meaning(doc) for name, doc in TABLES.items()},
     "clips": validation.list_of("[[clips]], one for each clip").meaning("The clips. Needed."),

@@ -54,7 +54,10 @@ def _expand(problem: Problem, u: Vector) -> tuple[np.ndarray, np.ndarray, np.nda
     lm = levenberg_marquardt.evaluate(HardModel(problem, point), point)
     # Few rows with the same squares as all residuals, those of the prior and of thresholds too.
     residuals, jacobian = np.asarray(lm.compressed.residuals), np.asarray(lm.compressed.jacobian)
-    at_prior = approximate_prior(space.prior, np.asarray(u))
+    weight = float(problem.weight)
+    at_prior = PriorApproximation(
+        *(weight * part for part in approximate_prior(space.prior, np.asarray(u)))
+    )
     smooth = np.asarray(space.smooth)
     gradient = np.where(smooth, jacobian.T @ residuals - at_prior.gradient, 0.0)
     information = jacobian.T @ jacobian - np.diag(at_prior.information)

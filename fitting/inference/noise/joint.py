@@ -41,7 +41,7 @@ def fit_with_noise(
         progress: called as they go on.
         kept: the stages of searches that were killed.
     """
-    if not options.estimates_any:
+    if not options.moves_optimum:
         return problem, solution
     for _ in range(MAX_ROUNDS):
         if solution.interrupted:

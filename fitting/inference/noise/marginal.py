@@ -75,7 +75,7 @@ def draw_sigmas(
     filled = np.resize(chosen, (-(-len(chosen) // BATCH) * BATCH, chosen.shape[1]))
     batches = jnp.asarray(filled, problem.space.start.dtype).reshape(-1, BATCH, chosen.shape[1])
     sums = np.concatenate([_sums(problem, batch) for batch in batches])[: len(chosen)]
-    counts = float(problem.independent_fraction) * np.asarray(problem.unknown_sigmas).sum(axis=1)
+    counts = float(problem.weight) * np.asarray(problem.unknown_sigmas).sum(axis=1)
     ratios = np.sqrt(sums / random.chisquare(counts, sums.shape))
     sigmas = noise_of(problem).sigmas
     return {kind: sigma * ratios[:, i] for i, (kind, sigma) in enumerate(sigmas.items())}

@@ -13,17 +13,22 @@ from jaxtyping import Array
 import jaxik
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind
-from fitting.problem.scene import MEASURED, WHITENED, Scene
+from fitting.problem.scene import LEAST_SIGMAS, MEASURED, WHITENED, Scene
 from fitting.problem.shared_world import run_scenes
 from fitting.problem.space import Vector
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 
 from . import series
-from .series import Errors, Estimate
+from .series import Errors
 from .settings import NoiseOptions
 
-SMALLEST = 1e-4  # of the given sigma; below it, a kind has no noise to speak of
+STEP = 1e-4  # sigmas, over which the slope of a residual's influence is taken
+LEAST_SLOPE = 0.05  # on average; under Cauchy's loss that of far outliers is negative
+
+
+class NoiseCollapse(ValueError):
+    """Estimated noise has shrunk to less than any capture has."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,11 +41,11 @@ class NoiseModel:
     """From one frame to the next."""
     tails: float
     """Degrees of freedom of Student's t, under the loss `student`."""
-    independent_fraction: float
-    """Of the residuals."""
+    weight: float
+    """Of the log-likelihood, for intervals and posterior."""
 
     def __post_init__(self) -> None:
-        numbers = [*self.sigmas.values(), self.tails, self.independent_fraction]
+        numbers = [*self.sigmas.values(), self.tails, self.weight]
         unknown = {*self.sigmas, *self.correlations} - set(MEASURED)
         if unknown or not all(0 < number < math.inf for number in numbers):
             raise ValueError(f"{self}; wanted positive numbers, for kinds of {list(MEASURED)}")
@@ -66,7 +71,7 @@ def noise_of(problem: Problem[jaxik.FootIK]) -> NoiseModel:
         sigmas={kind: float(getattr(sigmas, kind)) for kind in kinds},
         correlations={kind: float(sigmas.correlation_of(kind)) for kind in kinds},
         tails=float(problem.tails),
-        independent_fraction=float(problem.independent_fraction),
+        weight=float(problem.weight),
     )
 
 
@@ -74,10 +79,8 @@ def noise_of(problem: Problem[jaxik.FootIK]) -> NoiseModel:
 def with_noise(problem: Problem[jaxik.FootIK], noise: NoiseModel) -> Problem[jaxik.FootIK]:
     """The problem with this noise; kinds that it does not name keep theirs. Nothing recompiles."""
     scenes = tuple(_with_noise(scene, noise) for scene in problem.data)
-    numbers = (jnp.asarray(noise.independent_fraction), jnp.asarray(noise.tails))
-    return eqx.tree_at(
-        lambda p: (p.data, p.independent_fraction, p.tails), problem, (scenes, *numbers)
-    )
+    numbers = (jnp.asarray(noise.weight), jnp.asarray(noise.tails))
+    return eqx.tree_at(lambda p: (p.data, p.weight, p.tails), problem, (scenes, *numbers))
 
 
 def _with_noise(scene: Scene, noise: NoiseModel) -> Scene:
@@ -91,27 +94,30 @@ def _with_noise(scene: Scene, noise: NoiseModel) -> Scene:
 
 @in_float64
 def likeliest_noise(problem: Problem[jaxik.FootIK], u: Vector, options: NoiseOptions) -> NoiseModel:
-    """The noise that makes the errors at `u` likeliest; what is not estimated stays as it is."""
-    assumed, ik = noise_of(problem), problem.space.unpack(jnp.asarray(u))
-    pairs = zip(problem.data, _errors_by_kind(ik, problem.data), strict=True)
-    by_clip = [_counted(scene, values) for scene, values in pairs]
-    found = {
-        kind: _likeliest(
-            [errors[kind] for errors in by_clip], problem, options, assumed.correlations[kind]
+    """The noise that makes the errors at `u` likeliest; what is not estimated stays as it is.
+
+    Raises:
+        NoiseCollapse: the likeliest sigma of a kind is less than any capture has.
+    """
+    model, by_clip = noise_of(problem), _errors_of_clips(problem, u)
+    tails = float(problem.tails)
+    estimates = {
+        kind: series.likeliest(
+            [errors[kind] for errors in by_clip],
+            problem.loss,
+            tails,
+            None if options.correlation == "whitened" else correlation,
         )
-        for kind in assumed.sigmas
+        for kind, correlation in model.correlations.items()
+        if any(errors[kind].active.any() for errors in by_clip)
     }
-    model = assumed
     if options.sigmas == "estimated":
-        floors = {kind: SMALLEST * sigma for kind, sigma in assumed.sigmas.items()}
-        sigmas = {kind: max(found[kind].sigma, floors[kind]) for kind in found}
-        model = dataclasses.replace(model, sigmas=sigmas)
-    correlations = {kind: found[kind].correlation for kind in found}
+        sigmas = {kind: estimate.sigma for kind, estimate in estimates.items()}
+        _check_noise(sigmas)
+        model = dataclasses.replace(model, sigmas={**model.sigmas, **sigmas})
     if options.correlation == "whitened":
-        model = dataclasses.replace(model, correlations=correlations)
-    elif options.correlation == "counted":
-        fraction = _independent_fraction(by_clip, correlations)
-        model = dataclasses.replace(model, independent_fraction=fraction)
+        correlations = {kind: estimate.correlation for kind, estimate in estimates.items()}
+        model = dataclasses.replace(model, correlations={**model.correlations, **correlations})
     if problem.loss == "student" and options.sigmas == "estimated":
         values = [
             series.innovations(errors[kind], model.correlations[kind]) / model.sigmas[kind]
@@ -123,36 +129,63 @@ def likeliest_noise(problem: Problem[jaxik.FootIK], u: Vector, options: NoiseOpt
     return model
 
 
-def _likeliest(
-    clips: list[Errors], problem: Problem, options: NoiseOptions, given: float
-) -> Estimate:
-    """Of one kind, with its correlation as given, or estimated and taken out."""
-    if not any(errors.active.any() for errors in clips):
-        return Estimate(0.0, given, 0.0)
-    tails = float(problem.tails)
-    whitened = options.correlation == "whitened"
-    found = series.likeliest(clips, problem.loss, tails, None if whitened else given)
-    if options.correlation != "counted":
-        return found
-    autoregression = series.likeliest(clips, problem.loss, tails, None)
-    return found._replace(correlation=autoregression.correlation)
+def _check_noise(sigmas: Mapping[str, float]) -> None:
+    """Raises NoiseCollapse for a sigma that no capture has."""
+    for kind, sigma in sigmas.items():
+        if sigma < (least := LEAST_SIGMAS[kind]):
+            raise NoiseCollapse(
+                f"the noise of {kind} has collapsed: its likeliest sigma is {sigma:.2g}, and no "
+                f"capture is known to less than {least:g} (m, rad); what the system cannot follow "
+                'was taken for correlated noise, or nothing is left: take sigmas = "given" and '
+                'correlation = "counted" in [noise]'
+            )
 
 
-def _independent_fraction(
-    by_clip: list[dict[str, Errors]], correlations: Mapping[str, float]
-) -> float:
-    """Fraction of the residuals that counts as independent, all kinds together.
+@in_float64
+def counted(problem: Problem[jaxik.FootIK], u: Vector) -> Problem[jaxik.FootIK]:
+    """The problem with the weight that its residuals at `u` say; see `likelihood_weight`."""
+    weight = likelihood_weight(problem, u)
+    return with_noise(problem, dataclasses.replace(noise_of(problem), weight=weight))
 
-    `(1 + rho) / (1 - rho)` frames of a kind are worth one. Kinds are averaged as a composite
-    likelihood's score is, by their counts (Pauli, Racugno and Ventura 2011).
+
+@in_float64
+def likelihood_weight(problem: Problem[jaxik.FootIK], u: Vector) -> float:
+    """Weight of the log-likelihood at which intervals are as wide as the residuals say.
+
+    Of kinds of residuals, each a first-order autoregression, the variance of the score over the
+    curvature, both summed (Pauli, Racugno and Ventura 2011): `(1 + rho) / (1 - rho)` frames are
+    worth one, and residuals of twice their sigma a quarter. No residual counts as smaller than the
+    least sigma that a capture has.
     """
-    frames, count = 0.0, 0
-    for errors in by_clip:
-        for kind, rho in correlations.items():
-            active = int(errors[kind].active.sum())
-            frames += active * (1 + rho) / (1 - rho)
-            count += active
-    return min(1.0, count / max(frames, 1e-300))
+    noise, by_clip = noise_of(problem), _errors_of_clips(problem, u)
+    curvature = variance = 0.0
+    for kind, sigma in noise.sigmas.items():
+        for errors in by_clip:
+            in_sigmas = errors[kind]._replace(values=errors[kind].values / sigma)
+            residuals = series.whitened(in_sigmas, noise.correlations[kind])
+            scores = residuals._replace(values=_influence(problem, residuals.values))
+            if not scores.active.any():
+                continue
+            values, count = residuals.values[scores.active], int(scores.active.sum())
+            steps = _influence(problem, values + STEP) - _influence(problem, values - STEP)
+            curvature += count * max(float(steps.mean()) / (2 * STEP), LEAST_SLOPE)
+            rho = series.likeliest([scores], "squares", noise.tails, None).correlation
+            frames = min((1 + rho) / (1 - rho), len(scores.values))
+            squares = max(
+                float(np.mean(scores.values[scores.active] ** 2)), (LEAST_SIGMAS[kind] / sigma) ** 2
+            )
+            variance += count * squares * frames
+    return curvature / variance if variance else 1.0
+
+
+def _influence(problem: Problem[jaxik.FootIK], residuals: np.ndarray) -> np.ndarray:
+    return series.influence(residuals, problem.loss, float(problem.tails))
+
+
+def _errors_of_clips(problem: Problem[jaxik.FootIK], u: Vector) -> list[dict[str, Errors]]:
+    ik = problem.space.unpack(jnp.asarray(u))
+    pairs = zip(problem.data, _errors_by_kind(ik, problem.data), strict=True)
+    return [_counted(scene, values) for scene, values in pairs]
 
 
 def _counted(scene: Scene, by_kind: Mapping[str, Array]) -> dict[str, Errors]:

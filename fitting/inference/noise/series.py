@@ -102,10 +102,22 @@ def information_of_slopes(loss: Loss, tails: float) -> float:
 
 def innovations(errors: Errors, correlation: float) -> Float[np.ndarray, " values"]:
     """What the previous frame does not predict, of the errors that count, in their unit."""
+    return whitened(errors, correlation).values[errors.active]
+
+
+def whitened(errors: Errors, correlation: float) -> Errors:
+    """What the previous frame does not predict of errors, where there is one that counts."""
     values, follows = errors.values, _follows(errors)
     previous = np.concatenate([np.zeros_like(values[:1]), values[:-1]])
     innovation = (values - correlation * previous) / math.sqrt(1 - correlation**2)
-    return np.where(follows, innovation, values)[errors.active]
+    return errors._replace(values=np.where(follows, innovation, values))
+
+
+def influence(
+    residuals: Float[np.ndarray, "*values"], loss: Loss, tails: float
+) -> Float[np.ndarray, "*values"]:
+    """Derivative of half the loss by a residual, both in sigmas."""
+    return residuals * slope_of_rho(residuals**2, loss, tails, np)
 
 
 def scale(values: Float[np.ndarray, " values"], loss: Loss, tails: float) -> float:

@@ -59,6 +59,15 @@ class Solution:
     """Whether these were enough."""
     interrupted: bool = False
 
+    def weighted(self, weight: float) -> "Solution":
+        """The solution of the same problem with a weight; its own is 1."""
+        return dataclasses.replace(
+            self,
+            cost_before=weight * self.cost_before,
+            cost=weight * self.cost,
+            jacobian=weight**0.5 * self.jacobian,
+        )
+
     def following(self, before: "Solution") -> "Solution":
         """The solution with the history and the effort of an earlier one added to its own."""
         later = (

@@ -17,7 +17,7 @@ class Curves:
     """For each parameter the lowest points known, sorted by its value."""
 
     def __init__(self, problem: Problem, solution: Points):
-        self.space = problem.space
+        self.problem, self.space = problem, problem.space
         self.curves = [solution for _ in range(problem.space.size)]
 
     def add(self, targets: Targets, points: Points) -> None:
@@ -47,7 +47,7 @@ class Curves:
     def data_rises(self, i: int) -> Float[np.ndarray, " points"]:
         """The same of the cost without the parameter's own prior."""
         curve = self.curves[i]
-        cost = curve.cost - self.space.prior_costs(curve.u)[:, i]
+        cost = curve.cost - self.problem.prior_costs(curve.u)[:, i]
         return cost - cost.min()
 
     def highest(self, i: int) -> float:
@@ -80,7 +80,7 @@ class Curves:
                 curve.values,
                 curve.values[:, i],
                 curve.cost,
-                self.space.prior_costs(curve.u)[:, i],
+                self.problem.prior_costs(curve.u)[:, i],
             )
             for i, (parameter, curve) in enumerate(
                 zip(self.space.parameters, self.curves, strict=True)

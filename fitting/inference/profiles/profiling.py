@@ -113,7 +113,7 @@ def follow_outwards(profiling: Profiling) -> None:
         for k, (s, i) in enumerate(zip(active, index, strict=True)):
             last[s] = points[k : k + 1]
             u = np.concatenate([last[s].u, profiling.solution.u])
-            own = space.prior_costs(u)[:, i]
+            own = curves.problem.prior_costs(u)[:, i]
             rise = points.cost[k] - own[0] - (curves.best.cost[0] - own[1])
             if rise < LOW and position + 1 < len(sides[s][1]):
                 following.append(s)

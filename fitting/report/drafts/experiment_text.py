@@ -27,7 +27,6 @@ def as_toml(draft: Draft) -> str:
     folder = experiment.path.parent
     top = {name: getattr(experiment, name) for name in TOP}
     top["written_in"] = folder.resolve().as_posix()
-    noise = {"sigmas": experiment.noise.sigmas, "correlation": experiment.noise.correlation}
     parts = [OPENING.format(name=experiment.path.name), "", *_keys(top, _plain_keys(schema))]
     for entry in experiment.clips:
         own = _of_clip(entry, folder)
@@ -35,10 +34,9 @@ def as_toml(draft: Draft) -> str:
     for name in ("rules", "parameters"):
         parts += ["", _heading(name, schema)]
     parts += ["", _heading("free", schema), *_free(draft)]
-    values = {"noise": noise}
     for name in ("prior", "start", "sigmas", "noise", "hierarchy", "fit", "sample"):
         keys = _plain_keys(schema[name]["properties"])
-        parts += ["", _heading(name, schema), *_keys(values.get(name, {}), keys)]
+        parts += ["", _heading(name, schema), *_keys({}, keys)]
     return "\n".join(parts) + "\n"
 
 

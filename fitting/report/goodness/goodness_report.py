@@ -23,12 +23,14 @@ TOLERANCES = (
 
 def text(fitted: Fit) -> str:
     """The verdict and the sizes of the residuals, for the terminal."""
-    return joined([fitted.verdict.sentence, aligned(_size_table(fitted))], apart=True)
+    distances = aligned(goodness_tables.distance_table(fitted.distances))
+    return joined([fitted.verdict.sentence, distances, aligned(_size_table(fitted))], apart=True)
 
 
 def section(fitted: Fit) -> list[str]:
     """Paragraphs of Markdown."""
     parts = ["## Goodness of fit", f"**{fitted.verdict.sentence}**"]
+    parts.append(markdown(goodness_tables.distance_table(fitted.distances)))
     if not fitted.has_noise:
         return [*parts, TOLERANCES, markdown(goodness_tables.tolerance_table(fitted.groups))]
     parts += [_describe_sizes(fitted), markdown(_size_table(fitted))]
@@ -37,8 +39,8 @@ def section(fitted: Fit) -> list[str]:
 
 
 def _size_table(fitted: Fit) -> Table:
-    estimated = fitted.assumed.sigmas_estimated
-    return goodness_tables.size_table(fitted.groups, sigmas_estimated=estimated)
+    judged = not (fitted.assumed.sigmas_estimated or fitted.assumed.counted)
+    return goodness_tables.size_table(fitted.groups, judged=judged)
 
 
 def _describe_sizes(fitted: Fit) -> str:

@@ -2,27 +2,38 @@
 
 from collections.abc import Sequence
 
+from fitting.analysis.distances import CLOSE, MOTIONS, Distances
 from fitting.analysis.goodness.groups import Group
-from fitting.analysis.goodness.verdict import SMALL
+from fitting.analysis.goodness.verdict import NAMES, PARTS, SMALL, size
 from fitting.report.formatting import Table, number, percent
 from fitting.report.labels import RESIDUALS
 
 
-def size_table(groups: Sequence[Group], *, sigmas_estimated: bool = False) -> Table:
+def size_table(groups: Sequence[Group], *, judged: bool = True) -> Table:
     """How large the residuals are, and with how many they are judged.
 
     Args:
         groups: the rows.
-        sigmas_estimated: leaves out p, which says nothing then.
+        judged: False leaves out p, which says nothing where sigmas are not those of the noise.
     """
     heading = ["residuals", "active", "degrees of freedom", "reduced chi-square", "p"]
     table = [[*heading, "sigma", "noise", "noise / sigma"]]
     for group in groups:
         cells = [RESIDUALS[group.kind].name, str(group.left.count), f"{group.left.degrees:.0f}"]
-        p = "–" if sigmas_estimated else _p(group.left.p, group)
+        p = _p(group.left.p, group) if judged else "–"
         cells += [number(group.left.mean_square), p, *_sizes(group)]
         table.append(cells)
     return _with_clips(table, groups)
+
+
+def distance_table(distances: Distances) -> Table:
+    """How far motions are from the captured one, on fitted frames and on those held out."""
+    table = [["distance from the capture, rms", "frames", "flat animation", "before", "fitted"]]
+    for part, motions in distances.parts.items():
+        for kind in CLOSE:
+            cells = [size(kind, motions[motion][kind]) for motion in MOTIONS]
+            table.append([NAMES[kind], PARTS[part].removesuffix(" frames"), *cells])
+    return table
 
 
 def tolerance_table(groups: Sequence[Group]) -> Table:

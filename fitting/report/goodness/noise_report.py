@@ -12,7 +12,11 @@ from fitting.report.formatting import Table, interval, markdown, number
 from fitting.report.labels import RESIDUALS
 from fitting.studies.fit import Fit
 
-COUNTED = "Residuals of neighbouring frames are correlated: each counts as {:.3g} independent ones."
+COUNTED = (
+    "Neighbouring frames are alike, and residuals are not as large as their sigmas: for intervals, "
+    "each counts as {:.3g} independent ones of the size of its sigma. The best point does not "
+    "depend on that."
+)
 
 
 def section(fitted: Fit) -> list[str]:
@@ -20,13 +24,13 @@ def section(fitted: Fit) -> list[str]:
     options = fitted.experiment.noise
     if not options.estimates_any:
         return []
-    parts = ["### Noise, estimated with the parameters"]
+    parts = ["### Noise"]
     if options.sigmas == "estimated":
         parts.append(markdown(_estimated_sigmas(fitted)))
     if options.correlation == "whitened":
         parts.append(markdown(_estimated_correlations(fitted)))
     if options.correlation == "counted":
-        parts.append(COUNTED.format(fitted.noise.independent_fraction))
+        parts.append(COUNTED.format(fitted.noise.weight))
     if fitted.problem.loss == "student" and options.sigmas == "estimated":
         parts.append(f"Student's t has {fitted.noise.tails:.3g} degrees of freedom.")
     return parts

@@ -14,6 +14,7 @@ from fitting.analysis.worst_window import WorstWindow
 from fitting.datasets.clips import flight
 from fitting.report import fit_tables, worst_window_report
 from fitting.report.formatting import Table
+from fitting.report.goodness import goodness_tables
 from fitting.report.identifiability.sections import missing_table
 from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit
@@ -87,13 +88,14 @@ def _content(
         "verdict": sentences.verdict_word(fitted),
         "good": summary["converged"] and fitted.verdict.fits,
         "findings": sentences.findings(fitted, motions, accuracies),
-        "technical": f"{summary['message']} {summary['goodness']['sentence']}",
+        "technical": f"{summary['goodness']['sentence']} {summary['message']}",
         "requested": _asked(fitted),
         "rows": rows,
         "recovered": fit_tables.recovered(summary["parameters"], fitted.known_values)
         if fitted.known_values
         else "",
         "cost": (f"{summary['cost_before']:.6g}", f"{summary['cost']:.6g}"),
+        "distances": goodness_tables.distance_table(fitted.distances),
         "accuracy": figures.accuracy_table(accuracies),
         "placements": [figures.placement_table(_placements(clip)) for clip in motions],
         "names": [entry.reference.name for entry in fitted.experiment.clips],

@@ -14,7 +14,6 @@ from fitting.experiments.problems import ClipData, load_clip_data, problem_from_
 from fitting.experiments.record_only import PLACES
 from fitting.experiments.systems import DEFAULT_PRESET, Preset, preset_system
 from fitting.inference.choice import Forecast, choose_free
-from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.sensitivity import all_parameters
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
@@ -158,7 +157,6 @@ def draft(
         faithful=request.preset.faithful or request.record_only,
         name=folder.resolve().name,
         fps=SLOW if fast else None,
-        noise=NoiseOptions(sigmas="estimated", correlation="whitened"),
         record_only=request.record_only,
     )
     with activity.announced("Reading the clips and their ground"):

@@ -193,12 +193,10 @@ def _joined(
 
     What only a whole problem has, the independent fraction and Student's tails, is their mean.
     """
-    fraction = jnp.mean(jnp.stack([single.independent_fraction for single in problems]))
+    fraction = jnp.mean(jnp.stack([single.weight for single in problems]))
     tails = jnp.mean(jnp.stack([single.tails for single in problems]))
     scenes = tuple(scene for single in problems for scene in single.data)
-    return eqx.tree_at(
-        lambda p: (p.data, p.independent_fraction, p.tails), problem, (scenes, fraction, tails)
-    )
+    return eqx.tree_at(lambda p: (p.data, p.weight, p.tails), problem, (scenes, fraction, tails))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -90,7 +90,7 @@ class _Clip:
         self._scene: Scene = problem.data[index]
         self._random = np.random.default_rng([seed, index])
         self._density = NoiseDensity(problem.loss, float(problem.tails))
-        self._fraction = float(problem.independent_fraction)
+        self._fraction = float(problem.weight)
         self._frames: list[Float[np.ndarray, " frames"]] = []
         self._statistics: dict[str, list[np.ndarray]] = defaultdict(list)
         self._channels: dict[str, list[np.ndarray]] = defaultdict(list)
