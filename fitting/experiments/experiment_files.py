@@ -91,9 +91,10 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     Where one leads nowhere, it starts from where the file was written, if the table says so.
     """
     check_table(content, TOP_KEYS, f"{path}")
-    for key in ("clips", "free"):
-        if not content.get(key):
-            raise ValueError(f"{path}: there is no [{key}]; an experiment has at least one of them")
+    if not content.get("clips"):
+        raise ValueError(f"{path}: there is no [[clips]]; an experiment has at least one of them")
+    if "free" not in content:
+        raise ValueError(f"{path}: there is no [free]; it may be empty, where nothing is fitted")
     with validation.error_context(path):
         ik = preset_system(
             content.get("preset", DEFAULT_PRESET.name), faithful=content.get("faithful", False)

@@ -95,7 +95,7 @@ def _check(experiment: Experiment) -> None:
             "record_only and [hierarchy] scale_with_body exclude each other: a record's numbers "
             "are the same for every body"
         )
-    if not PLACES.intersection(experiment.free):
+    if experiment.free and not PLACES.intersection(experiment.free):
         raise ValueError(
             f"record_only: the record has no room for any of {list(experiment.free)}; it has for "
             f"{sorted(PLACES)}"

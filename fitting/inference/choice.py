@@ -1,8 +1,9 @@
 """Which parameters to free for clips of which nothing is known yet.
 
-Each parameter is swept over its range while the others stay at the system's values. The mean slope
-of every residual over such a sweep, which also sees what lies behind a threshold or a limit, stands
-in for its derivative, and a normal approximation then tells how far the clips would narrow down the
+Each parameter is swept over its range while the others stay at the system's values, and again at a
+few draws from a wide prior, for at one point a rule may happen to be idle. The mean slope of every
+residual over such a sweep, which also sees what lies behind a threshold or a limit, stands in for
+its derivative, and a normal approximation then tells how far the clips would narrow down the
 parameters together. The one they narrow down least is fixed, and so on, until they narrow down all.
 It is a forecast: what the clips do determine is for the fit to say.
 """
@@ -20,7 +21,7 @@ from fitting.problem.space import make_space
 from fitting.runtime.precision import in_float64
 
 from .identifiability import UNDETERMINED
-from .sensitivity import NEGLIGIBLE, FreeTable, sweep
+from .sensitivity import NEGLIGIBLE, FreeTable, sweep, sweep_points
 
 INDEPENDENT_EVERY = 0.5  # s between residuals of captured motion that tell something new
 
@@ -52,7 +53,7 @@ def choose_free(
     """A forecast for each parameter, in the order of the table.
 
     Args:
-        ik: the system, at whose values the others stay.
+        ik: the system.
         candidates: the parameters, with overrides of their declarations.
         scenes: the clips; of these the sigmas count, the references do not. Ranges are those for
             the body of the first one.
@@ -60,14 +61,18 @@ def choose_free(
     rig, names = scenes[0].rig, list(candidates)
     parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
     space = make_space(ik, parameters)
-    u = np.asarray(space.pack({}))
-    swept = zip(u, sweep(space, scenes, u), strict=True)
-    each = [
-        (_slope(tried - start, changes), np.abs(changes).max()) for start, (tried, changes) in swept
-    ]
-    slopes, reach = np.stack([slope for slope, _ in each]), np.array([size for _, size in each])
     seconds = float(np.mean([np.asarray(scene.frames.dt).mean() for scene in scenes]))
-    information = min(1.0, seconds / INDEPENDENT_EVERY) * slopes @ slopes.T
+    information, reach = np.zeros((space.size, space.size)), np.zeros(space.size)
+    points = sweep_points(space)
+    for u in points:
+        swept = zip(u, sweep(space, scenes, u), strict=True)
+        each = [
+            (_slope(tried - here, changes), np.abs(changes).max())
+            for here, (tried, changes) in swept
+        ]
+        slopes = np.stack([slope for slope, _ in each])
+        information += min(1.0, seconds / INDEPENDENT_EVERY) * slopes @ slopes.T / len(points)
+        reach = np.maximum(reach, [size for _, size in each])
     free, rivals = _narrowed_down(information)
     alone = 1.0 - 1.0 / (1.0 + SPREAD**2 * np.diag(information))
     return [

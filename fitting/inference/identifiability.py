@@ -103,6 +103,11 @@ def assess_identifiability(
         ValueError: if the Jacobian at the solution is not finite.
     """
     space = problem.space
+    if not space.size:
+        none = np.zeros(0)
+        return Identifiability(
+            (), {}, none, none, (), none, (), (), (), none, best_cost=solution.cost, improvement=0.0
+        )
     if not np.isfinite(solution.jacobian).all():
         raise ValueError(
             f"the Jacobian at the solution is not finite, so nothing is known of how well the"

@@ -63,11 +63,14 @@ def measure_sensitivity(
     """
     rig = scenes[0].rig
     space = make_space(ik, [free_parameter(ik, name, rig, **given) for name, given in free.items()])
-    random = np.random.default_rng(seed)
-    draws = SPREAD * random.normal(size=(DRAWS, space.size))
-    points = [np.asarray(space.pack({})), *draws]
-    reach = np.max([_reach(space, scenes, u) for u in points], axis=0)
+    reach = np.max([_reach(space, scenes, u) for u in sweep_points(space, seed)], axis=0)
     return {name: float(r) for name, r in zip(free, reach, strict=True) if r > NEGLIGIBLE}
+
+
+def sweep_points(space: Space, seed: int = 0) -> list[Float[np.ndarray, " free"]]:
+    """Where the other parameters stay during sweeps, u: as the system has them, and a few draws."""
+    random = np.random.default_rng(seed)
+    return [np.asarray(space.pack({})), *(SPREAD * random.normal(size=(DRAWS, space.size)))]
 
 
 def _reach(

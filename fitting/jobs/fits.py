@@ -25,11 +25,11 @@ from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
 from fitting.report.plots import style
 from fitting.runtime.precision import in_float64
-from fitting.studies import record_price, run_folder, translation
+from fitting.studies import capture_check, record_price, run_folder, translation
 from fitting.studies.assess import assess_solution
 from fitting.studies.fit import Fit, search, search_with_noise
 from fitting.studies.posterior.replay import replay
-from fitting.studies.sample import SampledFit, log_probability_at, sample_around
+from fitting.studies.sample import SampledFit, minus_cost_at, sample_around
 from fitting.studies.translation import TranslationRequest
 
 from .kept import kept_stages, remove
@@ -82,9 +82,9 @@ def fit(
         lines: list[str] = []
         clips = load_clips(experiment, lines.append)
         problem = problem_from_clips(experiment, clips)
-        free, count = len(experiment.free), len(clips)
-        heading = f"fitting {free} parameters of {experiment.preset} to {count} clip(s)"
-        log("\n".join([heading, *lines]))
+        what = f"{len(experiment.free)} parameters of" if experiment.free else "no parameter of"
+        heading = f"fitting {what} {experiment.preset} to {len(clips)} clip(s)"
+        log("\n".join([heading, *lines, *capture_check.check(clips).lines]))
         loaded(experiment, problem, clips)
         kept = kept_stages(run, experiment, problem, log)
         rehearsal = Rehearsal(problem) if run is not None and report else None
@@ -222,7 +222,7 @@ def _price_of_record(
 ) -> tuple[list[str], list[str]]:
     """What it costs to fit only what the record holds: for the terminal, and in Markdown."""
     experiment = fitted.experiment
-    if not experiment.record_only:
+    if not (experiment.record_only and experiment.free):
         return [], []
     if (names := left_out(experiment)) and not fitted.solution.interrupted:
         log(f"what the record costs: a search in which {', '.join(names)} are free, too")
@@ -255,21 +255,21 @@ def _adopt_lower_point(
     if translation.is_translation(run):
         return sampled
     log(
-        f"the chain met a point whose log-probability is {posterior.improvement:.3g} higher than "
-        "the fit's; the fit goes on from there"
+        f"the chain met a point whose cost is {posterior.improvement:.3g} lower than the fit's; "
+        "the fit goes on from there"
     )
     try:
         first = np.asarray(problem.space.pack(posterior.best_values))
         solution = search(problem, experiment, first=first)
-        at_solution = log_probability_at(problem, experiment, solution.u)
-        if solution.interrupted or at_solution <= posterior.start_log_probability:
+        at_solution = minus_cost_at(problem, experiment, solution.u)
+        if solution.interrupted or at_solution <= posterior.start_minus_cost:
             return sampled
         fitted = assess_solution(experiment, problem, solution)
     except KeyboardInterrupt:
         return sampled
     known_values = sampled.known_values
     fitted = dataclasses.replace(fitted, known_values=known_values, run=run, clips=clips)
-    at_solution = log_probability_at(problem, experiment, fitted.solution.u)
+    at_solution = minus_cost_at(problem, experiment, fitted.solution.u)
     run_folder.save_solution(run, experiment, problem, fitted.solution)
     run_folder.save_fit(run, fitted)
     fit_report.write_fit(run, fitted)
@@ -277,7 +277,7 @@ def _adopt_lower_point(
     sampled = dataclasses.replace(
         sampled,
         parameters=fitted.summary["parameters"],
-        posterior=dataclasses.replace(posterior, start_log_probability=at_solution),
+        posterior=dataclasses.replace(posterior, start_minus_cost=at_solution),
     )
     _save_and_report(run, sampled)
     return sampled

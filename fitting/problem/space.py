@@ -155,7 +155,7 @@ class Space(eqx.Module, Generic[System]):
             fraction = library.clip((coordinate - start) / (end - start), EDGE, 1 - EDGE)
             u[i] = library.log(fraction) - library.log1p(-fraction)
             leaves[parameter.leaf] = _with_value(self, i, leaf, value, library)
-        return _free_last(library.stack(library.broadcast_arrays(*u)))
+        return _free_last(_stack(library, u))
 
     @in_float64
     def prior_residuals(self, u: Rows) -> Rows:
@@ -250,7 +250,7 @@ class Space(eqx.Module, Generic[System]):
             values[i] = from_scale(coordinate, parameter.scale, library)
             leaf = leaves[parameter.leaf]
             leaves[parameter.leaf] = _with_value(self, i, leaf, values[i], library)
-        return leaves, library.stack(values)
+        return leaves, library.stack(values) if values else fractions
 
 
 def _shape(space: Space, name: str) -> tuple[int, ...]:  # no method: binding one takes 0.3 ms
@@ -281,6 +281,11 @@ def _with_value(space: Space, i: int, leaf: Any, value: Any, library: ModuleType
     return library.stack(library.broadcast_arrays(*legs))
 
 
+def _stack(library: ModuleType, columns: Sequence[Any]) -> Any:
+    """Columns of any shapes that go together, (free, *rows)."""
+    return library.stack(library.broadcast_arrays(*columns)) if columns else library.zeros((0,))
+
+
 def _free_last(columns: Any) -> Any:
     """(free, *rows) as (*rows, free)."""
     return library_of(columns).moveaxis(columns, 0, -1)
@@ -289,15 +294,16 @@ def _free_last(columns: Any) -> Any:
 def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]:
     """The space of these free parameters of a system, with the default prior and start.
 
+    There may be none: then the only point is the system as it is.
+
     Raises:
-        ValueError: for no parameter, one named twice, or one that has no room left above another.
+        ValueError: for one named twice, or one that has no room left above another.
     """
-    if not parameters:
-        raise ValueError("nothing is free; name at least one parameter")
     for parameter in parameters:
         _check_free_once(parameter, parameters)
         _check_room(ik, parameter, parameters)
-    dtype = parameter_tree.get(ik, parameters[0].leaf).dtype
+    leaves = [parameter_tree.get(ik, parameter.leaf) for parameter in parameters]
+    dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
     zeros = jax.device_put(np.zeros(len(parameters), dtype))
     space = Space(
         system=ik,

@@ -36,6 +36,8 @@ def fit_text(fitted: Fit) -> str:
     """The result of a fit, for the terminal."""
     rows, truth = fitted.summary["parameters"], fitted.known_values
     parts = [goodness_report.text(fitted), ""]
+    if not rows:
+        return joined([*parts, fitted.summary["message"]])
     parts += [fitted.summary["message"], cost_sentence(fitted), ""]
     parts.append(aligned(fit_tables.parameter_table(rows, truth)))
     if any("half_life" in row for row in rows):
@@ -68,26 +70,23 @@ def write_fit(
         before = (rehearsal or Rehearsal(fitted.problem)).results()
     with ExitStack() as drawing, calls_beside():
         with activity.announced("Drawing the curves of the parameters"):  # which takes longest
-            curves = _draw_profiles(run, fitted)
+            curves = _draw_search(run, fitted)
         plays = zip(fitted.problem.data, fitted.playbacks, strict=True)
         for index, (scene, after) in enumerate(plays):
             with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
                 first = playback.play(scene, before[index])
                 plots |= _draw_clip(run, fitted, index, first, after)
                 worst += _worst_window(run, fitted, index, after)
-        title = f"{fitted.experiment.name}: cost of the fit over time"
-        figure = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
-        plots |= curves | save_plot(run, "cost.png", title, figure)
+        plots |= curves
         with activity.announced("Measuring where limits are in effect"):
             clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
             limits = _limits(fitted, clips)
         parts = [
             *_result(fitted),
+            *_check(fitted),
             *opening,
             *goodness_report.section(fitted),
-            *_parameters(fitted),
-            *priors.prior_section(fitted.summary["parameters"]),
-            *identifiability_sections(fitted, clips),
+            *(_parameters(fitted, clips) if fitted.experiment.free else []),
             *limits,
             *worst,
             *details,
@@ -166,13 +165,19 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
     return plots
 
 
-def _draw_profiles(run: Path, fitted: Fit) -> Plots:
+def _draw_search(run: Path, fitted: Fit) -> Plots:
+    """Draws the curves of the parameters and the course of the search, where there was one."""
+    if not fitted.experiment.free:
+        return {}
+    title = f"{fitted.experiment.name}: cost of the fit over time"
+    cost = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
+    plots = save_plot(run, "cost.png", title, cost)
     title = f"{fitted.experiment.name}: how the cost rises over the range of each parameter"
     units = {row["name"]: row["unit"] for row in fitted.summary["parameters"]}
     parameters = {parameter.name: parameter for parameter in fitted.problem.space.parameters}
     profiles = fitted.identifiability.profiles
     figure = profile_plots.profiles(parameters, profiles, units, fitted.known_values, title)
-    return save_plot(run, "profiles.png", title, figure)
+    return save_plot(run, "profiles.png", title, figure) | plots
 
 
 def _result(fitted: Fit) -> list[str]:
@@ -187,14 +192,20 @@ def _result(fitted: Fit) -> list[str]:
     ]
 
 
-def _parameters(fitted: Fit) -> list[str]:
+def _check(fitted: Fit) -> list[str]:
+    if not fitted.check.lines:
+        return []
+    return ["## What these clips can tell", bullets(list(fitted.check.lines))]
+
+
+def _parameters(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
     rows, truth = fitted.summary["parameters"], fitted.known_values
     parts = ["## Parameters", markdown(fit_tables.parameter_table(rows, truth))]
     if truth:
         parts.append(f"{fit_tables.recovered(rows, truth)}.")
     if any("half_life" in row for row in rows):
         parts.append(markdown(fit_tables.gain_table(rows)))
-    return parts
+    return [*parts, *priors.prior_section(rows), *identifiability_sections(fitted, clips)]
 
 
 def _limits(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:

@@ -36,6 +36,8 @@ from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
 from jaxik.maths import parameter_tree, smoothing
 
+from . import capture_check
+from .capture_check import CaptureCheck
 from .goodness import DistancesSummary, GoodnessSummary, summarise, summarise_distances
 from .prior_summary import PriorSummary, summarise_priors
 
@@ -202,6 +204,11 @@ class Fit(Shown):
         scenes = zip(self.problem.data, self.before, strict=True)
         before = [playback.play(scene, result) for scene, result in scenes]
         return distances.measure(before, self.playbacks)
+
+    @cached_property
+    def check(self) -> CaptureCheck:
+        """What the clips can tell, whatever is fitted to them."""
+        return capture_check.check(self.clips)
 
     @property
     def kept_system(self) -> jaxik.FootIK:

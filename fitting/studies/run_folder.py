@@ -183,8 +183,8 @@ def _check_numbers(summary: FitSummary) -> None:
         NoiseModel(**summary["noise"])  # checks its numbers
     rows = summary["parameters"]
     names = [row["name"] for row in rows]
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"its parameters are {names}; wanted one or more, each once; {HINT}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"its parameters are {names}; wanted each once; {HINT}")
     for row in rows:
         for valley in row.get("valleys", ()):
             if len(valley.get("values", rows)) != len(rows):

@@ -17,6 +17,7 @@ from fitting.inference.sampling.posterior import (
     Posterior,
     SamplingProgress,
     WalkerStart,
+    minus_cost,
     sample_posterior,
 )
 from fitting.inference.sampling.prior_sensitivity import Reweighted, prior_sensitivity
@@ -97,6 +98,8 @@ def sample_around(
         raise ValueError(
             f"the fit has the parameters {names}, the experiment {list(problem.space.names)}"
         )
+    if not names:
+        raise ValueError("nothing was free in this fit, so there is no posterior to sample")
     start = walker_start(parameters, problem.space)
     problem = with_open_noise(problem, experiment)
     posterior = sample_posterior(
@@ -123,12 +126,13 @@ def walker_start(parameters: Sequence[FittedParameter], space: Space) -> WalkerS
     return WalkerStart(u, sd, np.array(known[1:]).reshape(-1, u.size))
 
 
-def log_probability_at(
+def minus_cost_at(
     problem: Problem[jaxik.FootIK], experiment: Experiment, u: Float[np.ndarray, " free"]
 ) -> float:
-    """Log-probability of a point, as a chain around a fit counts it."""
+    """Minus the cost of a point, as a chain around a fit compares it."""
     problem = with_open_noise(problem, experiment)
-    return float(problem.log_probability(jnp.asarray(u, problem.space.start.dtype)))
+    log_probability = problem.log_probability(jnp.asarray(u, problem.space.start.dtype))
+    return float(minus_cost(problem, u, np.asarray(log_probability)))
 
 
 def with_open_noise(

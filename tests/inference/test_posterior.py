@@ -179,7 +179,7 @@ def test_what_a_chain_gains_over_its_start_is_known():
     for start, gain in ((mean, 0.0), (mean + 3 * known.sd, None)):
         sampled = sample(problem, start, known.sd, max_steps=300)
         expected = float(problem.cost(jnp.asarray(start))) - lowest if gain is None else gain
-        assert sampled.start_log_probability == pytest.approx(-expected - lowest)
+        assert sampled.start_minus_cost == pytest.approx(-expected - lowest)
         assert expected - 1.0 < sampled.improvement <= expected
         values = problem.space.values(jnp.asarray(problem.space.pack(sampled.best_values)))
         assert list(sampled.best_values.values()) == pytest.approx(values.tolist())

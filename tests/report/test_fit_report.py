@@ -378,7 +378,7 @@ def test_a_posterior_stands_beside_its_prior(fitted, tmp_path, undrawn):
 
 
 def test_a_chain_that_meets_a_lower_point_hands_it_back(fitted, tmp_path, undrawn):
-    posterior = replace(invented_posterior(), start_log_probability=-8.0)
+    posterior = replace(invented_posterior(), start_minus_cost=-8.0)
     best = posterior.best_values
     assert posterior.improvement == pytest.approx(8.0, abs=0.1)
     text, numbers = write_posterior(tmp_path, fitted, posterior)
@@ -388,7 +388,7 @@ def test_a_chain_that_meets_a_lower_point_hands_it_back(fitted, tmp_path, undraw
     table = tomllib.loads((tmp_path / run_folder.LOWER_POINT).read_text())["start"]
     assert table["contact"]["planted_height"] == best["contact.planted_height"]
     assert numbers["lower_point"] == {"gain": posterior.improvement, "values": best}
-    posterior = replace(posterior, start_log_probability=0.0)
+    posterior = replace(posterior, start_minus_cost=0.0)
     assert write_posterior(tmp_path, fitted, posterior)[1]["lower_point"] is None
     assert not (tmp_path / run_folder.LOWER_POINT).exists()
 
@@ -485,9 +485,9 @@ def test_walkers_left_out_a_better_point_and_an_interval_that_contradicts_the_fi
     text = text_of(isolated=[2, 5], isolated_mass=0.0071)
     assert "Left out are walkers 2, 5" in text and "about 0.71 % of the posterior" in text
     top = float(toy_posterior().log_probability.max())
-    text = text_of(start_log_probability=top - 3.25)
+    text = text_of(start_minus_cost=top - 3.25)
     assert "log-probability is 3.25 higher" in text and "`Posterior.best_values`" in text
-    assert "contradicts" not in text_of(start_log_probability=top - 0.05)
+    assert "contradicts" not in text_of(start_minus_cost=top - 0.05)
     for value, width, kind, reason in (
         (0.6, 0.2, "smooth", None),
         (0.75, 0.2, "smooth", "leaves out the fit"),

@@ -26,7 +26,7 @@ def experiment_schema() -> Content:
     of_system = {
         "rules": system_schema.rules(),
         "parameters": system_schema.parameters(),
-        "free": system_schema.of_free_parameters("free") | {"minProperties": 1},
+        "free": system_schema.of_free_parameters("free"),
     }
     tables = of_system | {
         "prior": system_schema.prior(),

@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import partial
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -74,6 +75,8 @@ def find_best_fit(
     """
     if starts < 1:
         raise ValueError(f"starts is {starts}, wanted at least 1")
+    if not problem.space.size:
+        return _nothing_free(problem)
     first = problem.space.start if first is None else first
     latest = SearchState.at(np.asarray(first), seed=seed)
     watch = _Watch(progress)
@@ -157,6 +160,26 @@ def cost_before(problem: Problem) -> float:
     present = problem.space.pack({})
     cost = float(levenberg_marquardt.evaluate(HardModel(problem, present), present).cost)
     return cost if np.isfinite(cost) else np.inf
+
+
+def _nothing_free(problem: Problem) -> Solution:
+    """The system as it is, where there is nothing to search for."""
+    u = np.zeros(0)
+    cost = float(problem.cost(jnp.asarray(u)))
+    return Solution(
+        names=(),
+        u=u,
+        values=u,
+        cost_before=cost,
+        cost=cost,
+        converged=bool(np.isfinite(cost)),
+        message="Nothing is free: this is the system as it comes.",
+        jacobian=np.zeros((0, 0)),
+        history=(),
+        steps=0,
+        seconds=0.0,
+        agreed=True,
+    )
 
 
 def count_agreeing(ends: Sequence[float], settings: SearchSettings) -> int:

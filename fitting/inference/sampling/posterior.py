@@ -96,7 +96,9 @@ class Posterior(Shown):
     """Draws of the sigmas that were left open, by kind of residual; m, rad, ..."""
     islands: tuple[Island, ...] = ()
     """The heaviest first; none where there is only one."""
-    start_log_probability: float = math.inf
+    minus_costs: Float[np.ndarray, "steps walkers"] | None = None
+    """By which the fit compares points: as the log-probability, with the prior weighted, too."""
+    start_minus_cost: float = math.inf
     """Of the point around which the walkers started."""
     blocks: BlockLogLikelihood | None = None
     """Of some draws; None until they are run through the clips (`studies.posterior.replay`)."""
@@ -113,13 +115,17 @@ class Posterior(Shown):
 
     @property
     def improvement(self) -> float:
-        """How far the best draw is above the start, in log-probability; negative if it is below."""
-        return float(self.log_probability.max()) - self.start_log_probability
+        """How far the best draw is above the start, as the fit counts; negative if it is below."""
+        return float(self._judged.max()) - self.start_minus_cost
+
+    @property
+    def _judged(self) -> Float[np.ndarray, "steps walkers"]:
+        return self.log_probability if self.minus_costs is None else self.minus_costs
 
     @property
     def best_values(self) -> dict[str, float]:
-        """The most probable draw of all, by name, in the parameters' units."""
-        best = np.unravel_index(np.argmax(self.log_probability), self.log_probability.shape)
+        """The best draw of all, as the fit counts, by name, in the parameters' units."""
+        best = np.unravel_index(np.argmax(self._judged), self._judged.shape)
         return dict(zip(self.names, self.values[best].tolist(), strict=True))
 
     def to_inference_data(self, space: Space) -> Any:
@@ -190,7 +196,21 @@ def sample_posterior(
     with activity.announced("Summing up the chain"):
         at_start = _log_probability(problem, start, walkers)
         sampled = _posterior(problem, chain, outcome, time.monotonic() - began)
-    return dataclasses.replace(sampled, start_log_probability=at_start)
+    return dataclasses.replace(
+        sampled,
+        minus_costs=minus_cost(problem, sampled.u, sampled.log_probability),
+        start_minus_cost=float(minus_cost(problem, np.asarray(start.u), np.asarray(at_start))),
+    )
+
+
+def minus_cost(
+    problem: Problem,
+    u: Float[np.ndarray, "*rows free"],
+    log_probability: Float[np.ndarray, "*rows"],
+) -> Float[np.ndarray, "*rows"]:
+    """Minus the cost of points, whose lowest one is the fit, from their log-probability."""
+    of_prior = np.sum(problem.space.prior_costs(np.asarray(u)), axis=-1)
+    return np.asarray(log_probability + (1.0 - float(problem.weight)) * of_prior)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -114,7 +114,12 @@ def _free(draft: Draft) -> Iterator[str]:
             "Not free, as they change too little in these clips:",
             [f for f in forecasts if not f.is_free and not f.rival and f.moves],
         ),
-        ("Not free, as they change nothing in these clips:", [f for f in forecasts if not f.moves]),
+        (
+            "Not free, as the ground under all stances is flat:"
+            if draft.check.flat
+            else "Not free, as they change nothing in these clips:",
+            [f for f in forecasts if not f.moves],
+        ),
     ]
     for title, group in groups:
         if group:

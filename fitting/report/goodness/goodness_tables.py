@@ -36,6 +36,16 @@ def distance_table(distances: Distances) -> Table:
     return table
 
 
+def distances_of_preset(distances: Distances) -> Table:
+    """How far a system that nobody has fitted yet leaves the captured motion."""
+    table = [["distance from the capture, rms", "flat animation", "preset"]]
+    for kind in CLOSE:
+        motions = distances.parts["fitted"]
+        sizes = [size(kind, motions[motion][kind]) for motion in ("animation", "before")]
+        table.append([NAMES[kind], *sizes])
+    return table
+
+
 def tolerance_table(groups: Sequence[Group]) -> Table:
     """How large the errors are where there is no noise."""
     table = [["residuals", "active", "tolerance", "error, rms", "error / tolerance"]]

@@ -138,7 +138,7 @@ def _asked(fitted: Fit) -> Table:
 
 def _remarks(fitted: Fit) -> list[str]:
     """What limits the data of each clip."""
-    remarks = []
+    remarks = list(fitted.check.lines)
     entries = fitted.experiment.clips
     for clip, entry, scene in zip(fitted.clips, entries, fitted.problem.data, strict=True):
         name = entry.reference.name

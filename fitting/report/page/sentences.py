@@ -44,6 +44,8 @@ def _closeness(fitted: Fit, accuracies: Mapping[str, Accuracy]) -> str:
 
 def _determined(fitted: Fit) -> str:
     rows = fitted.summary["parameters"]
+    if not rows:
+        return "No parameter was fitted: this is the system as it comes."
     names = [row["name"] for row in rows if not row["determined"]]
     count = len(rows) - len(names)
     if not names:

@@ -7,15 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.datasets import coverage
-from fitting.datasets.clips import Clip, contacts, flight, summary
-from fitting.datasets.terrain import mesh_files
+from fitting.datasets.clips import Clip, flight, summary
 from fitting.datasets.terrain.reconstruction import Reconstruction
 from fitting.experiments.problems import ClipData
+from fitting.studies.capture_check import stances_of
 from jaxik.world import body
 
 FEW_STANCES = 6  # of a foot
 SCATTER = 0.03  # m, of soles above the ground, from which on the two do not belong together
-RELIEF = 0.05  # m between the lowest and the highest stance, below which ground is flat
 
 
 class Assumption(NamedTuple):
@@ -84,8 +83,8 @@ def knee_bend(clip: Clip) -> Float[np.ndarray, "frames legs"]:
 
 
 def _ground(data: ClipData, ground: Reconstruction | None) -> Iterator[Assumption]:
-    heights, soles = _under_stances(data)
-    covered = ~np.isnan(heights)
+    stances = stances_of(data)
+    covered = ~np.isnan(stances.ground)
     if ground is not None:
         error = 100 * ground.predictions[ground.chosen].rms
         text = (
@@ -98,7 +97,7 @@ def _ground(data: ClipData, ground: Reconstruction | None) -> Iterator[Assumptio
         yield Assumption("ground", "no foot stands on it", "better: a clip in which the feet stand")
         return
     else:
-        gap = (soles - heights)[covered]
+        gap = (stances.sole - stances.ground)[covered]
         text = (
             f"below {covered.mean():.0%} of the stances; soles stand {100 * np.median(gap):.1f} cm "
             f"above it, give or take {100 * np.std(gap):.1f} cm"
@@ -106,26 +105,6 @@ def _ground(data: ClipData, ground: Reconstruction | None) -> Iterator[Assumptio
         advice = "does this ground belong to this clip?"
         fits = covered.mean() >= coverage.ENOUGH and np.std(gap) < SCATTER
         yield Assumption("ground", text, "" if fits else advice)
-    relief = np.ptp(heights[covered]) if covered.any() else 0.0
-    text = f"stances differ by {100 * relief:.0f} cm in height"
-    flat = "foot IK has little to do there; better: clips on steps and slopes"
-    yield Assumption("relief", text, "" if relief >= RELIEF else flat)
-
-
-def _under_stances(data: ClipData) -> tuple[np.ndarray, np.ndarray]:
-    """Heights of ground and sole in the middle of each stance, m; NaN where there is no ground."""
-    clip, height_under = data.reference, mesh_files.height_function(data.terrain)
-    standing, ankles = clip.stance_labels(), clip.joints_ws(2)
-    places = [
-        (sum(run) // 2, leg)
-        for leg in range(standing.shape[1])
-        for run in contacts.runs(standing[:, leg])
-    ]
-    if not places:
-        return np.full(1, np.nan), np.zeros(1)
-    frames, legs = np.array(places).T
-    points = ankles[frames, legs]
-    return height_under(points), points[:, 1] - np.asarray(clip.rig.ankle_height)[legs]
 
 
 def _base(data: ClipData, *, base_is_own: bool) -> Assumption:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jaxik
+from fitting.analysis import distances, playback
+from fitting.analysis.distances import Distances
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.clips.load import AS_FOUND, ClipOptions
 from fitting.datasets.terrain.mesh_files import TerrainOptions
@@ -18,6 +20,8 @@ from fitting.inference.sensitivity import all_parameters
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
+from fitting.studies import capture_check
+from fitting.studies.capture_check import CaptureCheck
 
 from .assumptions import Assumption, of_clip
 
@@ -80,7 +84,11 @@ class Draft:
     assumptions: tuple[tuple[Assumption, ...], ...]
     """Of each clip."""
     forecasts: tuple[Forecast, ...]
-    """Of all parameters that could be free."""
+    """Of all parameters that could be free; of no reach where the ground is flat."""
+    check: CaptureCheck
+    """What the clips can tell."""
+    distances: Distances
+    """How far the system as it comes leaves the capture."""
     rig: jaxik.Rig
     """Of the first clip."""
 
@@ -145,7 +153,7 @@ def draft(
         grounds: of `reconstruct_grounds`, whose meshes are written.
 
     Raises:
-        ValueError: a file cannot be read, or nothing that could be free moves these clips.
+        ValueError: a file cannot be read.
     """
     entries = tuple(_entry(request, clips[i], i, ground) for i, ground in enumerate(grounds))
     fast = any(clip.fps > FAST for clip in clips)
@@ -168,21 +176,30 @@ def draft(
         for name, overrides in all_parameters(ik, rig).items()
         if not request.record_only or name in PLACES
     }
-    problem = problem_from_clips(replace(experiment, free=candidates), data)
-    with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
-        forecasts = choose_free(problem.space.system, candidates, problem.data)
+    check = capture_check.check(data)
+    if check.flat:
+        forecasts = [Forecast(name, is_free=False, reach=0, contraction=0) for name in candidates]
+    else:
+        problem = problem_from_clips(replace(experiment, free=candidates), data)
+        with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
+            forecasts = choose_free(problem.space.system, candidates, problem.data)
     free = {f.name: candidates[f.name] for f in forecasts if f.is_free}
-    if not free:
-        raise ValueError(
-            f"no parameter of {request.preset.name} could be determined by these clips; wanted "
-            "steps, slopes or other uneven ground under the feet"
-        )
+    if not (check.flat or free):
+        nothing = f"these clips determine no parameter of {request.preset.name}"
+        check = replace(check, lines=(nothing, *check.lines))
+    with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
+        scenes = problem_from_clips(experiment, data).data
+        as_it_comes = playback.play_all(ik, scenes)
     return Draft(
-        replace(experiment, free=free),
-        grounds,
-        tuple(_assumptions(request, clip, grounds[i]) for i, clip in enumerate(data)),
-        tuple(forecasts),
-        rig,
+        experiment=replace(experiment, free=free),
+        grounds=grounds,
+        assumptions=tuple(
+            _assumptions(request, clip, ground) for clip, ground in zip(data, grounds, strict=True)
+        ),
+        forecasts=tuple(forecasts),
+        check=check,
+        distances=distances.measure(as_it_comes, as_it_comes),
+        rig=rig,
     )
 
 
