@@ -27,6 +27,7 @@ SKELETONS = {
     "Poser": ("", "hip {l}Thigh {l}Shin {l}Foot {l}Toe"),
     "Mixamo": ("mixamorig:", "Hips {Left}UpLeg {Left}Leg {Left}Foot {Left}ToeBase"),
     "Mixamo of one character": ("Jane:", "Hips {Left}UpLeg {Left}Leg {Left}Foot {Left}ToeBase"),
+    "Biovision": ("", "Hips {Left}UpLeg {Left}LowLeg {Left}Foot {Left}Toe"),
     "LAFAN1": ("", "Hips {Left}UpLeg {Left}Leg {Left}Foot {Left}Toe"),
     "Unreal": ("", "pelvis thigh_{l} calf_{l} foot_{l} ball_{l}"),
     "Unity": ("", "Hips {Left}UpperLeg {Left}LowerLeg {Left}Foot {Left}Toes"),
@@ -34,6 +35,10 @@ SKELETONS = {
     "Rokoko": ("", "Hips {Left}Thigh {Left}Shin {Left}Foot {Left}Toe"),
     "Xsens": ("", "Pelvis {Left}UpperLeg {Left}LowerLeg {Left}Foot {Left}Toe"),
     "Xsens BVH": ("", "Hips {Left}Hip {Left}Knee {Left}Ankle {Left}Toe"),
+    "MakeHuman": ("", "root upperleg01.{L} lowerleg01.{L} foot.{L} toe1-1.{L}"),
+    "MakeHuman, 1.0": ("", "root UpLeg.{L} LoLeg.{L} Foot.{L} Toe.{L}"),
+    "MakeHuman, LowLeg": ("", "Hips UpLeg_{L} LowLeg_{L} Foot_{L} Toe_{L}"),
+    "MakeHuman, game engine": ("", "pelvis thigh_{l} calf_{l} foot_{l} ball_{l}"),
     "Bandai-Namco": ("", "Hips UpperLeg_{L} LowerLeg_{L} Foot_{L} Toes_{L}"),
     "SMPL": ("", "Pelvis {L}_Hip {L}_Knee {L}_Ankle {L}_Foot"),
     "SMPL of a file": ("m_avg_", "Pelvis {L}_Hip {L}_Knee {L}_Ankle {L}_Foot"),
@@ -84,6 +89,13 @@ def test_helpers_between_and_beside_the_joints_of_a_leg_and_a_mechanism_are_left
     parents = (-1, 0, 1, 2, 2, 4, 5, 1, 7, 8, 9, 0, 11, 11)
     roles = find_roles(tuple(names), parents)
     assert [names[joint] for joint in roles.legs[0].joints] == names[2:3] + names[4:7]
+    names = ["root", "spine05", "pelvis.L", "pelvis.R"]  # MakeHuman's bones are in two parts
+    for side in "LR":
+        names += [f"{bone}.{side}" for bone in ("upperleg01", "upperleg02", "lowerleg01")]
+        names += [f"{bone}.{side}" for bone in ("lowerleg02", "foot", "toe1-1", "toe2-1")]
+    parents = (-1, 0, 0, 0, 2, 4, 5, 6, 7, 8, 8, 3, 11, 12, 13, 14, 15, 15)
+    roles = find_roles(tuple(names), parents)
+    assert (roles.pelvis, roles.legs[1].joints) == (0, (11, 13, 15, 16))
     names = skeleton(*SKELETONS["Rigify, deforming"])
     mechanism = tuple(name.replace("DEF", "ORG") for name in names)
     assert find_roles(names + mechanism, TWICE).legs[0].joints == (1, 2, 3, 4)
