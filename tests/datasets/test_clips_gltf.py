@@ -214,6 +214,15 @@ def test_numbers_may_be_integers_lie_between_each_other_and_in_a_file_beside(tmp
             read_gltf(path)
 
 
+def not_a_number() -> str:
+    """The buffer of the walker with a NaN on the way of its hips, in the third key."""
+    file = walker()
+    view = file.header["bufferViews"][0]
+    place = view["byteOffset"] + 4 * (3 * 2 + 1)
+    file.content = file.content[:place] + struct.pack("<f", np.nan) + file.content[place + 4 :]
+    return json.loads(file.text())["buffers"][0]["uri"]
+
+
 def test_what_is_no_motion_is_refused_in_one_sentence(tmp_path):
     for path, value, message in (
         ("accessors.0.sparse", {}, "accessor 0 is sparse, which is not supported"),
@@ -231,6 +240,12 @@ def test_what_is_no_motion_is_refused_in_one_sentence(tmp_path):
         ("nodes.2.rotation", [0, 0, 0, 0], "the rotation of node 2 is no unit quaternion"),
         ("nodes.2.scale", [1e25] * 3, "LeftLeg is at"),
         ("skins.0.joints", [77], "77 among the joints of a skin"),
+        (
+            "buffers.0.uri",
+            not_a_number(),
+            r"translation of mixamorig:Hips, node 1: value 2 of "
+            r"accessor 0 is \[0.0, nan, 95.0\]",
+        ),
         ("animations", [], "no animation that moves nodes"),
         ("animations.0.samplers.0.interpolation", "SMOOTH", "node 1: interpolation 'SMOOTH'"),
         ("animations.0.samplers.0.input", 2, "node 1: times have 4 numbers for each key"),

@@ -160,6 +160,12 @@ WITHOUT_TERRAIN = {
     "text.obj": "v 0 0 0\nv 1 0 0\n",
     "text.stl": "solid nothing\nendsolid nothing\n",
     "text.off": "OFF\n3 1 0\n0 0 0\n1 0 nan\n0 0 1\n3 0 1 2\n",
+    "nan.obj": "# ground\nv 0 0 0\nv 1 -inf 0\nv 0 0 1\nf 1 3 2\n",
+    "nan.stl": "solid a\nfacet normal 0 1 0\nouter loop\nvertex 0 0 0\nvertex 0 0 1\n"
+    "vertex 1 NaN 0\nendloop\nendfacet\nendsolid a\n",
+    "nan.ply": "ply\nformat ascii 1.0\ncomment ours\nelement vertex 3\nproperty float x\n"
+    "property float y\nproperty float z\nelement face 1\n"
+    "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 nan\n0 0 1\n3 0 2 1\n",
     "cut.ply": "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
     "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
     "0 0 0\n1 0 0\n0 0 1\n3 0 2 1\n",
@@ -177,6 +183,8 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
         np.save(tmp_path / f"{name}.npy", array)
     save_ramp(tmp_path / "hill.npz")
     ramp().export(tmp_path / "hill.ply")
+    broken = [[0.0, 0.0, 0.0], [1.0, np.nan, 0.0], [0.0, 0.0, 1.0]]
+    trimesh.Trimesh(broken, [[0, 2, 1]], process=False).export(tmp_path / "nan.glb")
     for name, text in WITHOUT_TERRAIN.items():
         (tmp_path / name).write_text(text)
     for file, options, message in (
@@ -204,7 +212,11 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
         ("text.ply", {}, "text.ply: .*cannot read it"),
         ("text.obj", {}, "text.obj: .*needs triangles; the file holds PointCloud"),
         ("text.stl", {}, "text.stl: .*needs triangles"),
-        ("text.off", {}, "text.off: .*vertices are not finite"),
+        ("text.off", {}, r"text.off:4: wanted finite coordinates; got '1 0 nan'"),
+        ("nan.obj", {}, r"nan.obj:3: wanted finite coordinates; got 'v 1 -inf 0'"),
+        ("nan.stl", {}, r"nan.stl:6: wanted finite coordinates; got 'vertex 1 NaN 0'"),
+        ("nan.ply", {}, r"nan.ply:12: wanted finite coordinates; got '1 0 nan'"),
+        ("nan.glb", {}, r"nan.glb: vertex 1: wanted finite coordinates; got \[1.0, nan, 0.0\]"),
         ("cut.ply", {}, "cut.ply: .*head announces 5 lines of vertices and faces, there are 4"),
         ("cut.off", {}, "cut.off: .*head announces 5 lines of vertices and faces, there are 4"),
         ("short.off", {}, "short.off: .*the file is cut off in line 5 after its head"),

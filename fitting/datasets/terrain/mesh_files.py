@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,10 @@ from . import heightfield_files
 MESH_SUFFIXES = (".ply", ".obj", ".stl")  # of the formats that `save_mesh` writes
 FAR = 512.0  # m; further from the origin, 32 bits do not hold a tenth of a millimetre
 WITH_MATERIALS = ("obj", *gltf_checks.KINDS)  # whose images need not be read
+# A vertex of a text format with a number that is none.
+NOT_FINITE = re.compile(
+    rb"^[ \t]*(?:v|vertex)?[\d.e+\- \t]*\b(?:nan|inf|infinity)\b.*", re.IGNORECASE | re.MULTILINE
+)
 # A file with z up is rotated about x, as glTF exporters do: (x, y, z) becomes (x, z, -y).
 _WORLD_FROM_FILE = {
     "y": np.eye(3),
@@ -224,6 +229,14 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     vertices = np.array(mesh.vertices, np.float64)
     if vertices.shape[1:] != (3,):
         raise ValueError(f"{path}: its vertices have {vertices.shape[-1]} coordinates; wanted 3")
+    known = np.isfinite(vertices).all(axis=-1)
+    if not known.all():
+        first = int(np.argmin(known))
+        place, got = f"{path}: vertex {first}", str(vertices[first].tolist())
+        if line := NOT_FINITE.search(content):
+            number = content.count(b"\n", 0, line.start()) + 1
+            place, got = f"{path}:{number}", repr(line[0].decode(errors="replace").strip())
+        raise ValueError(f"{place}: wanted finite coordinates; got {got}")
     return vertices, np.array(mesh.faces, np.int64)
 
 

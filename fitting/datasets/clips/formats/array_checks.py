@@ -84,23 +84,28 @@ def _problem(array: np.ndarray, wanted: Wanted, sizes: dict[str, int]) -> str:
 
 
 def _problem_of_values(array: np.ndarray, wanted: Wanted) -> str:
-    if not np.isfinite(array).all():
-        return "has numbers that are not finite"
+    unknown = ~np.isfinite(array)
+    if unknown.any():
+        value = array[unknown].flat[0]
+        return f"has {value:g}{_place(unknown, wanted)}; wanted finite numbers"
     outside = (array < wanted.low) | (array > wanted.high)
     if outside.any():
         value = array[outside].flat[0]
-        return f"has {value:g}{_place(outside)}; wanted {wanted.low:g} to {wanted.high:g}"
+        return f"has {value:g}{_place(outside, wanted)}; wanted {wanted.low:g} to {wanted.high:g}"
     if wanted.unit:
         lengths = np.linalg.norm(np.clip(array, -2.0, 2.0), axis=-1)  # without overflow
         off = np.abs(lengths - 1) > NOT_UNIT
         if off.any():
-            return f"has a length of {lengths[off].flat[0]:.4g}{_place(off)}; wanted 1"
+            return f"has a length of {lengths[off].flat[0]:.4g}{_place(off, wanted)}; wanted 1"
     return ""
 
 
-def _place(chosen: np.ndarray | np.bool_) -> str:
-    """Where the first of the chosen entries is."""
-    return "" if chosen.ndim == 0 else f" at {[int(i) for i in np.argwhere(chosen)[0]]}"
+def _place(chosen: np.ndarray | np.bool_, wanted: Wanted) -> str:
+    """Where the first of the chosen entries is, and what the axes are."""
+    if chosen.ndim == 0:
+        return ""
+    place = [int(index) for index in np.argwhere(chosen)[0]]
+    return f" at {place} of {_words(wanted.shape[: chosen.ndim])}"
 
 
 def _words(shape: tuple[int | str, ...]) -> str:

@@ -11,6 +11,7 @@ bvhio 1.5.4 is correct but works in float32 and takes 9 s for 994 frames.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,14 @@ def read_bvh(path: Path) -> Recording:
     """
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return _Reader(path, lines).read()
+
+
+def _as_number(word: str) -> float:
+    """NaN for what is no number."""
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
 
 
 class _Reader:
@@ -60,12 +69,13 @@ class _Reader:
             remarks=remarks,
         )  # fmt: skip
 
-    def _error(self, what: str) -> ValueError:
+    def _error(self, what: str, word: str | None = None) -> ValueError:
+        """What is wrong in the current line, or with one word of it."""
         at_end = self.index >= len(self.lines)
         line = "the end of the file" if at_end else self.lines[self.index].strip()
         line = line if len(line) <= 60 else line[:57] + "..."
         number = min(self.index, len(self.lines)) + 1
-        return ValueError(f"{self.path}:{number}: {what}; got {line!r}")
+        return ValueError(f"{self.path}:{number}: {what}; got {word or line!r}")
 
     def _next(self, wanted: str) -> str:
         """Moves to the next line that is not empty and returns it, stripped."""
@@ -76,15 +86,14 @@ class _Reader:
             raise self._error(f"wanted {wanted}")
         return self.lines[self.index].strip()
 
-    def _numbers(self, words: list[str], count: int, what: str) -> list[float]:
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError as error:
-            raise self._error(f"wanted {count} numbers of {what} ({error})") from None
-        if len(numbers) != count:
-            raise self._error(f"wanted {count} numbers of {what}, there are {len(numbers)}")
+    def _numbers(self, words: list[str], names: Sequence[str], where: str) -> list[float]:
+        """The numbers with these names, which the message for a wrong one says."""
+        if len(words) != len(names):
+            raise self._error(f"wanted {len(names)} numbers of {where}, there are {len(words)}")
+        numbers = [_as_number(word) for word in words]
         if not np.all(np.isfinite(numbers)):
-            raise self._error(f"wanted finite numbers of {what}")
+            index = int(np.argmin(np.isfinite(numbers)))
+            raise self._error(f"wanted a finite number as {names[index]} in {where}", words[index])
         return numbers
 
     def _hierarchy(self) -> None:
@@ -97,7 +106,8 @@ class _Reader:
                 self._begin(keyword, words, open_joints)
             elif keyword == "OFFSET" and open_joints:
                 self._state(open_joints[-1], keyword)
-                self.offsets[open_joints[-1]] = self._numbers(words[1:], 3, "OFFSET")
+                where = f"OFFSET of {self.names[open_joints[-1]]}"
+                self.offsets[open_joints[-1]] = self._numbers(words[1:], "xyz", where)
             elif keyword == "CHANNELS" and open_joints:
                 self._state(open_joints[-1], keyword)
                 self.channels[open_joints[-1]] = self._channels(words)
@@ -155,21 +165,23 @@ class _Reader:
         match = re.fullmatch(r"Frame\s+Time\s*:\s*(\S+)", self._next("Frame Time:"), re.IGNORECASE)
         if not match:
             raise self._error("wanted 'Frame Time:' and seconds")
-        (frame_time,) = self._numbers([match[1]], 1, "Frame Time")
+        (frame_time,) = self._numbers([match[1]], ["seconds"], "Frame Time")
         if frame_time <= 0:
             raise self._error("wanted a frame time above 0 s")
         return frames, frame_time
 
     def _values(self, frames: int) -> tuple[np.ndarray, tuple[str, ...]]:
         """The channel values, (frames, channels), and remarks."""
-        count = sum(map(len, self.channels))
+        joints = zip(self.names, self.spellings, strict=True)
+        names = [f"{channel} of {joint}" for joint, channels in joints for channel in channels]
         values = []
         for frame in range(frames):
             words = self._next(f"frame {frame + 1} of {frames} declared").split()
-            values.append(self._numbers(words, count, f"frame {frame + 1}"))
+            values.append(self._numbers(words, names, f"frame {frame + 1}"))
         surplus = sum(bool(line.strip()) for line in self.lines[self.index + 1 :])
         remark = f"{frames} frames are declared and {frames + surplus} found; the rest is left out"
-        return np.array(values, np.float64).reshape(frames, count), (remark,) if surplus else ()
+        array = np.array(values, np.float64).reshape(frames, len(names))
+        return array, (remark,) if surplus else ()
 
     def _motion(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Local positions, file units, and local rotations, wxyz, of all joints."""

@@ -85,7 +85,10 @@ class Document:
         if accessor.get("normalized") is True and dtype.kind in "iu":
             array = np.maximum(array / np.iinfo(dtype).max, -1.0)
         if not np.isfinite(array).all():
-            raise ValueError(f"{where} has numbers that are not finite")
+            value = int(np.argmin(np.isfinite(array).all(axis=-1)))
+            raise ValueError(
+                f"value {value} of {where} is {array[value].tolist()}; wanted finite numbers"
+            )
         return array
 
     def _view(self, index: object) -> tuple[memoryview, object]:

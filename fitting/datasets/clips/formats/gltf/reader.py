@@ -13,7 +13,7 @@ from fitting.runtime.validation import error_context
 
 from .document import Document, Item, as_index, as_item, as_list
 from .sampling import WIDTHS, frame_times, read_curve
-from .tree import Curves, find_joints, read_tree, world_transforms
+from .tree import Curves, Tree, find_joints, read_tree, world_transforms
 
 SUFFIXES = (".glb", ".gltf")
 PATHS = tuple(WIDTHS)
@@ -40,7 +40,7 @@ def read_gltf(path: Path, animation: str | None = None, fps: float | None = None
         document = Document(path)
         tree = read_tree(document)
         name, chosen = _choose(_animations(document), animation)
-        curves = _curves(document, chosen, len(tree.nodes))
+        curves = _curves(document, chosen, tree)
         joints, remark = find_joints(document, tree, {node for node, _ in curves})
         nodes = len(tree.with_ancestors(joints))
         most = max(MOST_NUMBERS, document.size) // nodes
@@ -94,7 +94,7 @@ def _target(channel: Item) -> Item:
     return as_item(channel.get("target", {}), "the target of a channel")
 
 
-def _curves(document: Document, animation: Item, nodes: int) -> Curves:
+def _curves(document: Document, animation: Item, tree: Tree) -> Curves:
     """The curves of an animation; those of morph targets and of extensions are left out."""
     samplers = as_list(animation.get("samplers", []), "the samplers of an animation")
     curves: Curves = {}
@@ -103,10 +103,10 @@ def _curves(document: Document, animation: Item, nodes: int) -> Curves:
         target = _target(channel)
         path, node = target.get("path"), target.get("node")
         if path in PATHS and node is not None:
-            node = as_index(node, nodes, "nodes of a channel")
+            node = as_index(node, len(tree.nodes), "nodes of a channel")
             number = as_index(channel.get("sampler"), len(samplers), "samplers of a channel")
             sampler = as_item(samplers[number], f"sampler {number}")
-            with error_context(f"node {node}"):
+            with error_context(f"{path} of {tree.names([node])[0]}, node {node}"):
                 curves[node, path] = read_curve(document, sampler, path)
             keys += len(curves[node, path].times)
         if keys > max(MOST_NUMBERS, document.size):
