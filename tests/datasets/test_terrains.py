@@ -119,6 +119,13 @@ def test_pictures_and_arrays_have_metres_per_level_and_cell_under_any_number_of_
     points = [(10 + 0.5 * column, -2 + 0.5 * row) for row in range(4) for column in range(6)]
     expected = 1 + 0.001 * LEVELS[:4, :6].ravel()
     np.testing.assert_allclose(heights(ground, *points), expected, atol=1e-4)
+    small = (LEVELS % 200).astype(np.uint8)
+    for mode in ("L", "LA", "P", "RGB", "RGBA"):  # the same grey, whatever it is stored as
+        Image.fromarray(small).convert(mode).save(tmp_path / "grey.png")
+        ground = load_terrain(tmp_path / "grey.png", cell=0.5, scale=0.001)
+        expected = 0.001 * small[:4, :6].ravel()
+        corners = [(0.5 * column, 0.5 * row) for row in range(4) for column in range(6)]
+        np.testing.assert_allclose(heights(ground, *corners), expected, atol=1e-6)
     np.save(tmp_path / "hill.npy", np.where(LEVELS == 2030, np.nan, LEVELS / 1000))
     ground = load_terrain(tmp_path / "hill.npy", cell=2.0)
     np.testing.assert_allclose(heights(ground, (1.0, 3.0), (5.5, 3.5)), [1.505, np.nan], atol=1e-5)
@@ -178,7 +185,13 @@ WITHOUT_TERRAIN = {
 
 def test_what_is_missing_or_wrong_is_said(tmp_path):
     Image.fromarray(LEVELS).save(tmp_path / "hill.png")
-    Image.new("RGB", (4, 4)).save(tmp_path / "colour.png")
+    colour = Image.new("RGB", (4, 4))
+    colour.putpixel((1, 2), (9, 0, 0))
+    colour.save(tmp_path / "colour.png")
+    colour.quantize().save(tmp_path / "palette.png")
+    Image.new("RGBA", (4, 4)).save(tmp_path / "clear.png")
+    Image.new("1", (4, 4)).save(tmp_path / "ink.png")
+    (tmp_path / "deep.png").write_bytes(png_that_says(4, 4, colour_type=2))
     for name, array in (("hill", LEVELS), ("objects", np.array([None])), ("words", ["x"])):
         np.save(tmp_path / f"{name}.npy", array)
     save_ramp(tmp_path / "hill.npz")
@@ -202,7 +215,11 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
         ("hill.ply", {"layer": 32}, "from 0 to 31"),
         ("hill.ply", {"scale": 0.0}, "scale is metres per unit"),
         ("hill.ply", {"file_up": "x"}, "'y' or 'z'; got 'x'"),
-        ("colour.png", BOTH, "colour.png: wanted one channel .*; got a picture of mode 'RGB'"),
+        ("colour.png", BOTH, r"colour.png: 1 of 16 .* coloured, .* row 2, column 1: \[9, 0"),
+        ("palette.png", BOTH, "palette.png: 1 of 16 pixels are coloured, first that of row 2"),
+        ("clear.png", BOTH, "clear.png: 16 of 16 pixels are transparent, first that of row 0"),
+        ("deep.png", BOTH, "deep.png: has colours of 16 bits; save it as one channel of grey"),
+        ("ink.png", BOTH, "ink.png: wanted one channel .*; got a picture of mode '1'"),
         ("objects.npy", CELL, "objects.npy: wanted a NumPy array .*allow_pickle"),
         ("words.npy", CELL, "words.npy: the array must be real numbers"),
         ("text.png", BOTH, "text.png: wanted a PNG"),
@@ -229,14 +246,14 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
             load_terrain(tmp_path / file, **options)  # pyright: ignore[reportArgumentType]
 
 
-def png_that_says(columns: int, rows: int) -> bytes:
+def png_that_says(columns: int, rows: int, colour_type: int = 0) -> bytes:
     """A picture of 16 bits whose header says this, with a few bytes of pixels."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         check = struct.pack(">I", zlib.crc32(kind + content))
         return struct.pack(">I", len(content)) + kind + content + check
 
-    header = struct.pack(">IIBBBBB", columns, rows, 16, 0, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", columns, rows, 16, colour_type, 0, 0, 0)
     parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(bytes(100))), chunk(b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 

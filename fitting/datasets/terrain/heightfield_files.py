@@ -8,7 +8,8 @@
     interpolation   "bilinear" or "triangulated"; where missing, "bilinear"
 
 `.npy`, as `numpy.save` writes it: the heights alone. `.png`: a grey picture of 8 or 16 bits, whose
-levels are heights; x goes right and z goes down in it. For both the user says how far neighbours
+levels are heights; x goes right and z goes down in it. It may be stored in colours of 8 bits, as
+long as all of them are grey and opaque. For both the user says how far neighbours
 are apart, the cell, and for a picture also how many metres a level is.
 
 `jaxik.world.terrain.heightfield` says more about each array.
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image
+from PIL import Image, ImageFile
 
 from fitting.datasets import archives
 from fitting.runtime.validation import QUOTED, check_file, in_one_line
@@ -30,6 +31,8 @@ SUFFIXES = (ARCHIVE, ARRAY, PICTURE)
 REQUIRED = ("heights", "spacing")
 OPTIONAL = ("origin", "interpolation")
 GREY = {"L": 1, "I;16": 2, "I;16B": 2, "I": 4}  # bytes a pixel, by Pillow's modes
+COLOURED = {"P": 1, "LA": 2, "RGB": 3, "RGBA": 4}  # likewise; these may hold a grey picture
+OPAQUE = 255
 MOST_PIXELS = 2**26
 MOST_PACKED = 1040  # bytes of a picture for each of its file: deflate reaches 1032
 
@@ -115,22 +118,46 @@ def _read_picture(path: Path) -> np.ndarray:
     try:
         with Image.open(path, formats=["PNG"]) as picture:
             _check_picture(picture, path.stat().st_size)
-            return np.array(picture, np.float64)
+            levels = picture if picture.mode in GREY else _as_grey(picture)
+            return np.array(levels, np.float64)
     except (Image.DecompressionBombError, ValueError) as error:
         raise ValueError(f"{path}: {in_one_line(error, QUOTED)}") from None
     except Exception as error:  # Pillow has several of its own, SyntaxError among them
         raise ValueError(f"{path}: wanted a PNG ({in_one_line(error, QUOTED)})") from None
 
 
-def _check_picture(picture: Image.Image, file_bytes: int) -> None:
-    """ValueError unless it is grey, and as large as its file allows."""
+def _check_picture(picture: ImageFile.ImageFile, file_bytes: int) -> None:
+    """ValueError unless it may be grey, and is as large as its file allows."""
     columns, rows = picture.size
-    if picture.mode not in GREY:
+    pixel_bytes = GREY | COLOURED
+    if picture.mode not in pixel_bytes:
         raise ValueError(
             "wanted one channel of grey, of 8 or 16 bits; got a picture of mode "
             f"{picture.mode!r} in Pillow's words"
         )
+    if picture.mode in COLOURED and "16" in str(picture.tile):  # of which Pillow keeps 8
+        raise ValueError("has colours of 16 bits; save it as one channel of grey of 16 bits")
     if columns * rows > MOST_PIXELS:
         raise ValueError(f"says {columns} x {rows} pixels; wanted {MOST_PIXELS} at most")
-    if math.prod((columns, rows, GREY[picture.mode])) > MOST_PACKED * file_bytes:
+    if math.prod((columns, rows, pixel_bytes[picture.mode])) > MOST_PACKED * file_bytes:
         raise ValueError(f"says {columns} x {rows} pixels, and has {file_bytes} bytes")
+
+
+def _as_grey(picture: Image.Image) -> np.ndarray:
+    """The one channel of a picture that is stored in colours.
+
+    Raises:
+        ValueError: a pixel is coloured or transparent; it names the first.
+    """
+    pixels = np.array(picture.convert("RGBA"))
+    for wrong, what in (
+        ((pixels[..., :1] != pixels[..., 1:3]).any(axis=-1), "coloured"),
+        (pixels[..., 3] != OPAQUE, "transparent"),
+    ):
+        if wrong.any():
+            row, column = (int(place) for place in np.argwhere(wrong)[0])
+            raise ValueError(
+                f"{wrong.sum()} of {wrong.size} pixels are {what}, first that of row {row}, column "
+                f"{column}: {pixels[row, column].tolist()}; wanted grey alone, as heights"
+            )
+    return pixels[..., 0]
