@@ -1,6 +1,7 @@
 """Clips: joints by name, measured rigs, contact labels, roots, edits and summaries."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fitting.datasets.clips import edit, load_clip, rigs
+from fitting.datasets.clips import edit, load_clip, rigs, save_clip
 from fitting.datasets.clips.contacts import detect_stances, runs
 from fitting.datasets.clips.formats.bvh import read_bvh
 from fitting.datasets.clips.joint_roles import Trunk, find_roles, find_trunk, partners
 from fitting.datasets.clips.joints.map_files import read_joint_map, template
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
+from fitting.datasets.clips.load import ClipOptions, draft_joint_map
 from fitting.datasets.clips.rigs import LegMotion
 from fitting.datasets.clips.summary import as_json, as_text, describe
 from jaxik.world.skeleton import Transform, forward_kinematics
@@ -118,9 +120,6 @@ def test_no_pair_of_legs_or_two_possible_ones_are_refused_with_the_names_of_join
         assert repr(names[1]) in str(error.value) and repr(names[10]) in str(error.value)
     with pytest.raises(ValueError, match=r"no pair of legs.*\['Hips', 'Tail'\].*MotionBuilder"):
         find_roles(("Hips", "Tail"), (-1, 0))
-    feet = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot")
-    with pytest.raises(ValueError, match="neither toe nor end site: LeftFoot has no child"):
-        find_roles(feet, (-1, 0, 1, 2, 0, 4, 5))
 
 
 def test_the_trunk_is_the_way_from_the_pelvis_to_the_head():
@@ -191,6 +190,27 @@ def test_a_bone_in_two_parts_is_as_long_as_both(tmp_path):
     path.write_text(text.replace("  JOINT RightUpLeg", "  }\n  JOINT RightUpLeg"))
     clip = load_clip(path)
     assert clip.scale == 0.01 and float(clip.rig.thigh[0]) == pytest.approx(0.42)
+
+
+def test_a_foot_that_ends_at_its_ankle_gets_the_ball_of_a_persons_and_a_remark(tmp_path):
+    path, map_file = tmp_path / "leaf.bvh", tmp_path / "map.toml"
+    text = re.sub(r"\s*End Site\s*{[^}]*}", "", BVH).partition("0 87 0")[0]
+    path.write_text(text + 3 * ("0 82 0 0 0 30 " + 18 * "0 " + "\n"))  # it faces 30° to the left
+    clip = load_clip(path)
+    map_file.write_text(draft_joint_map(path, ClipOptions()))
+    assert "_end" not in map_file.read_text() and "no map is needed" in map_file.read_text()
+    assert len(clip.joint_names) == 9 and (clip.channels or ())[7:] == ("", "")
+    ahead = 0.15 * 0.82 * np.array([0.5 * 0.9539, -0.3, 0.8660 * 0.9539])
+    for loaded in (clip, load_clip(path, joints=map_file)):
+        for leg, side in enumerate(("Left", "Right")):
+            ankle, ball = loaded.rig.joints[leg][2:]
+            assert loaded.joint_names[ball] == f"{side}Foot_end"
+            foot = loaded.positions_ws[:, ball] - loaded.positions_ws[:, ankle]
+            np.testing.assert_allclose(foot, np.tile(ahead, (3, 1)), atol=1e-4)
+            remark = f"the {side.lower()} foot ends at {side}Foot; its ball is taken to be 0.123 m"
+            assert any(remark in text for text in loaded.remarks)
+    save_clip(tmp_path / "again.bvh", clip)  # in which the ends are there
+    assert load_clip(tmp_path / "again.bvh").joint_names[4] == "LeftFoot_end"
 
 
 OWN = {"hip": "Schenkel", "knee": "Knie", "ankle": "Foot_A"}

@@ -15,6 +15,7 @@ from jaxik.world.skeleton import Rig
 
 from . import contacts
 from .clip import Clip
+from .guesses.balls import with_balls
 from .joint_roles import Leg, Roles, find_roles
 from .joints.map_files import ADVICE
 from .kinematics import continuous, local_from_world, world_from_local
@@ -99,6 +100,9 @@ def clip_from_recording(
             f"{source}: {rate:.4g} frames per second; wanted {SLOWEST:g} to {FASTEST:g}; "
             "give fps=... if you know better"
         )
+    if roles is not None:
+        recording, roles, guessed = with_balls(recording, roles, rate)
+        remarks += guessed
     positions_ws, rotations_ws = world_from_local(
         recording.parents, recording.positions_ls, recording.rotations_ls
     )

@@ -27,7 +27,12 @@ class Leg:
     side: float
     """+1 left, -1 right, 0 neither."""
     joints: tuple[int, int, int, int]
-    """Hip, knee, ankle, toe."""
+    """Hip, knee, ankle, toe; the toe of a foot that ends at the ankle is the ankle."""
+
+    @property
+    def ends_at_ankle(self) -> bool:
+        """Whether no joint shows where the foot points."""
+        return self.joints[2] == self.joints[3]
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,8 @@ def find_roles(
 ) -> Roles:
     """The roles of a skeleton's joints.
 
-    A foot without a toe joint uses the first child of its ankle, usually an end site.
+    A foot without a toe joint uses the first child of its ankle, usually an end site; without that
+    it ends at the ankle.
 
     Args:
         names: the joints.
@@ -113,7 +119,7 @@ def find_roles(
     legs = []
     for (name, side), (*bones, toe) in zip(SIDES.items(), (match.left, match.right), strict=True):
         hip, knee, ankle = bones
-        toe = _end_of_foot(names, parents, name, ankle) if toe is None else toe
+        toe = _end_of_foot(parents, ankle) if toe is None else toe
         legs.append(Leg(name, side, (hip, knee, ankle, toe)))
     return Roles(match.dialect, match.pelvis, tuple(legs))
 
@@ -145,19 +151,14 @@ def _by_hand(names: tuple[str, ...], parents: tuple[int, ...], joints: Mapping[s
         letter = re.sub(r"(?<=l)eft$|(?<=r)ight$", "", suffix)[-1:]
         leg = LEG_NAMES.get(suffix, suffix)
         toe = index_of.get(f"toe_{suffix}")
-        toe = _end_of_foot(names, parents, leg, ankle) if toe is None else toe
+        toe = _end_of_foot(parents, ankle) if toe is None else toe
         legs.append(Leg(leg, SIDES.get(LEG_NAMES.get(letter, ""), 0.0), (hip, knee, ankle, toe)))
     return Roles("by hand", index_of["pelvis"], tuple(legs))
 
 
-def _end_of_foot(names: tuple[str, ...], parents: tuple[int, ...], leg: str, ankle: int) -> int:
-    """The first child of an ankle, for a foot without a toe joint."""
-    if ankle not in parents:
-        raise ValueError(
-            f"the {leg} foot has neither toe nor end site: {names[ankle]} has no child; "
-            f"the joints are {list(names)}"
-        )
-    return parents.index(ankle)
+def _end_of_foot(parents: tuple[int, ...], ankle: int) -> int:
+    """For a foot without a toe joint, the first child of its ankle, or else the ankle."""
+    return parents.index(ankle) if ankle in parents else ankle
 
 
 def partners(names: tuple[str, ...]) -> tuple[int, ...]:

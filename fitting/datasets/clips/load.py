@@ -16,6 +16,7 @@ from .formats.gltf.reader import SUFFIXES as GLTF
 from .formats.gltf.reader import read_gltf
 from .formats.npz import read_npz
 from .joints.map_files import read_joint_map, template
+from .recording import Recording
 
 JointMap = Mapping[str, str] | str | Path
 """Role to joint name, see `joint_roles.find_roles`; or a file that `joints.map_files` reads."""
@@ -111,14 +112,10 @@ def load_clip(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in (*formats.READERS, ".npz"):
-        raise ValueError(f"{path}: wanted a {', '.join(formats.READERS)} or .npz file")
-    check_file(path)
+    _check_arguments(path, asf, animation)
     if isinstance(joints, str | Path):
         joints = read_joint_map(Path(joints))
     overrides = Overrides(scale, fps, up, joints)
-    if asf is not None and suffix != ".amc":
-        raise ValueError(f"{path}: only an .amc has its skeleton in an .asf; got {asf}")
     if suffix == ".npz":
         arguments = {**vars(overrides), "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
@@ -126,19 +123,36 @@ def load_clip(
         return read_npz(path, variant)
     if variant != "captured":
         raise ValueError(f"{path}: only blocks .npz files have the variant {variant!r}")
-    if animation is not None and suffix not in GLTF:
-        raise ValueError(f"{path}: only glTF files have an animation to choose, {animation!r}")
     if suffix == ".c3d":
         recording = read_c3d(path, joints, scale)
         if joints is not None:  # which named markers
             overrides = replace(overrides, joints={role: joint_name(role) for role in joints})
-    elif suffix in GLTF:
-        recording = read_gltf(path, animation, fps)
-    elif asf is not None:
-        recording = read_asfamc(path, Path(asf))
     else:
-        recording = formats.READERS[suffix](path)
+        recording = _read(path, asf, animation, fps)
     return clip_from_recording(recording, path.name, overrides)
+
+
+def _check_arguments(path: Path, asf: str | Path | None, animation: str | None) -> None:
+    """ValueError for no such file, an unknown format, or an argument of another format."""
+    suffix = path.suffix.lower()
+    if suffix not in (*formats.READERS, ".npz"):
+        raise ValueError(f"{path}: wanted a {', '.join(formats.READERS)} or .npz file")
+    check_file(path)
+    if asf is not None and suffix != ".amc":
+        raise ValueError(f"{path}: only an .amc has its skeleton in an .asf; got {asf}")
+    if animation is not None and suffix not in (*GLTF, ".npz"):
+        raise ValueError(f"{path}: only glTF files have an animation to choose, {animation!r}")
+
+
+def _read(
+    path: Path, asf: str | Path | None, animation: str | None, fps: float | None = None
+) -> Recording:
+    """The contents of a file that holds joints."""
+    if path.suffix.lower() in GLTF:
+        return read_gltf(path, animation, fps)
+    if asf is not None:
+        return read_asfamc(path, Path(asf))
+    return formats.READERS[path.suffix.lower()](path)
 
 
 def draft_joint_map(path: Path, options: ClipOptions) -> str:
@@ -156,5 +170,6 @@ def draft_joint_map(path: Path, options: ClipOptions) -> str:
     if path.suffix.lower() == ".c3d":
         check_file(path)
         return draft_marker_map(path)
-    clip = load_clip(path, **vars(replace(options, joints=None)))
-    return template(clip.joint_names, clip.parents, clip.source)
+    _check_arguments(path, options.asf, options.animation)
+    recording = _read(path, options.asf, options.animation)
+    return template(recording.names, recording.parents, path.name)

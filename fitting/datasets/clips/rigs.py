@@ -89,7 +89,7 @@ def measure_rig(
     side = np.array([leg.side for leg in roles.legs])
     left_ws = left_directions(positions_ws[:, hips], side, rotations_ws[:, roles.pelvis])
     legs = [
-        _measure_leg(_leg_motion(leg, left_ws, positions_ws, rotations_ws), stance[:, index])
+        _measure_leg(leg_motion(leg, left_ws, positions_ws, rotations_ws), stance[:, index])
         for index, leg in enumerate(roles.legs)
     ]
     axes, feet, lengths = (np.stack(part) for part in zip(*legs, strict=True))
@@ -207,9 +207,10 @@ def left_directions(
     return _rotation(pelvis_rotations_ws).apply([1.0, 0.0, 0.0])
 
 
-def _leg_motion(
+def leg_motion(
     leg: Leg, left_ws: Vectors, positions_ws: np.ndarray, rotations_ws: np.ndarray
 ) -> LegMotion:
+    """The motion of a leg among that of all joints, m and wxyz; see `left_directions`."""
     hip, knee, ankle, toe = (positions_ws[:, joint] for joint in leg.joints)
     hip_rot, knee_rot, ankle_rot = (rotations_ws[:, joint] for joint in leg.joints[:3])
     return LegMotion(hip, knee, ankle, toe, hip_rot, knee_rot, ankle_rot, left_ws)
@@ -251,7 +252,7 @@ def stiff_knees(
 ) -> tuple[str, ...]:
     """Names of the legs whose knees move too little to show their axes."""
     left_ws = np.zeros((len(positions_ws), 3))  # which is not read
-    motions = (_leg_motion(leg, left_ws, positions_ws, rotations_ws) for leg in roles.legs)
+    motions = (leg_motion(leg, left_ws, positions_ws, rotations_ws) for leg in roles.legs)
     return tuple(
         leg.name
         for leg, motion in zip(roles.legs, motions, strict=True)

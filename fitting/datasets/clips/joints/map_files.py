@@ -28,9 +28,9 @@ HEAD = """\
 # [[clips]] as joints = "MAP.toml".
 """
 TAIL = """
-# A toe may be left out or empty: the foot then ends in the first child of its ankle. Legs may have
-# any names and number: hip_fore_left, knee_fore_left, ...; names that end in l or left are of left
-# legs.
+# A toe may be left out or empty: the foot then ends in the first child of its ankle, or without one
+# where the ball of a person's foot would be. Legs may have any names and number: hip_fore_left,
+# knee_fore_left, ...; names that end in l or left are of left legs.
 #
 # All joints, each below its parent:
 """

@@ -73,6 +73,8 @@ def _as_joints(names: tuple[str, ...]) -> dict[str, str] | None:
         roles = find_roles(names, (-1,) * len(names))
     except ValueError:
         return None
+    if any(leg.ends_at_ankle for leg in roles.legs):  # a map of markers needs all joints
+        return None
     joints = {"pelvis": names[roles.pelvis]}
     for leg in roles.legs:
         for role, joint in zip(LEG_ROLES, leg.joints, strict=True):
