@@ -167,6 +167,21 @@ def test_joints_are_those_of_the_larger_skin_or_else_what_moves_and_hangs_from_i
     assert recording.remarks == ("1 joints of other skeletons in the file are left out",)
 
 
+def test_joints_that_move_beside_a_skin_and_those_that_hang_from_it_are_taken(load):
+    """A skin of the trunk alone; legs whose parts are meshes, and toes that do not move."""
+    nodes = [{"name": "hips", "children": [1, 2]}, {"name": "spine"}]
+    nodes += [{"name": "leg", "mesh": 0, "children": [3, 4]}, {"name": "toe"}]
+    nodes += [{"name": "shoe", "mesh": 0}]
+    for skins, skinned in (([{"joints": [1]}], (1,)), ([], ())):
+        for moved in ((0, 1, 2), (1, 2), (2,)):
+            keys = {(node, "rotation"): TURNING for node in moved}
+            recording = load(Gltf(nodes, skins=skins).animate("w", keys))
+            assert set(recording.names) >= {"leg", "toe"} and "shoe" not in recording.names
+            assert ("spine" in recording.names) == bool(skinned or 1 in moved)
+            remarks = ("1 joints that no skin has are taken too, as they move",)
+            assert recording.remarks == (remarks if skinned else ())
+
+
 def test_one_of_several_animations_is_chosen_by_its_name(tmp_path):
     file = walker()
     file.animate("Run", {(1, "translation"): (TENTH, [[0, 0, 90], [0, 0, 80]], "LINEAR")})

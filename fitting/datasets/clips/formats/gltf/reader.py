@@ -41,7 +41,7 @@ def read_gltf(path: Path, animation: str | None = None, fps: float | None = None
         tree = read_tree(document)
         name, chosen = _choose(_animations(document), animation)
         curves = _curves(document, chosen, tree)
-        joints, remark = find_joints(document, tree, {node for node, _ in curves})
+        joints, left_out = find_joints(document, tree, {node for node, _ in curves})
         nodes = len(tree.with_ancestors(joints))
         most = max(MOST_NUMBERS, document.size) // nodes
         times, frame_time, remarks = frame_times(list(curves.values()), fps, most)
@@ -54,7 +54,7 @@ def read_gltf(path: Path, animation: str | None = None, fps: float | None = None
     return Recording(
         tree.names(joints), parents, offsets_ls[0], positions_ls, rotations_ls, frame_time,
         metres_per_unit=1.0, up_axis="y", rest_rotations_ls=rest_rotations_ls[0],
-        remarks=(*remarks, *filter(None, [remark])),
+        remarks=(*remarks, *left_out),
     )  # fmt: skip
 
 

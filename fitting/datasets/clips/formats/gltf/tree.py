@@ -15,7 +15,6 @@ Curves = dict[tuple[int, str], Curve]
 """By node and path."""
 
 DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0,) * 3}
-NO_JOINTS = ("mesh", "camera")
 FLAT = 1e-6  # of a length; axes that are less apart have no direction of their own
 
 
@@ -83,12 +82,14 @@ def read_tree(document: Document) -> Tree:
     return Tree(nodes, parents)
 
 
-def find_joints(document: Document, tree: Tree, animated: set[int]) -> tuple[list[int], str]:
-    """The joints of the skeleton that an animation moves, parents first, and a remark.
+def find_joints(
+    document: Document, tree: Tree, animated: set[int]
+) -> tuple[list[int], tuple[str, ...]]:
+    """The joints of the skeleton that an animation moves, parents first, and remarks.
 
-    They are the joints of the skins that it moves, or in a file without skins the nodes that it
-    moves and what hangs from them, and the nodes between these. Of several separate skeletons the
-    one with the most joints is taken.
+    They are the joints of the skins that it moves, the nodes that it moves beside them, or all that
+    it moves in a file without skins; what hangs from these, and the nodes between them. Of several
+    separate skeletons the one with the most joints is taken.
     """
     ancestors = tree.with_ancestors(animated)
     skins = [
@@ -97,7 +98,9 @@ def find_joints(document: Document, tree: Tree, animated: set[int]) -> tuple[lis
         if (joints := as_list(skin.get("joints"), "the joints of a skin"))
     ]
     moved = [joints for joints in skins if joints & ancestors] or skins
-    members = set().union(*moved) if moved else _moved_nodes(tree, animated)
+    skinned = set().union(*moved)
+    beside = animated - tree.with_ancestors(skinned)
+    members = skinned | _hanging(tree, skinned | beside, animated)
     if not members:
         raise ValueError("no joints: neither a skin nor a node that the animation moves")
     below = [int(node in members) for node in range(len(tree.nodes))]  # members from a node on
@@ -111,18 +114,26 @@ def find_joints(document: Document, tree: Tree, animated: set[int]) -> tuple[lis
             inside.add(node)
             if top not in members and below[node] == below[top]:  # all of them are below this one
                 inside, top = {node}, node
-    others = len(members) - below[top]
-    remark = f"{others} joints of other skeletons in the file are left out" if others else ""
-    return [node for node in tree.order if node in inside], remark
+    remarks = []
+    if skinned and (unskinned := beside & members & inside):
+        remarks.append(f"{len(unskinned)} joints that no skin has are taken too, as they move")
+    if others := len(members) - below[top]:
+        remarks.append(f"{others} joints of other skeletons in the file are left out")
+    return [node for node in tree.order if node in inside], tuple(remarks)
 
 
-def _moved_nodes(tree: Tree, animated: set[int]) -> set[int]:
-    """Animated nodes and all below them, without meshes and cameras."""
-    moved: set[int] = set()
+def _hanging(tree: Tree, tops: set[int], animated: set[int]) -> set[int]:
+    """Nodes and all below them, without cameras, and without meshes that do not move themselves."""
+    below: set[int] = set()
     for node in tree.order:
-        if node in animated or tree.parents[node] in moved:
-            moved.add(node)
-    return {node for node in moved if not set(NO_JOINTS) & set(tree.nodes[node])} or moved
+        if node in tops or tree.parents[node] in below:
+            below.add(node)
+
+    def is_joint(node: int) -> bool:
+        item = tree.nodes[node]
+        return not {"camera", "skin"} & set(item) and ("mesh" not in item or node in animated)
+
+    return {node for node in below if is_joint(node)}
 
 
 def world_transforms(
