@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 from scipy.interpolate import RBFInterpolator
+from trimesh.exchange.gltf import export_gltf
 
 from fitting.cli import main
 from fitting.datasets import clips
@@ -244,6 +245,36 @@ def test_what_is_missing_or_wrong_is_said(tmp_path):
     ):
         with pytest.raises(ValueError, match=f"(?s){message}"):
             load_terrain(tmp_path / file, **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_what_is_missing_or_compressed_in_a_gltf_is_said(tmp_path):
+    files = export_gltf(trimesh.Scene(ramp()))
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    path = tmp_path / "ground.gltf"
+    draco = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    for place, value, message in (
+        ("asset", {"version": "2.0"}, ""),
+        ("buffers.1.uri", "gone.bin", "buffer 1 is in .gone.bin.: no such file; put that file be"),
+        ("buffers.1.uri", "../gltf_buffer_1.bin", "wanted a file beside this one"),
+        ("meshes.0.primitives.0.extensions", draco,
+         r"mesh 0 is compressed \(KHR_draco_mesh_compression\); export it without compression"),
+        ("bufferViews.1.extensions", {"EXT_meshopt_compression": {}},
+         r"bufferView 1 is compressed \(EXT_meshopt_compression\); export it without"),
+        ("accessors.1.sparse", {"count": 1}, "accessor 1 is sparse, which is not supported"),
+    ):  # fmt: skip
+        header = item = json.loads(files["model.gltf"])
+        *keys, last = (int(word) if word.isdecimal() else word for word in place.split("."))
+        for key in keys:
+            item = item[key]
+        item[last] = value
+        path.write_text(json.dumps(header))
+        if not message:
+            assert len(load_terrain(path).surfaces) == 1
+            continue
+        with pytest.raises(ValueError, match=f"ground.gltf: [^:]*{message}") as error:
+            load_terrain(path)
+        assert "\n" not in str(error.value) and "trimesh" not in str(error.value)
 
 
 def png_that_says(columns: int, rows: int, colour_type: int = 0) -> bytes:

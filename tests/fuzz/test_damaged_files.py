@@ -274,5 +274,5 @@ def test_a_gltf_reads_its_own_buffers_and_no_file_outside_its_folder(tmp_path):
     load_terrain(file)
     buffer.rename(tmp_path / buffer.name)
     file.write_text(file.read_text().replace(buffer.name, f"../{buffer.name}"))
-    with pytest.raises(ValueError, match="model.gltf: trimesh cannot read it"):
+    with pytest.raises(ValueError, match="model.gltf: .*wanted a file beside this one"):
         load_terrain(file)

@@ -209,7 +209,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
     content = path.read_bytes()  # of a file, trimesh would try to read as much as a header says
     try:
         _check_whole(kind, content)
-        content = gltf_checks.checked(kind, content)
+        content = gltf_checks.checked(kind, content, path.parent)
         with _silent_trimesh():
             # Unprocessed, as trimesh would otherwise merge and drop vertices.
             resolver = FilePathResolver(str(path))
@@ -217,6 +217,8 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, 
                 io.BytesIO(content), file_type=kind, resolver=resolver, process=False, **options
             )
             mesh = scene.to_mesh()
+    except gltf_checks.RefusalError as error:
+        raise ValueError(f"{path}: {in_one_line(error, QUOTED)}") from None
     except ImportError:  # of a package that guesses encodings, which is no requirement
         raise ValueError(
             f"{path}: trimesh cannot read it: neither a whole binary file nor text in UTF-8"

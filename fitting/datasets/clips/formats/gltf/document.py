@@ -11,13 +11,17 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float64
 
-from fitting.datasets.gltf_checks import BINARY, check_accessor
-from fitting.runtime.validation import check_file
+from fitting.datasets.gltf_checks import (
+    BINARY,
+    DATA,
+    buffer_path,
+    check_accessor,
+    check_uncompressed,
+)
 
 Item = Mapping[str, Any]
 
@@ -61,8 +65,6 @@ class Document:
 
     def _read_array(self, number: int) -> Float64[np.ndarray, "count width"]:
         accessor, where = self.items("accessors")[number], f"accessor {number}"
-        if "sparse" in accessor:
-            raise ValueError(f"{where} is sparse, which is not supported; export it in full")
         check_accessor(number, accessor)
         component, kind = accessor.get("componentType"), accessor.get("type")
         if component not in tuple(COMPONENTS) or kind not in tuple(WIDTHS):
@@ -96,10 +98,7 @@ class Document:
         views = self.items("bufferViews")
         number = as_index(index, len(views), "bufferViews")
         view, where = views[number], f"bufferView {number}"
-        if extensions := [
-            name for name in as_item(view.get("extensions", {}), where) if "compression" in name
-        ]:
-            raise ValueError(f"{where} is compressed ({extensions[0]}); export it uncompressed")
+        check_uncompressed(where, as_item(view.get("extensions", {}), where))
         content = self._buffer(as_index(view.get("buffer"), len(self.items("buffers")), "buffers"))
         start = as_index(view.get("byteOffset", 0), LARGEST_COUNT, f"offsets of {where}")
         length = as_index(view.get("byteLength"), LARGEST_COUNT, f"lengths of {where}")
@@ -117,18 +116,13 @@ class Document:
             return self.binary
         if not isinstance(uri, str):
             raise ValueError(f"the uri of buffer {number} is {uri!r}; wanted a text")
-        if uri.startswith("data:"):
+        if uri.startswith(DATA):
             head, _, text = uri.partition(",")
             try:
                 return base64.b64decode(text if head.endswith(";base64") else "?", validate=True)
             except binascii.Error:
                 raise ValueError(f"the uri of buffer {number} is no base64") from None
-        name = unquote(uri)
-        if not name or "\0" in name or Path(name).is_absolute() or ".." in Path(name).parts:
-            raise ValueError(f"buffer {number} is in {uri!r}; wanted a file beside this one")
-        path = self.folder / name
-        check_file(path)
-        content = path.read_bytes()
+        content = buffer_path(self.folder, number, uri).read_bytes()
         self.size += len(content)
         return content
 
