@@ -15,7 +15,8 @@ from fitting.datasets.clips import Clip, formats, load_clip, save_clip
 from fitting.datasets.clips.edit import mask_pops
 from fitting.datasets.clips.formats.asfamc import read_asfamc
 from fitting.datasets.clips.formats.bvh import read_bvh
-from fitting.datasets.clips.recording import Y_UP_FROM_Z_UP, Recording
+from fitting.datasets.clips.guesses import units
+from fitting.datasets.clips.recording import INCH, Y_UP_FROM_Z_UP, Recording
 from fitting.datasets.synthetic import multi_limb, speed_profile, walker
 from support.sample_clips import AMC, AMC_FILES, ASF, BVH, BVH_FILES, stair_walk
 
@@ -232,7 +233,7 @@ def test_what_no_body_or_argument_can_be_is_refused_but_bounds_give_way_to_argum
          r"Hips is at .* in frame 1; wanted at most 1e\+06 m, at 0.01 m per unit"),
         ("Frame Time: 0.0083333", "Frame Time: 1e21", {},
          r"1e-21 frames per second; wanted 0.001 to 100000; give fps="),
-        ("", "", {"scale": 10.0}, "left thigh is 420 m long; wanted at most 100; give another "),
+        ("", "", {"scale": 10.0}, "left thigh is 420 m long; wanted at most 100; give --s.*: 0.01"),
         ("", "", {"scale": -1.0}, "scale is -1"),
         ("", "", {"fps": 0.0}, "fps is 0"),
         ("", "", {"up": "x"}, "wanted 'y'"),
@@ -253,7 +254,15 @@ def test_frames_too_many_and_bodies_that_are_odd_get_a_remark(write_bvh):
         (BVH.replace("Frames: 3", "Frames: 2"), 2, True, "2 frames are declared and 3 found"),
         (head + "MOTION\nFrames: 1\nFrame Time: 0.01\n0 0 0\n", 1, False, "no bone has a length"),
         (lying, 3, True, "not above the feet"),
-        (BVH.replace("OFFSET 0 -42 0", "OFFSET 0 -94 0"), 3, True, "1.340 m; doubtful: give --sc"),
+        (BVH, 3, True, "legs of 82 units, taken as centimetres, are 0.820 m; sure, as in no other"),
+        (BVH, 3, True, "up axis guessed: y; sure, as the pelvis is 0.7"),
+        (
+            BVH.replace("OFFSET 0 -42 0", "OFFSET 0 -94 0"),
+            3,
+            True,
+            "are 1.340 m; doubtful, as people's are 0.6 to 1.1 m, children's from 0.4 m; give "
+            "--scale (scale=... in Python) if you know better: 0.00627 makes them an adult's, 0.84",
+        ),
         (BVH.replace("OFFSET 0 -42 0", "OFFSET 0 0 0", 1), 3, False, "left thigh has no length"),
     ):
         clip = load_clip(write_bvh(text))
@@ -266,6 +275,31 @@ def test_frames_too_many_and_bodies_that_are_odd_get_a_remark(write_bvh):
     assert np.allclose(clip.rig.foot, 0.0)
     assert not any("doubtful" in said for said in clip.remarks)
     assert np.isfinite(np.asarray(clip.rig.ankle_from_foot)).all()
+
+
+@pytest.mark.parametrize(
+    ("leg", "scale", "remark"),
+    [
+        (82.0, 0.01, r"centimetres, are 0.820 m; sure, as in no other usual unit are they a pers"),
+        (15.0, INCH / 0.45, "ASF units, are 0.847 m; sure"),
+        (41.0, INCH, r"inches, are 1.041 m; not sure, as in centimetres they are 0.410 m, a ch"),
+        (50.0, INCH, r"inches, are 1.270 m; doubtful, .*: 0.01, for centimetres, makes them 0.5"),
+        (21.68, INCH / 0.45, r"1.224 m; doubtful, .*: 0.0254, for inches, makes them 0.551 m, and "
+         "0.0387 makes them an adult's, 0.84 m$"),
+        (0.3, 1.0, r"metres, are 0.300 m; doubtful, .* better: 2.8 makes them an adult's, 0.84 m$"),
+    ],
+)  # fmt: skip
+def test_a_guessed_unit_says_how_sure_it_is_and_what_else_it_may_be(leg, scale, remark):
+    guessed, text = units.guess(leg)
+    assert guessed == scale and re.search(f"legs of {leg:g} units, taken as .*{remark}", text)
+
+
+def test_a_stated_unit_is_doubted_where_it_makes_no_person():
+    assert [units.doubt(leg, 1.0) for leg in (0.4, 0.84, 1.1)] == ["", "", ""]
+    for leg, remedy in ((84.0, "0.01, for centimetres, makes them 0.840 m"), (1.25, "0.672 makes")):
+        text = units.doubt(leg, 1.0)
+        assert text.startswith(f"the legs are {leg:g} m long by the scale that the file states; do")
+        assert f"give --scale (scale=... in Python) if you know better: {remedy}" in text
 
 
 # ASF and AMC

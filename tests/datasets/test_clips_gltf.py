@@ -60,6 +60,18 @@ def test_a_character_below_a_turned_and_scaled_armature_is_read_in_metres(tmp_pa
     np.testing.assert_allclose(clip.offsets_ls[1], [0.1, 0.0, 0.0], atol=1e-6)
 
 
+def test_a_character_in_centimetres_is_doubted_unless_its_scale_is_given(tmp_path):
+    file = walker()
+    file.header["nodes"][0]["scale"] = [1.0, 1.0, 1.0]
+    (tmp_path / "walk.gltf").write_text(file.text())
+    clip = load_clip(tmp_path / "walk.gltf")
+    (doubt,) = (remark for remark in clip.remarks if "doubtful" in remark)
+    assert "the legs are 87.09 m long" in doubt and "better: 0.01, for centimetres" in doubt
+    clip = load_clip(tmp_path / "walk.gltf", scale=0.01)
+    assert clip.rig.thigh[0] == pytest.approx(0.45, abs=0.01)
+    assert not any("doubtful" in remark for remark in clip.remarks)
+
+
 @pytest.mark.parametrize("fps", [None, 25.0])
 def test_values_between_keys_follow_the_interpolation(load, fps):
     slopes = np.arange(30.0).reshape(2, 5, 3)

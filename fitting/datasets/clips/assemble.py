@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from jaxik.world import body
 from jaxik.world.skeleton import Rig
 
 from . import contacts
 from .clip import Clip
+from .guesses import units
 from .guesses.balls import with_balls
 from .joint_roles import Leg, Roles, find_roles
 from .joints.map_files import ADVICE
@@ -22,7 +22,6 @@ from .kinematics import continuous, local_from_world, world_from_local
 from .recording import (
     FASTEST,
     FURTHEST,
-    INCH,
     LONGEST,
     SHORTEST,
     SLOWEST,
@@ -31,11 +30,11 @@ from .recording import (
 )
 from .rigs import measure_rig, measure_soles, relative_size, stiff_knees
 
+UP_ADVICE = "give --up (up=... in Python) if you know better"
+UPRIGHT = 0.5, 0.8  # of the way from feet to pelvis: how far it goes up at least, and surely
 HUGE = 1e12  # units of a file, whatever they are
 RATES = (24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 250, 300, 360, 480)
 RATE_TOLERANCE = 0.005  # relative: 23.976 becomes 24, and the raw frame time is kept
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": INCH, "ft": 12 * INCH, "ASF unit": INCH / 0.45}
-PLAUSIBLE_RATIO = 1.5  # to an adult's leg; beyond it the guessed unit is called doubtful
 
 
 @dataclass(frozen=True)
@@ -86,11 +85,11 @@ def clip_from_recording(
         remarks.append(f"{_first_clause(error)}; {ADVICE}")
     scale = overrides.scale
     if scale is None:
-        scale = recording.metres_per_unit or _guess_scale(recording, roles, remarks)
+        scale = _find_scale(recording, roles, remarks)
     recording = recording.scaled(scale)
     _check_places(recording, source, FURTHEST, f"m, at {scale:g} m per unit (scale=...)")
     if roles is not None:
-        roles = _with_bones(recording, source, roles, remarks)
+        roles = _with_bones(recording, source, roles, scale, remarks)
     up = overrides.up or recording.up_axis or _guess_up(recording, roles, remarks)
     if up == "z":
         recording = recording.rotated(Y_UP_FROM_Z_UP)
@@ -205,7 +204,7 @@ def _check_places(recording: Recording, source: str, furthest: float, unit: str)
 
 
 def _with_bones(
-    recording: Recording, source: str, roles: Roles, remarks: list[str]
+    recording: Recording, source: str, roles: Roles, scale: float, remarks: list[str]
 ) -> Roles | None:
     """The roles, unless a leg has no thigh or no shin: then none, and a remark.
 
@@ -213,11 +212,12 @@ def _with_bones(
         ValueError: a bone of a leg is longer than a body's can be.
     """
     for leg in roles.legs:
-        for bone, length in zip(("thigh", "shin"), _bone_lengths(recording, leg), strict=True):
+        lengths = _bone_lengths(recording, leg)
+        for bone, length in zip(("thigh", "shin"), lengths, strict=True):
             if length > LONGEST:
                 raise ValueError(
-                    f"{source}: the {leg.name} {bone} is {length:.4g} m long; "
-                    f"wanted at most {LONGEST:g}; give another --scale (scale=... in Python)"
+                    f"{source}: the {leg.name} {bone} is {length:.4g} m long; wanted at most "
+                    f"{LONGEST:g}; {units.remedy(sum(lengths) / scale, scale)}"
                 )
             if length < SHORTEST:
                 remarks.append(
@@ -272,22 +272,21 @@ def _leg_length(recording: Recording, roles: Roles | None) -> float:
     return float(reach.max())
 
 
-def _guess_scale(recording: Recording, roles: Roles | None, remarks: list[str]) -> float:
-    """Metres per unit, from the unit that makes the legs most similar to an adult's."""
+def _find_scale(recording: Recording, roles: Roles | None, remarks: list[str]) -> float:
+    """Metres per unit that the file states, or else those of the most likely unit."""
     leg = _leg_length(recording, roles)
+    if (stated := recording.metres_per_unit) is not None:
+        if roles is not None and leg > 0.0 and (text := units.doubt(leg, stated)):
+            remarks.append(text)
+        return stated
     if leg == 0.0:
         remarks.append("scale not recognised, as no bone has a length; taken as metres")
         return 1.0
-    unit = min(UNITS, key=lambda name: abs(np.log(leg * UNITS[name] / body.LEG)))
-    metres = leg * UNITS[unit]
-    plausible = 1 / PLAUSIBLE_RATIO < metres / body.LEG < PLAUSIBLE_RATIO
-    doubt = (
-        ""
-        if roles is not None and plausible
-        else "; doubtful: give --scale (scale=... in Python) if you know it"
-    )
-    remarks.append(f"scale guessed: legs of {leg:.4g} units in {unit} are {metres:.3f} m{doubt}")
-    return UNITS[unit]
+    guessed, text = units.guess(leg)
+    if roles is None:
+        text = f"{text.partition(';')[0]}; doubtful, as these are chains of any bones"
+    remarks.append(text)
+    return guessed
 
 
 def _guess_up(recording: Recording, roles: Roles | None, remarks: list[str]) -> str:
@@ -300,11 +299,18 @@ def _guess_up(recording: Recording, roles: Roles | None, remarks: list[str]) -> 
     )
     if roles is None:
         extent = np.median(np.ptp(positions, axis=1), axis=0)
-        return "z" if extent[2] > 2 * extent[1] else "y"
+        up = "z" if extent[2] > 2 * extent[1] else "y"
+        remarks.append(f"up axis guessed: {up}; doubtful, as no legs are recognised; {UP_ADVICE}")
+        return up
     ankles = positions[:, [leg.joints[2] for leg in roles.legs]].mean(axis=1)
     rise = np.median(positions[:, roles.pelvis] - ankles, axis=0)
-    if max(rise[1], rise[2]) < 0.5 * np.linalg.norm(rise):
-        remarks.append(
-            "the pelvis is not above the feet along y or z; give --up (up=... in Python)"
-        )
-    return "z" if rise[2] > rise[1] else "y"
+    up, height = ("z", rise[2]) if rise[2] > rise[1] else ("y", rise[1])
+    distance = float(np.linalg.norm(rise))
+    if height < UPRIGHT[0] * distance:
+        sureness = f"doubtful, as the pelvis is not above the feet along y or z; {UP_ADVICE}"
+    elif height < UPRIGHT[1] * distance:
+        sureness = f"not sure, as the pelvis is ahead of the feet rather than above; {UP_ADVICE}"
+    else:
+        sureness = f"sure, as the pelvis is {height:.2f} m above the feet along it"
+    remarks.append(f"up axis guessed: {up}; {sureness}")
+    return up

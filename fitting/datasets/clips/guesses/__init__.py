@@ -1,1 +1,1 @@
-"""What a motion file may leave open, guessed: the balls of feet that end at the ankle."""
+"""What a motion file may leave open: its unit, and balls of feet that end at the ankle."""
