@@ -1,8 +1,9 @@
 """How much ground a terrain has under the feet of a clip; what to do where it has little.
 
 A terrain in another unit, with another axis up, or somewhere else, has no ground where the feet
-stand. Each of these mistakes is undone in turn, and what brings ground under the feet is the likely
-remedy. Lengths are metres, y up.
+stand; neither has a clip in another unit. Each of these mistakes is undone in turn, and what brings
+ground under the feet, and takes none away that is near them, is the likely remedy. Lengths are
+metres, y up.
 """
 
 import warnings
@@ -13,17 +14,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from jaxik.world import body
 from jaxik.world.heightfield import Heightfield
 from jaxik.world.surfaces import Mesh
 from jaxik.world.terrain import Terrain
 
 from .clips.clip import Clip
+from .clips.guesses import units
 from .ground_path import SKY, heights_under, step_height
 from .terrain.mesh_files import AS_IS, TerrainOptions
 
 ENOUGH = 0.8  # fraction of stances with ground under them, from which the terrain is in place
 LITTLE = 0.5  # below which there is nothing that could be fitted
-PARTLY = 0.2  # above which the unit is right, and the terrain is too small or aside
+PARTLY = 0.2  # above which the unit is right, and the terrain is too small or aside; likewise near
 UNITS = (0.01, 0.001, 0.0254, 0.3048)  # m: centimetre, millimetre, inch, foot; by how usual
 FACTORS = tuple(factor for unit in UNITS for factor in (unit, 1.0 / unit))
 
@@ -58,6 +61,8 @@ class Coverage:
     """With which the terrain was read."""
     remedy: TerrainOptions | None
     """With which it has enough ground; None if nothing helps, or nothing needs to."""
+    clip_scale: float | None = None
+    """Metres per unit of the clip's file, which belong to the remedy; None leaves them."""
 
     @property
     def is_enough(self) -> bool:
@@ -72,7 +77,8 @@ class Coverage:
         """
         remedy = "no other unit, up axis or offset helps: does the terrain cover the whole path?"
         if self.remedy is not None:
-            remedy = f"likely remedy: {_changes(self.options, self.remedy, as_keys)}"
+            changes = _changes(self.options, self.remedy, self.clip_scale, as_keys)
+            remedy = f"likely remedy: {changes}"
         return (
             f"{self.clip}: there is ground under {100 * self.share:.1f} % of its standing feet: "
             f"the feet are at {self.feet}; the terrain is at {self.terrain}; {remedy}"
@@ -110,18 +116,61 @@ def measure(
     feet = np.concatenate([clip.joints_ws(2), balls], axis=1).reshape(-1, 3)
     standing = balls[stance]
     share = _share(terrain, standing) if len(standing) else 1.0
-    remedy = None
+    remedy, clip_scale = None, None
     if share < ENOUGH:
+        clip_scale = None if clip.source.lower().endswith(".npz") else _person_scale(clip)
+        factor = 1.0 if clip_scale is None else clip_scale / clip.scale
+        stances = _Stances(factor * standing, factor * step_height(clip))
         ground = _Ground(terrain, options)
-        remedy = _find_remedy(standing, step_height(clip), ground, reload, share < PARTLY)
+        if clip_scale is not None and stances.are_over(terrain):
+            remedy = options
+        else:
+            before = stances.near(terrain)
+            stances = replace(stances, enough_near=before if before >= PARTLY else 0.0)
+            remedy = _find_remedy(stances, ground, reload, share < PARTLY)
+        clip_scale = None if remedy is None else clip_scale
     box = Box(feet.min(axis=0), feet.max(axis=0))
-    return Coverage(clip.source, share, box, bounds(terrain), options, remedy)
+    return Coverage(clip.source, share, box, bounds(terrain), options, remedy, clip_scale)
+
+
+def _person_scale(clip: Clip) -> float | None:
+    """Metres per unit of the clip's file that make its body a person's; None where others do."""
+    return units.likelier(body.leg_length(clip.rig) / clip.scale, clip.scale)
 
 
 def bounds(terrain: Terrain) -> Box:
     """The box around all surfaces; infinite around planes and functions."""
     points = np.concatenate([_extremes(surface) for surface in terrain.surfaces])
     return Box(points.min(axis=0), points.max(axis=0))
+
+
+@dataclass(frozen=True)
+class _Stances:
+    """Balls of standing feet, m, and what ground they need."""
+
+    points: Points
+    step: float
+    """m, difference in height that is near, and that needs no offset."""
+    enough_near: float = 0.0
+    """Fraction of the points that need ground near them."""
+
+    def near(self, terrain: Terrain) -> float:
+        """Fraction of the points that have ground near them."""
+        heights = heights_under(terrain, self.points, self.points[:, 1] + self.step)
+        return float(np.mean(heights >= self.points[:, 1] - self.step))  # NaN is not
+
+    def are_over(self, terrain: Terrain) -> bool:
+        """Whether they have the ground that they need."""
+        covered = _share(terrain, self.points) >= ENOUGH
+        return covered and self.near(terrain) >= self.enough_near
+
+    def moved(self, offset: np.ndarray) -> "_Stances":
+        """Relative to a terrain that is moved by an offset, m."""
+        return replace(self, points=self.points - offset)
+
+    def scaled(self, factor: float) -> "_Stances":
+        """As many times as large."""
+        return replace(self, points=self.points * factor, step=self.step * factor)
 
 
 class _Ground(NamedTuple):
@@ -132,38 +181,38 @@ class _Ground(NamedTuple):
 
 
 def _find_remedy(
-    standing: Points,
-    step: float,
+    stances: _Stances,
     ground: _Ground,
     reload: Callable[[TerrainOptions], Terrain] | None,
     any_unit: bool,
 ) -> TerrainOptions | None:
-    """The first change of the options that brings enough ground under points; None if none does.
+    """The first change of the options that brings enough ground under feet; None if none does.
 
     Args:
-        standing: balls of standing feet, m.
-        step: m, difference in height that needs no offset.
+        stances: where they stand.
         ground: as it was read.
         reload: reads it with other options.
         any_unit: whether other units of length are tried.
     """
+    if stances.enough_near:  # axis and unit are right
+        reload, any_unit = None, False
     grounds = [ground, *_turned(ground, reload)]
     for other in grounds[1:]:
-        if _share(other.terrain, standing) >= ENOUGH:
+        if stances.are_over(other.terrain):
             return other.options
     grounds.sort(key=lambda each: float(_size(each.terrain)[1]))  # one that stands upright is last
     for terrain, options in grounds:
         offset, scale = np.array(options.offset), options.scale or 1.0
-        too_small = (_size(terrain) < np.ptp(standing, axis=0))[[0, 2]].any()
+        too_small = (_size(terrain) < np.ptp(stances.points, axis=0))[[0, 2]].any()
         for factor in FACTORS if any_unit else ():
             if factor > 1.0 and not too_small:
                 continue
-            if _share(terrain, (standing - offset) / factor + offset) >= ENOUGH:
+            if stances.moved(offset).scaled(1.0 / factor).moved(-offset).are_over(terrain):
                 return replace(options, scale=scale * factor)
     for terrain, options in grounds:
-        moved = _offset_to(terrain, standing, step)
-        if moved is not None:
-            x, y, z = (float(value) for value in np.round(options.offset + moved, 2))
+        moved = _offset_to(terrain, stances)
+        if moved is not None and stances.moved(moved).are_over(terrain):
+            x, y, z = (float(value) + 0.0 for value in np.round(options.offset + moved, 2))
             return replace(options, offset=(x, y, z))
     return None
 
@@ -186,18 +235,19 @@ def _size(terrain: Terrain) -> Float64[np.ndarray, "3"]:
     return high - low
 
 
-def _offset_to(terrain: Terrain, standing: Points, step: float) -> np.ndarray | None:
+def _offset_to(terrain: Terrain, stances: _Stances) -> np.ndarray | None:
     """By how much to move a terrain to have its middle under the feet, m; None if that is no help.
 
     It is moved in height where it is further from the feet than a step.
     """
     low, high = bounds(terrain)
+    standing, step = stances.points, stances.step
     if not np.isfinite([low, high]).all():
         return None
     lowest, highest = standing.min(axis=0), standing.max(axis=0)
     offset = ((lowest + highest) - (low + high)) / 2 * [1.0, 0.0, 1.0]
     heights = heights_under(terrain, standing - offset, SKY)
-    if np.mean(~np.isnan(heights)) < ENOUGH:
+    if np.isnan(heights).all():
         return None
     rise = float(np.nanmedian(standing[:, 1] - heights))
     return offset + [0.0, rise if abs(rise) > step else 0.0, 0.0]
@@ -226,9 +276,13 @@ def _extremes(surface: object) -> Points:
             return np.array([[-np.inf] * 3, [np.inf] * 3])
 
 
-def _changes(old: TerrainOptions, new: TerrainOptions, as_keys: bool) -> str:
-    """The options in which two differ, as a user writes them."""
+def _changes(
+    old: TerrainOptions, new: TerrainOptions, clip_scale: float | None, as_keys: bool
+) -> str:
+    """The scale of the clip and the options in which two differ, as a user writes them."""
     changes = []
+    if clip_scale is not None:
+        changes.append(f"scale = {clip_scale:.10g}" if as_keys else f"--scale {clip_scale:.10g}")
     for field in fields(TerrainOptions):
         value = getattr(new, field.name)
         if value == getattr(old, field.name):

@@ -314,8 +314,10 @@ Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 def covered(route, tmp_path):
     """Measures the coverage of the walk by a hill with other vertices."""
 
-    def measure(vertices: np.ndarray, options: TerrainOptions = AS_IS) -> coverage.Coverage:
-        save_mesh(tmp_path / "hill.obj", vertices, hill().faces)
+    def measure(
+        vertices: np.ndarray, options: TerrainOptions = AS_IS, faces: np.ndarray | None = None
+    ) -> coverage.Coverage:
+        save_mesh(tmp_path / "hill.obj", vertices, hill().faces if faces is None else faces)
 
         def load(options: TerrainOptions) -> terrain.Terrain:
             return load_terrain(tmp_path / "hill.obj", **vars(options))
@@ -351,6 +353,24 @@ def test_the_other_axis_and_other_units_are_named(covered):
         assert measured.text().endswith(f"; likely remedy: {words}")
 
 
+def test_a_body_that_is_no_persons_is_scaled_and_not_its_terrain(route):
+    giant = replace(
+        route,
+        positions_ws=100.0 * route.positions_ws,
+        measured_rig=replace(route.rig, thigh=100 * route.rig.thigh, shin=100 * route.rig.shin),
+        source="walk.glb",
+    )
+    for ground, scale, remedy in (
+        (slab(0.0, -2.0, 9.0), 1.0, "--scale 0.01"),
+        (slab(0.0, 98.0, 109.0), 0.1, "--scale 0.001 --terrain-offset"),
+    ):
+        measured = coverage.measure(replace(giant, scale=scale), ground)
+        assert f"; likely remedy: {remedy}" in measured.text()
+    assert "remedy: scale = 0.001, terrain_offset = [" in measured.text(as_keys=True)
+    saved = coverage.measure(replace(giant, source="walk.npz"), slab(0.0, -2.0, 9.0))
+    assert "remedy: --terrain-scale 100" in saved.text()  # an archive takes no scale
+
+
 def test_a_terrain_far_away_or_aside_is_moved_below_the_feet(covered):
     far = np.array([480_000.0, 120.0, -5_200_000.0])
     measured = covered(hill().vertices + far)
@@ -382,6 +402,14 @@ def test_a_terrain_in_place_or_below_no_or_a_part_of_the_path_has_no_remedy(cove
     assert measured.text().endswith("offset helps: does the terrain cover the whole path?")
     measured = covered(hill().vertices * [1.0, 1.0, 0.1] + [0.0, 0.0, 1.0])
     assert 0.2 < measured.share < 0.5 and measured.remedy is None
+    # A hole under a third of the path, and a wall that would be a floor if it lay down.
+    flat = [[-9, 0, -2], [-9, 0, 2], [9, 0, 2], [9, 0, -2]]
+    flat += [[-9, 0, 4], [-9, 0, 9], [9, 0, 9], [9, 0, 4]]
+    wall = [[-9, -9, 9], [-9, 9, 9], [9, 9, 9], [9, -9, 9]]
+    corners = np.arange(12).reshape(3, 4)
+    faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    measured = covered(np.array([*flat, *wall], float), faces=faces)
+    assert 0.5 < measured.share < 0.8 and measured.remedy is None
     # A plane is everywhere, and a heightfield has a box.
     assert coverage.measure(route, terrain.plane()).share == 1.0
     field = terrain.heightfield(np.arange(6.0).reshape(2, 3), (0.5, 2.0), (10.0, 1.0, 0.0))

@@ -54,6 +54,12 @@ def doubt(leg: float, scale: float) -> str:
     )
 
 
+def likelier(leg: float, scale: float) -> float | None:
+    """Metres per unit that make legs a person's; None if these do, or if no usual unit does."""
+    other = None if PEOPLE[0] <= leg * scale <= PEOPLE[1] else _other_unit(leg, scale)
+    return None if other is None else UNITS[other]
+
+
 def remedy(leg: float, scale: float) -> str:
     """Which scale to give instead of this one, m per unit, for legs of so many units."""
     fitted = f"{LEG / leg:.3g} makes them an adult's, {LEG:g} m"
