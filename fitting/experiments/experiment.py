@@ -195,8 +195,8 @@ class Experiment(Shown):
             )
         if self.noise.correlation == "whitened" and self.independent_every:
             raise ValueError(
-                f"{self.path}: independent_every and [noise] correlation = 'whitened' would account "
-                "for the same correlation twice; leave one of them out"
+                f"{self.path}: independent_every and [noise] correlation = 'whitened' would "
+                "account for the same correlation twice; leave one of them out"
             )
         if all(entry.held_out for entry in self.clips):
             raise ValueError(f"{self.path}: all clips are held out; wanted one that is not")

@@ -126,8 +126,8 @@ NOISE_KEYS = {
     ),
 }
 TABLES = {
-    "free": "What is fitted; {} takes range, kind and scale from the rule's declaration. Needed, and may"
-    " be empty.",
+    "free": "What is fitted, if anything; {} takes range, kind and scale from the rule's"
+    " declaration. Needed.",
     "prior": "What is known of free parameters before any clip.",
     "start": "Where the search begins; left out, at the system's values.",
     "rules": "Rules that differ from the preset's, by stage.",
