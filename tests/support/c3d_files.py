@@ -1,6 +1,7 @@
 """C3D files of known bodies: markers are put on joints whose places are known."""
 
-from collections.abc import Mapping
+import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ WIDTHS = {"KneeWidth": 104.0, "AnkleWidth": 70.0}  # mm
 MEASURES = {letter + name: width for letter in "LR" for name, width in WIDTHS.items()}
 RADIUS = 0.007  # m, of a marker
 DEPTH = 0.15  # m, of the pelvis
+BLOCK = 512  # bytes
+INTEL, DEC, MIPS = 84, 85, 86
 Places = dict[str, np.ndarray]
 
 
@@ -88,4 +91,73 @@ def write_c3d(
     content["data"]["analogs"] = np.ones((1, channels, 4 * len(stacked)))
     content["data"]["meta_points"]["residuals"] = np.where(np.isnan(points[:1]), -1.0, 1.0)
     content.write(str(path))
+    return path
+
+
+def write_bytes(
+    path: Path,
+    positions: np.ndarray,
+    parameters: Mapping[str, Mapping[str, float | Sequence[str]]],
+    processor: int = INTEL,
+    scale: float = -1.0,
+    *,
+    samples: int = 0,
+    word_3: int | None = None,
+) -> Path:
+    """Writes a file byte by byte, as the C3D User Guide says, for what ezc3d does not write.
+
+    Args:
+        path: file name.
+        positions: (frames, points, 3), in the file's unit and axes; NaN are gaps.
+        parameters: by group and name, beside `POINT:USED`, `SCALE` and `RATE`; numbers keep their
+            type. The group "" is not there, only what belongs to it.
+        processor: whose numbers it holds.
+        scale: of integers; negative for floats.
+        samples: analog values beside the points of each frame, all of them 1000.
+        word_3: how many of them the header states; None is the truth.
+    """
+    order = ">" if processor == MIPS else "<"
+
+    def floats(values: np.ndarray | Sequence[float]) -> bytes:
+        if processor != DEC:
+            return np.asarray(values, f"{order}f4").tobytes()
+        return np.multiply(values, 4, dtype="<f4").view("<u2").reshape(-1, 2)[:, ::-1].tobytes()
+
+    def entry(number: int, name: str, body: bytes) -> bytes:
+        head = struct.pack("bb", len(name), number) + name.encode()
+        return head + struct.pack(f"{order}H", 2 + len(body)) + body
+
+    def parameter(number: int, name: str, value: float | Sequence[str]) -> bytes:
+        if isinstance(value, int):
+            body = struct.pack(f"{order}bbh", 2, 0, value)
+        elif isinstance(value, float):
+            body = struct.pack("bb", 4, 0) + floats([value])
+        else:
+            text = "".join(label.ljust(16) for label in value).encode()
+            body = struct.pack("bbBB", -1, 2, 16, len(value)) + text
+        return entry(number, name, body + b"\0")
+
+    frames, count, _ = positions.shape
+    point = {"USED": count, "SCALE": scale, "RATE": 60.0, **parameters.get("POINT", {})}
+    groups = {**parameters, "POINT": point}
+    section = bytes([1, 0x50, 0, processor])
+    for number, (group, values) in enumerate(groups.items(), start=1):
+        section += entry(-number, group, b"\0") if group else b""
+        section += b"".join(parameter(number, name, value) for name, value in values.items())
+    section += bytes(2)
+    section += bytes(-len(section) % BLOCK)
+    data = np.zeros((frames, 4 * count + samples))
+    data[:, 4 * count :] = 1000.0
+    lost = np.isnan(positions).any(axis=-1, keepdims=True)
+    points = np.where(lost, [0.0, 0.0, 0.0, -1.0], np.insert(positions, 3, 0.0, axis=-1))
+    if scale > 0:
+        points[..., :3] /= scale
+    data[:, : 4 * count] = points.reshape(frames, -1)
+    header = bytearray(BLOCK)
+    words = [count, samples if word_3 is None else word_3, 1, frames, 0]
+    struct.pack_into(f"{order}5H", header, 2, *words)
+    struct.pack_into(f"{order}H", header, 16, 2 + len(section) // BLOCK)
+    header[:2], header[12:16] = b"\x02\x50", floats([scale])
+    values = floats(data) if scale < 0 else np.round(data).astype(f"{order}i2").tobytes()
+    path.write_bytes(bytes(header) + section + values)
     return path

@@ -1,8 +1,8 @@
 """C3D files: markers become joints.
 
-`structure` checks the bytes, `markers` reads points through ezc3d (the extra `c3d`), `marker_sets`
-makes joint centres of them, `plug_in_gait` those of Vicon's lower-body marker set, and `reader`
-puts a `Recording` together.
+`structure` reads the bytes, `markers` what is known of the points, `marker_sets` makes joint
+centres of them, `plug_in_gait` those of Vicon's lower-body marker set, and `reader` puts a
+`Recording` together.
 
 Start with `reader.read_c3d`.
 """

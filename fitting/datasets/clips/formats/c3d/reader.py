@@ -40,7 +40,7 @@ def read_c3d(
 
     Raises:
         ValueError: with the file's name, where it is no whole C3D file of markers, lacks those that
-            are named, or no frame has them all; where ezc3d is not installed.
+            are named, or no frame has them all.
     """
     with error_context(path):
         markers = _turned(read_markers(path))

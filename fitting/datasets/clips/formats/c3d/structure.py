@@ -1,39 +1,26 @@
-"""Holds a C3D file against its own bytes before ezc3d opens it.
+"""The bytes of a C3D file: its header, parameters and points, as the C3D User Guide has them.
 
-ezc3d ends the process with a segmentation fault, or never returns, where some bytes of a file are
-damaged (3 % and 1 % of files with random damage, version 1.7.2). So the header and all parameters
-are walked first, as the C3D User Guide describes them: whatever they claim has to lie within the
-file, which also bounds the memory that reading takes.
+Whatever header and parameters claim has to lie within the file, which also bounds the memory that
+reading takes. Analog values are skipped: how many lie beside the points of a frame is all that has
+to be known of them.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
 
 BLOCK = 512  # bytes
 KEY = 0x50  # second byte of every C3D file
+DEC = 85
 Order = Literal["little", "big"]
-PROCESSORS: dict[int, tuple[Order, int]] = {  # and the byte of a float that holds its sign
-    84: ("little", 3),  # Intel
-    85: ("little", 1),  # DEC
-    86: ("big", 0),  # MIPS
-}
-WIDTHS = {-1: 1, 1: 1, 2: 2, 4: 4}  # bytes of a value, by the type of a parameter
-TEXT, INTEGER, FLOAT = -1, 2, 4
+ORDERS: dict[int, Order] = {84: "little", DEC: "little", 86: "big"}  # Intel, DEC and MIPS
+TEXT, FLOAT = -1, 4
+WIDTHS = {TEXT: 1, 1: 1, 2: 2, FLOAT: 4}  # bytes of a value, by the type of a parameter
 MOST_DIMENSIONS = 7
-KINDS = {  # of the parameters by which ezc3d finds its way
-    "POINT": {
-        "USED": {INTEGER}, "SCALE": {FLOAT}, "RATE": {FLOAT}, "DATA_START": {INTEGER},
-        "FRAMES": {INTEGER, FLOAT}, "LABELS": {TEXT}, "DESCRIPTIONS": {TEXT}, "UNITS": {TEXT},
-    },
-    "ANALOG": {
-        "USED": {INTEGER}, "RATE": {FLOAT}, "GEN_SCALE": {FLOAT}, "SCALE": {FLOAT},
-        "OFFSET": {INTEGER}, "LABELS": {TEXT}, "DESCRIPTIONS": {TEXT}, "UNITS": {TEXT},
-        "FORMAT": {TEXT},
-    },
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,7 +34,11 @@ class Parameter:
 
 
 class Structure:
-    """The header of a file, and its parameters by the names of group and parameter."""
+    """The header of a file, its parameters by the names of group and parameter, and its points.
+
+    Raises:
+        ValueError: without the file's name, where what it claims does not lie within the file.
+    """
 
     def __init__(self, content: bytes):
         if len(content) < 2 * BLOCK or content[1] != KEY or not content[0]:
@@ -57,25 +48,111 @@ class Structure:
             )
         self.content = content
         start = (content[0] - 1) * BLOCK
-        if start + 4 > len(content) or content[start + 3] not in PROCESSORS or start < BLOCK:
+        if start + 4 > len(content) or content[start + 3] not in ORDERS or start < BLOCK:
             raise ValueError(
                 f"its parameters are said to begin at byte {start} of {len(content)}, where there "
-                f"are none; wanted the kind of processor, {list(PROCESSORS)}, in their fourth byte"
+                f"are none; wanted the kind of processor, {list(ORDERS)}, in their fourth byte"
             )
-        self.order: Order
-        self.order, self.sign = PROCESSORS[content[start + 3]]
+        self._processor = content[start + 3]
+        self._order: Order = ORDERS[self._processor]
         self.parameters = self._read_parameters(start + 4)
 
-    def word(self, number: int) -> int:
-        """A word of the header, counted from 1 as in the guide, without a sign."""
-        return int.from_bytes(self.content[2 * number - 2 : 2 * number], self.order)
-
-    def count(self, group: str, name: str) -> int | None:
-        """A whole number that a parameter holds, without a sign; None if there is none."""
+    def texts(self, group: str, name: str) -> list[str]:
+        """What a parameter holds, without blanks around; empty if it is not there or no text."""
         parameter = self.parameters.get((group, name))
-        if parameter is None or not parameter.content or parameter.kind != INTEGER:
-            return None
-        return int.from_bytes(parameter.content[:2], self.order)
+        if parameter is None or parameter.kind != TEXT or not parameter.content:
+            return []
+        width = parameter.shape[0]
+        starts = range(0, len(parameter.content), width)
+        texts = [parameter.content[start : start + width] for start in starts]
+        return [text.decode(errors="replace").strip(" \0") for text in texts]
+
+    def numbers(self, group: str, name: str) -> Float64[np.ndarray, " values"]:
+        """What a parameter holds, integers without a sign; empty if it is not there or text."""
+        parameter = self.parameters.get((group, name))
+        if parameter is None or parameter.kind == TEXT:
+            return np.zeros(0)
+        if parameter.kind == FLOAT:
+            return self._floats(parameter.content)
+        return self._array(parameter.content, f"u{WIDTHS[parameter.kind]}").astype(np.float64)
+
+    def number(self, group: str, name: str) -> float:
+        """The first number of a parameter; 0 if there is none."""
+        return float(next(iter(self.numbers(group, name)), 0.0))
+
+    def points(self) -> Float64[np.ndarray, "frames points 4"]:
+        """Places in the file's unit and axes, and a number with a minus where nothing was seen.
+
+        Raises:
+            ValueError: without the file's name, where header and parameters contradict each other,
+                or more is claimed than the file holds.
+        """
+        count, first, last = (self._word(number) for number in (2, 4, 5))
+        used = self.numbers("POINT", "USED")
+        if len(used) and used[0] != count:
+            raise ValueError(f"{count} markers in the header, and {used[0]:g} in POINT:USED")
+        scales = self.numbers("POINT", "SCALE")
+        scale = scales[0] if len(scales) else self._floats(self.content[12:16])[0]
+        width = 4 if scale < 0 else 2  # bytes of a value: floats where the scale is negative
+        frames, begin = max(last - first + 1, 0), (self._word(9) - 1) * BLOCK
+        samples = self._samples(frames * width, 4 * count, len(self.content) - begin)
+        size = frames * width * (4 * count + samples)
+        if begin < BLOCK or begin + size > len(self.content):
+            raise ValueError(
+                f"{frames} frames of {count} markers and {samples} analog values begin at byte "
+                f"{begin} and take {size} bytes; the file has {len(self.content)}"
+            )
+        content = self.content[begin : begin + size]
+        if scale < 0:
+            values = self._floats(content)
+        else:
+            with np.errstate(all="ignore"):  # what is not finite was not seen
+                values = self._array(content, "i2") * scale
+        values = values.reshape(frames, 4 * count + samples)[:, : 4 * count]
+        return values.reshape(frames, count, 4)
+
+    def _samples(self, column: int, coordinates: int, room: int) -> int:
+        """Analog values beside the points of a frame.
+
+        Where the header and the parameters contradict each other, that number is right with which
+        the data, or the block in which they end, end with the file.
+
+        Args:
+            column: bytes that a value of each frame takes.
+            coordinates: values of each frame that belong to points.
+            room: bytes from the first frame to the end of the file.
+        """
+        samples = self._word(3)
+        rate, point_rate = self.number("ANALOG", "RATE"), self.number("POINT", "RATE")
+        if not (rate > 0 and point_rate > 0):
+            return samples
+        stated = self.number("ANALOG", "USED") * rate / point_rate
+        if not 0 <= stated < np.inf or round(stated) == samples:
+            return samples
+        counts = (samples, round(stated))
+        sizes = [column * (coordinates + n) for n in counts]
+        ends = [room in (size, math.ceil(size / BLOCK) * BLOCK) for size in sizes]
+        if sum(ends) != 1:
+            raise ValueError(
+                f"{counts[0]} analog values a frame in the header, and {counts[1]} by ANALOG:USED, "
+                "ANALOG:RATE and POINT:RATE, and the file's length does not show which is right; "
+                "export it again"
+            )
+        return counts[ends.index(True)]
+
+    def _word(self, number: int) -> int:
+        """A word of the header, counted from 1 as in the guide, without a sign."""
+        return int.from_bytes(self.content[2 * number - 2 : 2 * number], self._order)
+
+    def _array(self, content: bytes, kind: str) -> np.ndarray:
+        return np.frombuffer(content, np.dtype(kind).newbyteorder(self._order))
+
+    def _floats(self, content: bytes) -> Float64[np.ndarray, " values"]:
+        with np.errstate(all="ignore"):  # of values that are no numbers
+            if self._processor != DEC:
+                return self._array(content, "f4").astype(np.float64)
+            swapped = self._array(content, "u2").reshape(-1, 2)[:, ::-1].tobytes()
+            return self._array(swapped, "f4") / 4.0  # the bias of the exponent is 2 more
 
     def _read_parameters(self, start: int) -> dict[tuple[str, str], Parameter]:
         groups: dict[int, str] = {}
@@ -90,9 +167,11 @@ class Structure:
                 raise ValueError(f"the parameter {name} is twice in group {number}")
             else:
                 parameters[number, name] = self._read_parameter(name, at, end)
-        if lost := {number for number, _ in parameters} - set(groups):
-            raise ValueError(f"parameters belong to group {min(lost)}, which is not there")
-        return {(groups[number], name): value for (number, name), value in parameters.items()}
+        return {  # without those of a group that is not there
+            (groups[number], name): value
+            for (number, name), value in parameters.items()
+            if number in groups
+        }
 
     def _entries(self, start: int) -> Iterator[tuple[int, str, int, int]]:
         """Number, name and place of each entry; that of a group is negative."""
@@ -105,7 +184,7 @@ class Structure:
             raw = self.content[at + 2 : name_end]
             if not number or not raw.isascii() or not raw.decode("ascii").isprintable():
                 raise ValueError(f"no name of a parameter at byte {at}, but {raw[:20]!r}")
-            step = int.from_bytes(self.content[name_end : name_end + 2], self.order)
+            step = int.from_bytes(self.content[name_end : name_end + 2], self._order)
             end = name_end + step if step else len(self.content)
             if end > len(self.content) or 0 < step < 3:
                 raise ValueError(
@@ -143,28 +222,3 @@ class Structure:
     def _check_description(self, name: str, at: int, end: int) -> None:
         if at >= end or at + 1 + self.content[at] > end:
             raise ValueError(f"the description of the parameter {name} does not end before {end}")
-
-
-def check_structure(path: Path) -> None:
-    """Raises ValueError, without the file's name, for a file that ezc3d must not open."""
-    structure = Structure(path.read_bytes())
-    for group, kinds in KINDS.items():
-        for name, wanted in kinds.items():
-            parameter = structure.parameters.get((group, name))
-            if parameter is not None and parameter.kind not in wanted:
-                raise ValueError(f"{group}:{name} has values of type {parameter.kind}; "
-                                 f"wanted {sorted(wanted)}")  # fmt: skip
-    points, samples = structure.word(2), structure.word(3)
-    used = structure.count("POINT", "USED")
-    if used is not None and used != points:
-        raise ValueError(f"{points} markers in the header, and {used} in POINT:USED")
-    first, last = structure.word(4), structure.word(5)
-    frames = max(last - first + 1, 0)
-    value = 4 if structure.content[12 + structure.sign] & 0x80 else 2
-    size = frames * value * (4 * points + samples)
-    begin = (structure.word(9) - 1) * BLOCK
-    if not 2 * BLOCK <= begin + BLOCK or begin + size > len(structure.content):
-        raise ValueError(
-            f"{frames} frames of {points} markers and {samples} analog values begin at byte {begin}"
-            f" and take {size} bytes; the file has {len(structure.content)}"
-        )
