@@ -153,6 +153,8 @@ def test_a_map_of_markers_is_drafted_by_how_their_names_begin_and_no_map_of_an_n
     archive = ROOT / "data" / "clips" / "uneven_walk.npz"
     assert main.main(["inspect", str(archive), "--joints"]) == main.MISTAKE
     assert "takes no joint map" in capsys.readouterr().err
+    draft = guess_map(("LKNE", "LKNEM", "LANK", "LTIO"))  # of which one is a joint's centre
+    assert (draft["knee_left"], draft["ankle_left"]) == ("LKNE + LKNEM", "LTIO")
     draft = guess_map(("lateral_ankle", "LKNE", "left_toe", "R.KNE", "Bob:RANK"))
     assert (draft["ankle_left"], draft["knee_left"], draft["toe_left"]) == ("", "LKNE", "left_toe")
     assert (draft["knee_right"], draft["ankle_right"]) == ("R.KNE", "Bob:RANK")
@@ -190,6 +192,24 @@ def test_what_is_wrong_about_analog_values_and_groups_moves_no_marker(tmp_path, 
     path = tmp_path / "analog.c3d"
     write_bytes(path, points(), parameters, samples=6, word_3=word_3)
     np.testing.assert_array_equal(read_markers(path).positions, points())
+
+
+def test_what_a_model_has_computed_is_no_marker(tmp_path, capsys):
+    labels = ["LKNE", "LKneeAngles", "Sum", "LKJC", "Ann:LNormalisedGRF", "Push"]
+    groups = ["MODELED_MARKERS", "MARKER_UNITS", "REACTIONS", "REACTION_UNITS"]
+    lists = {"SCALARS": ["Sum"], "REACTIONS": ["Push"], "MODELED_MARKERS": ["LKJC"]}
+    stated = {"POINT": {"LABELS": labels, "TYPE_GROUPS": groups, **lists}}
+    places = np.arange(90.0).reshape(5, 6, 3)
+    path = write_bytes(tmp_path / "model.c3d", places, stated)
+    markers = read_markers(path)
+    assert markers.names == ("LKNE", "LKJC")
+    np.testing.assert_array_equal(markers.positions, places[:, [0, 3]])
+    assert any("left out: LKneeAngles, Ann:LNormalisedGRF" in r for r in load_clip(path).remarks)
+    assert main.main(["inspect", str(path), "--joints"]) == 0
+    assert 'knee_left = "LKJC"' in capsys.readouterr().out
+    write_bytes(path, places[:, :1], {"POINT": {"LABELS": ["LHipMoment"]}})
+    with pytest.raises(ValueError, match="no markers, only 1 angles, forces and the like"):
+        load_clip(path)
 
 
 def test_files_without_motion_are_refused_in_one_line(walk, places, tmp_path):

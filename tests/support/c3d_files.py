@@ -133,8 +133,8 @@ def write_bytes(
         elif isinstance(value, float):
             body = struct.pack("bb", 4, 0) + floats([value])
         else:
-            text = "".join(label.ljust(16) for label in value).encode()
-            body = struct.pack("bbBB", -1, 2, 16, len(value)) + text
+            text = "".join(label.ljust(24) for label in value).encode()
+            body = struct.pack("bbBB", -1, 2, 24, len(value)) + text
         return entry(number, name, body + b"\0")
 
     frames, count, _ = positions.shape

@@ -22,9 +22,13 @@ from .markers import UNITS, Markers
 
 AND = " + "  # between the markers of which a joint is the mean
 ORDER = ("pelvis", *LEG_ROLES)
-# What the names of markers contain, or are, without the letter of the side.
-GUESSES = {"hip": ("hjc", "fep", "hip", "tro"), "knee": ("kne", "kjc", "feo"),
-           "ankle": ("ank", "ajc", "mal"), "toe": ("toe", "mt2", "met")}  # fmt: skip
+# How names begin after the letter of the side: first those of joint centres, which need no others.
+GUESSES = {
+    "hip": (("hjc",), ("fep",), ("hip", "tro")),
+    "knee": (("kjc",), ("feo",), ("kne",)),
+    "ankle": (("ajc",), ("tio",), ("ank", "mal")),
+    "toe": (("toe", "mt2", "met"),),
+}
 PELVIS_MARKERS = ("lasi", "rasi", "lpsi", "rpsi", "sacr")
 Places = Mapping[str, Vectors]
 Rotations = Float64[np.ndarray, "known 4"]
@@ -263,7 +267,9 @@ def guess_map(names: tuple[str, ...]) -> dict[str, str]:
     roles = {"pelvis": AND.join(pelvis)}
     for side in LEG_NAMES.values():
         for role in LEG_ROLES:
-            words = GUESSES.get(role, ())
-            own = [name for name, text in plain_names.items() if _follows(text, side, words)]
-            roles[f"{role}_{side}"] = AND.join(own)
+            choices = (
+                AND.join(name for name, text in plain_names.items() if _follows(text, side, words))
+                for words in GUESSES[role]
+            )
+            roles[f"{role}_{side}"] = next(filter(None, choices), "")
     return roles

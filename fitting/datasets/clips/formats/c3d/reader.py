@@ -16,9 +16,8 @@ from fitting.runtime.validation import error_context
 
 from . import plug_in_gait
 from .marker_sets import JointMotion, Skeleton, bridge, from_map, from_plug_in_gait, guess_map
-from .markers import AXES, Markers, read_markers
+from .markers import AXES, Markers, listed, read_markers
 
-NAMED = 8  # markers, in a remark
 UNEVEN = 0.1  # of a bone's length, by which it changes in a capture that is in order
 UPRIGHT = 0.5  # of the way from the ankles to the pelvis, at least, goes up
 
@@ -104,6 +103,7 @@ def _recording(markers: Markers, motion: JointMotion) -> Recording:
     offsets_ls = np.median(positions_ls[motion.known], axis=0)
     up = _up_axis(markers)
     remarks = (
+        *markers.remarks,
         *motion.remarks,
         *_gaps(markers, motion.used, motion.known),
         *_uneven_bones(motion.skeleton),
@@ -125,10 +125,9 @@ def _gaps(
     if not order:
         return ()
     names = [f"{markers.names[used[index]]} in {lost[index]}" for index in order]
-    listed = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
     return (
-        f"{(~known).sum()} of {len(known)} frames are masked, as markers were not seen ({listed}): "
-        "no fit looks at them, and joints move there on straight lines",
+        f"{(~known).sum()} of {len(known)} frames are masked, as markers were not seen "
+        f"({listed(names)}): no fit looks at them, and joints move there on straight lines",
     )
 
 
@@ -180,6 +179,7 @@ def _bare(markers: Markers) -> Recording:
         np.median(positions, axis=0), positions, rotations, markers.frame_time,
         metres_per_unit=markers.metres_per_unit,
         up_axis=_up_axis(markers),
-        remarks=("no set of markers recognised: known is Plug-in Gait, lower body (LASI, RASI, "
+        remarks=(*markers.remarks,
+                 "no set of markers recognised: known is Plug-in Gait, lower body (LASI, RASI, "
                  "LPSI and RPSI or SACR, and of each leg THI, KNE, TIB, ANK, HEE, TOE)",),
     )  # fmt: skip
