@@ -46,11 +46,15 @@ def errors(clip, body) -> np.ndarray:
     return np.linalg.norm(mine - theirs, axis=-1)
 
 
-def test_joint_centres_and_rotations_are_those_of_the_body(walk, body):
-    clip = load_clip(walk)
+@pytest.mark.parametrize("unseen", [(), ("LHEE", "RHEE", "LPSI", "RPSI"), ("RHEE",)])
+def test_joint_centres_and_rotations_are_those_of_the_body(places, body, tmp_path, unseen):
+    seen = {name: np.full_like(p, np.nan) if name in unseen else p for name, p in places.items()}
+    seen["SACR"] = (places["LPSI"] + places["RPSI"]) / 2
+    clip = load_clip(write_c3d(tmp_path / "walk.c3d", seen, measures=MEASURES))
     assert errors(clip, body).max() < TOLERANCE
     assert (clip.fps, clip.up_axis, clip.scale, clip.mask) == (60.0, "z", 0.001, None)
-    assert clip.remarks == ()
+    heels = " and ".join(name for name in unseen if name.endswith("HEE"))
+    assert [r.partition(",")[0] for r in clip.remarks] == [f"without {heels}"] * bool(heels)
     np.testing.assert_allclose(clip.rig.thigh, 0.5, atol=TOLERANCE)
     np.testing.assert_allclose(clip.rig.shin, 0.48, atol=TOLERANCE)
     np.testing.assert_allclose(clip.rig.ball_height, body.rig.ball_height, atol=1e-4)

@@ -120,7 +120,15 @@ def from_plug_in_gait(
         for side, letter in plug_in_gait.SIDES.items():
             joints[f"toe_{side}"] = places[f"{letter}TOE"]
         joints = {role: joint / scale for role, joint in joints.items()}
-    heels = {side: raw[f"{letter}HEE"] for side, letter in plug_in_gait.SIDES.items()}
+    heels = {
+        side: raw[heel]
+        for side, heel in zip(plug_in_gait.SIDES, plug_in_gait.HEELS, strict=True)
+        if heel in raw
+    }
+    if unseen := [heel for heel in plug_in_gait.HEELS if heel not in raw]:
+        remarks.append(
+            f"without {' and '.join(unseen)}, how a foot rolls is a guess: as its knee's hinge does"
+        )
     pelvis = [raw["LASI"], raw["RASI"], np.mean([raw[name] for name in subject.back], axis=0)]
     return JointMotion(_skeleton(joints, pelvis, heels), known, used, guess, (*remarks, *more))
 

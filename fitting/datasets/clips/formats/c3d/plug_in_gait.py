@@ -24,6 +24,7 @@ MARKER_RADIUS = 7.0 * MM  # m, of the usual marker of 14 mm
 KNEE_WIDTH, ANKLE_WIDTH = 0.11, 0.08  # of a leg's length; where none was measured
 PELVIS_WIDTH = 0.25  # m, between an adult's anterior spines: to guess a unit by
 SIDES = {"left": "L", "right": "R"}
+HEELS = tuple(f"{letter}HEE" for letter in SIDES.values())
 PELVIS = ("LASI", "RASI")
 BACKS = (("LPSI", "RPSI"), ("SACR",))
 # What labs store beside markers, or Plug-in Gait computes: the first that is there is taken.
@@ -43,6 +44,8 @@ class Subject:
     """Both posterior spines, or the sacrum."""
     modelled: Mapping[str, str]
     """For joints of which the file holds the centres, the ending of their names, as `FEP`."""
+    heels: tuple[str, ...]
+    """The heels' names in Plug-in Gait, of both legs, of one or of none."""
 
     @property
     def used(self) -> tuple[str, ...]:
@@ -50,8 +53,9 @@ class Subject:
         joints = [
             (self.modelled[joint],) if joint in self.modelled else MARKED[joint] for joint in MARKED
         ]
-        endings = [*(ending for joint in joints for ending in joint), "TOE", "HEE"]
-        return (*PELVIS, *self.back, *(letter + e for letter in SIDES.values() for e in endings))
+        endings = [*(ending for joint in joints for ending in joint), "TOE"]
+        of_legs = [letter + ending for letter in SIDES.values() for ending in endings]
+        return (*PELVIS, *self.back, *of_legs, *self.heels)
 
 
 def find_subject(names: tuple[str, ...]) -> Subject | None:
@@ -85,7 +89,7 @@ def _subject(names: Mapping[str, str]) -> Subject | None:
     }
     if not {"knee", "ankle"} <= set(modelled):  # the widths of both follow from markers on both
         modelled = {joint: ending for joint, ending in modelled.items() if joint == "hip"}
-    subject = Subject(names, back, modelled)
+    subject = Subject(names, back, modelled, tuple(heel for heel in HEELS if heel in names))
     return subject if set(subject.used) <= set(names) else None
 
 

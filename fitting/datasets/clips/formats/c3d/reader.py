@@ -46,11 +46,17 @@ def read_c3d(
         if joints is not None:
             checked = map_files.check_joint_map(dict(joints), "the joint map")
             return _recording(markers, from_map(markers, checked))
-        if (subject := plug_in_gait.find_subject(markers.names)) is not None:
+        if (subject := _subject(markers)) is not None:
             return _recording(markers, from_plug_in_gait(markers, subject, scale))
         if (known := _as_joints(markers.names)) is not None:
             return _recording(markers, from_map(markers, known))
         return _bare(markers)
+
+
+def _subject(markers: Markers) -> plug_in_gait.Subject | None:
+    """Who wears Plug-in Gait, at best without the markers that were never seen."""
+    names = tuple(name for n, name in enumerate(markers.names) if markers.seen[:, n].any())
+    return plug_in_gait.find_subject(names) or plug_in_gait.find_subject(markers.names)
 
 
 def draft_marker_map(path: Path) -> str:
@@ -181,5 +187,5 @@ def _bare(markers: Markers) -> Recording:
         up_axis=_up_axis(markers),
         remarks=(*markers.remarks,
                  "no set of markers recognised: known is Plug-in Gait, lower body (LASI, RASI, "
-                 "LPSI and RPSI or SACR, and of each leg THI, KNE, TIB, ANK, HEE, TOE)",),
+                 "LPSI and RPSI or SACR, and of each leg THI, KNE, TIB, ANK, TOE, at best HEE)",),
     )  # fmt: skip
