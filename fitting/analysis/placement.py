@@ -31,7 +31,7 @@ class Soles:
     """Both points of each sole over the ground; see the module."""
 
     height: Float64[np.ndarray, "frames legs 2"]
-    """m above the ground, negative in it; NaN where there is no ground."""
+    """m above the ground, negative in it; NaN where there is no ground, and in masked frames."""
     ground: Float64[np.ndarray, "frames legs 2"]
     """m, height of the ground below the point; NaN where there is none."""
     stance: Bool[np.ndarray, "frames legs"]
@@ -107,7 +107,8 @@ def soles(solved: Clip, animated: Clip, terrain: Terrain, floor: float = 0.0) ->
     path = ground_path.path_heights(solved, terrain, floor)
     lowest = points[..., 1] if path is None else np.maximum(points[..., 1], path[:, None, None])
     ground = ground_path.heights_under(terrain, points, lowest + ground_path.step_height(animated))
-    return Soles(points[..., 1] - ground, ground, animated.stance_labels())
+    height = np.where(animated.observed[:, None, None], points[..., 1] - ground, np.nan)
+    return Soles(height, ground, animated.observed_stances())
 
 
 def assess(feet: Soles, solved: Clip, animated: Clip, own_speed: Clip | None = None) -> Placement:

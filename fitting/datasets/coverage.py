@@ -114,7 +114,7 @@ def measure(
     """
     stance, balls = clip.stance_labels(), clip.joints_ws(3)
     feet = np.concatenate([clip.joints_ws(2), balls], axis=1).reshape(-1, 3)
-    standing = balls[stance]
+    standing = balls[stance & clip.observed[:, None]]
     share = _share(terrain, standing) if len(standing) else 1.0
     remedy, clip_scale = None, None
     if share < ENOUGH:

@@ -121,13 +121,16 @@ def with_remark_if_uneven(clip: Clip) -> Clip:
 def stance_difference(clip: Clip) -> float:
     """How far apart the heights are at which the ball of a foot stands, m: most of any foot.
 
-    The heights are medians over each stance; the highest and lowest tenth of them are left out.
+    The heights are medians over the observed frames of each stance; the highest and lowest tenth
+    of them are left out.
     """
-    balls, stance = clip.joints_ws(3), clip.stance_labels()
+    balls, stance = clip.joints_ws(3), clip.observed_stances()
     differences = [0.0]
     for leg in range(stance.shape[1]):
-        runs = contacts.runs(stance[:, leg])
-        heights = [np.median(balls[first : last + 1, leg, 1]) for first, last in runs]
+        heights = [
+            np.median(balls[first : last + 1, leg, 1][clip.observed[first : last + 1]])
+            for first, last in contacts.runs(stance[:, leg])
+        ]
         if heights:
             low, high = np.quantile(heights, [0.1, 0.9])
             differences.append(float(high - low))

@@ -206,7 +206,7 @@ def _ground_under_stances(
     ground = heights_under(
         terrain, balls, np.maximum(path[:, None], balls[..., 1]) + step_height(clip)
     )
-    known = stance & ~np.isnan(ground)
+    known = stance & clip.observed[:, None] & ~np.isnan(ground)
     return np.stack([ground[known], balls[known][:, 1]]) - floor
 
 

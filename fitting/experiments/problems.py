@@ -252,7 +252,7 @@ def make_scene(
     legs = reference.leg_pose_ws()
     stance = reference.stance
     labels = np.zeros(legs.ankle.pos.shape[:2]) if stance is None else stance.astype(float)
-    observed = np.ones(reference.frame_count, bool) if reference.mask is None else reference.mask
+    observed = reference.observed
     held_out = np.zeros_like(observed) if held_out is None else held_out
     all_sigmas = DEFAULT_SIGMAS | dict(sigmas)
     if stance is None:

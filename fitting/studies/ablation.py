@@ -217,7 +217,7 @@ def _part(clip: Clip, part: int, folds: int) -> slice:
 def _hide(data: ClipData, frames: slice) -> ClipData:
     """The clip with some frames of its reference masked."""
     reference = data.reference
-    mask = np.ones(reference.frame_count, bool) if reference.mask is None else reference.mask.copy()
+    mask = reference.observed.copy()
     mask[frames] = False
     return data._replace(reference=replace(reference, mask=mask))
 

@@ -76,7 +76,7 @@ def check(clips: Sequence[ClipData]) -> CaptureCheck:
 def stances_of(data: ClipData) -> Stances:
     """The stances of a clip over its ground; none where no foot stands."""
     clip, height_under = data.reference, mesh_files.height_function(data.terrain)
-    standing, balls = clip.stance_labels(), clip.joints_ws(3)
+    standing, balls = clip.observed_stances(), clip.joints_ws(3)
     places = [
         (first, last, leg)
         for leg in range(standing.shape[1])
@@ -101,8 +101,8 @@ def _quality(data: ClipData, stances: Stances) -> Iterator[str]:
     size = body.ratio(clip.rig)
     if clip.fps < MIN_RATE:
         yield f"{clip.fps:g} Hz is too slow for feet; wanted {MIN_RATE:g} Hz or more"
-    if clip.mask is not None and (gaps := contacts.runs(~np.asarray(clip.mask, bool))):
-        share = float(np.mean(~np.asarray(clip.mask, bool)))
+    if gaps := contacts.runs(~clip.observed):
+        share = float(np.mean(~clip.observed))
         longest = max(last - first + 1 for first, last in gaps) / clip.fps
         if share > MAX_MISSING or longest > MAX_GAP:
             yield f"{share:.0%} of the frames were not observed, up to {longest:.2f} s on end"

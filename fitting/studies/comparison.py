@@ -169,7 +169,8 @@ def compare(
         measured = {}
         for index, name in enumerate(clips):
             gaps = measures.gaps(soles_ws[index], ground[index])
-            feet = FootStates(gaps, clip.stance_labels(), reached[name])
+            gaps[~clip.observed] = np.nan
+            feet = FootStates(gaps, clip.observed_stances(), reached[name])
             measured[name] = measures.measure(
                 motions[name], motions[ANIMATED], feet, clip.fps, clip.cuts
             )

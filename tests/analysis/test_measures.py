@@ -19,6 +19,7 @@ from fitting.datasets.clips.clip import Clip
 from fitting.datasets.synthetic import gait, walker
 from jaxik.world import terrain
 from support.grounds import flight, hill, terrain_of
+from support.sample_clips import seen_within
 
 UP = np.array([0.0, 1.0, 0.0])
 
@@ -279,6 +280,14 @@ def test_a_walk_stands_on_its_floor_and_a_pop_is_a_jump_of_an_ankle_from_the_pel
     still = walk.select(slice(0, 1))
     placed = placement.assess(placement.soles(still, still, FLOOR), still, still)
     assert np.isnan([placed.slide, placed.pop.value]).all(), "of one frame"
+
+
+def test_feet_are_not_measured_in_masked_frames(walk):
+    clip = seen_within(dataclasses.replace(walk, stance=walk.stance_labels()), 100, 300)
+    lifted = raised(clip, np.where(clip.observed, 0.0, 0.05))
+    placed = placement.assess(placement.soles(lifted, clip, FLOOR), lifted, clip)
+    assert placed.floating == placed.sunk == placed.groundless == 0.0
+    assert placed.highest.value < 0.01
 
 
 def test_the_cause_of_misplaced_feet_is_named_with_its_size(walk):

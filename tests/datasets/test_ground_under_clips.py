@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets import coverage, flat_animation, ground_path
 from fitting.datasets.clip_frames import raised
-from fitting.datasets.clips import Clip, load_clip, save_clip
+from fitting.datasets.clips import Clip, edit, load_clip, save_clip
 from fitting.datasets.clips.contacts import runs
+from fitting.datasets.clips.summary import as_text, describe
 from fitting.datasets.coverage import GroundWarning
 from fitting.datasets.flat_animation import flatten_clip, load_flat_animation, with_rigid_legs
 from fitting.datasets.synthetic import gait, walker
@@ -20,7 +21,7 @@ from fitting.studies.animations import AnimationFiles, load_animation
 from jaxik.world import terrain
 from support import bodies, experiments
 from support.grounds import edges_between_footfalls, flight, hill, terrain_of
-from support.sample_clips import flat_floor, stair_walk, stairs
+from support.sample_clips import flat_floor, seen_within, stair_walk, stairs
 
 STRAIGHT = walker.WalkStyle(bend=0.0)
 
@@ -303,6 +304,27 @@ def test_a_clip_is_taken_as_flat_with_a_remark_if_captured_on_uneven_ground(walk
     noisy = flat.with_motion(flat.positions_ws + random * [0.0, 1.0, 0.0], flat.rotations_ws)
     noisy = replace(noisy, stance=flat.stance_labels())
     assert flat_animation.with_remark_if_uneven(noisy) is noisy
+
+
+def test_only_observed_frames_are_counted_as_standing_and_measured(tmp_path):
+    flat = walker.walk(6.0, 30.0)
+    labels, ankles = flat.stance_labels(), flat.joints_ws(2)
+    first = 60 + int(np.argmax(ankles[60:90, 0, 1]))  # in which a foot hangs highest
+    late = seen_within(flat, first, 120)
+    late = replace(late, stance=labels | ~late.observed[:, None])  # what is held stands still
+    save_clip(tmp_path / "late.npz", late)
+    described = describe(load_clip(tmp_path / "late.npz"))
+    for leg, stands in zip(described["legs"].values(), labels[first:121].T, strict=True):
+        assert leg["contact_share"] == pytest.approx(stands.mean())
+        assert leg["contacts"] == len(runs(stands))
+    assert f"of the {121 - first} observed frames" in as_text(described)
+    assert flat_animation.stance_difference(late) < 0.01
+    over_sole = edit.on_floor(late, -0.01).rig.ankle_height
+    np.testing.assert_allclose(over_sole, gait.ANKLE_HEIGHT + 0.01, atol=1e-3)
+    start = late.joints_ws(3)[0, :, 2].max() + 0.1  # beyond which there is ground
+    behind = terrain.heightfield(np.zeros((2, 2)), 20.0, (-10.0, 0.0, start))
+    share = coverage.measure(late.select(late.observed), behind).share
+    assert 0.5 < share < 1.0 and coverage.measure(late, behind).share == share
 
 
 # Coverage: terrain that does not lie below a clip, and the remedy that must be named

@@ -1,5 +1,7 @@
 """Small files of motion and a walk over stairs, for the tests of loaders, edits and terrain."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from fitting.datasets.clips.assemble import JointMotion, clip_from_joints
@@ -151,6 +153,13 @@ def stair_walk(height_under: HeightFunction = stairs, strides: int = 3) -> Clip:
         np.stack(stance, axis=-1), FPS,
     )  # fmt: skip
     return clip_from_joints(motion, "stair walk")
+
+
+def seen_within(clip: Clip, first: int, last: int) -> Clip:
+    """The clip with the frames before and after these masked, and held as those of markers are."""
+    frames = np.arange(clip.frame_count)
+    within = np.clip(frames, first, last)
+    return replace(clip.select(within), mask=frames == within)
 
 
 # Clips of several dialects whose joints are known, in the folder of shared motion.

@@ -84,6 +84,11 @@ class Clip:
         return {name: track for name, track in tracks.items() if track is not None}
 
     @property
+    def observed(self) -> Bool[np.ndarray, " frames"]:
+        """True where a frame may be trusted: by the mask, or in all."""
+        return np.ones(self.frame_count, bool) if self.mask is None else self.mask
+
+    @property
     def frame_count(self) -> int:
         """Number of frames."""
         return len(self.positions_ws)
@@ -138,6 +143,14 @@ class Clip:
         if self.stance is not None:
             return self.stance
         return contacts.detect_stances(self.joints_ws(3), self.fps, body.ratio(self.rig))
+
+    def observed_stances(self) -> Bool[np.ndarray, "frames legs"]:
+        """`stance_labels` without the stances of which no frame was observed."""
+        labels = self.stance_labels().copy()
+        for stance in labels.T:
+            for first, last in contacts.runs(stance):
+                stance[first : last + 1] = self.observed[first : last + 1].any()
+        return labels
 
     def leg_pose_ws(self) -> LegPose:
         """World transforms of the legs' joints, (frames, legs), in JAX's default precision."""

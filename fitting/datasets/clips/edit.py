@@ -150,7 +150,9 @@ def on_floor(clip: Clip, floor: float) -> Clip:
     if floor == 0.0:  # over which they were measured
         return clip
     rig = clip.rig if clip.measured_rig is None else clip.measured_rig  # `clip.rig` explains
-    rig = with_soles(rig, clip.positions_ws, clip.rotations_ws, clip.stance_labels(), floor)
+    seen = clip.observed
+    motion = clip.positions_ws[seen], clip.rotations_ws[seen], clip.stance_labels()[seen]
+    rig = with_soles(rig, *motion, floor)
     return replace(clip, measured_rig=rig)
 
 
@@ -172,7 +174,7 @@ def pops(clip: Clip) -> Bool[np.ndarray, " frames"]:
 def mask_pops(clip: Clip) -> Clip:
     """The clip with frames of marker pops masked, in addition to those masked already."""
     good = ~pops(clip)
-    return replace(clip, mask=good if clip.mask is None else clip.mask & good)
+    return replace(clip, mask=clip.observed & good)
 
 
 def mirror(clip: Clip) -> Clip:

@@ -27,9 +27,9 @@ class LegSummary(TypedDict):
     ankle_from_foot: list[float]
     """Unit quaternions, wxyz."""
     contacts: int
-    """Number of stances."""
+    """Number of stances of which a frame was observed."""
     contact_share: float
-    """0..1, of the frames."""
+    """0..1, of the observed frames."""
     contacts_from: str
     """File or motion."""
 
@@ -39,6 +39,8 @@ class ClipSummary(TypedDict):
 
     file: str
     frames: int
+    observed_frames: int
+    """Those that are not masked."""
     seconds: float
     fps: float
     raw_frame_time: float
@@ -70,6 +72,7 @@ def describe(clip: Clip) -> ClipSummary:
     return {
         "file": clip.source,
         "frames": clip.frame_count,
+        "observed_frames": int(clip.observed.sum()),
         "seconds": clip.seconds,
         "fps": clip.fps,
         "raw_frame_time": clip.raw_frame_time,
@@ -95,7 +98,8 @@ def _joint_map(clip: Clip) -> dict[str, str]:
 
 
 def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
-    rig, stance = clip.rig, clip.stance_labels()
+    rig, stance = clip.rig, clip.observed_stances()
+    share = stance[clip.observed].sum(axis=0) / max(clip.observed.sum(), 1)
     return {
         name: {
             "side": float(rig.side[leg]),
@@ -107,11 +111,21 @@ def _describe_legs(clip: Clip) -> dict[str, LegSummary]:
             "knee_axis": np.asarray(rig.knee_axis_ls[leg]).tolist(),
             "ankle_from_foot": np.asarray(rig.ankle_from_foot[leg]).tolist(),
             "contacts": len(contacts.runs(stance[:, leg])),
-            "contact_share": float(stance[:, leg].mean()),
+            "contact_share": float(share[leg]),
             "contacts_from": "file" if clip.stance is not None else "motion",
         }
         for leg, name in enumerate(rig.names)
     }
+
+
+def contact_text(summary: ClipSummary, leg: LegSummary) -> str:
+    """How often and how long a foot stands."""
+    observed = summary["observed_frames"]
+    frames = "frames" if observed == summary["frames"] else f"{observed} observed frames"
+    return (
+        f"stands {leg['contacts']} times, {leg['contact_share']:.0%} of the {frames} "
+        f"(from the {leg['contacts_from']})"
+    )
 
 
 def rows(summary: ClipSummary) -> list[list[str]]:
@@ -147,11 +161,7 @@ def rows(summary: ClipSummary) -> list[list[str]]:
                 f"ankle {leg['ankle_height']:.3f} m and ball {leg['ball_height']:.3f} m over "
                 "the sole",
             ],
-            [
-                "",
-                f"stands {leg['contacts']} times, {leg['contact_share']:.0%} of the frames "
-                f"(from the {leg['contacts_from']})",
-            ],
+            ["", contact_text(summary, leg)],
         ]
     return lines + [["note", warning] for warning in summary["warnings"]]
 

@@ -154,14 +154,13 @@ def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
         ValueError: no foot ever stands.
     """
     clip = edit.mask_pops(clip)
-    unmasked = np.ones(clip.frame_count, bool) if clip.mask is None else clip.mask
     standing, ankles, balls = clip.stance_labels(), clip.joints_ws(2), clip.joints_ws(3)
     records = []
     for leg in range(standing.shape[1]):
         for first, last in contacts.runs(standing[:, leg]):
             beside = slice(max(first - 1, 0), last + 2)  # a frame before and after, for speeds
             frames = np.arange(beside.start, min(beside.stop, clip.frame_count))
-            good = unmasked[beside] & (first <= frames) & (frames <= last)
+            good = clip.observed[beside] & (first <= frames) & (frames <= last)
             if good.any():
                 here = ankles[beside, leg], balls[beside, leg]
                 flat = flat_frames(here[0], here[1], good)

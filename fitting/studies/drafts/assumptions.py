@@ -63,10 +63,7 @@ def _legs(clip: Clip) -> Iterator[Assumption]:
         text = f"the {name} knee bends by {low:.0f}° to {high:.0f}°"
         yield Assumption("knees", text)
     for name, leg in described["legs"].items():
-        text = (
-            f"the {name} foot stands {leg['contacts']} times, {leg['contact_share']:.0%} of the "
-            f"frames (from the {leg['contacts_from']})"
-        )
+        text = f"the {name} foot {summary.contact_text(described, leg)}"
         few = leg["contacts"] < FEW_STANCES
         yield Assumption(
             "contacts", text, "few steps determine little: take a longer clip" if few else ""
