@@ -19,7 +19,7 @@ from .rigs import with_soles
 POP = 0.02  # m: a second difference at `POP_RATE` that no body produces
 POP_RATE = 120.0  # Hz
 REST_ANGLE = np.radians(1.0)  # a joint rotated less is at rest
-REST_FRACTION = 0.5  # of the joints, at rest in a T-pose
+REST_FRACTION = 0.5  # of the joints that turn, at rest in a T-pose
 JUMP = 4.0  # times the median step: the step from a T-pose into the motion
 RAMP_SECONDS = 0.1  # duration of a filter's ramp out of a T-pose
 RAMP_SPEED = 2.0  # times the median step
@@ -110,39 +110,52 @@ def trim(clip: Clip, start: float = 0.0, end: float | None = None) -> Clip:
 
 
 def drop_t_pose(clip: Clip) -> Clip:
-    """The clip without a leading T-pose, the ramp out of it, and trailing repeated frames."""
+    """The clip without a leading T-pose, the ramp out of it, and trailing repeated frames.
+
+    Masked frames at both ends are left out as well.
+    """
     first, last = motion_span(clip)
     whole = (first, last) == (0, clip.frame_count - 1)
     return clip if whole else clip.select(slice(first, last + 1))
 
 
+def observed_span(clip: Clip) -> tuple[int, int]:
+    """First and last frame that is not masked; those of the clip if all are."""
+    observed = np.flatnonzero(clip.observed)
+    return (int(observed[0]), int(observed[-1])) if len(observed) else (0, clip.frame_count - 1)
+
+
 def motion_span(clip: Clip) -> tuple[int, int]:
     """First and last frame that `drop_t_pose` keeps.
 
-    A clip starts with a T-pose if most joints of its first frame are at rest and some joint then
-    jumps, relative to the root, by several times its usual step. The frames after the jump are a
-    ramp as long as they move faster than the clip usually does.
+    A clip starts with a T-pose if most of the joints that turn are at rest in its first frame and
+    some joint then jumps, relative to the root, by several times its usual step. The frames after
+    the jump are a ramp as long as they move faster than the clip usually does.
     """
+    start, end = observed_span(clip)
+    clip = clip.select(slice(start, end + 1))
     steps = np.linalg.norm(np.diff(clip.positions_ws, axis=0), axis=-1).max(axis=1, initial=0.0)
     if not steps.any():
-        return 0, clip.frame_count - 1
-    last = int(np.flatnonzero(steps > 1e-9)[-1]) + 1
+        return start, end
+    end = start + int(np.flatnonzero(steps > 1e-9)[-1]) + 1
     about_root = clip.positions_ws - clip.positions_ws[:, :1]
     steps = np.linalg.norm(np.diff(about_root, axis=0), axis=-1).max(axis=1)
     jump = int(np.flatnonzero(np.append(steps, 1.0) > 1e-9)[0])  # a T-pose may be held
-    _, rotations_ls = local_from_world(clip.parents, clip.positions_ws[:1], clip.rotations_ws[:1])
-    angles = 2 * np.arccos(np.clip(np.abs(rotations_ls[0, 1:, 0]), 0.0, 1.0))
     usual = np.median(steps)
-    if (
-        jump >= len(steps)
-        or (angles < REST_ANGLE).mean() < REST_FRACTION
-        or steps[jump] <= JUMP * usual
-    ):
-        return 0, last
+    if jump >= len(steps) or steps[jump] <= JUMP * usual or not _starts_at_rest(clip):
+        return start, end
     ramp_end = jump + 1 + round(RAMP_SECONDS * clip.fps)
     fast = contacts.runs(steps[jump:ramp_end] > RAMP_SPEED * usual)
     ramp = contacts.merge_runs(fast, round(RAMP_GAP * clip.fps))[0]
-    return jump + ramp[1] + 1, last
+    return start + jump + ramp[1] + 1, end
+
+
+def _starts_at_rest(clip: Clip) -> bool:
+    """Whether most of the joints that ever turn are at rest in the first frame."""
+    _, rotations_ls = local_from_world(clip.parents, clip.positions_ws, clip.rotations_ws)
+    angles = 2 * np.arccos(np.clip(np.abs(rotations_ls[:, 1:, 0]), 0.0, 1.0))
+    turning = np.ptp(angles, axis=0) >= REST_ANGLE
+    return bool(turning.any() and (angles[0, turning] < REST_ANGLE).mean() >= REST_FRACTION)
 
 
 def on_floor(clip: Clip, floor: float) -> Clip:

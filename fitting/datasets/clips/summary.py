@@ -62,11 +62,11 @@ class ClipSummary(TypedDict):
 def describe(clip: Clip) -> ClipSummary:
     """What is known of a clip, including guesses and defects, as plain data."""
     warnings = list(clip.remarks)
-    first, last = edit.motion_span(clip)
-    if first:
+    (first, last), (start, end) = edit.motion_span(clip), edit.observed_span(clip)
+    if first > start:
         warnings.append(f"starts with a T-pose; the motion begins at frame {first}")
-    if last < clip.frame_count - 1:
-        warnings.append(f"the last frame is repeated {clip.frame_count - 1 - last} times")
+    if last < end:
+        warnings.append(f"the last frame is repeated {end - last} times")
     if clip.measured_rig is not None and (popped := int(edit.pops(clip).sum())):
         warnings.append(f"markers pop in {popped} frames")
     return {
