@@ -88,8 +88,34 @@ def test_frames_with_gaps_are_masked_and_nothing_is_measured_on_them(places, bod
     assert errors(clip, body)[clip.mask].max() < TOLERANCE
     assert np.isfinite(clip.positions_ws).all() and np.isfinite(clip.rotations_ws).all()
     np.testing.assert_allclose(clip.rig.shin, 0.48, atol=TOLERANCE)
+    gone = {f"p{n}": place.copy() for n, place in enumerate(places.values())}
+    for place in gone.values():
+        place[:30] = place[-20:] = np.nan
+    bare = load_clip(write_c3d(tmp_path / "gone.c3d", gone))
+    assert np.flatnonzero(bare.observed).tolist() == [*range(30, 88)]
+    warnings = describe(bare)["warnings"]
+    assert "50 of 108 frames are masked, as no marker was seen" in warnings
+    assert not [text for text in warnings if "T-pose" in text or "repeated" in text]
     text = as_text(describe(clip))
     assert "18 of 108 frames are masked" in text and "LTHI in 10, LASI in 5, RTOE in 3" in text
+
+
+def test_bones_whose_length_jumps_have_swapped_markers_and_no_others(places, tmp_path):
+    def remarks(places, joints=None) -> str:
+        path = write_c3d(tmp_path / "bones.c3d", places, measures=MEASURES)
+        return "\n".join(load_clip(path, joints=joints).remarks)
+
+    swapped = {name: place.copy() for name, place in places.items()}
+    for name, other in (("LANK", "RANK"), ("RANK", "LANK")):
+        swapped[name][30:33] = places[other][30:33]
+    assert "from left_knee to left_ankle the distance jumps in 2 frames" in remarks(swapped)
+    # A marker on the shin is no ankle: its distance from the toe changes with the foot.
+    joints = {"pelvis": "LPSI + RPSI"}
+    for side, letter in (("left", "L"), ("right", "R")):
+        own = {"hip": "ASI", "knee": "KNE", "ankle": "TIB", "toe": "TOE"}
+        joints |= {f"{role}_{side}": letter + ending for role, ending in own.items()}
+    text = remarks(places, joints)
+    assert "from left_ankle to left_toe it is" in text and "swapped" not in text
 
 
 def test_units_axes_rate_and_names_are_the_files_own_or_guessed_with_a_remark(

@@ -15,10 +15,14 @@ from fitting.datasets.clips.recording import Recording
 from fitting.runtime.validation import error_context
 
 from . import plug_in_gait
-from .marker_sets import JointMotion, Skeleton, bridge, from_map, from_plug_in_gait, guess_map
+from .marker_sets import JointMotion, bridge, from_map, from_plug_in_gait, guess_map
 from .markers import AXES, Markers, listed, read_markers
 
 UNEVEN = 0.1  # of a bone's length, by which it changes in a capture that is in order
+UNRECOGNISED = (
+    "no set of markers recognised: known is Plug-in Gait, lower body (LASI, RASI, LPSI and RPSI or "
+    "SACR, and of each leg THI, KNE, TIB, ANK, TOE, at best HEE)"
+)
 UPRIGHT = 0.5  # of the way from the ankles to the pelvis, at least, goes up
 
 
@@ -112,7 +116,7 @@ def _recording(markers: Markers, motion: JointMotion) -> Recording:
         *markers.remarks,
         *motion.remarks,
         *_gaps(markers, motion.used, motion.known),
-        *_uneven_bones(motion.skeleton),
+        *_uneven_bones(motion),
         *_lying(names, known_ws, up),
     )
     return Recording(
@@ -137,19 +141,30 @@ def _gaps(
     )
 
 
-def _uneven_bones(skeleton: Skeleton) -> tuple[str, ...]:
-    """A remark for each bone of a leg whose length changes as no bone's does."""
-    names, parents, positions_ws, _ = skeleton
+def _uneven_bones(motion: JointMotion) -> tuple[str, ...]:
+    """A remark for each bone of a leg whose length changes as no bone's does.
+
+    From one frame to the next it jumps where markers are swapped. Skin that moves over the bone,
+    and markers beside the joint after which they are named, change it as fast as the leg moves.
+    """
+    names, parents, positions_ws, _ = motion.skeleton
+    follows = np.diff(np.flatnonzero(motion.known)) == 1
     remarks = []
     for joint, parent in enumerate(parents):
         if parent < 0:
             continue
         bone = np.linalg.norm(positions_ws[:, joint] - positions_ws[:, parent], axis=-1)
         low, middle, high = np.quantile(bone, [0.05, 0.5, 0.95])
-        if high - low > UNEVEN * middle:
+        place = f"from {names[parent]} to {names[joint]}"
+        if jumps := int((np.abs(np.diff(bone))[follows] > UNEVEN * middle).sum()):
             remarks.append(
-                f"from {names[parent]} to {names[joint]} it is {low:.4g} to {high:.4g} units: "
-                "markers have moved or have been swapped"
+                f"{place} the distance jumps in {jumps} frames, by more than {UNEVEN:.0%}: markers "
+                "have been swapped or have slipped"
+            )
+        elif high - low > UNEVEN * middle:
+            remarks.append(
+                f"{place} it is {low:.4g} to {high:.4g} units: markers move over the bone there, "
+                "or are not those of these joints"
             )
     return tuple(remarks)
 
@@ -174,6 +189,10 @@ def _bare(markers: Markers) -> Recording:
     if not seen:
         raise ValueError(f"none of its {len(markers.names)} markers was ever seen")
     frames = np.arange(len(markers.positions))
+    mask = np.asarray(markers.seen.any(axis=1))
+    remarks = [*markers.remarks, UNRECOGNISED]
+    if lost := int((~mask).sum()):
+        remarks.append(f"{lost} of {len(mask)} frames are masked, as no marker was seen")
     known = [np.flatnonzero(markers.seen[:, index]) for index in seen]
     places = [markers.positions[at, index] for at, index in zip(known, seen, strict=True)]
     bridged = [bridge(frames, *pair) for pair in zip(known, places, strict=True)]
@@ -183,9 +202,6 @@ def _bare(markers: Markers) -> Recording:
     return Recording(
         tuple(markers.names[index] for index in seen), (-1,) * len(seen),
         np.median(positions, axis=0), positions, rotations, markers.frame_time,
-        metres_per_unit=markers.metres_per_unit,
-        up_axis=_up_axis(markers),
-        remarks=(*markers.remarks,
-                 "no set of markers recognised: known is Plug-in Gait, lower body (LASI, RASI, "
-                 "LPSI and RPSI or SACR, and of each leg THI, KNE, TIB, ANK, TOE, at best HEE)",),
+        metres_per_unit=markers.metres_per_unit, up_axis=_up_axis(markers),
+        mask=mask if lost else None, remarks=tuple(remarks),
     )  # fmt: skip
