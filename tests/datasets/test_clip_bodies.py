@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips import edit, load_clip, rigs, save_clip
 from fitting.datasets.clips.contacts import detect_stances, runs
+from fitting.datasets.clips.footing.noise import amplitude
 from fitting.datasets.clips.formats.bvh import read_bvh
 from fitting.datasets.clips.joint_roles import Trunk, find_roles, find_trunk, partners
 from fitting.datasets.clips.joints.map_files import read_joint_map, template
@@ -392,6 +393,17 @@ def test_detected_stances_of_a_synthetic_walk_are_the_true_ones(walk):
     ball = np.stack([0 * height, height, 0 * height], axis=-1)[:, None]
     detected = detect_stances(ball, 60.0)[:, 0]
     assert detected[:35].all() and detected[85:].all() and not detected[42:78].any()
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.01, 0.02])  # m
+def test_noise_of_captured_feet_neither_hides_stances_nor_splits_them(walk, noise):
+    balls_ws = walk.joints_ws(3)
+    noisy_ws = balls_ws + noise * np.random.default_rng(1).standard_normal(balls_ws.shape)
+    assert amplitude(noisy_ws) == pytest.approx(noise, rel=0.1) and amplitude(balls_ws) < 1e-4
+    detected, true = (detect_stances(balls, walk.fps) for balls in (noisy_ws, balls_ws))
+    assert (detected == true).mean() > 0.9
+    assert [len(runs(each[:, 0])) for each in (detected, true)] == [len(runs(true[:, 0]))] * 2
+    assert amplitude(balls_ws[:4]) == 0.0  # of a clip too short to show it
 
 
 def test_detected_stances_agree_with_the_labels_of_the_blocks_benchmark(mocap):

@@ -2,7 +2,8 @@
 
 A foot stands while its ball is slow, provided that it was put down: a ball that rises into a slow
 spell and falls out of it hangs at the top of a swing or a jump. Heights are not compared with a
-floor, since the ground may be at any height.
+floor, since the ground may be at any height. Balls that noise shakes are smoothed for speeds, and
+stand for as long as they stay within the noise of their place.
 
 Limits are for an adult. A body twice as large moves twice as fast if it plays the same animation,
 and the root of two times as fast at an equal Froude number. Its limit of speed lies between them.
@@ -16,8 +17,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from jaxik.world.frame import UP
 
+from .footing import noise
+
 MAX_SPEED = 0.25  # m/s: the ball of a standing foot is slower, even a runner's
 SPEED_POWER = 0.7  # of a body's size, with which the limit of speed grows
+SPEED_NOISE = 0.33  # of that limit, along an axis: what smoothing leaves of noise in speeds
+REACH = 2.0  # deviations of the noise, within which a noisy ball is where it stands
 HALF_WINDOW = 0.025  # s, on each side of a frame, for measuring speed
 MAX_GAP = 0.05  # s: shorter interruptions of a stance are marker noise
 MIN_STANCE = 0.06  # s: shorter slow spells are no stance; runners stand for 0.075 s
@@ -36,13 +41,18 @@ def detect_stances(
         fps: frames per second.
         size: length of the legs relative to an adult's.
     """
-    slow = speeds(ball_ws, fps) < MAX_SPEED * size**SPEED_POWER
+    limit = MAX_SPEED * size**SPEED_POWER
+    shake = noise.amplitude(ball_ws)
+    smooth_ws = noise.smoothed(ball_ws, shake, SPEED_NOISE * limit, fps)
+    slow = speeds(smooth_ws, fps) < limit
     stance = np.zeros_like(slow)
     for leg in range(slow.shape[1]):
         for first, last in merge_runs(runs(slow[:, leg]), round(MAX_GAP * fps)):
             long_enough = last - first + 1 >= MIN_STANCE * fps
             window = round(HANG_WINDOW * fps)
-            if long_enough and not _hangs(ball_ws[:, leg, 1] / size, first, last, window):
+            if long_enough and not _hangs(smooth_ws[:, leg, 1] / size, first, last, window):
+                if smooth_ws is not ball_ws:
+                    first, last = _whole(ball_ws[:, leg], first, last, REACH * shake)
                 stance[first : last + 1, leg] = True
     return stance
 
@@ -181,6 +191,19 @@ def _aside(
         return np.zeros(3)
     beside = swing_ws[middle] - last_ws - part * way
     return beside / (4.0 * part * (1.0 - part))
+
+
+def _whole(
+    ball_ws: Float64[np.ndarray, "frames 3"], first: int, last: int, reach: float
+) -> tuple[int, int]:
+    """First and last frame of a stance whose ends smoothing has blurred.
+
+    It lasts as long as the ball is within `reach`, m, of where it stands.
+    """
+    away = np.linalg.norm(ball_ws - np.median(ball_ws[first : last + 1], axis=0), axis=-1) > reach
+    before, after = np.flatnonzero(away[:first]), np.flatnonzero(away[last + 1 :])
+    first = int(before[-1]) + 1 if len(before) else 0
+    return first, last + int(after[0]) if len(after) else len(ball_ws) - 1
 
 
 def _hangs(height: Float64[np.ndarray, " frames"], first: int, last: int, window: int) -> bool:
