@@ -127,6 +127,8 @@ def warning_texts(placement: Placement, cause: Cause | None) -> list[str]:
             amount, abs(100 * amount), "high" if amount > 0 else "low"
         )
         texts.append(f"{_off_ground(placement)}; likely cause: {reason}")
+    elif math.isnan(placement.sunk):
+        texts.append("no foot of the animation ever stands; see its contacts with `jaxik inspect`")
     if placement.slide > SLIDE_LIMIT * placement.size:
         texts.append(
             f"standing feet slide by {_cm(placement.slide)} a stance more than animated (most: "

@@ -122,6 +122,9 @@ def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cau
     assert placement_report.warning_texts(GOOD, None) == []
     (text,) = placement_report.warning_texts(UNKNOWN, Cause("missing"))
     assert text.startswith("there is no ground under 100.0 % of the soles; likely cause: ")
+    unlabelled = dataclasses.replace(GOOD, sunk=NAN, floating=NAN, slide=NAN)
+    (text,) = placement_report.warning_texts(unlabelled, None)
+    assert text.startswith("no foot of the animation ever stands; see ")
     bad = dataclasses.replace(GOOD, slide=0.05, pop=Extreme(0.124, 3, "left"))
     assert placement_report.warning_texts(bad, None) == [
         "standing feet slide by 5.0 cm a stance more than animated (most: 4.4 cm, left, frame 9)",
