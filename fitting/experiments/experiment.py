@@ -1,7 +1,7 @@
 """An experiment: which parameters of which system are fitted to which clips."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,6 +89,8 @@ class ClipEntry:
     """Skeleton of an `.amc`."""
     animation: str | None = None
     """Which animation of a glTF file that has several."""
+    travel: str | None = None
+    """Whether the roots of reference and base travel as standing feet show."""
     terrain_scale: float | None = None
     """Metres per unit of the terrain's file."""
     terrain_offset: tuple[float, float, float] | None = None
@@ -103,11 +105,9 @@ class ClipEntry:
         """The fields that say how reference, base and terrain are read; paths become absolute."""
         joints = clip.joints
         return {
+            **vars(clip),
             "joints": Path(joints).resolve() if isinstance(joints, str | Path) else joints,
-            "scale": clip.scale,
-            "up": clip.up,
             "asf": None if clip.asf is None else clip.asf.resolve(),
-            "animation": clip.animation,
             "file_up": terrain.file_up,
             "terrain_scale": terrain.scale,
             "terrain_offset": terrain.offset if any(terrain.offset) else None,
@@ -117,7 +117,9 @@ class ClipEntry:
     @property
     def clip_options(self) -> ClipOptions:
         """How reference and base are read."""
-        return ClipOptions(self.joints, self.scale, self.up, self.asf, self.animation)
+        return ClipOptions(
+            **{field.name: getattr(self, field.name) for field in fields(ClipOptions)}
+        )
 
     @property
     def terrain_options(self) -> TerrainOptions:

@@ -419,6 +419,47 @@ def test_detected_stances_agree_with_the_labels_of_the_blocks_benchmark(mocap):
     assert [len(runs(detected[:, leg])) for leg in (0, 1)] == [28, 26]
 
 
+@pytest.fixture(scope="module")
+def flat_walk():
+    return stair_walk(flat_floor)
+
+
+@pytest.mark.parametrize("factor", [1e-9, 0.6, 1.4, 2.0])
+def test_feet_under_a_root_that_goes_too_far_or_not_at_all_stand_and_can_be_put_right(
+    flat_walk, tmp_path, factor
+):
+    """A factor of 1e-9 is a cycle in place."""
+    path = tmp_path / "walk.bvh"
+    save_clip(path, replace(edit.at_speed(flat_walk, factor), stance=None))
+    pelvis_ws = flat_walk.positions_ws[:, flat_walk.rig.pelvis]
+    walked = np.linalg.norm(pelvis_ws[-1] - pelvis_ws[0])
+    speed = abs(factor - 1.0) * walked / flat_walk.seconds
+    true = detect_stances(flat_walk.joints_ws(3), flat_walk.fps)
+    in_place = factor < 0.1
+    direction = "forward" if factor > 1.0 else "back"
+    slide = f"standing feet slide {direction} by {100 * speed:.0f} cm/s (sure: "
+    in_words = f"in place: standing feet move back at {speed:.2f} m/s (sure: "
+    for travel, moved in ((None, in_place), ("auto", in_place), ("stances", True), ("none", False)):
+        clip = load_clip(path, travel=travel)
+        assert (clip.stance_labels() == true).mean() > 0.98, travel
+        (remark,) = [text for text in clip.remarks if "standing feet" in text]
+        assert remark.startswith(in_words if in_place else slide), remark
+        assert ("give --travel stances" in remark) == (not moved), remark
+        root_ws = clip.positions_ws[:, clip.rig.pelvis]
+        distance = np.linalg.norm(root_ws[-1] - root_ws[0])
+        assert distance == pytest.approx(walked * (1.0 if moved else factor), abs=0.02), travel
+
+
+def test_travel_is_one_of_three_words_and_needs_feet_that_stand(flat_walk, tmp_path):
+    path = tmp_path / "walk.bvh"
+    save_clip(path, flat_walk.select(slice(0, 2)))
+    with pytest.raises(ValueError, match="travel is 'walk'; wanted one of auto, stances, none"):
+        load_clip(path, travel="walk")
+    assert any(text.startswith("no foot ever stands, neither") for text in load_clip(path).remarks)
+    with pytest.raises(ValueError, match="no foot ever stands, from which travel could follow"):
+        load_clip(path, travel="stances")
+
+
 def test_resampling_keeps_duration_bones_and_frames_and_trimming_both_ends(walk):
     for fps in (120.0, 50.0, 30.0, 24.0, 144.0):
         other = edit.resample(walk, fps)

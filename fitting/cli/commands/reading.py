@@ -1,6 +1,7 @@
 """How clips and terrain are read, as the options say it."""
 
 import argparse
+from dataclasses import fields
 
 from fitting.datasets.clips.load import ClipOptions
 from fitting.datasets.terrain.mesh_files import TerrainOptions
@@ -12,7 +13,8 @@ def clip_options(options: argparse.Namespace) -> ClipOptions:
     Args:
         options: what `parsers.options.add_clip_options` adds.
     """
-    return ClipOptions(options.joints, options.scale, options.up, options.asf, options.animation)
+    names = (field.name for field in fields(ClipOptions))
+    return ClipOptions(**{name: getattr(options, name) for name in names})
 
 
 def terrain_options(options: argparse.Namespace) -> TerrainOptions:

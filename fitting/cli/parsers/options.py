@@ -113,6 +113,11 @@ def add_clip_units(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--animation", metavar="NAME", help="which animation of a .glb or .gltf that has several"
     )
+    group.add_argument(
+        "--travel", choices=("auto", "stances", "none"),
+        help="move the root so that standing feet stay put (stances), leave it (none), or move it "
+        "where the clip is clearly a cycle in place (default: auto)",
+    )  # fmt: skip
 
 
 def add_terrain_options(command: argparse.ArgumentParser) -> None:

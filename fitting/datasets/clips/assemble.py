@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from fitting.runtime.validation import error_context
 from jaxik.world.skeleton import Rig
 
-from . import contacts
 from .clip import Clip
+from .footing import skating
+from .footing.skating import TRAVELS, Feet
 from .guesses import units
 from .guesses.balls import with_balls
 from .joint_roles import Leg, Roles, find_roles
@@ -28,7 +30,7 @@ from .recording import (
     Y_UP_FROM_Z_UP,
     Recording,
 )
-from .rigs import measure_rig, measure_soles, relative_size, stiff_knees
+from .rigs import left_directions, measure_rig, measure_soles, relative_size, stiff_knees
 
 UP_ADVICE = "give --up (up=... in Python) if you know better"
 UPRIGHT = 0.5, 0.8  # of the way from feet to pelvis: how far it goes up at least, and surely
@@ -49,10 +51,14 @@ class Overrides:
     """Either "y" or "z"."""
     joints: Mapping[str, str] | None = None
     """Role to joint name, see `joint_roles.find_roles`."""
+    travel: str | None = None
+    """Whether the root travels as standing feet show: one of `TRAVELS`; None is "auto"."""
 
     def __post_init__(self) -> None:
         if self.up not in (None, "y", "z"):
             raise ValueError(f"up is {self.up!r}; wanted 'y' or 'z'")
+        if self.travel not in (None, *TRAVELS):
+            raise ValueError(f"travel is {self.travel!r}; wanted one of {', '.join(TRAVELS)}")
         for name, value in (("scale", self.scale), ("fps", self.fps)):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}; wanted a number above 0")
@@ -107,15 +113,23 @@ def clip_from_recording(
     )
     rig = None
     if roles is not None:
-        joints = [leg.joints for leg in roles.legs]
-        balls_ws = positions_ws[:, [leg[3] for leg in joints]]
-        stance = contacts.detect_stances(balls_ws, rate, relative_size(positions_ws, joints))
+        feet = skating.measure(_feet(roles, positions_ws, rotations_ws, rate))
+        stance = feet.stance
+        with error_context(source):
+            if feet.moves_root(overrides.travel):
+                positions_ws = positions_ws + feet.travel_ws[:, None]
+        remarks += feet.remarks(overrides.travel)
         if (known := recording.mask) is not None:  # nothing is measured on a guess
             seen_ws, turned_ws, stance = positions_ws[known], rotations_ws[known], stance[known]
         else:
             seen_ws, turned_ws = positions_ws, rotations_ws
+        if not stance.any():
+            remarks.append(
+                "no foot ever stands, neither still nor at one velocity with others; the axes of "
+                "the feet are guesses"
+            )
         for leg, stands in zip(roles.legs, stance.T, strict=True):
-            if not stands.any():
+            if stance.any() and not stands.any():
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
         rig = measure_rig(roles, seen_ws, turned_ws, stance)
         remarks += _guessed_knees(roles, seen_ws, turned_ws)
@@ -164,6 +178,16 @@ def clip_from_joints(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
         rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
         stance=motion.stance, remarks=remarks,
+    )  # fmt: skip
+
+
+def _feet(roles: Roles, positions_ws: np.ndarray, rotations_ws: np.ndarray, fps: float) -> Feet:
+    joints = np.array([leg.joints for leg in roles.legs])
+    side = np.array([leg.side for leg in roles.legs])
+    left_ws = left_directions(positions_ws[:, joints[:, 0]], side, rotations_ws[:, roles.pelvis])
+    return Feet(
+        positions_ws[:, joints[:, 3]], positions_ws[:, roles.pelvis], left_ws, fps,
+        relative_size(positions_ws, [leg.joints for leg in roles.legs]),
     )  # fmt: skip
 
 

@@ -14,6 +14,8 @@ from jaxik.world import body
 from jaxik.world.skeleton import LegPose, Rig, Skeleton, Transform
 
 from . import contacts
+from .footing import skating
+from .footing.skating import Feet, Skating
 from .joint_roles import find_roles
 from .joints.map_files import ADVICE
 from .kinematics import continuous, cuts
@@ -142,7 +144,14 @@ class Clip:
         """Whether each foot stands: the stored contact labels, or else detected from its motion."""
         if self.stance is not None:
             return self.stance
-        return contacts.detect_stances(self.joints_ws(3), self.fps, body.ratio(self.rig))
+        return self.skating.stance
+
+    @cached_property
+    def skating(self) -> Skating:
+        """How the standing feet skate, from the motion alone."""
+        pelvis_ws = self.positions_ws[:, self.rig.pelvis]
+        size = body.ratio(self.rig)
+        return skating.measure(Feet(self.joints_ws(3), pelvis_ws, self.left_ws(), self.fps, size))
 
     def observed_stances(self) -> Bool[np.ndarray, "frames legs"]:
         """`stance_labels` without the stances of which no frame was observed."""

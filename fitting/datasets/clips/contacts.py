@@ -32,7 +32,10 @@ SHORTEST_WAY = 0.05  # m between footholds, below which nothing is beside it
 
 
 def detect_stances(
-    ball_ws: Float64[np.ndarray, "frames legs 3"], fps: float, size: float = 1.0
+    ball_ws: Float64[np.ndarray, "frames legs 3"],
+    fps: float,
+    size: float = 1.0,
+    slack: float = 0.0,
 ) -> Bool[np.ndarray, "frames legs"]:
     """True where a foot stands.
 
@@ -40,11 +43,10 @@ def detect_stances(
         ball_ws: position of the ball of each foot, m, y up.
         fps: frames per second.
         size: length of the legs relative to an adult's.
+        slack: m/s, by which balls of standing feet may be faster than they are as a rule.
     """
-    limit = MAX_SPEED * size**SPEED_POWER
-    shake = noise.amplitude(ball_ws)
-    smooth_ws = noise.smoothed(ball_ws, shake, SPEED_NOISE * limit, fps)
-    slow = speeds(smooth_ws, fps) < limit
+    smooth_ws = steadied(ball_ws, fps, size)
+    slow = speeds(smooth_ws, fps) < speed_limit(size) + slack
     stance = np.zeros_like(slow)
     for leg in range(slow.shape[1]):
         for first, last in merge_runs(runs(slow[:, leg]), round(MAX_GAP * fps)):
@@ -52,9 +54,23 @@ def detect_stances(
             window = round(HANG_WINDOW * fps)
             if long_enough and not _hangs(smooth_ws[:, leg, 1] / size, first, last, window):
                 if smooth_ws is not ball_ws:
-                    first, last = _whole(ball_ws[:, leg], first, last, REACH * shake)
+                    reach = REACH * noise.amplitude(ball_ws)
+                    first, last = _whole(ball_ws[:, leg], first, last, reach)
                 stance[first : last + 1, leg] = True
     return stance
+
+
+def speed_limit(size: float) -> float:
+    """Speed of the ball below which a foot stands, m/s, by the length of the legs as above."""
+    return MAX_SPEED * size**SPEED_POWER
+
+
+def steadied(
+    ball_ws: Float64[np.ndarray, "frames legs 3"], fps: float, size: float
+) -> Float64[np.ndarray, "frames legs 3"]:
+    """The balls without the noise that hides which of them are slow; as they are without it."""
+    left = SPEED_NOISE * speed_limit(size)
+    return noise.smoothed(ball_ws, noise.amplitude(ball_ws), left, fps)
 
 
 def speeds(points_ws: Float64[np.ndarray, "frames *b 3"], fps: float) -> np.ndarray:

@@ -39,6 +39,8 @@ class ClipOptions:
     """Skeleton of an AMC file."""
     animation: str | None = None
     """Which animation of a glTF file."""
+    travel: str | None = None
+    """Whether the root travels as standing feet show: one of `footing.skating.TRAVELS`."""
 
     def of_file(self, path: Path) -> "ClipOptions":
         """Those that a file of this format takes, where several files share the options."""
@@ -83,6 +85,7 @@ def load_clip(
     joints: JointMap | None = None,
     variant: str = "captured",
     animation: str | None = None,
+    travel: str | None = None,
 ) -> Clip:
     """Reads a BVH, AMC (with its ASF), glTF, GLB, C3D or NPZ file as a clip in metres with y up.
 
@@ -100,6 +103,8 @@ def load_clip(
         variant: which clip of a file of the `blocks` benchmark: "captured" or "base", the flat
             animation.
         animation: which animation of a glTF file; None takes the only one.
+        travel: "stances" moves the root so that standing feet stay where they stand, "none" leaves
+            it, and "auto", or None, moves it in a cycle that is clearly in place.
 
     Returns:
         The clip; its `remarks` list every guess. A file without recognised legs loads, and its
@@ -115,7 +120,7 @@ def load_clip(
     _check_arguments(path, asf, animation)
     if isinstance(joints, str | Path):
         joints = read_joint_map(Path(joints))
-    overrides = Overrides(scale, fps, up, joints)
+    overrides = Overrides(scale, fps, up, joints, travel)
     if suffix == ".npz":
         arguments = {**vars(overrides), "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:

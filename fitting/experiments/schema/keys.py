@@ -2,6 +2,7 @@
 
 from typing import get_args
 
+from fitting.datasets.clips.footing.skating import TRAVELS
 from fitting.datasets.ground_path import ROOTS
 from fitting.experiments.systems import BODY
 from fitting.inference.noise.settings import Correlation, Sigmas
@@ -53,6 +54,10 @@ CLIP_KEYS: dict[str, Constraint] = {
     "scale": UNITS.meaning("Metres per unit of reference and base; left out, guessed."),
     "up": AXIS.meaning("Up axis of reference and base; left out, guessed."),
     "animation": validation.TEXT.meaning("Which animation of a .glb or .gltf that has several."),
+    "travel": validation.one_of(TRAVELS).meaning(
+        "Whether the roots of reference and base are moved so that standing feet stay put, or left,"
+        " or moved where the clip is clearly a cycle in place; left out, auto."
+    ),
     "file_up": AXIS.meaning("Up axis of the terrain's file."),
     "terrain_scale": UNITS.meaning("Metres per unit of the terrain's file."),
     "terrain_offset": OFFSET.meaning("By which the terrain is moved.", "m"),
