@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 
-from fitting.runtime import activity, xla
+from fitting.runtime import activity, jax_start
 from fitting.runtime.validation import in_one_line
 
 from . import without_jax
@@ -48,8 +48,8 @@ def _function(command: str) -> Callable[[argparse.Namespace], int]:
         return without_jax.COMMANDS[command]
     gc.set_threshold(*COLLECTIONS)
     atexit.register(gc.freeze)  # or Python, as it ends, looks at all of them several times more
-    xla.configure_xla()
     with activity.announced("Importing JAX"):
+        jax_start.start()
         from . import commands
 
     return commands.COMMANDS[command]

@@ -46,11 +46,20 @@ def test_here_all_is_well_and_it_runs_where_jax_cannot_be_imported(tmp_path):
 
 def test_a_flag_that_ends_the_process_is_a_line_with_a_remedy(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(installation, "examine", lambda: iter(()))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("XLA_FLAGS", "--xla_nonsense=1")
     assert main.main(["doctor", "--quick"]) == without_jax.PROBLEMS_FOUND
     output = capsys.readouterr()
     assert "Unknown flag in XLA_FLAGS: --xla_nonsense=1" in output.out
     assert "do: unset XLA_FLAGS" in output.out and "Traceback" not in output.out + output.err
+
+
+def test_the_advice_on_a_variable_of_jax_is_to_unset_it(tmp_path):
+    done = doctor(tmp_path, PYTHONPATH=str(ROOT), JAX_NUM_CPU_DEVICES="x")
+    wanted = '! {}: Invalid value "x" for JAX flag jax_num_cpu_devices\n  do: correct or unset '
+    for subject in ("packages", "JAX"):
+        assert wanted.format(subject) in done.stdout
+    assert done.stdout.endswith("2 to mend\n")
 
 
 @pytest.mark.slow

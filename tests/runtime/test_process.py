@@ -8,13 +8,14 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.runtime import allocator, threads, xla
+from fitting.runtime import allocator, jax_start, threads, xla
 from fitting.runtime.parallel import cluster, effort
 from fitting.runtime.precision import for_other_thread, in_float64, with_floats
 from support.experiments import ROOT
@@ -134,6 +135,74 @@ def test_arrays_reuse_the_memory_of_those_that_were_freed_unless_the_user_set_it
     small = {"NUMPY_MADVISE_HUGEPAGE": "0"}  # pages
     assert int(printed(FAULTS, **small)) < 2 * pages
     assert int(printed(FAULTS, **small, MALLOC_TRIM_THRESHOLD_="131072")) > 5 * pages
+
+
+# Variables of the environment that JAX does not start with, or commands do not work under
+
+TRY = """
+from fitting.runtime import jax_start
+try:
+    jax_start.start()
+except jax_start.StartError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("JAX_PLATFORMS", "x", "no device with JAX_PLATFORMS=x: Unable to initialize backend 'x'"),
+        ("JAX_NUM_CPU_DEVICES", "x", 'Invalid value "x" for JAX flag jax_num_cpu_devices'),
+    ],
+)
+def test_a_variable_that_jax_does_not_start_with_is_a_line_with_a_remedy(name, value, said):
+    line = printed(TRY, **os.environ | {name: value})
+    assert said in line and line.count("\n") == 1 and f"unset {name}" in line
+
+
+def test_a_platform_that_is_not_here_is_refused_where_jax_only_asserts_that_it_is(monkeypatch):
+    monkeypatch.setattr(jax, "devices", Mock(side_effect=AssertionError))
+    for values, said in (
+        ({"JAX_PLATFORMS": "cuda"}, " with JAX_PLATFORMS=cuda: there is none like that; unset "),
+        ({}, ": there is none like that; set JAX_PLATFORMS=cpu"),
+    ):
+        for name in jax_start.OF_DEVICES:
+            monkeypatch.delenv(name, raising=False)
+        for name, value in values.items():
+            monkeypatch.setenv(name, value)
+        with pytest.raises(jax_start.StartError, match=f"JAX finds no device{said}"):
+            jax_start.start()
+
+
+def test_flags_that_would_end_the_process_are_refused(monkeypatch):
+    for flags, reason in (
+        ("--x=1", "Unknown flag in XLA_FLAGS: --x=1"),
+        ("--xla_cpu_prefer_vector_width=x", "Couldn't interpret value x for flag"),
+        ("no_file", 'Could not open file "no_file"'),
+    ):
+        monkeypatch.setenv(xla.VARIABLE, flags)
+        with pytest.raises(jax_start.StartError, match=f"XLA_FLAGS={flags}: {reason}.*; unset XLA"):
+            jax_start.start()
+
+
+def test_settings_for_debugging_under_which_no_command_works_are_ignored(monkeypatch):
+    wrong = {"jax_debug_nans": True, "jax_debug_infs": True, "jax_disable_jit": True,
+             "jax_numpy_rank_promotion": "raise", "jax_numpy_dtype_promotion": "strict",
+             "jax_check_tracer_leaks": True, "jax_transfer_guard": "disallow"}  # fmt: skip
+    assert jax_start.NEEDED.keys() == wrong.keys()
+    before = {name: getattr(jax.config, name) for name in wrong}
+    try:
+        for name, value in wrong.items():
+            jax.config.update(name, value)
+            jax_start.ignore_debugging()  # in Python, whoever set it keeps it
+            assert getattr(jax.config, name) == value
+            monkeypatch.setenv(name.upper(), str(value))
+            with pytest.warns(RuntimeWarning, match=f"{name.upper()} is ignored: "):
+                jax_start.ignore_debugging()
+            assert getattr(jax.config, name) == jax_start.NEEDED[name][0]
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
 
 
 # Calls in threads

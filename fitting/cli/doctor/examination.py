@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from fitting.cli.terminal import show
 from fitting.report.guides.layout import wrapped
-from fitting.runtime import activity
+from fitting.runtime import activity, jax_start
 from fitting.runtime.validation import in_one_line
 
 from . import machine
@@ -58,6 +58,8 @@ def _guarded(subject: str, examine: Callable[[], Iterator[Finding]]) -> Iterator
     """The findings; one more where looking itself fails."""
     try:
         yield from examine()
+    except jax_start.StartError as error:
+        yield Finding(subject, "could not be examined", error.problem, error.remedy)
     except Exception as error:  # a broken installation may raise anything
         problem = f"{type(error).__name__}: {in_one_line(error, 300)}"
         yield Finding(subject, "could not be examined", problem, "pip install --upgrade jaxik")
@@ -84,15 +86,10 @@ def _in_other_process(options: Sequence[str]) -> Iterator[Finding]:
     yield from filter(None, map(from_json, done.stdout.splitlines()))
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
-        last = next((line for line in lines if "Unknown flag" in line), lines[-1] if lines else "")
-        yield Finding("JAX", "stopped", f"{_ending(done.returncode)}: {last[:300]}", _remedy(last))
+        last = lines[-1][:300] if lines else ""
+        problem = f"{_ending(done.returncode)}: {last}"
+        yield Finding("JAX", "stopped", problem, "pip install --force-reinstall jaxik jax jaxlib")
 
 
 def _ending(status: int) -> str:
     return f"ended by {signal.Signals(-status).name}" if status < 0 else f"ended with {status}"
-
-
-def _remedy(line: str) -> str:
-    if "Unknown flag" in line or "XLA_FLAGS" in line:
-        return f"unset XLA_FLAGS, which is {os.environ.get('XLA_FLAGS', '')!r}"
-    return "pip install --force-reinstall jaxik jax jaxlib"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from fitting.runtime import activity
+from fitting.runtime import activity, jax_start
 from fitting.runtime.validation import in_one_line
 
 from .findings import Finding
@@ -83,6 +83,8 @@ def _problem(requirement: Requirement, version: str | None) -> str:
                 warnings.simplefilter("ignore")
                 importlib.import_module(module)
         except Exception as error:  # whatever a broken installation may raise
+            if refusal := jax_start.about_variable(error):
+                raise refusal from None
             return f"{module} cannot be imported: {in_one_line(error, 200)}"
     return ""
 

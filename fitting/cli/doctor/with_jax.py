@@ -7,15 +7,19 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from fitting.runtime import xla
+from fitting.runtime import jax_start, xla
 
 from .findings import Finding
 
 
 def examine(*, quick: bool) -> Iterator[Finding]:
     """Everything; `quick` leaves the self-test out."""
-    xla.configure_xla()
-    import jax  # after its flags are set
+    try:
+        jax_start.start()
+    except jax_start.StartError as error:
+        yield Finding("JAX", "does not start", error.problem, error.remedy)
+        return
+    import jax
 
     devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     yield Finding("devices", ", ".join(devices))
