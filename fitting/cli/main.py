@@ -7,10 +7,10 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 
-from fitting.runtime import activity, jax_start
+from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
-from . import without_jax
+from . import jax_start, without_jax
 from .parser import make_parser
 from .terminal import unread, watched
 

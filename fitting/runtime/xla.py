@@ -1,6 +1,7 @@
 """XLA and JAX settings that make these programs fast on a CPU; they have no effect on a GPU."""
 
 import os
+import warnings
 from importlib import metadata
 from pathlib import Path
 
@@ -41,6 +42,18 @@ FLAGS = {
 }
 
 
+# Settings of JAX with the only value that commands can work under, and why.
+NEEDED = {
+    "jax_debug_nans": (False, "what is missing is NaN"),
+    "jax_debug_infs": (False, "some parameters are infinite"),
+    "jax_disable_jit": (False, "without compiled programs a fit takes hours"),
+    "jax_numpy_rank_promotion": ("allow", "arrays of different ranks are combined"),
+    "jax_numpy_dtype_promotion": ("standard", "arrays of different types are combined"),
+    "jax_check_tracer_leaks": (False, "every program would be traced anew at each call"),
+    "jax_transfer_guard": (None, "arrays come from NumPy and go there"),
+}
+
+
 def configure_xla() -> None:
     """Sets XLA flags that suit a CPU; call it before JAX computes anything, or nothing changes.
 
@@ -60,6 +73,18 @@ def configure_xla() -> None:
     keep_freed_memory()
     if ASYNC_DISPATCH not in os.environ:
         jax.config.update(ASYNC_DISPATCH.lower(), False)
+
+
+def ignore_debugging() -> None:
+    """Switches off the settings for debugging that no command can work under, with a warning."""
+    import jax
+
+    for name, (value, reason) in NEEDED.items():
+        variable = name.upper()
+        if variable in os.environ and getattr(jax.config, name) != value:
+            jax.config.update(name, value)
+            del os.environ[variable]  # processes that this one starts need not say so again
+            warnings.warn(f"{variable} is ignored: {reason}", RuntimeWarning, stacklevel=2)
 
 
 def jaxlib_version() -> str:

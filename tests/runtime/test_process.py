@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.runtime import allocator, jax_start, threads, xla
+from fitting.cli import jax_start
+from fitting.runtime import allocator, threads, xla
 from fitting.runtime.parallel import cluster, effort
 from fitting.runtime.precision import for_other_thread, in_float64, with_floats
 from support.experiments import ROOT
@@ -32,6 +33,7 @@ print(float(jnp.ones(3).sum()), os.environ.get("XLA_FLAGS", ""))
 FAULTS = """
 import resource
 import numpy as np
+from fitting.cli import jax_start
 from fitting.runtime import allocator
 allocator.keep_freed_memory()
 np.ones(4 << 20, np.float32)
@@ -140,7 +142,7 @@ def test_arrays_reuse_the_memory_of_those_that_were_freed_unless_the_user_set_it
 # Variables of the environment that JAX does not start with, or commands do not work under
 
 TRY = """
-from fitting.runtime import jax_start
+from fitting.cli import jax_start
 try:
     jax_start.start()
 except jax_start.StartError as error:
@@ -189,17 +191,17 @@ def test_settings_for_debugging_under_which_no_command_works_are_ignored(monkeyp
     wrong = {"jax_debug_nans": True, "jax_debug_infs": True, "jax_disable_jit": True,
              "jax_numpy_rank_promotion": "raise", "jax_numpy_dtype_promotion": "strict",
              "jax_check_tracer_leaks": True, "jax_transfer_guard": "disallow"}  # fmt: skip
-    assert jax_start.NEEDED.keys() == wrong.keys()
+    assert xla.NEEDED.keys() == wrong.keys()
     before = {name: getattr(jax.config, name) for name in wrong}
     try:
         for name, value in wrong.items():
             jax.config.update(name, value)
-            jax_start.ignore_debugging()  # in Python, whoever set it keeps it
+            xla.ignore_debugging()  # in Python, whoever set it keeps it
             assert getattr(jax.config, name) == value
             monkeypatch.setenv(name.upper(), str(value))
             with pytest.warns(RuntimeWarning, match=f"{name.upper()} is ignored: "):
-                jax_start.ignore_debugging()
-            assert getattr(jax.config, name) == jax_start.NEEDED[name][0]
+                xla.ignore_debugging()
+            assert getattr(jax.config, name) == xla.NEEDED[name][0]
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

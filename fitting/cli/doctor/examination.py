@@ -6,9 +6,10 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
+from fitting.cli import jax_start
 from fitting.cli.terminal import show
 from fitting.report.guides.layout import wrapped
-from fitting.runtime import activity, jax_start
+from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
 from . import machine

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from fitting.runtime import activity, jax_start
+from fitting.cli import jax_start
+from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
 from .findings import Finding

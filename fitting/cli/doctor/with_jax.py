@@ -7,7 +7,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from fitting.runtime import jax_start, xla
+from fitting.cli import jax_start
+from fitting.runtime import xla
 
 from .findings import Finding
 

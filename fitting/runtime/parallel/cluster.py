@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 
-from fitting.runtime import cache_folder, jax_start, xla
+from fitting.runtime import cache_folder, xla
 from fitting.runtime.precision import in_float64
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def _prepare() -> None:
     """Has a worker compute as this process does; nothing of JAX has run there before."""
     os.environ.pop(TRIMMED, None)
     xla.configure_xla()
-    jax_start.ignore_debugging()
+    xla.ignore_debugging()
     cache_folder.use_default()
 
 

@@ -8,24 +8,13 @@ import os
 import re
 import subprocess
 import sys
-import warnings
 
-from . import xla
-from .validation import in_one_line
+from fitting.runtime import xla
+from fitting.runtime.validation import in_one_line
 
 PARSED = "from jaxlib import xla_client; xla_client.CompileOptions()"  # reads the flags
 REASON = re.compile(r"^[EF]\d{4} [^]]*\] (.*)", re.MULTILINE)  # in what XLA prints as it ends
 OF_DEVICES = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME", "JAX_NUM_CPU_DEVICES")
-# Settings of JAX with the only value that commands can work under, and why.
-NEEDED = {
-    "jax_debug_nans": (False, "what is missing is NaN"),
-    "jax_debug_infs": (False, "some parameters are infinite"),
-    "jax_disable_jit": (False, "without compiled programs a fit takes hours"),
-    "jax_numpy_rank_promotion": ("allow", "arrays of different ranks are combined"),
-    "jax_numpy_dtype_promotion": ("standard", "arrays of different types are combined"),
-    "jax_check_tracer_leaks": (False, "every program would be traced anew at each call"),
-    "jax_transfer_guard": (None, "arrays come from NumPy and go there"),
-}
 
 
 class StartError(ValueError):
@@ -51,7 +40,7 @@ def start() -> None:
         import jax
     except ValueError as error:
         raise about_variable(error) or error from None
-    ignore_debugging()
+    xla.ignore_debugging()
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # JAX asserts that there is any
@@ -62,18 +51,6 @@ def start() -> None:
         raise StartError(
             f"JAX finds no device{values}: {reason}", f"{remedy} JAX_PLATFORMS=cpu"
         ) from None
-
-
-def ignore_debugging() -> None:
-    """Switches off the settings for debugging that no command can work under, with a warning."""
-    import jax
-
-    for name, (value, reason) in NEEDED.items():
-        variable = name.upper()
-        if variable in os.environ and getattr(jax.config, name) != value:
-            jax.config.update(name, value)
-            del os.environ[variable]  # processes that this one starts need not say so again
-            warnings.warn(f"{variable} is ignored: {reason}", RuntimeWarning, stacklevel=2)
 
 
 def about_variable(error: Exception) -> StartError | None:
