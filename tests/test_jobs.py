@@ -355,7 +355,9 @@ def test_an_interrupted_fit_writes_its_best_point_and_the_same_command_goes_on(
         assert main.main(words) == main.INTERRUPTED == 130
     numbers = numbers_of(run)
     assert numbers["message"].startswith("Interrupted after 0 steps") and not numbers["converged"]
-    assert np.isfinite(numbers["cost"]) and numbers["message"] in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert np.isfinite(numbers["cost"]) and numbers["message"] in output
+    assert "\ninterrupted; assessing and writing the best point so far\n" in output
     assert run_folder.SUMMARY in tree(run)
     assert main.main(words) == 0
     assert numbers_of(run)["parameters"] == numbers_of(done.run)["parameters"]
@@ -398,7 +400,9 @@ def test_sampling_continues_its_chain(done, run, capsys):
 def test_an_interrupted_sampling_keeps_its_chain(run, monkeypatch, capsys):
     monkeypatch.setattr(progress, "sample_line", interrupt)
     assert main.main(["sample", str(run), "--max-steps", "300"]) == main.INTERRUPTED
-    assert "Interrupted, the chain is kept" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "interrupted; summarising and writing the chain" in output
+    assert "Interrupted, the chain is kept" in output
     assert len(chain_of(run)) == 100
 
 

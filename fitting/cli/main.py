@@ -10,12 +10,12 @@ from collections.abc import Callable, Sequence
 from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
 
-from . import jax_start, without_jax
+from . import jax_start, start, without_jax
 from .parser import make_parser
 from .terminal import unread, watched
 
 JAX_CACHE = "persistent compilation cache"  # in warnings of JAX
-MISTAKE, INTERRUPTED = 2, 130  # exit statuses
+MISTAKE, INTERRUPTED = 2, start.INTERRUPTED  # exit statuses
 # Allocations between searches for dead cycles of objects. Imports and traces leave hundreds of
 # thousands of objects that live on; by Python's own numbers a first fit spends 3 s looking at them.
 COLLECTIONS = (200_000, 10, 10)
@@ -33,13 +33,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with unread.work_goes_on(), warnings.catch_warnings():
             warnings.showwarning = _show_warning
             with watched():
-                return _function(options.command)(options)
+                return _run(options)
     except (ValueError, OSError) as error:
         print(f"jaxik {options.command}: {in_one_line(error)}", file=sys.stderr)
         return MISTAKE
     except KeyboardInterrupt:
         print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Runs the function of a command; those that run without JAX may import at any moment."""
+    function = _function(options.command)
+    if options.command in without_jax.COMMANDS:
+        return function(options)
+    with start.interrupts_raised():
+        return function(options)
 
 
 def _function(command: str) -> Callable[[argparse.Namespace], int]:

@@ -13,6 +13,8 @@ from fitting.inference.sampling.posterior import SamplingProgress
 from fitting.runtime import activity
 from fitting.studies.calibration.calibration import CalibrationProgress
 
+from . import start
+
 Report = TypeVar("Report")
 Handler: TypeAlias = Callable[[int, FrameType | None], object] | int | None  # of a signal
 
@@ -21,7 +23,8 @@ class ProgressLine(Generic[Report]):
     """Notes reports with the work that is going on.
 
     Inside this context no Ctrl-C is lost. One that arrives while Python collects garbage ends in a
-    hook of JAX that swallows it; it is raised again at the next report.
+    hook of JAX that swallows it; it is raised again at the next report. The second Ctrl-C ends the
+    process at once.
     """
 
     def __init__(self, show: Callable[[Report], str]):
@@ -40,7 +43,10 @@ class ProgressLine(Generic[Report]):
             signal.signal(signal.SIGINT, self.handler)
 
     def _interrupt(self, *_: object) -> None:
+        if self.interrupted:
+            start.end()
         self.interrupted = True
+        start.say("interrupted; ending what is being computed; Ctrl-C again stops at once")
         raise KeyboardInterrupt
 
     def __call__(self, report: Report) -> None:

@@ -102,6 +102,8 @@ def run_suite(
     """
     with output_folder(output) as folder:
         finished = suite.run_suite(systems_of, plan, during=during)
+        if finished.interrupted:
+            log("interrupted; drawing and writing the finished situations")
         if folder is not None:
             with activity.announced("Drawing the situations"):
                 suite_report.write(folder, finished)

@@ -35,6 +35,8 @@ from fitting.studies.translation import TranslationRequest
 from .kept import kept_stages, remove
 from .output import Loaded, Log, log_output, output_folder, silent, unwatched
 
+INTERRUPTED = "interrupted; assessing and writing the best point so far"
+
 
 class Shown(NamedTuple):
     """What a fit shows and judges: nothing of it decides what is found."""
@@ -96,6 +98,8 @@ def fit(
                 progress(reached)
 
         problem, solution = search_with_noise(problem, experiment, watch, kept)
+        if solution.interrupted:
+            log(INTERRUPTED)
         shown = Shown(clips, known_values)
         if run is not None and report:
             style.prepare_saving()
@@ -149,6 +153,8 @@ def sample(
     with output_folder(run):
         chain = None if run is None else run / run_folder.CHAIN
         posterior = sample_around(parameters, problem, experiment, chain, progress)
+        if posterior.interrupted:
+            log("interrupted; summarising and writing the chain so far")
         played = None
         try:
             if not posterior.interrupted:
@@ -202,6 +208,8 @@ def translate(
         start = translation.starting_point(problem)
         kept = kept_stages(run, experiment, problem, log)
         solution = search(problem, experiment, progress, start, kept)
+        if solution.interrupted:
+            log(INTERRUPTED)
         shown = Shown(prepared.clips, has_noise=False)
         if run is not None:
             translation.save_source(run, prepared)

@@ -11,12 +11,13 @@ import sys
 import tomllib
 import warnings
 from pathlib import Path
+from unittest.mock import Mock
 
 import jsonschema
 import numpy as np
 import pytest
 
-from fitting.cli import main, progress, without_jax
+from fitting.cli import main, progress, start, without_jax
 from fitting.cli.commands import COMMANDS
 from fitting.cli.parser import make_parser
 from fitting.cli.parsers.guides import SHELLS
@@ -92,7 +93,56 @@ def test_wrong_words_are_rejected_and_an_old_one_still_works_and_says_the_new_on
     assert error.startswith("jaxik ablate: ") and "no such file" in error
 
 
-def test_an_interrupt_swallowed_by_a_hook_is_raised_later(monkeypatch):
+# Ctrl-C, as the command begins, at work, and as it ends
+COMMAND = """
+import signal, sys, time
+from fitting.cli import start
+
+class Hook:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)  # where no error can be raised
+
+def work(options):
+    Hook()
+    for _ in range(1000):
+        time.sleep(0.01)
+
+if sys.argv[1] == "example":
+    from fitting.cli import main
+    main._function = lambda command: work
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if status := start.main():
+    sys.exit(status)
+signal.raise_signal(signal.SIGINT)
+"""
+# An import that is interrupted, as modules of C report it.
+IMPORTED = """
+import signal
+try:
+    signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    raise ImportError("while initializing the extension")
+"""
+
+
+@pytest.mark.parametrize("words", [["parameters"], ["example"], ["completion", "bash"]])
+def test_an_interrupt_at_any_moment_is_a_line_and_its_status(words, tmp_path):
+    (tmp_path / "jax.py").write_text(IMPORTED, encoding="utf-8")
+    search_path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND, *words],
+        env=os.environ | {"PYTHONPATH": search_path}, capture_output=True, text=True, timeout=15,
+    )  # fmt: skip
+    assert done.returncode == start.INTERRUPTED == 130
+    assert done.stderr == f"\njaxik {words[0]}: interrupted\n"
+
+
+def test_an_interrupt_swallowed_by_a_hook_is_raised_later_and_a_second_one_ends_the_process(
+    monkeypatch, capfd
+):
+    ended = Mock()
+    monkeypatch.setattr(start, "end", ended)
+
     def show(_) -> str:
         try:
             signal.raise_signal(signal.SIGINT)
@@ -104,8 +154,13 @@ def test_an_interrupt_swallowed_by_a_hook_is_raised_later(monkeypatch):
     with activity.announced("Searching") as work, progress.ProgressLine(show) as line:
         line(report)
         assert work.note == "going on"
+        assert "Ctrl-C again stops at once" in capfd.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             line(report)
+        assert not ended.called
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert ended.called
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

@@ -20,6 +20,7 @@ import jaxik
 from fitting.cli import main
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import make_problem
+from fitting.jobs.many import fits as many_fits
 from fitting.jobs.many import task as task_of_worker
 from fitting.problem.residuals import errors_by_kind, residuals_by_kind
 from fitting.problem.scene import Scene
@@ -98,6 +99,23 @@ def test_a_fit_is_another_one_if_its_experiment_or_a_file_of_it_changes(experime
 
 
 # What is kept
+
+
+def test_a_fit_that_was_finished_as_the_interrupt_came_counts(out, experiment_file, monkeypatch):
+    for kept in list(out.glob(f"runs/**/{rows.ROW}"))[1:]:
+        kept.unlink()
+
+    def interrupted(client, make, tasks):
+        make(tasks[0])  # its row is written, and nobody hears of it
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(many_fits, "_computed", interrupted)
+    lines: list[str] = []
+    fits = fit_many(experiment_file, out, seeds=2, log=lines.append)
+    assert fits.interrupted and len(fits.finished) == 2 and fits.made == 1
+    assert any("Finished: 2 of 4 fits" in line for line in lines)
+    assert "interrupted; writing the table of the finished fits" in lines
 
 
 def test_each_fit_is_a_run_and_a_row(finished):

@@ -91,6 +91,8 @@ def fit_many(
                 _compute(client, make, tally, progress, log)
         except KeyboardInterrupt:
             interrupted = True
+            tally.look_again()
+            log("interrupted; writing the table of the finished fits")
         fits = tally.fits(interrupted=interrupted)
         _write(fits, loaded, log)
         return fits

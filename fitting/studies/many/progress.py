@@ -89,6 +89,12 @@ class Tally:
         self._made += 1
         self._failed += row["state"] == "failed"
 
+    def look_again(self) -> None:
+        """Takes the rows that were written and not yet told of, as an interrupt came between."""
+        for task in self.missing:
+            if self._rows[task.run.as_posix()] is None and (row := kept_row(self.folder, task)):
+                self.add(row)
+
     def progress(self) -> ManyProgress:
         """How far the fits are."""
         done = len(self.tasks) - len(self.missing) + self._made

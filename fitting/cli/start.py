@@ -1,0 +1,64 @@
+"""The command `jaxik` from its first moment, and what Ctrl-C does to it.
+
+An interrupt in the middle of an import is lost, comes out as another error or, in modules of C,
+ends the process with a segmentation fault. So while the command imports, Ctrl-C ends the process at
+once, with a line and the exit status of an interrupt. Imports nothing that takes time.
+"""
+
+import atexit
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+INTERRUPTED = 130  # exit status
+AGAIN = 0.05  # s until an interrupt that was lost is raised again
+SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
+
+
+def main() -> int:
+    """Runs the command; this is what the shell calls."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # the last thing that is done
+        signal.signal(signal.SIGINT, end)
+    from .main import main as run
+
+    return run()
+
+
+def end(*_: object) -> None:
+    """Ends the process at once, with a line."""
+    say("interrupted", SHOW_CURSOR if os.isatty(2) else "")
+    os._exit(INTERRUPTED)
+
+
+def say(text: str, code: str = "") -> None:
+    """Prints a line on stderr, also where an interrupt came in the middle of another one."""
+    with suppress(OSError):
+        os.write(2, f"{code}\n{' '.join(['jaxik', *sys.argv[1:2]])}: {text}\n".encode())
+
+
+@contextmanager
+def interrupts_raised() -> Iterator[None]:
+    """Has Ctrl-C raise KeyboardInterrupt in this context, for work that knows what to finish."""
+    if signal.getsignal(signal.SIGINT) is not end:  # a program of its own calls this
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.unraisablehook = _raise_again
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, end)
+
+
+def _raise_again(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Raises an interrupt again that came where none can be raised, as in a hook of JAX."""
+    if not isinstance(unraisable.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+    elif signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        import _thread
+        import threading
+
+        threading.Timer(AGAIN, _thread.interrupt_main).start()
