@@ -50,6 +50,7 @@ INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
 SEARCH = "search.json"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads
 HINT = "`jaxik fit` makes a run"
+UNFINISHED = "its fit is going on, or was stopped and goes on when its command is called again"
 FIT_FILE = JsonFile(
     FitSummary, "the numbers of a fit", HINT, essential={"parameters", *SAMPLER_KEYS}
 )
@@ -166,6 +167,8 @@ def _check_files(run: Path, names: Sequence[str]) -> None:
         raise ValueError(f"{run}: {'a file' if run.exists() else 'no such folder'}; {HINT}")
     for name in names:
         if not (run / name).is_file():
+            if (run / SEARCH).is_file() or (run / LOCK).is_file():
+                raise ValueError(f"{run}: no {name} yet: {UNFINISHED}")
             present = sorted(path.name for path in run.iterdir()) or "nothing"
             raise ValueError(f"{run}: no {name}; there is {present}; {HINT}")
 

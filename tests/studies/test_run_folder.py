@@ -129,7 +129,7 @@ def test_a_fitted_system_needs_neither_experiment_nor_clips_but_a_finished_fit(f
         ik = run_folder.load_fitted_system(folder)
         assert float(parameter_tree.get(ik, NAMES[0])) == pytest.approx(fitted.solution.values[0])
     (moved / run_folder.SEARCH).write_text("{}")
-    with pytest.raises(ValueError, match="no fit.json; there is"):
+    with pytest.raises(ValueError, match="no fit.json yet: its fit is going on, or was stopped"):
         run_folder.load_fitted_system(moved)
     run_folder.save_solution(run, fitted.experiment, fitted.problem, fitted.solution)
     with pytest.raises(ValueError, match="no fit.json; there is .*parameters.toml"):
@@ -258,6 +258,27 @@ def test_a_folder_in_which_a_search_was_killed_counts_as_new(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(ValueError, match=r"something in it already: \['notes.txt'\]"):
         run_folder.check_new_folder(tmp_path)
+
+
+def test_commands_say_of_a_folder_in_which_a_search_goes_on_that_it_is_not_finished(
+    tmp_path, capsys
+):
+    run = tmp_path / "run"
+    run.mkdir()
+    on_ground = [ROOT / "data/clips/uneven_walk_base.npz", "--terrain"]
+    on_ground += [ROOT / "data/terrains/slope.ply", "-o", tmp_path / "out.npz"]
+    for name in (LOCK, run_folder.SEARCH):
+        (run / name).touch()
+        for words in (
+            ["sample", run],
+            ["view", run],
+            ["apply", run, *on_ground],
+            ["export", run, "-o", tmp_path / "out.toml"],
+            ["compare", "--runs", f"{run},{tmp_path}", "-o", tmp_path / "out"],
+        ):
+            error = refusal(words, tmp_path, capsys)
+            assert "toml yet: its fit is going on, or was stopped" in error
+        (run / name).unlink()
 
 
 # Of earlier releases
