@@ -27,7 +27,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
                 _check_claim(archive, entry)
         if size <= MAX_BYTES:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                return dict(arrays)
+                return {name: _with_common_floats(array) for name, array in arrays.items()}
     except Exception as error:  # zipfile, zlib and NumPy each raise their own
         what = in_one_line(error, QUOTED)
         raise ValueError(f"{path}: wanted a NumPy archive of plain arrays ({what})") from None
@@ -38,6 +38,14 @@ def check_array_file(path: Path) -> None:
     """ValueError for an `.npy` that is no plain array, or claims to be longer than it is."""
     with path.open("rb") as file:
         _check_header(file, path.name, path.stat().st_size)
+
+
+def _with_common_floats(array: np.ndarray) -> np.ndarray:
+    """The array, with 64 bits where it has floats of another width than 32 or 64."""
+    if array.dtype.kind != "f" or array.dtype in (np.float32, np.float64):
+        return array
+    with np.errstate(over="ignore"):  # infinity is refused later
+        return array.astype(np.float64)
 
 
 def _check_claim(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:

@@ -607,3 +607,21 @@ def test_knees_open_about_their_measured_axis_and_standing_feet_are_level_and_po
         if fact["format"] == "ASF/AMC":  # hinge about x of axes rotated by 20 degrees about z
             sin, cos = np.sin(np.radians(20)), np.cos(np.radians(20))
             assert np.allclose(rig.knee_axis_ls, [[-cos, -sin, 0], [-cos, sin, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.longdouble])
+def test_an_archive_with_floats_of_another_width_is_read_in_64_bits(kind, tmp_path):
+    clip = walker.walk(0.5, 30.0)
+    save_clip(tmp_path / "a.npz", clip)
+    with np.load(tmp_path / "a.npz") as archive:
+        arrays = dict(archive)
+    floats = {name: array for name, array in arrays.items() if array.dtype.kind == "f"}
+    changed = {name: array.astype(kind) for name, array in floats.items()}
+    np.savez(tmp_path / "b.npz", **(arrays | changed))
+    again = load_clip(tmp_path / "b.npz")
+    assert again.positions_ws.dtype == again.rotations_ws.dtype == np.float64
+    tolerance = 1e-2 if kind is np.float16 else 1e-12
+    np.testing.assert_allclose(again.positions_ws, clip.positions_ws, atol=tolerance)
+    for name in ("thigh", "shin", "knee_axis_ls"):
+        here, there = (np.asarray(getattr(rig, name)) for rig in (clip.rig, again.rig))
+        np.testing.assert_allclose(there, here, atol=tolerance)
