@@ -1,6 +1,7 @@
 """Files that are written completely or not at all, also where the power fails or the disk is full.
 
-A file is written under a temporary name beside it, which says which process writes it. What killed
+A file is written under a temporary name beside it, which says which process writes it. Of a link,
+it is the file that it leads to which is written, and the link stays. What killed
 processes have left under such names is removed when the next file is written in the same folder.
 Names by 0.1.0 do not say which process it was: those go when the same file is written again, if
 they are old.
@@ -31,12 +32,18 @@ def check_output_file(path: Path) -> None:
     """Checks, before anything is computed, that a file can be written here.
 
     Raises:
-        ValueError: the path is a folder, or its folder does not exist.
+        ValueError: the path is a folder or a device, or its folder does not exist.
     """
-    if path.is_dir():
-        raise ValueError(f"{path}: cannot be written: it is a folder")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: cannot be written: there is no folder {path.parent}")
+    if path.exists() and not path.is_file():
+        kind = "a folder" if path.is_dir() else "no regular file"
+        raise ValueError(f"{path}: cannot be written: it is {kind}")
+    if not (folder := _without_link(path).parent).is_dir():
+        raise ValueError(f"{path}: cannot be written: there is no folder {folder}")
+
+
+def _without_link(path: Path) -> Path:
+    """The path, or where it leads to if it is a link."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def relative_path(path: Path, folder: Path) -> str:
@@ -60,13 +67,14 @@ def write(path: Path, fill: Callable[[Path], object], *, lasting: bool = True) -
         ValueError: the folder does not exist or may not be written to, or the disk is full.
     """
     check_output_file(path)
+    target = _without_link(path)
     try:
         if lasting:
-            sweep(path.parent)
-            _sweep_first_release(path)
+            sweep(target.parent)
+            _sweep_first_release(target)
         stem = path.stem.encode()[:LONGEST_STEM].decode(errors="ignore")
         prefix = f".{stem}.jaxik-{HOST}-{os.getpid()}-"
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
         try:
@@ -76,9 +84,9 @@ def write(path: Path, fill: Callable[[Path], object], *, lasting: bool = True) -
             temporary.chmod(0o666 & ~mask)  # mkstemp makes files that only their owner can read
             if lasting:
                 _synchronise(temporary)  # the content before the name
-            os.replace(temporary, path)
+            os.replace(temporary, target)
             if lasting and os.name == "posix":
-                _synchronise(path.parent)
+                _synchronise(target.parent)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:

@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from unittest.mock import Mock
 
@@ -42,6 +43,25 @@ def test_a_file_replaces_the_one_before_and_a_failure_leaves_that_and_nothing_el
     with pytest.raises(error):
         files.write(path, fill)
     assert path.read_text(encoding="utf-8") == text and names(tmp_path) == ["clip.npz"]
+
+
+def test_what_a_link_leads_to_is_written_and_the_link_stays(tmp_path):
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    for link, target in (("a.txt", folder / "b.dat"), ("b.txt", Path("a.txt"))):  # the last by both
+        (tmp_path / link).symlink_to(target)
+        for text in ("first", "second"):
+            files.write_text(tmp_path / link, text)
+            assert (tmp_path / link).is_symlink() and names(folder) == ["b.dat"]
+            assert (folder / "b.dat").read_text() == text
+    suffixes: list[str] = []
+    files.write(tmp_path / "a.txt", lambda temporary: suffixes.append(temporary.suffix))
+    assert suffixes == [".txt"], "by which writers know the format"
+    (tmp_path / "astray").symlink_to(tmp_path / "no" / "a.txt")
+    with pytest.raises(ValueError, match="astray: cannot be written: there is no folder .*no"):
+        files.check_output_file(tmp_path / "astray")
+    with pytest.raises(ValueError, match="null: cannot be written: it is no regular file"):
+        files.write_text(Path(os.devnull), "text")
 
 
 def test_a_path_that_cannot_be_written_is_refused_before_anything_is_computed(
