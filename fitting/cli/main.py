@@ -24,22 +24,23 @@ RENAMED = {"contribution": "ablate"}  # old commands, which still work in this r
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status; a user's mistake prints one line on stderr."""
-    words = _with_new_command(list(sys.argv[1:] if arguments is None else arguments))
-    if null := [word for word in words if "\0" in word]:  # no path, but not every command tries
-        print(f"jaxik: a word with a null byte: {null[0]!r}", file=sys.stderr)
-        return MISTAKE
-    options = make_parser().parse_args(words)
-    try:
-        with unread.work_goes_on(), warnings.catch_warnings():
-            warnings.showwarning = _show_warning
-            with watched():
-                return _run(options)
-    except (ValueError, OSError) as error:
-        print(f"jaxik {options.command}: {in_one_line(error)}", file=sys.stderr)
-        return MISTAKE
-    except KeyboardInterrupt:
-        print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
-        return INTERRUPTED
+    with unread.work_goes_on():
+        words = _with_new_command(list(sys.argv[1:] if arguments is None else arguments))
+        if null := [word for word in words if "\0" in word]:  # no path, but not every command tries
+            print(f"jaxik: a word with a null byte: {null[0]!r}", file=sys.stderr)
+            return MISTAKE
+        options = make_parser().parse_args(words)
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _show_warning
+                with watched():
+                    return _run(options)
+        except (ValueError, OSError) as error:
+            print(f"jaxik {options.command}: {in_one_line(error)}", file=sys.stderr)
+            return MISTAKE
+        except KeyboardInterrupt:
+            print(f"\njaxik {options.command}: interrupted", file=sys.stderr)
+            return INTERRUPTED
 
 
 def _run(options: argparse.Namespace) -> int:

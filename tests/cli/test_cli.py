@@ -1,5 +1,6 @@
 """The command line, as its user sees it; what needs a fit is in `tests/test_jobs.py`."""
 
+import io
 import json
 import os
 import re
@@ -179,6 +180,20 @@ def test_work_goes_on_when_nobody_reads_what_is_printed(monkeypatch, tmp_path):
         os.close(reader)
         os.close(other)
         assert main.main(["doctor"]) == 3 and (tmp_path / "result").exists()
+        assert main.main(["completion", "ba\0sh"]) == main.MISTAKE
+        monkeypatch.setattr(main, "_function", Mock(side_effect=ValueError("a mistake")))
+        assert main.main(["doctor"]) == main.MISTAKE
+
+
+@pytest.mark.parametrize("command", ["parameters stride", "schema", "schema --format json"])
+def test_characters_that_a_stream_lacks_are_replaced(command, monkeypatch, capsys):
+    run(*command.split())
+    printed = capsys.readouterr().out
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
+    run(*command.split())
+    assert stream.buffer.getvalue().decode() == printed.encode("ascii", "replace").decode()
+    assert not printed.isascii()
 
 
 def test_a_mistake_is_reported_and_nothing_written(tmp_path, capsys, monkeypatch):

@@ -1,4 +1,4 @@
-"""Streams whose reader may go, as that of `jaxik fit … | head` does, while the work goes on."""
+"""Streams whose reader may go, as in `jaxik fit … | head`, or that lack characters, as in ASCII."""
 
 import io
 import os
@@ -9,13 +9,18 @@ from typing import Any
 
 
 class _Stream:
-    """A stream that falls silent when nobody reads it any more, instead of failing."""
+    """A stream that does not fail: it falls silent when nobody reads it any more.
+
+    It replaces characters that its encoding lacks.
+    """
 
     def __init__(self, stream: io.TextIOBase) -> None:
         self._stream = stream
 
     def write(self, text: str, /) -> int:
-        return self._try(lambda: self._stream.write(text)) or len(text)
+        encoding = self._stream.encoding or "utf-8"
+        known = text.encode(encoding, "replace").decode(encoding)
+        return self._try(lambda: self._stream.write(known)) or len(text)
 
     def flush(self) -> None:
         self._try(self._stream.flush)
@@ -38,7 +43,7 @@ class _Stream:
 
 @contextmanager
 def work_goes_on() -> Iterator[None]:
-    """Within this context nothing fails because stdout or stderr lost their reader."""
+    """Within this context nothing fails because of stdout or stderr."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (stream and _Stream(stream) for stream in before)  # pyright: ignore
     try:
