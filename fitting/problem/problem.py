@@ -55,9 +55,10 @@ class Problem(eqx.Module, Generic[System]):
         """The part of the cost that the prior of each parameter contributes."""
         return float(self.weight) * self.space.prior_costs(u)
 
+    @in_float64
     def with_weight(self, weight: float) -> "Problem[System]":
-        """The same problem with another weight."""
-        return eqx.tree_at(lambda p: p.weight, self, jax.device_put(np.float64(weight)))
+        """The same problem with another weight. Nothing recompiles."""
+        return eqx.tree_at(lambda p: p.weight, self, jnp.full_like(self.weight, weight))
 
     @in_float64
     def cost(self, u: Vector) -> Float[Array, ""]:

@@ -245,22 +245,21 @@ def roots(ik: toy.Toy, data: jax.Array) -> jax.Array:
 
 
 @pytest.mark.parametrize("loss", get_args(Loss))
-def test_the_log_probability_is_minus_half_the_independent_losses_and_the_prior(loss):
-    data, fraction = jnp.asarray([-9.0, 0.1]), jnp.asarray(0.3)
-    problem = problem_of(
-        toy.Toy(), ["foot.share"], data, roots, loss, independent_fraction=fraction
-    )
+def test_a_weight_scales_the_whole_cost_and_of_the_probability_only_the_likelihood(loss):
+    data = jnp.asarray([-9.0, 0.1])
+    problem = problem_of(toy.Toy(), ["foot.share"], data, roots, loss).with_weight(0.3)
     u = jnp.asarray([0.7])
-    z = np.asarray(problem.space.values(u)[0] - data)
-    prior = float(problem.space.prior_residuals(u)[0])
-    expected = -0.5 * (0.3 * LOSSES[loss](z).sum() + prior**2)
-    np.testing.assert_allclose(problem.log_probability(u), expected, rtol=TOLERANCE)
-    np.testing.assert_allclose(problem.cost(u), -expected, rtol=TOLERANCE)
+    losses = LOSSES[loss](np.asarray(problem.space.values(u)[0] - data)).sum()
+    prior = float(problem.space.prior_residuals(u)[0]) ** 2
+    log_probability = -0.5 * (0.3 * losses + prior)
+    np.testing.assert_allclose(problem.log_probability(u), log_probability, rtol=TOLERANCE)
+    np.testing.assert_allclose(problem.cost(u), 0.15 * (losses + prior), rtol=TOLERANCE)
+    np.testing.assert_allclose(problem.prior_costs(u), [0.15 * prior], rtol=TOLERANCE)
     beyond = replace(problem, data=jnp.asarray([0.9, 0.1]))
     assert beyond.log_probability(jnp.asarray([-3.0])) == -jnp.inf
 
 
-def test_other_data_bounds_starts_and_priors_do_not_compile_again():
+def test_other_data_bounds_starts_priors_and_weights_do_not_compile_again():
     traces = []
 
     @eqx.filter_jit
@@ -269,11 +268,12 @@ def test_other_data_bounds_starts_and_priors_do_not_compile_again():
         return problem.cost(u)
 
     problem = problem_of(toy.Toy(), ["foot.share"], jnp.zeros(1), roots)
+    cost(problem, jnp.zeros(1))
     for value, prior in ((0.1, ParameterPrior(spread=0.5)), (0.2, ParameterPrior("uniform"))):
         space = problem.space.with_start({"foot.share": value}).with_prior(Priors(prior))
         space = eqx.tree_at(lambda s: s.low, space, space.low - value)
         data = jnp.asarray([value])
-        cost(replace(problem, space=space, data=data), data)
+        cost(replace(problem, space=space, data=data).with_weight(value), data)
     assert len(traces) == 1
 
 

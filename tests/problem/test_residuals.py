@@ -77,7 +77,7 @@ def changed(
 def problem(tmp_path_factory) -> Problem:
     """Two seconds with every kind of residual and an unobserved frame, made for an adult."""
     path = write(
-        tmp_path_factory.mktemp("scene"), top='preset = "record"\nfaithful = true\nbody = "adult"',
+        tmp_path_factory.mktemp("scene"), top='preset = "record"\nfaithful = true\nbody = "adult"\nloss = "squares"',
         clips=CLIP, clip="end = 2.0", rest=EVERY_KIND,
     )  # fmt: skip
     problem = problems.make_problem(experiment_files.load_experiment(path))
@@ -227,10 +227,7 @@ def measured(problem) -> Problem:
 @pytest.mark.parametrize(("correlation", "fraction"), [(0.0, 1.0), (0.9, 1.0), (0.0, 0.1)])
 def test_residuals_at_the_truth_are_the_noise_that_is_assumed(measured, correlation, fraction):
     """Standard normal, and as correlated as the fraction of independent ones says."""
-    noisy = dataclasses.replace(
-        changed(measured, {"correlation": correlation}),
-        independent_fraction=jnp.full_like(measured.independent_fraction, fraction),
-    )
+    noisy = changed(measured, {"correlation": correlation}).with_weight(fraction)
     u, drawn = np.asarray([0.7, -1.2]), []
     same = {"label": measured.data[0].reference.label}  # for which there is a program
     for seed in range(8):
