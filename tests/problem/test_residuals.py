@@ -76,10 +76,9 @@ def changed(
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory) -> Problem:
     """Two seconds with every kind of residual and an unobserved frame, made for an adult."""
-    path = write(
-        tmp_path_factory.mktemp("scene"), top='preset = "record"\nfaithful = true\nbody = "adult"\nloss = "squares"',
-        clips=CLIP, clip="end = 2.0", rest=EVERY_KIND,
-    )  # fmt: skip
+    top = 'preset = "record"\nfaithful = true\nbody = "adult"\nloss = "squares"'
+    folder = tmp_path_factory.mktemp("scene")
+    path = write(folder, top=top, clips=CLIP, clip="end = 2.0", rest=EVERY_KIND)
     problem = problems.make_problem(experiment_files.load_experiment(path))
     observed = jnp.ones_like(problem.data[0].reference.observed).at[MASKED].set(False)
     return changed(problem, reference={"observed": observed})

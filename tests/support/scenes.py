@@ -14,4 +14,4 @@ def experiment() -> Experiment:
     """With sigmas that its posterior may leave open."""
     clips = "".join(f"{CLIP}start = 1.0\nend = {1.0 + length}\n" for length in LENGTHS)
     with tempfile.TemporaryDirectory() as folder:
-        return load_experiment(write(Path(folder), clips=clips))
+        return load_experiment(write(Path(folder), top='loss = "squares"', clips=clips))
