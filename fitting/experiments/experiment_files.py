@@ -125,7 +125,10 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
     }
     top = with_floats(content, ("fps", "holdout", "independent_every"))
     top.pop("written_in", None)  # another folder is named when it is written again
-    experiment = Experiment(**{"path": path, "name": path.stem, **top, **tables})
+    defaults: Content = {"path": path, "name": path.stem}
+    if tables["noise"].sigmas == "estimated":  # which takes a distribution of noise
+        defaults["loss"] = "squares"
+    experiment = Experiment(**{**defaults, **top, **tables})
     return restrict(experiment) if experiment.record_only else experiment
 
 

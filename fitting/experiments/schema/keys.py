@@ -161,7 +161,8 @@ TOP_KEYS: dict[str, Constraint] = {
         "Whether free parameters that the game's record has no room for are left out."
     ),
     "loss": validation.one_of(get_args(Loss)).meaning(
-        "How residuals count; all but squares give a few wrong frames less influence."
+        "How residuals count; all but squares give a few wrong frames less influence. Left out,"
+        " huber; squares where sigmas are estimated."
     ),
     "fps": validation.RATE.meaning("Rate to which clips are resampled; left out, none.", "Hz"),
     "holdout": validation.number(0.0, 0.9).meaning(
