@@ -212,6 +212,8 @@ def test_numbers_of_every_processor_are_read_as_floats_and_as_integers(tmp_path,
     ("parameters", "word_3"),
     [
         ({"ANALOG": {"USED": 6}}, 6),  # without a rate
+        ({"ANALOG": {"USED": 6}}, 0),
+        ({"ANALOG": {"RATE": 60.0}}, 6),
         ({"ANALOG": {"USED": 6, "RATE": 240.0}}, 6),  # four times as many as there are
         ({"ANALOG": {"USED": 3, "RATE": 120.0}}, 0),
         ({"ANALOG": {"USED": 6, "RATE": 60.0, "OFFSET": 0.5}}, 6),  # no integer

@@ -156,7 +156,7 @@ def write_bytes(
     header = bytearray(BLOCK)
     words = [count, samples if word_3 is None else word_3, 1, frames, 0]
     struct.pack_into(f"{order}5H", header, 2, *words)
-    struct.pack_into(f"{order}H", header, 16, 2 + len(section) // BLOCK)
+    struct.pack_into(f"{order}2H", header, 16, 2 + len(section) // BLOCK, 1)
     header[:2], header[12:16] = b"\x02\x50", floats([scale])
     values = floats(data) if scale < 0 else np.round(data).astype(f"{order}i2").tobytes()
     path.write_bytes(bytes(header) + section + values)

@@ -123,10 +123,12 @@ class Structure:
             room: bytes from the first frame to the end of the file.
         """
         samples = self._word(3)
+        channels = self.numbers("ANALOG", "USED")
         rate, point_rate = self.number("ANALOG", "RATE"), self.number("POINT", "RATE")
-        if not (rate > 0 and point_rate > 0):
+        times = rate / point_rate if rate > 0 and point_rate > 0 else self._word(10)
+        if not len(channels) or not times:
             return samples
-        stated = self.number("ANALOG", "USED") * rate / point_rate
+        stated = float(channels[0]) * times
         if not 0 <= stated < np.inf or round(stated) == samples:
             return samples
         counts = (samples, round(stated))
@@ -134,8 +136,8 @@ class Structure:
         ends = [room in (size, math.ceil(size / BLOCK) * BLOCK) for size in sizes]
         if sum(ends) != 1:
             raise ValueError(
-                f"{counts[0]} analog values a frame in the header, and {counts[1]} by ANALOG:USED, "
-                "ANALOG:RATE and POINT:RATE, and the file's length does not show which is right; "
+                f"{counts[0]} analog values a frame in the header, and {counts[1]} by ANALOG:USED "
+                "and the rates, and the file's length does not show which is right; "
                 "export it again"
             )
         return counts[ends.index(True)]
