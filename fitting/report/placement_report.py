@@ -31,9 +31,9 @@ class PlacementWarning(UserWarning):
 
 
 CAUSES = {
-    "missing": "the terrain does not lie below the path (its scale, its up axis or its place)",
+    "missing": "the terrain does not lie below the whole path",
     "units": "the terrain is in another unit of length: one of its units is {0:.4g} m "
-    "(--terrain-scale)",
+    "(--terrain-scale {0:.4g})",
     "offset": "all feet are {1:.0f} cm too {2}: check the clip's floor (--floor) and the height of "
     "the terrain (--terrain-offset)",
     "root": "the root stays on the animation's floor where the ground rises (use --root ground)",

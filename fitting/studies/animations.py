@@ -62,6 +62,10 @@ class AnimationFiles:
         """The terrain of the file."""
         return self._load_terrain(self.terrain_options)
 
+    def load_terrain_in(self, unit: float) -> Terrain:
+        """The terrain of the file in another unit, m."""
+        return self._load_terrain(replace(self.terrain_options, scale=unit))
+
     def coverage(self, terrain: Terrain) -> Coverage:
         """How much of it is under the feet of the clip."""
         return coverage.measure(
@@ -92,6 +96,8 @@ class Animation:
     """The clip as the pipeline's input, where that does not follow from the clip alone."""
     captured: Clip | None = None
     """The motion over this terrain from which the flat animation was made, where it is known."""
+    files: AnimationFiles | None = None
+    """From which it was read, if it was."""
 
     @cached_property
     def frames(self) -> jaxik.Frame:
@@ -152,7 +158,23 @@ class Animation:
         _, placed = self.place(solved)
         if not placed.misplaced:
             return placed, None
-        return placed, likely_cause(self._soles(self.placed_clip), self.placed_clip)
+        animated, files = self.placed_clip, self.files
+        unit = 1.0 if files is None else files.terrain_options.scale or 1.0
+        soles = self._soles(animated)
+        return placed, likely_cause(soles, animated, unit=unit, trial=self._soles_without)
+
+    def _soles_without(self, cause: Cause) -> Soles | None:
+        """The soles of the animation after the remedy for a cause; None where that is no remedy."""
+        try:
+            if cause.kind == "root" and self.root.rise is None:
+                _, choice = place_root(self.clip, self.terrain, "ground", self.floor)
+                return self._soles(raised(self.clip, choice.rise))
+            if cause.kind == "units" and self.files is not None:
+                terrain = self.files.load_terrain_in(cause.amount)
+                return placement.soles(self.placed_clip, self._own_speed, terrain, self.floor)
+        except ValueError:  # no ground below the path, or a terrain beyond all bounds
+            pass
+        return None
 
     def place(self, solved: Clip) -> tuple[Soles, Placement]:
         """The soles of a solved clip over the ground, and how its feet are placed."""
@@ -198,8 +220,9 @@ def load_animation(files: AnimationFiles, *, to_fit: bool = False) -> Animation:
     captured = _captured(files, placed)
     clip, tracks = track_files.along(clip, files.tracks)
     return Animation(
-        clip, terrain, files.floor, root, speed=files.speed, tracks=tracks, captured=captured
-    )
+        clip, terrain, files.floor, root, speed=files.speed, tracks=tracks, captured=captured,
+        files=files,
+    )  # fmt: skip
 
 
 def _captured(files: AnimationFiles, placed: Clip) -> Clip | None:

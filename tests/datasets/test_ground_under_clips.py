@@ -439,6 +439,33 @@ def test_a_terrain_in_place_or_below_no_or_a_part_of_the_path_has_no_remedy(cove
     assert coverage.measure(route, field).share == 0.0
 
 
+def test_a_cause_of_misplaced_feet_is_named_only_where_its_remedy_helps(route, tmp_path):
+    def cause_of(clip: Clip, ground: str, root: str, **options) -> tuple[str, float]:
+        save_clip(tmp_path / "walk.npz", clip)
+        files = AnimationFiles(
+            tmp_path / "walk.npz", tmp_path / ground, root=root,
+            terrain_options=TerrainOptions(**options),
+        )  # fmt: skip
+        animation = load_animation(files)
+        _, cause = animation.assess(animation.placed_clip)
+        assert cause is not None
+        return cause
+
+    corners = [[-5.0, -11.5, -3.0], [-5.0, -11.5, 12.0], [5.0, 12.5, 12.0], [5.0, 12.5, -3.0]]
+    save_mesh(tmp_path / "across.obj", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+    for root, kind in (("auto", "unknown"), ("ground", "unknown"), ("animation", "root")):
+        assert cause_of(route, "across.obj", root)[0] == kind, root
+    # A hill in feet: the scale of an array is that of its heights, of a mesh it moves the hill.
+    heights, z = hill().vertices[::5, 1:].T
+    np.save(tmp_path / "hill.npy", np.tile(heights[:, None] / 2, (1, 61)))
+    save_mesh(tmp_path / "hill.obj", hill().vertices, hill().faces)
+    climbed = np.interp(route.positions_ws[:, route.rig.pelvis, 2], z, heights)
+    climber = raised(route, 0.3048 * climbed)
+    place = {"offset": (-3.0, 0.0, -2.0), "cell": 0.1, "scale": 2.0}
+    assert cause_of(climber, "hill.npy", "animation", **place) == ("units", 0.6096)
+    assert cause_of(climber, "hill.obj", "animation")[0] != "units"
+
+
 def test_a_flat_animation_without_ground_warns_and_is_refused_where_it_is_fitted_to(
     route, tmp_path
 ):

@@ -106,13 +106,13 @@ def test_the_table_says_how_often_how_far_and_where_and_what_is_unknown_is_null_
 def test_feet_that_are_badly_placed_are_a_warning_with_frames_and_the_likely_cause():
     sunk = dataclasses.replace(GOOD, sunk=0.62)
     floor = "the root stays on the animation's floor where the ground rises (use --root"
-    unit = "the terrain is in another unit of length: one of its units is 0.01 m"
+    unit = "the terrain is in another unit of length: one of its units is 0.01 m (--terrain-sc"
     for cause, words in (
         (Cause("root"), floor),
         (Cause("units", 0.01), unit),
         (Cause("offset", -0.12), "all feet are 12 cm too low: check the clip's floor (--floor)"),
         (Cause("offset", 0.5), "all feet are 50 cm too high"),
-        (Cause("missing"), "the terrain does not lie below the path"),
+        (Cause("missing"), "the terrain does not lie below the whole path"),
         (Cause("unknown"), "none of missing ground, units, root, floor and offset"),
     ):
         (text,) = placement_report.warning_texts(sunk, cause)
