@@ -26,7 +26,7 @@ class Cause(NamedTuple):
 
 
 Trial = Callable[[Cause], Soles | None]
-"""Where the soles are after the remedy for a cause; None where it is none."""
+"""Where the soles are after the remedy for a cause; None where there is no remedy to try."""
 
 
 def likely_cause(

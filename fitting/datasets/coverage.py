@@ -26,7 +26,7 @@ from .terrain.mesh_files import AS_IS, TerrainOptions
 
 ENOUGH = 0.8  # fraction of stances with ground under them, from which the terrain is in place
 LITTLE = 0.5  # below which there is nothing that could be fitted
-PARTLY = 0.2  # above which the unit is right, and the terrain is too small or aside; likewise near
+PARTLY = 0.2  # above which the unit is right; likewise of those with ground near them
 UNITS = (0.01, 0.001, 0.0254, 0.3048)  # m: centimetre, millimetre, inch, foot; by how usual
 FACTORS = tuple(factor for unit in UNITS for factor in (unit, 1.0 / unit))
 

@@ -250,9 +250,12 @@ def test_what_no_body_or_argument_can_be_is_refused_but_bounds_give_way_to_argum
 def test_frames_too_many_and_bodies_that_are_odd_get_a_remark(write_bvh):
     head = "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n}\n"
     lying = re.sub(r"\n0 87 (\d) 0 0 \d", r"\n0 87 \1 90 0 0", BVH)  # along x
+    no_legs = BVH.replace("Leg", "Bone")
     for text, frame_count, has_legs, remark in (
         (BVH.replace("Frames: 3", "Frames: 2"), 2, True, "2 frames are declared and 3 found"),
         (head + "MOTION\nFrames: 1\nFrame Time: 0.01\n0 0 0\n", 1, False, "no bone has a length"),
+        (no_legs, 3, False, "guessed: 0.01 m per unit; doubtful, as no legs are recognised; give"),
+        (no_legs, 3, False, "up axis guessed: y; doubtful, as no legs are recognised; give --up"),
         (lying, 3, True, "not above the feet"),
         (BVH, 3, True, "legs of 82 units, taken as centimetres, are 0.820 m; sure, as in no other"),
         (BVH, 3, True, "up axis guessed: y; sure, as the pelvis is 0.7"),

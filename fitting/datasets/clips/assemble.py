@@ -32,6 +32,7 @@ from .recording import (
 )
 from .rigs import left_directions, measure_rig, measure_soles, relative_size, stiff_knees
 
+NO_LEGS = "no legs are recognised"
 UP_ADVICE = "give --up (up=... in Python) if you know better"
 UPRIGHT = 0.5, 0.8  # of the way from feet to pelvis: how far it goes up at least, and surely
 HUGE = 1e12  # units of a file, whatever they are
@@ -308,7 +309,7 @@ def _find_scale(recording: Recording, roles: Roles | None, remarks: list[str]) -
         return 1.0
     guessed, text = units.guess(leg)
     if roles is None:
-        text = f"{text.partition(';')[0]}; doubtful, as these are chains of any bones"
+        text = f"scale guessed: {guessed:.4g} m per unit; doubtful, as {NO_LEGS}; {units.ADVICE}"
     remarks.append(text)
     return guessed
 
@@ -324,7 +325,7 @@ def _guess_up(recording: Recording, roles: Roles | None, remarks: list[str]) -> 
     if roles is None:
         extent = np.median(np.ptp(positions, axis=1), axis=0)
         up = "z" if extent[2] > 2 * extent[1] else "y"
-        remarks.append(f"up axis guessed: {up}; doubtful, as no legs are recognised; {UP_ADVICE}")
+        remarks.append(f"up axis guessed: {up}; doubtful, as {NO_LEGS}; {UP_ADVICE}")
         return up
     ankles = positions[:, [leg.joints[2] for leg in roles.legs]].mean(axis=1)
     rise = np.median(positions[:, roles.pelvis] - ankles, axis=0)

@@ -18,6 +18,7 @@ UNITS = {
     "ASF units": INCH / 0.45,
 }
 ADULTS, PEOPLE = (0.6, 1.1), (0.4, 1.1)  # m, legs of adults, and of children too
+ADVICE = "give --scale (scale=... in Python) if you know better"
 EXPECTED = f"people's are {ADULTS[0]:g} to {ADULTS[1]:g} m, children's from {PEOPLE[0]:g} m"
 
 
@@ -68,7 +69,7 @@ def remedy(leg: float, scale: float) -> str:
         fitted = f"{UNITS[other]:.4g}, for {other}, makes them {metres:.3f} m" + (
             "" if ADULTS[0] <= metres else f", and {fitted}"
         )
-    return f"give --scale (scale=... in Python) if you know better: {fitted}"
+    return f"{ADVICE}: {fitted}"
 
 
 def _other_unit(leg: float, scale: float) -> str | None:
