@@ -359,6 +359,21 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_or_else_those_of_feet_
         _ = replace(walk, measured_rig=None).rig
 
 
+def test_a_foot_is_flat_where_its_heel_is_low_and_not_where_it_is_still_on_its_toes():
+    heel = np.concatenate([np.full(20, 0.04), np.linspace(0.04, 0.1, 10), np.full(20, 0.1)])
+    ankle_height = np.tile(np.append(heel, 0.2), 4)
+    ankle_height[-51:-1] = 0.1  # a whole stance on toes
+    still = np.zeros(len(ankle_height))
+    ankle = np.stack([still, ankle_height, still], axis=-1)
+    ankle[:, 0] += 1e-4 * np.sin(3.0 * np.arange(len(ankle))) * (ankle_height < 0.05)
+    toe = ankle * [1.0, 0.0, 1.0] + [0.0, 0.0, 0.12]
+    flat = rigs.flat_frames(ankle, toe, ankle_height < 0.15)
+    assert flat.sum() >= 15 and np.array_equal(np.unique(ankle_height[flat]), [0.04])
+    two = slice(-102, None)  # stances, of which neither is the rule
+    flat = rigs.flat_frames(ankle[two], toe[two], ankle_height[two] < 0.15)
+    assert np.array_equal(np.unique(ankle_height[two][flat]), [0.04, 0.1])
+
+
 def test_the_model_root_is_below_the_pelvis_and_faces_forward_whatever_the_pelvis_does(walk):
     root = walk.world_from_model(floor=0.25)
     assert np.allclose(root.pos[:, 1], 0.25)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxik.world.body import LEG
 from jaxik.world.skeleton import Rig
 
+from . import contacts
 from .joint_roles import Leg, Roles
 from .leg_geometry import Vectors, knee_hinges, unit
 
@@ -20,7 +21,8 @@ Rotations = Float64[np.ndarray, "frames 4"]  # wxyz
 
 UP = np.array([0.0, 1.0, 0.0])
 KNEE_MOTION = np.radians(3.0)  # RMS knee rotation below which the motion shows no axis
-FLAT_FRACTION = 0.25  # of the stance frames, those with the slowest ankle: the foot is flat
+FLAT_FRACTION = 0.25  # of a stance's frames, in which the foot is flat at least
+FLAT_RISE = 0.05  # of a foot's length, by which the ankle of a flat foot rises and falls
 LEVEL = 0.4  # of a foot's length, in which the heights of its ball lie on a level floor
 HIGHEST_BALL = 0.75  # of a foot's length, its ball's height over the sole; higher is no floor
 USUAL_BALL = 0.45  # likewise, of the feet of people
@@ -134,11 +136,11 @@ def measure_soles(
 ) -> SoleHeights:
     """How far ankle and ball of each foot are above its sole while it stands flat.
 
-    These are medians of their heights above the floor, both moved by half of what they differ from
-    the height of the ankle over the ball along the foot's own up axis: then a foot that lies flat
-    is on the floor with both. Where balls stand at different heights, or
-    nowhere near the floor, the clip shows no floor for that foot. Its ball is then as high as that
-    of a person's foot of its length.
+    These are medians over stances of their heights above the floor, both moved by half of what they
+    differ from the height of the ankle over the ball along the foot's own up axis: then a foot that
+    lies flat is on the floor with both. Where balls stand at different heights, or nowhere near the
+    floor, the clip shows no floor for that foot. Its ball is then as high as that of a person's
+    foot of its length.
 
     Args:
         rig: the legs; their heights over the sole are not read.
@@ -153,7 +155,11 @@ def measure_soles(
         thigh, shin, foot = np.median(np.linalg.norm(bones, axis=-1), axis=0)
         foot = foot if foot > 0 else USUAL_FOOT * (thigh + shin)
         flat = flat_frames(positions_ws[:, ankle], positions_ws[:, toe], stance[:, leg])
-        above = positions_ws[flat][:, [ankle, toe], 1] - floor
+        spans = contacts.runs(stance[:, leg]) or [(0, len(flat) - 1)]
+        stances = (np.flatnonzero(flat[a : b + 1]) + a for a, b in spans)
+        heights_ws = positions_ws[:, [ankle, toe], 1]
+        above = [np.median(heights_ws[frames], axis=0) for frames in stances if len(frames)]
+        above = np.array(above) - floor
         (ankle_height, ball_height), balls = np.median(above, axis=0), above[:, 1]
         axes = _rotation(np.asarray(rig.ankle_from_foot, np.float64)[leg : leg + 1])
         foot_rot = _rotation(rotations_ws[:, ankle]) * axes
@@ -263,9 +269,12 @@ def stiff_knees(
 def flat_frames(
     ankle: Vectors, toe: Vectors, stance: Bool[np.ndarray, " frames"]
 ) -> Bool[np.ndarray, " frames"]:
-    """True in frames in which a foot lies flat: it stands and its ankle is at its slowest.
+    """True in frames in which a foot lies flat.
 
-    Without any stance, the frames in which the ball of the foot is lowest.
+    In each stance these are, of the frames in which its heel is lowest, those in which its ankle is
+    slowest: a foot may also stand still on its toes. Where most stances agree on how high the ankle
+    is over the ball, the others are left out. Without any stance, the frames in which the ball of
+    the foot is lowest.
 
     Args:
         ankle: m, y up.
@@ -275,7 +284,20 @@ def flat_frames(
     if not stance.any():
         return toe[:, 1] <= np.quantile(toe[:, 1], FLAT_FRACTION)
     steps = np.linalg.norm(np.gradient(ankle, axis=0), axis=-1) if len(ankle) > 1 else np.zeros(1)
-    return stance & (steps <= np.quantile(steps[stance], FLAT_FRACTION))
+    rise = (ankle - toe)[:, 1]
+    slack = FLAT_RISE * float(np.median(np.linalg.norm(ankle - toe, axis=-1)))
+    stances = []
+    for first, last in contacts.runs(stance):
+        frames = np.arange(first, last + 1)
+        frames = frames[rise[frames] <= np.quantile(rise[frames], FLAT_FRACTION) + slack]
+        stances.append(frames[steps[frames] <= np.quantile(steps[frames], FLAT_FRACTION)])
+    rises = np.array([np.median(rise[frames]) for frames in stances])
+    usual = np.abs(rises - np.quantile(rises, 0.5, method="nearest")) <= slack
+    if usual.mean() <= 0.5:
+        usual[:] = True
+    flat = np.zeros(len(stance), bool)
+    flat[np.concatenate([stances[index] for index in np.flatnonzero(usual)])] = True
+    return flat
 
 
 def foot_axes(leg: LegMotion, flat: Bool[np.ndarray, " frames"]) -> Float64[np.ndarray, "4"]:
