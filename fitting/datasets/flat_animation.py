@@ -97,12 +97,12 @@ def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = A
     variant = "base" if is_blocks_file(path) else "captured"
     clip = load_clip(path, variant=variant, **vars(options))
     with error_context(path):
-        return as_flat_animation(clip, floor)
+        return as_flat_animation(clip, floor, options.sole)
 
 
-def as_flat_animation(clip: Clip, floor: float = 0.0) -> Clip:
+def as_flat_animation(clip: Clip, floor: float = 0.0, sole: float | None = None) -> Clip:
     """A clip that was animated for a flat floor, ready for foot IK; see `load_flat_animation`."""
-    return edit.on_floor(with_rigid_legs(clip), floor)
+    return edit.on_floor(with_rigid_legs(clip), floor, sole)
 
 
 def with_remark_if_uneven(clip: Clip) -> Clip:

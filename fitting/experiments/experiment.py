@@ -91,6 +91,8 @@ class ClipEntry:
     """Which animation of a glTF file that has several."""
     travel: str | None = None
     """Whether the roots of reference and base travel as standing feet show."""
+    sole: float | None = None
+    """m, of the balls of their feet over the soles."""
     terrain_scale: float | None = None
     """Metres per unit of the terrain's file."""
     terrain_offset: tuple[float, float, float] | None = None

@@ -41,21 +41,20 @@ def remove(mesh: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write(mesh: Path, terrain: Reconstruction, clip: Clip, sole: float, margin: float) -> None:
+def write(mesh: Path, terrain: Reconstruction, clip: Clip, margin: float) -> None:
     """Writes the chosen surface as a mesh, and beside it the numbers and a picture.
 
     Args:
         mesh: output file, .ply, .obj or .stl.
         terrain: what was reconstructed.
         clip: from which it was.
-        sole: assumed height of the ball joint above the sole, m.
         margin: how far the mesh extends beyond the stances, m.
     """
     vertices, faces = terrain.surface.mesh(*terrain.extent(margin))
     title = f"Ground of {clip.source}: {describe_surface(terrain)}"
     figure = terrain_plots.plan(terrain, margin, clip.rig.names, title)
     style.save(mesh.with_suffix(FIGURE), figure)
-    text = json.dumps(numbers(terrain, clip, sole), indent=2) + "\n"
+    text = json.dumps(numbers(terrain, clip), indent=2) + "\n"
     files.write_text(mesh.with_suffix(NUMBERS), text)
     files.write(mesh, lambda temporary: mesh_files.save_mesh(temporary, vertices, faces))
 
@@ -109,13 +108,13 @@ def describe_surface(terrain: Reconstruction) -> str:
             raise TypeError(f"no description for {surface}")
 
 
-def numbers(terrain: Reconstruction, clip: Clip, sole: float) -> dict[str, object]:
+def numbers(terrain: Reconstruction, clip: Clip) -> dict[str, object]:
     """What the JSON file holds: metres, radians, frames; null where a value is unknown."""
     return {
         "clip": clip.source,
         "frames": clip.frame_count,
         "fps": clip.fps,
-        "ball_over_sole": sole,
+        "ball_over_sole": _rounded(terrain.sole),
         "chosen": terrain.chosen,
         "tested": {
             kind: {

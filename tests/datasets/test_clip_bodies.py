@@ -21,6 +21,7 @@ from fitting.datasets.clips.kinematics import local_from_world, world_from_local
 from fitting.datasets.clips.load import ClipOptions, draft_joint_map
 from fitting.datasets.clips.rigs import LegMotion
 from fitting.datasets.clips.summary import as_json, as_text, describe
+from fitting.datasets.flat_animation import load_flat_animation
 from jaxik.world.skeleton import Transform, forward_kinematics
 from support.sample_clips import BVH, flat_floor, stair_walk
 
@@ -357,6 +358,30 @@ def test_heights_over_the_sole_are_those_of_a_flat_stance_or_else_those_of_feet_
     assert len([remark for remark in walk.remarks if "no level floor" in remark]) == 2
     with pytest.raises(ValueError, match="stair walk was loaded without legs"):
         _ = replace(walk, measured_rig=None).rig
+
+
+@pytest.mark.parametrize("offset, taken", [(0.0, 0.02), (0.06, 0.45 * 0.1118), (-0.04, 0.0)])
+def test_feet_off_their_floor_are_said_to_be_and_soles_can_be_given(tmp_path, offset, taken):
+    """The balls of these feet are 0.02 m over their soles, and 0.05 m below their ankles."""
+    flat = stair_walk(lambda points: np.full(len(points), 0.02 + offset))
+    path = tmp_path / "walk.bvh"
+    save_clip(path, replace(flat, stance=None))
+    place = "over" if offset > 0 else "in"
+    for sole, height in ((None, taken), (0.02, 0.02)):
+        clip = load_clip(path, sole=sole)
+        assert np.allclose(clip.rig.ball_height, height, atol=1e-3)
+        assert np.allclose(clip.rig.ankle_height, height + 0.05, atol=1e-3)
+        said = [text for text in clip.remarks if "sole" in text]
+        over = 0.02 + offset - height
+        start = f"standing feet are {100 * abs(over):.1f} cm {place} the floor at height 0 m in all"
+        assert len(said) == (offset != 0.0) and all(text.startswith(start) for text in said), said
+        assert all(f"Then give --floor {over:.3f}" in text for text in said)
+    laid = load_flat_animation(path, offset)
+    assert np.allclose(laid.rig.ball_height, 0.02, atol=1e-3)
+    assert not any("sole" in text for text in laid.remarks)
+    for sole in (-0.01, np.nan):
+        with pytest.raises(ValueError, match=f"sole is {sole}; wanted a number of metres"):
+            load_clip(path, sole=sole)
 
 
 def test_a_foot_is_flat_where_its_heel_is_low_and_not_where_it_is_still_on_its_toes():

@@ -346,7 +346,7 @@ def test_the_memory_for_stances_grows_with_their_number_and_not_its_square():
     motion = (np.concatenate([part] * repeats) for part in (clip.positions_ws, clip.rotations_ws))
     long = replace(clip.with_motion(*motion), stance=np.tile(clip.stance_labels(), (repeats, 1)))
     tracemalloc.start()
-    stances = reconstruction.find_stances(long)
+    stances = reconstruction.find_stances(long, 0.0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(stances.leg) > 2000 and peak < 10 * long.positions_ws.nbytes
@@ -361,14 +361,14 @@ def test_a_stance_on_toes_is_used_only_if_no_flat_one_is_near(monkeypatch):
     lift[first : last + 1, toe, 1] = 0.05
     lift[first : last + 1, ankle, 1] = 0.05
     raised = floor_walk.with_motion(floor_walk.positions_ws + lift, floor_walk.rotations_ws)
-    assert not reconstruction.find_stances(raised).toes.any()
+    assert not reconstruction.find_stances(raised, 0.0).toes.any()
     lift[first : last + 1, ankle, 1] = 0.12
     clip = floor_walk.with_motion(floor_walk.positions_ws + lift, floor_walk.rotations_ws)
-    stances = reconstruction.find_stances(clip)
+    stances = reconstruction.find_stances(clip, 0.0)
     (on_toes,) = np.flatnonzero(stances.toes)
     assert stances.leg[on_toes] == 0 and stances.used[on_toes]  # others are 30 cm away or more
     monkeypatch.setattr(reconstruction, "NEAR", 0.5)
-    used = reconstruction.find_stances(clip).used
+    used = reconstruction.find_stances(clip, 0.0).used
     np.testing.assert_array_equal(used, np.arange(len(stances.leg)) != on_toes)
 
 
@@ -572,6 +572,17 @@ def test_a_synthetic_slope_is_a_plane_also_of_a_bounded_number_of_stances(
     assert shares == [pytest.approx([0, 20, 40, 60, 80, 100, 100])] * 3
 
 
+@pytest.mark.parametrize("sole, height", [(None, 0.0), (0.03, -0.01)])
+def test_ground_lies_a_sole_below_the_balls_as_the_rig_has_it_or_as_it_is_given(
+    coarse_search, sole, height
+):
+    walk = stair_walk(lambda points: np.full(len(points), 0.02), strides=4)
+    ground = reconstruction.reconstruct(walk, sole=sole)
+    assert ground.sole == pytest.approx(0.02 if sole is None else sole, abs=1e-6)
+    points = ground.stances.points
+    np.testing.assert_allclose(ground.surface.heights(points), height, atol=1e-3)
+
+
 def test_the_terrain_of_the_uneven_walk_is_reconstructed_as_smooth(coarse_search):
     walk = clips.load_clip(ROOT / "data" / "clips" / "uneven_walk.npz")
     ground = reconstruction.reconstruct(walk, sole=gait.BALL_HEIGHT)
@@ -590,13 +601,14 @@ def test_the_blocks_of_subject_03_are_reconstructed_within_a_centimetre(mocap):
     stances on toes only.
     """
     reference = json.loads((mocap / "blocks" / "terrain_subject03.json").read_text())
-    assert reference["ball_joint_height_above_surface"] == reconstruction.SOLE
+    sole = reference["ball_joint_height_above_surface"]
     known = Grid(reference["cell_size"], reference["yaw_rad"], tuple(reference["origin"]))
     cells = np.array([[cell["i"], cell["j"]] for cell in reference["cells"]])
     heights = np.array([cell["height"] for cell in reference["cells"]])
     clean = np.array([cell["n_clean"] > 0 for cell in reference["cells"]])
     clip = clips.load_clip(mocap / "clips" / "cmu_asfamc" / "03_03.amc")
-    ground = reconstruction.reconstruct(clip)
+    assert np.allclose(clip.rig.ball_height, sole, atol=0.01)  # as estimated from the feet
+    ground = reconstruction.reconstruct(clip, sole=sole)
     assert ground.chosen == "blocks" and isinstance(ground.surface, surfaces.LevelBlocks)
     error = ground.surface.heights(known.points(cells + 0.5)) - heights
     assert np.sqrt(np.mean(error**2)) < 0.01

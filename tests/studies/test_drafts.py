@@ -28,6 +28,7 @@ from fitting.studies.drafts.draft import DraftRequest
 from jaxik.maths import parameter_tree
 from support import quick
 from support.experiments import ROOT, write
+from support.sample_clips import flat_floor, stair_walk
 from support.small_studies import HALF_SECOND
 
 WALK, BASE = ROOT / "data/clips/uneven_walk.npz", ROOT / "data/clips/uneven_walk_base.npz"
@@ -198,3 +199,21 @@ def test_ground_of_another_clip_is_doubted():
         if assumption.topic == "ground"
     ]
     assert advice == ["", "does this ground belong to this clip?"]
+
+
+def test_soles_are_measured_estimated_or_given_and_it_is_said_which():
+    data = load_clip_data(ClipEntry(WALK, GROUND, BASE), None)
+    level = data._replace(reference=stair_walk(flat_floor))
+    for each, is_given, words, is_doubted in (
+        (level, False, "over their soles, measured over the level floor", False),
+        (data, False, "over their soles, estimated from the feet's length", True),
+        (data, True, "over their soles, as was given", False),
+    ):
+        (soles,) = (
+            assumption
+            for assumption in assumptions.of_clip(
+                each, None, base_is_own=True, sole_is_given=is_given
+            )
+            if assumption.topic == "soles"
+        )
+        assert words in soles.text and ("--sole" in soles.advice) == is_doubted, soles

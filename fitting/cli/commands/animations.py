@@ -21,8 +21,8 @@ from . import reading, status
 OF_CLIPS = {  # options of a clip and a terrain, as they are where they are not used
     "--floor": 0.0, "--root": "auto", "--speed": 1.0, "--tracks": None, "--joints": None,
     "--scale": None, "--up": None, "--asf": None, "--animation": None, "--travel": None,
-    "--file-up": "y",
-    "--terrain-offset": (0.0, 0.0, 0.0), "--terrain-scale": None, "--terrain-cell": None,
+    "--sole": None, "--file-up": "y", "--terrain-offset": (0.0, 0.0, 0.0),
+    "--terrain-scale": None, "--terrain-cell": None,
 }  # fmt: skip
 
 

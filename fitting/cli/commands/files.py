@@ -45,9 +45,9 @@ def terrain(options: argparse.Namespace) -> int:
         clip = load_clip(options.clip, **vars(reading.clip_options(options)))
     kind = None if options.model == "auto" else options.model
     with activity.announced(f"Reconstructing the ground of {options.clip.name}"):
-        ground = reconstruct(clip, sole=options.sole, kind=kind)
+        ground = reconstruct(clip, kind=kind)
     with activity.announced("Drawing and writing the ground"):
-        terrain_report.write(options.output, ground, clip, options.sole, options.margin)
+        terrain_report.write(options.output, ground, clip, options.margin)
     print(f"{terrain_report.count_stances(ground)}\n")
     show(aligned(terrain_report.prediction_table(ground)))
     print(f"\n{terrain_report.describe_surface(ground)}; written to {options.output}")

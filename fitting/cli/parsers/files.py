@@ -57,10 +57,6 @@ def add_terrain(commands: Commands) -> None:
     )
     add_output(terrain, "MESH", ".ply, .obj or .stl")
     terrain.add_argument(
-        "--sole", type=number(0, 10, "metres"), default=0.055, metavar="M",
-        help="height of the ball joint over the sole, m (default: 0.055, an adult's in shoes)",
-    )  # fmt: skip
-    terrain.add_argument(
         "--model", choices=("auto", "plane", "smooth", "blocks"), default="auto",
         help="what is written (default: chosen by the error of prediction)",
     )  # fmt: skip

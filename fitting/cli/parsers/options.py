@@ -118,6 +118,10 @@ def add_clip_units(group: argparse._ArgumentGroup) -> None:
         help="move the root so that standing feet stay put (stances), leave it (none), or move it "
         "where the clip is clearly a cycle in place (default: auto)",
     )  # fmt: skip
+    group.add_argument(
+        "--sole", type=number(0, 10, "metres"), metavar="M",
+        help="height of the ball joints over the soles, m (default: measured or estimated)",
+    )  # fmt: skip
 
 
 def add_terrain_options(command: argparse.ArgumentParser) -> None:

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from fitting.runtime.validation import error_context
-from jaxik.world.skeleton import Rig
 
 from .clip import Clip
-from .footing import skating
+from .footing import skating, soles
 from .footing.skating import TRAVELS, Feet
 from .guesses import units
 from .guesses.balls import with_balls
@@ -30,7 +29,7 @@ from .recording import (
     Y_UP_FROM_Z_UP,
     Recording,
 )
-from .rigs import left_directions, measure_rig, measure_soles, relative_size, stiff_knees
+from .rigs import left_directions, measure_rig, relative_size, stiff_knees
 
 NO_LEGS = "no legs are recognised"
 UP_ADVICE = "give --up (up=... in Python) if you know better"
@@ -134,7 +133,7 @@ def clip_from_recording(
                 remarks.append(f"the {leg.name} foot never stands; its axes are a guess")
         rig = measure_rig(roles, seen_ws, turned_ws, stance)
         remarks += _guessed_knees(roles, seen_ws, turned_ws)
-        remarks += _guessed_soles(rig, seen_ws, turned_ws, stance)
+        remarks += soles.remarks(rig, seen_ws, turned_ws, stance)
     return Clip(
         recording.names, recording.parents, recording.offsets_ls, positions_ws, rotations_ws,
         float(rate), recording.frame_time, source, float(scale), up,
@@ -174,7 +173,7 @@ def clip_from_joints(
     roles = find_roles(motion.names, motion.parents, joints)
     rig = measure_rig(roles, motion.positions_ws, rotations_ws, motion.stance)
     remarks = _guessed_knees(roles, motion.positions_ws, rotations_ws)
-    remarks += _guessed_soles(rig, motion.positions_ws, rotations_ws, motion.stance)
+    remarks += soles.remarks(rig, motion.positions_ws, rotations_ws, motion.stance)
     return Clip(
         motion.names, motion.parents, np.median(positions_ls, axis=0), motion.positions_ws,
         rotations_ws, motion.fps, 1.0 / motion.fps, source, 1.0, "y", roles.dialect, rig,
@@ -200,19 +199,6 @@ def _guessed_knees(
         f"the {name} knee hardly moves, so its axis is a guess: take a clip in which it bends, or "
         "do not trust where this knee points"
         for name in stiff_knees(roles, positions_ws, rotations_ws)
-    )
-
-
-def _guessed_soles(
-    rig: Rig, positions_ws: np.ndarray, rotations_ws: np.ndarray, stance: np.ndarray
-) -> tuple[str, ...]:
-    """A remark for each foot whose height over its sole is a guess."""
-    measured = measure_soles(rig, positions_ws, rotations_ws, stance).measured
-    return tuple(
-        f"the {name} foot stands flat on no level floor at height 0; its ankle is taken to be "
-        f"{height:.3f} m over its sole, from the foot's length"
-        for name, height, known in zip(rig.names, rig.ankle_height, measured, strict=True)
-        if not known
     )
 
 

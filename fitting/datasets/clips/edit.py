@@ -12,9 +12,10 @@ from jaxik.world.skeleton import Rig
 
 from . import contacts
 from .clip import Clip
+from .footing import soles
 from .joint_roles import partners
 from .kinematics import local_from_world, world_from_local
-from .rigs import with_soles
+from .rigs import with_sole, with_soles
 
 POP = 0.02  # m: a second difference at `POP_RATE` that no body produces
 POP_RATE = 120.0  # Hz
@@ -158,15 +159,28 @@ def _starts_at_rest(clip: Clip) -> bool:
     return bool(turning.any() and (angles[0, turning] < REST_ANGLE).mean() >= REST_FRACTION)
 
 
-def on_floor(clip: Clip, floor: float) -> Clip:
-    """The clip with its rig's heights over the sole measured over a floor at this height, m."""
-    if floor == 0.0:  # over which they were measured
+def on_floor(clip: Clip, floor: float, sole: float | None = None) -> Clip:
+    """The clip with its rig's heights over the sole measured over a floor, or given.
+
+    Args:
+        clip: any clip with legs.
+        floor: height of the floor, m.
+        sole: m, of the balls of flat feet over their soles; None measures it.
+
+    Raises:
+        ValueError: `sole` is not a finite number of 0 or more, or the clip has no legs.
+    """
+    if floor == 0.0 and sole is None:  # over which they were measured
         return clip
+    if sole is not None and not (np.isfinite(sole) and sole >= 0):
+        raise ValueError(f"sole is {sole}; wanted a number of metres from 0 on")
     rig = clip.rig if clip.measured_rig is None else clip.measured_rig  # `clip.rig` explains
     seen = clip.observed
     motion = clip.positions_ws[seen], clip.rotations_ws[seen], clip.stance_labels()[seen]
-    rig = with_soles(rig, *motion, floor)
-    return replace(clip, measured_rig=rig)
+    rig = with_soles(rig, *motion, floor) if sole is None else with_sole(rig, sole)
+    others = tuple(text for text in clip.remarks if soles.SUBJECT not in text)
+    remarks = (*others, *soles.remarks(rig, *motion, floor))
+    return replace(clip, measured_rig=rig, remarks=remarks)
 
 
 def pops(clip: Clip) -> Bool[np.ndarray, " frames"]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from fitting.runtime.validation import check_file
 
-from . import formats
+from . import edit, formats
 from .assemble import Overrides, clip_from_recording
 from .clip import Clip
 from .formats.asfamc import read_asfamc
@@ -41,12 +41,14 @@ class ClipOptions:
     """Which animation of a glTF file."""
     travel: str | None = None
     """Whether the root travels as standing feet show: one of `footing.skating.TRAVELS`."""
+    sole: float | None = None
+    """m, of the balls of flat feet over their soles."""
 
     def of_file(self, path: Path) -> "ClipOptions":
         """Those that a file of this format takes, where several files share the options."""
         suffix = path.suffix.lower()
         if suffix == ".npz":
-            return ClipOptions()
+            return ClipOptions(sole=self.sole)
         asf = self.asf if suffix == ".amc" else None
         return replace(self, asf=asf, animation=self.animation if suffix in GLTF else None)
 
@@ -66,8 +68,8 @@ class ClipOptions:
         taken = {name for file in files for name in self.of_file(file).given}
         if unused := sorted(set(self.given) - taken):
             raise ValueError(
-                f"{where}: {unused[0]} is of no use: an .npz states all that itself, only an .amc "
-                "has an .asf, and only a .glb or .gltf an animation to choose"
+                f"{where}: {unused[0]} is of no use: an .npz states all but --sole itself, only an "
+                ".amc has an .asf, and only a .glb or .gltf an animation to choose"
             )
 
 
@@ -86,6 +88,7 @@ def load_clip(
     variant: str = "captured",
     animation: str | None = None,
     travel: str | None = None,
+    sole: float | None = None,
 ) -> Clip:
     """Reads a BVH, AMC (with its ASF), glTF, GLB, C3D or NPZ file as a clip in metres with y up.
 
@@ -105,6 +108,8 @@ def load_clip(
         animation: which animation of a glTF file; None takes the only one.
         travel: "stances" moves the root so that standing feet stay where they stand, "none" leaves
             it, and "auto", or None, moves it in a cycle that is clearly in place.
+        sole: m, of the balls of flat feet over their soles; None measures it over a floor at height
+            0, or estimates it from the feet's length.
 
     Returns:
         The clip; its `remarks` list every guess. A file without recognised legs loads, and its
@@ -125,7 +130,7 @@ def load_clip(
         arguments = {**vars(overrides), "animation": animation}
         if unused := [name for name, value in arguments.items() if value is not None]:
             raise ValueError(f"{path}: {unused} do not apply to .npz clips, which state all that")
-        return read_npz(path, variant)
+        return edit.on_floor(read_npz(path, variant), 0.0, sole)
     if variant != "captured":
         raise ValueError(f"{path}: only blocks .npz files have the variant {variant!r}")
     if suffix == ".c3d":
@@ -134,7 +139,7 @@ def load_clip(
             overrides = replace(overrides, joints={role: joint_name(role) for role in joints})
     else:
         recording = _read(path, asf, animation, fps)
-    return clip_from_recording(recording, path.name, overrides)
+    return edit.on_floor(clip_from_recording(recording, path.name, overrides), 0.0, sole)
 
 
 def _check_arguments(path: Path, asf: str | Path | None, animation: str | None) -> None:

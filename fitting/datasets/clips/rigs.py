@@ -24,8 +24,9 @@ KNEE_MOTION = np.radians(3.0)  # RMS knee rotation below which the motion shows 
 FLAT_FRACTION = 0.25  # of a stance's frames, in which the foot is flat at least
 FLAT_RISE = 0.05  # of a foot's length, by which the ankle of a flat foot rises and falls
 LEVEL = 0.4  # of a foot's length, in which the heights of its ball lie on a level floor
-HIGHEST_BALL = 0.75  # of a foot's length, its ball's height over the sole; higher is no floor
+HIGHEST_BALL = 0.6  # of a foot's length, its ball's height over the sole; captured: 0.2 to 0.55
 USUAL_BALL = 0.45  # likewise, of the feet of people
+USUAL_ERROR = 0.02  # m, by which captured clips of adults differ from it
 USUAL_FOOT = 0.15  # of a leg's length, ankle to ball; for a foot that is a single point
 
 
@@ -55,6 +56,8 @@ class SoleHeights(NamedTuple):
     """Metres."""
     measured: Bool[np.ndarray, " legs"]
     """False where the clip shows no foot flat on a level floor: a guess from the foot's length."""
+    standing: Float64[np.ndarray, " legs"]
+    """m, of the ball over the floor while the foot stands; NaN where it does at no one height."""
 
 
 class LegMeasurement(NamedTuple):
@@ -149,7 +152,7 @@ def measure_soles(
         stance: when each foot stands.
         floor: height of the floor, m.
     """
-    heights, measured = [], []
+    heights, measured, standing = [], [], []
     for leg, (hip, knee, ankle, toe) in enumerate(rig.joints):
         bones = np.diff(positions_ws[:, [hip, knee, ankle, toe]], axis=1)
         thigh, shin, foot = np.median(np.linalg.norm(bones, axis=-1), axis=0)
@@ -168,6 +171,7 @@ def measure_soles(
         level = np.quantile(balls, 0.9) - np.quantile(balls, 0.1) <= LEVEL * foot
         on_floor = -LEVEL * foot <= ball_height <= HIGHEST_BALL * foot
         measured.append(bool(stance[:, leg].any() and level and on_floor))
+        standing.append(ball_height if stance[:, leg].any() and level else np.nan)
         if not measured[-1]:
             ball_height = USUAL_BALL * foot
             ankle_height = ball_height + max(rise, 0.0)
@@ -176,7 +180,15 @@ def measure_soles(
             ankle_height, ball_height = middle + rise / 2, middle - rise / 2
         heights.append([max(ankle_height, 0.0), max(ball_height, 0.0)])
     ankle, ball = np.array(heights).T
-    return SoleHeights(ankle, ball, np.array(measured))
+    return SoleHeights(ankle, ball, np.array(measured), np.array(standing))
+
+
+def with_sole(rig: Rig, sole: float) -> Rig:
+    """The rig with the balls of all feet at this height over their soles, m, when they are flat."""
+    with jax.enable_x64(True):
+        ball = jnp.full(len(rig.names), float(sole))
+        ankle = jnp.maximum(ball + rig.ankle_height - rig.ball_height, 0.0)
+    return replace(rig, ankle_height=ankle, ball_height=ball)
 
 
 def relative_size(

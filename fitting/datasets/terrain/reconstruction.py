@@ -21,7 +21,6 @@ from . import block_grids, surfaces
 from .block_grids import Footprints, RankedGrids
 from .surfaces import Surface
 
-SOLE = 0.055  # m, ball joint above the sole: CMU database, subject 03, in his shoes
 # A foot is on its toes where it is pitched down more than usual: by 5 degrees, and by three
 # standard deviations (estimated from the median absolute deviation), as slopes make pitch vary.
 TOE_PITCH, TOE_DEVIATIONS = np.radians(5.0), 3.0 * 1.4826
@@ -93,6 +92,8 @@ class Reconstruction:
     grids: RankedGrids
     chosen: str
     """Kind."""
+    sole: float
+    """m, height of the ball joints above the soles."""
 
     @property
     def surface(self) -> Surface:
@@ -105,12 +106,15 @@ class Reconstruction:
         return points.min(axis=0) - margin, points.max(axis=0) + margin
 
 
-def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> Reconstruction:
+def reconstruct(
+    clip: Clip, *, sole: float | None = None, kind: str | None = None
+) -> Reconstruction:
     """The ground below a captured clip.
 
     Args:
         clip: over ground of any shape, with y up.
-        sole: m, height of the ball joint above the sole; it shifts the whole ground.
+        sole: m, height of the ball joints above the soles; it shifts the whole ground. None is the
+            mean of the rig's.
         kind: which of `SURFACE_KINDS` to choose; None chooses by cross-validation.
 
     Raises:
@@ -118,6 +122,8 @@ def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> R
     """
     if kind not in (None, *SURFACE_KINDS):
         raise ValueError(f"no kind of ground named {kind!r}; there are {list(SURFACE_KINDS)}")
+    if sole is None:
+        sole = float(np.mean(np.asarray(clip.rig.ball_height)))
     stances = find_stances(clip, sole)
     feet = stances.footprints
     if len(feet.balls) < MIN_STANCES:
@@ -140,10 +146,10 @@ def reconstruct(clip: Clip, *, sole: float = SOLE, kind: str | None = None) -> R
     predictions = {name: leave_one_out(fit, feet) for name, fit in fits.items()}
     fitted = {name: fit(feet) for name, fit in fits.items()}
     chosen = choose(predictions) if kind is None else kind
-    return Reconstruction(stances, fitted, predictions, grids, chosen)
+    return Reconstruction(stances, fitted, predictions, grids, chosen, sole)
 
 
-def find_stances(clip: Clip, sole: float = SOLE) -> Stances:
+def find_stances(clip: Clip, sole: float) -> Stances:
     """Position and height of every stance of a clip.
 
     They are medians over the frames in which the foot is stillest, without frames in which a marker

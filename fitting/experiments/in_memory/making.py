@@ -21,7 +21,7 @@ from .selectors import Free, free_table
 
 PATH = Path("experiment")  # that messages name
 OF_FILES = (
-    "file_up", "joints", "scale", "up", "asf", "animation", "travel", "terrain_scale",
+    "file_up", "joints", "scale", "up", "asf", "animation", "travel", "sole", "terrain_scale",
     "terrain_offset", "terrain_cell",
 )  # fmt: skip
 """Keys of a clip that say how its files are read."""

@@ -58,6 +58,11 @@ CLIP_KEYS: dict[str, Constraint] = {
         "Whether the roots of reference and base are moved so that standing feet stay put, or left,"
         " or moved where the clip is clearly a cycle in place; left out, auto."
     ),
+    "sole": validation.number(0, 10, "metres").meaning(
+        "Height of the balls of reference and base over their soles; left out, measured or"
+        " estimated.",
+        "m",
+    ),
     "file_up": AXIS.meaning("Up axis of the terrain's file."),
     "terrain_scale": UNITS.meaning("Metres per unit of the terrain's file."),
     "terrain_offset": OFFSET.meaning("By which the terrain is moved.", "m"),

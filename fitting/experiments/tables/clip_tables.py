@@ -54,7 +54,7 @@ def read_clip(value: object, places: Places) -> ClipEntry:
     """
     path = places.file
     table = check_table(value, CLIP_KEYS, f"{path} [[clips]]")
-    entry = with_floats(table, ("start", "end", "scale", "terrain_scale", "terrain_cell"))
+    entry = with_floats(table, ("start", "end", "scale", "sole", "terrain_scale", "terrain_cell"))
     for key in ("reference", "terrain"):
         if key not in table:
             raise ValueError(f"{path} [[clips]]: there is no {key}; it needs reference and terrain")

@@ -15,7 +15,7 @@ MARGIN = 2.0  # m of ground around the stances, over which a foot may swing
 
 def write_ground(ground: Ground) -> None:
     """Writes ground that was reconstructed, with its numbers and a picture."""
-    terrain_report.write(ground.mesh, ground.terrain, ground.clip, ground.sole, MARGIN)
+    terrain_report.write(ground.mesh, ground.terrain, ground.clip, MARGIN)
 
 
 def write(draft: Draft) -> None:

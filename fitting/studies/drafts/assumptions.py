@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from fitting.datasets import coverage
 from fitting.datasets.clips import Clip, flight, summary
+from fitting.datasets.clips.rigs import USUAL_ERROR, measure_soles
 from fitting.datasets.terrain.reconstruction import Reconstruction
 from fitting.experiments.problems import ClipData
 from fitting.studies.capture_check import stances_of
@@ -28,7 +29,11 @@ class Assumption(NamedTuple):
 
 
 def of_clip(
-    data: ClipData, ground: Reconstruction | None, *, base_is_own: bool
+    data: ClipData,
+    ground: Reconstruction | None,
+    *,
+    base_is_own: bool,
+    sole_is_given: bool = False,
 ) -> list[Assumption]:
     """The assumptions about one clip of an experiment.
 
@@ -36,10 +41,12 @@ def of_clip(
         data: the loaded clip.
         ground: what the terrain was reconstructed from; None for a terrain that was given.
         base_is_own: whether the flat animation was given, and not made from the capture.
+        sole_is_given: whether heights over the sole were given, and not measured or estimated.
     """
     return [
         *_body(data.reference),
         *_legs(data.reference),
+        _soles(data.reference, is_given=sole_is_given),
         *_ground(data, ground),
         _base(data, base_is_own=base_is_own),
     ]
@@ -68,6 +75,25 @@ def _legs(clip: Clip) -> Iterator[Assumption]:
         yield Assumption(
             "contacts", text, "few steps determine little: take a longer clip" if few else ""
         )
+
+
+def _soles(clip: Clip, *, is_given: bool) -> Assumption:
+    """How high balls are over their soles, which shifts reconstructed ground, and how sure."""
+    heights = np.asarray(clip.rig.ball_height)
+    text = f"balls are {100 * heights.mean():.1f} cm over their soles"
+    if is_given:
+        return Assumption("soles", f"{text}, as was given")
+    labels = clip.stance_labels()
+    soles = measure_soles(clip.rig, clip.positions_ws, clip.rotations_ws, labels)
+    if soles.measured.all():
+        spread = 100 * np.ptp(heights) / 2
+        text += f", measured over the level floor at height 0 (feet differ by ±{spread:.1f} cm)"
+        return Assumption("soles", text)
+    return Assumption(
+        "soles",
+        f"{text}, estimated from the feet's length, give or take {100 * USUAL_ERROR:.0f} cm",
+        "better: measure it, and give it as --sole",
+    )
 
 
 def knee_bend(clip: Clip) -> Float[np.ndarray, "frames legs"]:

@@ -10,7 +10,7 @@ from fitting.analysis.distances import Distances
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.clips.load import AS_FOUND, ClipOptions
 from fitting.datasets.terrain.mesh_files import TerrainOptions
-from fitting.datasets.terrain.reconstruction import SOLE, Reconstruction, reconstruct
+from fitting.datasets.terrain.reconstruction import Reconstruction, reconstruct
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, load_clip_data, problem_from_clips
 from fitting.experiments.record_only import PLACES
@@ -70,8 +70,6 @@ class Ground:
     mesh: Path
     terrain: Reconstruction
     clip: Clip
-    sole: float = SOLE
-    """m, of a ball joint above its sole."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +205,8 @@ def _assumptions(
     request: DraftRequest, data: ClipData, ground: Ground | None
 ) -> tuple[Assumption, ...]:
     terrain = None if ground is None else ground.terrain
-    return tuple(of_clip(data, terrain, base_is_own=bool(request.bases)))
+    is_given = request.reading.sole is not None
+    return tuple(of_clip(data, terrain, base_is_own=bool(request.bases), sole_is_given=is_given))
 
 
 def _entry(request: DraftRequest, clip: Clip, index: int, ground: Ground | None) -> ClipEntry:
