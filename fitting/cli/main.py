@@ -6,6 +6,7 @@ import gc
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from fitting.runtime import activity
 from fitting.runtime.validation import in_one_line
@@ -19,6 +20,7 @@ MISTAKE, INTERRUPTED = 2, start.INTERRUPTED  # exit statuses
 # Allocations between searches for dead cycles of objects. Imports and traces leave hundreds of
 # thousands of objects that live on; by Python's own numbers a first fit spends 3 s looking at them.
 COLLECTIONS = (200_000, 10, 10)
+LIBRARIES, OWN = ("site-packages", "dist-packages"), ("jaxik", "fitting")  # folders
 RENAMED = {"contribution": "ablate"}  # old commands, which still work in this release
 
 
@@ -78,10 +80,19 @@ def _with_new_command(words: list[str]) -> list[str]:
     return words
 
 
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"jaxik: {message}", file=sys.stderr)
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, *_: object, **__: object
+) -> None:
+    print(f"jaxik: {_library(filename)}{message}", file=sys.stderr)
     if JAX_CACHE in str(message):  # JAX would repeat it for each program
         warnings.filterwarnings("ignore", message=f".*{JAX_CACHE}")
+
+
+def _library(filename: str) -> str:
+    """The library of another in which this file lies, as the beginning of a line; empty of ours."""
+    parts = Path(filename).parts
+    name = next((parts[i + 1] for i, part in enumerate(parts[:-1]) if part in LIBRARIES), "")
+    return f"{name.removesuffix('.py')} says: " if name and name not in OWN else ""
 
 
 if __name__ == "__main__":

@@ -138,6 +138,23 @@ def test_an_interrupt_at_any_moment_is_a_line_and_its_status(words, tmp_path):
     assert done.stderr == f"\njaxik {words[0]}: interrupted\n"
 
 
+def test_a_warning_of_another_library_comes_under_its_name(monkeypatch, capsys):
+    def work(_) -> int:
+        for place in ("arviz_base/a.py", "odd.py", "fitting/b.py", "jaxik/c.py"):
+            file = f"/env/lib/python3.11/site-packages/{place}"
+            warnings.warn_explicit(f"of {place}", UserWarning, file, 1)
+        warnings.warn_explicit("of a checkout", UserWarning, "/home/checkout/fitting/b.py", 1)
+        return 0
+
+    monkeypatch.setattr(main, "_function", lambda command: work)
+    with warnings.catch_warnings(action="always"):
+        run("doctor")
+    assert capsys.readouterr().err.splitlines() == [
+        "jaxik: arviz_base says: of arviz_base/a.py", "jaxik: odd says: of odd.py",
+        "jaxik: of fitting/b.py", "jaxik: of jaxik/c.py", "jaxik: of a checkout",
+    ]  # fmt: skip
+
+
 def test_an_interrupt_swallowed_by_a_hook_is_raised_later_and_a_second_one_ends_the_process(
     monkeypatch, capfd
 ):

@@ -62,6 +62,11 @@ def test_the_summary_of_arviz_has_our_figures(posterior, tree):
         assert float(r_hat[row["name"]]) == pytest.approx(row["r_hat"], abs=0.01)
 
 
+def test_a_young_chain_with_fewer_steps_than_walkers_warns_of_nothing(posterior, space):
+    tree = replace(posterior, burn_in=296).to_inference_data(space)  # warnings are errors here
+    assert dict(tree["posterior"].sizes) == {"chain": 7, "draw": 4}
+
+
 def test_draws_have_their_walkers_steps_units_and_kinds(posterior, tree):
     draws = tree["posterior"]
     assert draws["chain"].values.tolist() == [0, 1, 2, 3, 4, 6, 7]

@@ -4,6 +4,7 @@ ArviZ is optional; `pip install "jaxik[posterior]"` brings what is used here.
 """
 
 import importlib.util
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -91,14 +92,15 @@ def to_inference_data(posterior: Posterior, space: Space) -> Any:
         posterior.log_probability[posterior.burn_in :], posterior.isolated, axis=1
     )
     names = posterior.names
-    tree = from_dict(
-        {
-            "posterior": {name: posterior.kept[..., i].T for i, name in enumerate(names)},
-            "sample_stats": {"lp": log_probability.T},
-            "prior": {name: drawn[None, :, i] for i, name in enumerate(names)},
-        },
-        attrs={"/": {"inference_library": "emcee", "message": posterior.message, "format": FORMAT}},
-    )
+    groups = {
+        "posterior": {name: posterior.kept[..., i].T for i, name in enumerate(names)},
+        "sample_stats": {"lp": log_probability.T},
+        "prior": {name: drawn[None, :, i] for i, name in enumerate(names)},
+    }
+    of_all = {"inference_library": "emcee", "message": posterior.message, "format": FORMAT}
+    with warnings.catch_warnings():  # a young chain has fewer steps than walkers
+        warnings.filterwarnings("ignore", "Found chain dimension to be longer than draw")
+        tree = from_dict(groups, attrs={"/": of_all})
     walkers = np.delete(np.arange(posterior.u.shape[1]), posterior.isolated)
     steps = posterior.thin_by * (1 + np.arange(posterior.burn_in, len(posterior.u)))
     for group in ("posterior", "sample_stats"):
