@@ -169,8 +169,9 @@ class _Evidence:
     def of(self, grid: Grid) -> float:
         """Of one grid: the log of the sum over levels, summed over the blocks."""
         number = _cell_numbers(grid.cells(self.points))
-        member = np.equal.outer(np.arange(number.max() + 1), number).astype(np.float64)
-        cells = member @ self.likelihood + self.prior
+        order = np.argsort(number, kind="stable")
+        first = np.searchsorted(number[order], np.arange(number.max() + 1))
+        cells = np.add.reduceat(self.likelihood[order], first) + self.prior
         top = cells.max(axis=1)
         return float(np.sum(top + np.log(np.exp(cells - top[:, None]).sum(axis=1))))
 

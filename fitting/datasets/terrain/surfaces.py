@@ -179,10 +179,11 @@ def _leave_one_out_error(points: np.ndarray, heights: np.ndarray) -> Callable[[f
     def error(smoothing: float) -> float:
         # With P the projection on the modes and K the kernel: the leave-one-out residual at each
         # point is ((P K P + smoothing P)⁻¹ heights) divided by the inverse's own diagonal.
-        inverse = modes / (np.maximum(stiffness, 0.0) + smoothing) @ modes.T
-        diagonal = np.diag(inverse)
+        weights = 1.0 / (np.maximum(stiffness, 0.0) + smoothing)
+        diagonal = modes**2 @ weights
         predicted = diagonal > 1e-9 * diagonal.max(initial=0.0)  # the others determine a height
-        return float(np.sum(((inverse @ heights)[predicted] / diagonal[predicted]) ** 2))
+        residuals = modes @ (weights * (modes.T @ heights))
+        return float(np.sum((residuals[predicted] / diagonal[predicted]) ** 2))
 
     return error
 
