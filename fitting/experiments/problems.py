@@ -166,7 +166,9 @@ def _load_base(base: Path, entry: ClipEntry) -> Clip:
     return load_flat_animation(base, options=entry.clip_options.of_file(base))
 
 
-def load_clip_data(entry: ClipEntry, fps: float | None, *, has_file: bool = True) -> ClipData:
+def load_clip_data(
+    entry: ClipEntry, fps: float | None, *, has_file: bool = True, captured: Clip | None = None
+) -> ClipData:
     """Loads one clip of an experiment.
 
     Warns where there is little ground under the feet.
@@ -175,6 +177,7 @@ def load_clip_data(entry: ClipEntry, fps: float | None, *, has_file: bool = True
         entry: of the experiment.
         fps: Hz, to which it is resampled; None keeps its rate.
         has_file: whether remedies are spelled as keys of a file, and not as options of a command.
+        captured: the reference, where it has been read before.
 
     Raises:
         ValueError: a file cannot be read, the base does not belong to the reference, or there is
@@ -191,7 +194,8 @@ def load_clip_data(entry: ClipEntry, fps: float | None, *, has_file: bool = True
         coverage.require(measured, as_keys=has_file)
 
     terrain = load_ground(entry.terrain_options)
-    captured = _load_reference(entry)
+    if captured is None:
+        captured = _load_reference(entry)
     if entry.mask_pops:
         with error_context(entry.reference):
             captured = edit.mask_pops(captured)  # before resampling, which would smear a pop

@@ -56,7 +56,8 @@ class AnimationFiles:
     @cached_property
     def flat_clip(self) -> Clip:
         """The flat animation of the file."""
-        return load_flat_animation(self.clip, self.floor, self.clip_options)
+        with activity.announced(f"Reading {self.clip.name}"):
+            return load_flat_animation(self.clip, self.floor, self.clip_options)
 
     def load_terrain(self) -> Terrain:
         """The terrain of the file."""

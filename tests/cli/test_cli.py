@@ -34,11 +34,13 @@ from fitting.experiments.schema.experiment_schema import experiment_schema
 from fitting.inference.optimisation.solution import Progress
 from fitting.jobs import examples
 from fitting.runtime import activity
+from fitting.studies.animations import AnimationFiles
 from jaxik.maths import parameter_tree
 from support import gltf_files, grounds
 from support.commands import commands, refusal
 from support.experiments import ROOT, write
 from support.sample_clips import BVH
+from support.watching import Recorder
 
 DATA = ROOT / "data"
 BASE, GROUND = DATA / "clips" / "uneven_walk_base.npz", DATA / "terrains" / "slope.ply"
@@ -363,6 +365,17 @@ def test_inspect_describes_a_clip_in_words_and_as_json_and_asks_for_one_of_sever
     assert "2 animations: 'Walk', 'Run'; choose one" in line
     run("inspect", path, "--animation", "Run")
     assert "2 frames" in capsys.readouterr().out
+
+
+def test_the_reading_of_a_clip_is_announced(monkeypatch):
+    recorder = Recorder()
+    monkeypatch.setattr(main, "watched", lambda: activity.watched_by(recorder))
+    run("inspect", BASE)
+    assert recorder.titles[-1] == f"Reading {BASE.name}"
+    recorder = Recorder()
+    with activity.watched_by(recorder):
+        AnimationFiles(BASE, GROUND).flat_clip  # noqa: B018  # as `run` and others do
+    assert recorder.titles == [f"Reading {BASE.name}"]
 
 
 # Numbers among the options: both ends of a range are accepted, nothing beyond is

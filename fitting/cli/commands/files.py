@@ -2,6 +2,8 @@
 
 import argparse
 import warnings
+from contextlib import AbstractContextManager
+from pathlib import Path
 
 from fitting import jobs
 from fitting.cli.parsers.files import TEMPLATE
@@ -26,9 +28,12 @@ def inspect(options: argparse.Namespace) -> int:
     if options.joints == TEMPLATE:
         if options.json:
             raise ValueError("--json is for what was understood, and not for a joint map")
-        print(draft_joint_map(options.clip, how))
+        with _announced(options.clip):
+            drafted = draft_joint_map(options.clip, how)
+        print(drafted)
         return 0
-    clip = load_clip(options.clip, **vars(how))
+    with _announced(options.clip):
+        clip = load_clip(options.clip, **vars(how))
     described = summary.describe(clip)
     if options.json:
         print(summary.as_json(described))
@@ -37,11 +42,15 @@ def inspect(options: argparse.Namespace) -> int:
     return 0
 
 
+def _announced(clip: Path) -> AbstractContextManager[activity.Work]:
+    return activity.announced(f"Reading {clip.name}")
+
+
 @in_float64
 def terrain(options: argparse.Namespace) -> int:
     """Reconstructs the ground of a clip; writes a mesh, its numbers and a plot."""
     terrain_report.check_output_files(options.output)
-    with activity.announced(f"Reading {options.clip.name}"):
+    with _announced(options.clip):
         clip = load_clip(options.clip, **vars(reading.clip_options(options)))
     kind = None if options.model == "auto" else options.model
     with activity.announced(f"Reconstructing the ground of {options.clip.name}"):

@@ -166,7 +166,10 @@ def draft(
         record_only=request.record_only,
     )
     with activity.announced("Reading the clips and their ground"):
-        data = [load_clip_data(entry, experiment.fps, has_file=False) for entry in entries]
+        data = [
+            load_clip_data(entry, experiment.fps, has_file=False, captured=clip)
+            for entry, clip in zip(entries, clips, strict=True)
+        ]
     rig = data[0].base.rig
     ik = experiment.starting_system(rig)
     candidates = {
