@@ -380,7 +380,7 @@ def test_the_reading_of_a_clip_is_announced(monkeypatch):
 
 # Numbers among the options: both ends of a range are accepted, nothing beyond is
 
-OF_CLIPS = {"--scale": ("1e-9", "1e6")}
+OF_CLIPS = {"--scale": ("1e-9", "1e6"), "--sole": ("0", "10")}
 OF_TERRAINS = {"--terrain-scale": ("1e-9", "1e6"), "--terrain-cell": ("0.001", "1e4")}
 OF_TERRAINS |= {"--terrain-offset": ("-1e6", "1e6")}
 OF_ANIMATIONS = {"--floor": ("-1e6", "1e6"), "--speed": ("0.01", "100")} | OF_CLIPS | OF_TERRAINS
@@ -403,7 +403,7 @@ RANGES = {  # by command, with other words that it needs
     "translate --from mec --to record --clip a --terrain b -o out":
         {"--fps": ("1", "1000")} | OF_CLIPS | OF_TERRAINS,
     "inspect walk.bvh": OF_CLIPS,
-    "terrain walk.bvh -o hill.ply": {"--sole": ("0", "10"), "--margin": ("0", "100")} | OF_CLIPS,
+    "terrain walk.bvh -o hill.ply": {"--margin": ("0", "100")} | OF_CLIPS,
     "record show footik.bin": OF_RECORDS,
     "record to-toml footik.bin -o out": OF_RECORDS,
     "record to-bytes footik.toml -o out": OF_RECORDS,

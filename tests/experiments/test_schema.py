@@ -313,7 +313,8 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "[sample]": SAMPLE,
 }
 OF_CLIPS = {
-    "start": (0, 1e6), "end": (1e-3, 1e6), "terrain_scale": (1e-9, 1e6), "terrain_cell": (1e-3, 1e4)
+    "start": (0, 1e6), "end": (1e-3, 1e6), "terrain_scale": (1e-9, 1e6),
+    "terrain_cell": (1e-3, 1e4), "sole": (0, 10),
 }  # fmt: skip
 
 

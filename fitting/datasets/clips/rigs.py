@@ -178,7 +178,8 @@ def measure_soles(
         else:
             middle = (ankle_height + ball_height) / 2
             ankle_height, ball_height = middle + rise / 2, middle - rise / 2
-        heights.append([max(ankle_height, 0.0), max(ball_height, 0.0)])
+        sunk = max(-ball_height, 0.0)  # of a foot that stands in the floor
+        heights.append([max(ankle_height + sunk, 0.0), ball_height + sunk])
     ankle, ball = np.array(heights).T
     return SoleHeights(ankle, ball, np.array(measured), np.array(standing))
 
