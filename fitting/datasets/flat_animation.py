@@ -3,7 +3,9 @@
 Foot IK takes such an animation and the terrain, and should return the captured motion. To derive
 it, the terrain is taken out from under the feet: during a stance a foot is lowered by the height of
 the ground below it, and between two stances by a quintic smoothstep from one height to the next.
-The pelvis keeps its path in the ground plane at a constant height. Knees follow from the law of
+The pelvis keeps its path in the ground plane at a constant height: what it does on uneven ground is
+for foot IK to find. Where the ground is flat, there is nothing to find, and the clip itself is such
+an animation: the pelvis moves as captured. Knees follow from the law of
 cosines, in the plane in which the captured leg bends.
 """
 
@@ -24,6 +26,7 @@ from .clips.formats.npz import is_blocks_file
 from .clips.kinematics import local_from_world, world_from_local
 from .clips.leg_geometry import Vectors, bone_rotation, knee_hinges, knee_positions, unit
 from .clips.load import AS_FOUND, ClipOptions
+from .relief import FLAT, relief
 
 HeightFunction = Callable[[np.ndarray], np.ndarray]
 """Ground heights, m, (points,), below points (points, 3), m."""
@@ -34,7 +37,10 @@ MAX_REACH = 0.9995  # of a leg's length, to which it may be extended
 
 
 def flatten_clip(
-    clip: Clip, height_under: HeightFunction, *, pelvis_height: float | None = None
+    clip: Clip,
+    height_under: HeightFunction,
+    *,
+    pelvis_height: float | Float64[np.ndarray, " frames"] | None = None,
 ) -> Clip:
     """The clip over a flat floor at y = 0.
 
@@ -46,7 +52,8 @@ def flatten_clip(
         clip: captured motion over terrain. Its contact labels decide when a foot stands; if it has
             none, they are detected from its motion.
         height_under: the height of the terrain.
-        pelvis_height: m; None keeps the mean height above the ground under the standing feet.
+        pelvis_height: m; None keeps the captured heights on flat ground, and their mean above the
+            ground under the standing feet on any other.
 
     Raises:
         ValueError: a foot never stands, or the ground height under a stance is not finite.
@@ -55,7 +62,10 @@ def flatten_clip(
     stance = clip.stance_labels()
     ground = ground_heights(clip, stance, height_under)
     pelvis = clip.positions_ws[:, rig.pelvis]
-    if pelvis_height is None:
+    balls = clip.joints_ws(3)[stance]
+    if pelvis_height is None and relief(balls[:, [0, 2]], ground[stance]) < FLAT * body.ratio(rig):
+        pelvis_height = pelvis[:, 1] - ground.mean(axis=1)
+    elif pelvis_height is None:
         any_foot = stance.any(axis=1)
         under = (ground * stance).sum(axis=1)[any_foot] / stance.sum(axis=1)[any_foot]
         pelvis_height = float(np.mean(pelvis[any_foot, 1] - under))

@@ -11,15 +11,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fitting.datasets.clips import contacts
+from fitting.datasets.relief import FLAT, relief
 from fitting.datasets.terrain import mesh_files
 from fitting.experiments.problems import ClipData
 from jaxik.world import body
 
-RELIEF = 0.05  # m between the lowest and the highest stance, below which ground is flat
-MAX_TILT = np.radians(2.0)  # of a floor that is meant to be level
-PLANE = 5  # stances, more than which may show how a floor is tilted
 STEP = 0.10  # m: what a capture should climb
-FLAT = (
+ON_FLAT_GROUND = (
     "the ground under all stances is flat (they differ by {:.0f} cm in height): this capture only "
     "tells that foot IK must leave the feet alone; to learn the rest, record the walk over steps "
     f"of {100 * STEP:.0f} cm or more"
@@ -62,11 +60,11 @@ def check(clips: Sequence[ClipData]) -> CaptureCheck:
     """What clips can tell, and how good their data are."""
     each = [stances_of(clip) for clip in clips]
     reliefs = [
-        _relief(stances) / body.ratio(clip.reference.rig)
+        relief(*_known(stances)) / body.ratio(clip.reference.rig)
         for clip, stances in zip(clips, each, strict=True)
     ]
-    flat = bool(reliefs) and max(reliefs) < RELIEF
-    lines = [FLAT.format(100 * max(reliefs))] if flat else []
+    flat = bool(reliefs) and max(reliefs) < FLAT
+    lines = [ON_FLAT_GROUND.format(100 * max(reliefs))] if flat else []
     for clip, stances in zip(clips, each, strict=True):
         source = f"{clip.reference.source}: " if len(clips) > 1 else ""
         lines += [source + line for line in _quality(clip, stances)]
@@ -121,22 +119,10 @@ def _quality(data: ClipData, stances: Stances) -> Iterator[str]:
         )
 
 
-def _relief(stances: Stances) -> float:
-    """By how much the ground differs between stances, m; a floor that is tilted a little is flat.
-
-    Infinite where no foot stands on ground.
-    """
+def _known(stances: Stances) -> tuple[np.ndarray, np.ndarray]:
+    """Places and heights of the ground, where there is some."""
     known = ~np.isnan(stances.ground)
-    ground, place = stances.ground[known], stances.place[known]
-    if not len(ground):
-        return np.inf
-    rest = ground - ground.mean()
-    if len(ground) > PLANE:
-        columns = np.column_stack([place - place.mean(axis=0), np.ones(len(place))])
-        plane = np.linalg.lstsq(columns, rest, rcond=None)[0]
-        if np.hypot(*plane[:2]) < np.tan(MAX_TILT):
-            rest = rest - columns @ plane
-    return float(np.ptp(rest))
+    return stances.place[known], stances.ground[known]
 
 
 def _trend(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

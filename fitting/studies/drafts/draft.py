@@ -7,6 +7,7 @@ from pathlib import Path
 import jaxik
 from fitting.analysis import distances, playback
 from fitting.analysis.distances import Distances
+from fitting.analysis.goodness.verdict import describe_setback
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.clips.load import AS_FOUND, ClipOptions
 from fitting.datasets.terrain.mesh_files import TerrainOptions
@@ -27,6 +28,10 @@ from .assumptions import Assumption, of_clip
 
 EXPERIMENT = "experiment.toml"
 FAST, SLOW = 45.0, 30.0  # Hz: clips above the one are resampled to the other, which is enough
+HARM = (
+    "{} as it comes does not leave these feet alone, as it must on flat ground: {}; a fit of what "
+    "is free below can stop that"
+)
 SHORTEST = 0.1  # s that is worth cutting off an end without motion
 
 
@@ -178,19 +183,24 @@ def draft(
         if not request.record_only or name in PLACES
     }
     check = capture_check.check(data)
-    if check.flat:
+    with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
+        as_it_comes = playback.play_all(ik, problem_from_clips(experiment, data).data)
+    apart = distances.measure(as_it_comes, as_it_comes)
+    if check.flat and not apart.setbacks:
         forecasts = [Forecast(name, is_free=False, reach=0, contraction=0) for name in candidates]
     else:
         problem = problem_from_clips(replace(experiment, free=candidates), data)
         with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
             forecasts = choose_free(problem.space.system, candidates, problem.data)
     free = {f.name: candidates[f.name] for f in forecasts if f.is_free}
-    if not (check.flat or free):
-        nothing = f"these clips determine no parameter of {request.preset.name}"
-        check = replace(check, lines=(nothing, *check.lines))
-    with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
-        scenes = problem_from_clips(experiment, data).data
-        as_it_comes = playback.play_all(ik, scenes)
+    lines = []
+    if check.flat and apart.setbacks:
+        lines.append(HARM.format(request.preset.name, describe_setback(apart.setbacks[0])))
+    if forecasts and not any(forecast.moves for forecast in forecasts):
+        lines.append(f"no parameter of {request.preset.name} moves anything in these clips")
+    elif not free and not check.flat:
+        lines.append(f"these clips determine no parameter of {request.preset.name}")
+    check = replace(check, lines=(*check.lines, *lines))
     return Draft(
         experiment=replace(experiment, free=free),
         grounds=grounds,
@@ -199,7 +209,7 @@ def draft(
         ),
         forecasts=tuple(forecasts),
         check=check,
-        distances=distances.measure(as_it_comes, as_it_comes),
+        distances=apart,
         rig=rig,
     )
 
