@@ -26,8 +26,8 @@ from fitting.report.goodness import record_price_report
 from fitting.report.plots import style
 from fitting.runtime.precision import in_float64
 from fitting.studies import capture_check, record_price, run_folder, translation
-from fitting.studies.assess import assess_solution
-from fitting.studies.fit import Fit, search, search_with_noise
+from fitting.studies.assess import assess_solution, search, search_with_noise
+from fitting.studies.fit import Fit
 from fitting.studies.posterior.replay import replay
 from fitting.studies.sample import SampledFit, minus_cost_at, sample_around
 from fitting.studies.translation import TranslationRequest

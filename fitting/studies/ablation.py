@@ -35,7 +35,7 @@ from fitting.runtime.validation import error_context
 from jaxik.world.similarity import similar
 
 from .animations import Animation
-from .fit import search_with_noise
+from .assess import search_with_noise
 
 NUMBERS = "contribution.json"
 

@@ -1,4 +1,4 @@
-"""The assessment of a solution, from which the search goes on where it meets a lower point."""
+"""The search of an experiment, and the assessment of its solution, which may meet a lower point."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,15 +9,77 @@ from jaxtyping import Float
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import assess_identifiability
+from fitting.inference.noise.joint import fit_with_noise
+from fitting.inference.noise.model import counted
 from fitting.inference.optimisation.kept_stages import KeptStages
-from fitting.inference.optimisation.search import refine
+from fitting.inference.optimisation.search import find_best_fit, refine
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.problem.problem import Problem
+from fitting.runtime import activity
 
-from .fit import Fit, search, weighted
+from .fit import Fit
 
 MAX_RETURNS = 3  # to the search from lower points
 MIN_IMPROVEMENT = 0.1  # of the cost: a point that much lower is worth another search
+
+
+def search(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+    first: Float[np.ndarray, " free"] | None = None,
+    kept: KeptStages | None = None,
+) -> Solution:
+    """The best fit, without any estimate of how certain it is.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of the search.
+        progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
+        first: the u from which the first descent begins; None is the experiment's.
+        kept: the stages of a search that was killed, which goes on after them.
+    """
+    return find_best_fit(
+        problem.with_weight(1.0),
+        experiment.fit.search,
+        starts=experiment.fit.starts,
+        first=first,
+        seed=experiment.seed,
+        progress=progress,
+        kept=kept,
+    )
+
+
+def search_with_noise(
+    problem: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+    kept: KeptStages | None = None,
+) -> tuple[Problem[jaxik.FootIK], Solution]:
+    """The best fit with the noise that the experiment estimates, and the problem with this noise.
+
+    Unless the experiment asks for noise that moves the best point, it only gets a weight.
+
+    Args:
+        problem: the problem of the experiment.
+        experiment: its settings of noise and search.
+        progress: as for `search`.
+        kept: as for `search`.
+    """
+    solution = search(problem, experiment, progress, kept=kept)
+    settings, noise = experiment.fit.search, experiment.noise
+    problem, solution = fit_with_noise(problem, noise, solution, settings, progress, kept)
+    return weighted(problem, experiment, solution), solution
+
+
+def weighted(
+    problem: Problem[jaxik.FootIK], experiment: Experiment, solution: Solution
+) -> Problem[jaxik.FootIK]:
+    """The problem with the weight by which the residuals at its solution count for intervals."""
+    if experiment.noise.correlation != "counted" or experiment.independent_every:
+        return problem
+    with activity.announced("Weighing the residuals"):
+        return counted(problem, solution.u)
 
 
 def assess_solution(

@@ -1,7 +1,7 @@
 """One fit: the search, what it found, and its numbers as `fit.json` holds them."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NotRequired, TypeAlias, TypedDict
@@ -11,20 +11,17 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxik
-from fitting.analysis import distances, playback
-from fitting.analysis.distances import Distances
-from fitting.analysis.goodness import groups, verdict
+from fitting.analysis import playback
+from fitting.analysis.goodness import distances, groups, verdict
+from fitting.analysis.goodness.distances import Distances
 from fitting.analysis.goodness.groups import Assumed, Group
 from fitting.analysis.goodness.verdict import Verdict
 from fitting.analysis.playback import Playback
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.problems import ClipData
 from fitting.inference.identifiability import Identifiability
-from fitting.inference.noise.joint import fit_with_noise
-from fitting.inference.noise.model import NoiseModel, counted, noise_of
-from fitting.inference.optimisation.kept_stages import KeptStages
-from fitting.inference.optimisation.search import find_best_fit
-from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.inference.noise.model import NoiseModel, noise_of
+from fitting.inference.optimisation.solution import Solution
 from fitting.inference.profiles import profile
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED
@@ -277,65 +274,6 @@ class Fit(Shown):
         if self.experiment.noise.estimates_any:
             summary["noise"] = dataclasses.asdict(self.noise)
         return summary
-
-
-def search(
-    problem: Problem[jaxik.FootIK],
-    experiment: Experiment,
-    progress: Callable[[Progress], None] | None = None,
-    first: Float[np.ndarray, " free"] | None = None,
-    kept: KeptStages | None = None,
-) -> Solution:
-    """The best fit, without any estimate of how certain it is.
-
-    Args:
-        problem: the problem of the experiment.
-        experiment: its settings of the search.
-        progress: called as the search goes on; KeyboardInterrupt keeps the best point so far.
-        first: the u from which the first descent begins; None is the experiment's.
-        kept: the stages of a search that was killed, which goes on after them.
-    """
-    return find_best_fit(
-        problem.with_weight(1.0),
-        experiment.fit.search,
-        starts=experiment.fit.starts,
-        first=first,
-        seed=experiment.seed,
-        progress=progress,
-        kept=kept,
-    )
-
-
-def search_with_noise(
-    problem: Problem[jaxik.FootIK],
-    experiment: Experiment,
-    progress: Callable[[Progress], None] | None = None,
-    kept: KeptStages | None = None,
-) -> tuple[Problem[jaxik.FootIK], Solution]:
-    """The best fit with the noise that the experiment estimates, and the problem with this noise.
-
-    Unless the experiment asks for noise that moves the best point, it only gets a weight.
-
-    Args:
-        problem: the problem of the experiment.
-        experiment: its settings of noise and search.
-        progress: as for `search`.
-        kept: as for `search`.
-    """
-    solution = search(problem, experiment, progress, kept=kept)
-    settings, noise = experiment.fit.search, experiment.noise
-    problem, solution = fit_with_noise(problem, noise, solution, settings, progress, kept)
-    return weighted(problem, experiment, solution), solution
-
-
-def weighted(
-    problem: Problem[jaxik.FootIK], experiment: Experiment, solution: Solution
-) -> Problem[jaxik.FootIK]:
-    """The problem with the weight by which the residuals at its solution count for intervals."""
-    if experiment.noise.correlation != "counted" or experiment.independent_every:
-        return problem
-    with activity.announced("Weighing the residuals"):
-        return counted(problem, solution.u)
 
 
 def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:

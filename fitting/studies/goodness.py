@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NotRequired, TypedDict
 
-from fitting.analysis.distances import Distances
+from fitting.analysis.goodness.distances import Distances
 from fitting.analysis.goodness.groups import Group
 from fitting.analysis.goodness.verdict import Verdict, describe_setback
 

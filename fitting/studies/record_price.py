@@ -14,7 +14,8 @@ from fitting.inference.optimisation.solution import Progress
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 
-from .fit import Fit, search
+from .assess import search
+from .fit import Fit
 
 
 @dataclasses.dataclass(frozen=True)

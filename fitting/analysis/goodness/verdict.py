@@ -10,10 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fitting.analysis.distances import CLOSE, Distances, Part, Setback
-
 from . import groups as kinds
 from . import noise
+from .distances import CLOSE, Distances, Part, Setback
 from .groups import Assumed, Group
 
 SIGNIFICANT = 1e-3  # p-value, over all groups, above which nothing is a finding

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from fitting.analysis.distances import CLOSE, MOTIONS, Distances
+from fitting.analysis.goodness.distances import CLOSE, MOTIONS, Distances
 from fitting.analysis.goodness.groups import Group
 from fitting.analysis.goodness.verdict import NAMES, PARTS, SMALL, size
 from fitting.report.formatting import Table, number, percent

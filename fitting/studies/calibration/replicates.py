@@ -27,8 +27,8 @@ from fitting.problem.problem import Problem
 from fitting.problem.simulation import simulate
 from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
-from fitting.studies.assess import assess_solution
-from fitting.studies.fit import FittedParameter, Interval, search_with_noise
+from fitting.studies.assess import assess_solution, search_with_noise
+from fitting.studies.fit import FittedParameter, Interval
 from fitting.studies.sample import sample_around, with_open_noise
 
 DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99

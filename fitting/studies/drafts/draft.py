@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jaxik
-from fitting.analysis import distances, playback
-from fitting.analysis.distances import Distances
+from fitting.analysis import playback
+from fitting.analysis.goodness import distances
+from fitting.analysis.goodness.distances import Distances
 from fitting.analysis.goodness.verdict import describe_setback
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.clips.load import AS_FOUND, ClipOptions

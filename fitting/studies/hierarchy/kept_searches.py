@@ -22,7 +22,7 @@ from fitting.runtime.storage.declared_types import Finite
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import Content, error_context
 from fitting.studies.ablation import labelled
-from fitting.studies.fit import search_with_noise
+from fitting.studies.assess import search_with_noise
 
 SEARCHES = "searches"
 
@@ -71,7 +71,7 @@ class KeptSearches:
             KeyboardInterrupt: the search was interrupted; it goes on when it is called again.
             ValueError: a file in the folder is something else.
         """
-        noise = self.experiment.noise if with_its_noise else NoiseOptions()
+        noise = self.experiment.noise if with_its_noise else NoiseOptions(correlation="given")
         path = self._path(problem, noise)
         found = None if path is None else _read(path, problem.space.size)
         if found is None:

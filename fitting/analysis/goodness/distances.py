@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from .playback import Playback
-from .worst_window import PER_LEG
+from fitting.analysis.playback import Playback
+from fitting.analysis.worst_window import PER_LEG
 
 Part: TypeAlias = Literal["fitted", "held_out"]
 Motion: TypeAlias = Literal["animation", "before", "fitted"]
