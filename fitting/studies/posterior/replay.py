@@ -90,7 +90,7 @@ class _Clip:
         self._scene: Scene = problem.data[index]
         self._random = np.random.default_rng([seed, index])
         self._density = NoiseDensity(problem.loss, float(problem.tails))
-        self._fraction = float(problem.weight)
+        self._weight = float(problem.weight)
         self._frames: list[Float[np.ndarray, " frames"]] = []
         self._statistics: dict[str, list[np.ndarray]] = defaultdict(list)
         self._channels: dict[str, list[np.ndarray]] = defaultdict(list)
@@ -108,14 +108,14 @@ class _Clip:
         given = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
         ratios = {kind: sigma / given[kind] for kind, sigma in sigmas.items()}
         frames = likelihoods.of_frames(played, self._scene, self._density, ratios)
-        self._frames.append(self._fraction * frames)
+        self._frames.append(self._weight * frames)
         self._last = played
         if not replicated:
             return
         for kind in self.kinds:
             plain, _, active = groups.series(played, kind)
             correlation = float(self._scene.sigmas.correlation_of(kind))
-            process = NoiseProcess(self._density, correlation, self._fraction)
+            process = NoiseProcess(self._density, correlation, min(1.0, self._weight))
             noise = process.draw(self._random, (len(plain), plain.shape[1]))
             both = (plain / ratios.get(kind, 1.0), noise)
             rows = [predictive.statistics_of(residuals, active) for residuals in both]
