@@ -28,6 +28,7 @@ from fitting.experiments import experiment_files, parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.systems import Preset
 from fitting.inference.noise.model import NoiseModel
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
 from fitting.problem.problem import Problem
@@ -133,7 +134,11 @@ def load_fit(run: Path) -> tuple[Experiment, FitSummary]:
     _check_files(run, (EXPERIMENT, FIT, PARAMETERS))
     summary = _load_summary(run)
     _check_toml_format(run / EXPERIMENT)
-    return experiment_files.load_experiment(run / EXPERIMENT), summary
+    experiment = experiment_files.load_experiment(run / EXPERIMENT)
+    if "distances" not in summary:  # of an earlier release, with its defaults
+        noise = experiment.noise if "noise" in summary else NoiseOptions(correlation="given")
+        experiment = dataclasses.replace(experiment, holdout=0.0, noise=noise)
+    return experiment, summary
 
 
 def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:

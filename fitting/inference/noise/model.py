@@ -18,6 +18,7 @@ from fitting.problem.shared_world import run_scenes
 from fitting.problem.space import Vector
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
+from fitting.runtime.storage.declared_types import FORMERLY
 
 from . import series
 from .series import Errors
@@ -41,7 +42,7 @@ class NoiseModel:
     """From one frame to the next."""
     tails: float
     """Degrees of freedom of Student's t, under the loss `student`."""
-    weight: float
+    weight: float = dataclasses.field(metadata={FORMERLY: "independent_fraction"})
     """Of the log-likelihood, for intervals and posterior."""
 
     def __post_init__(self) -> None:

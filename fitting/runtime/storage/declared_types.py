@@ -2,7 +2,8 @@
 
 The declaration says what is written; here it also says what is accepted when it is read again.
 `Annotated[float, constraint]` narrows a type by a `Constraint` of `runtime.validation`;
-`Annotated[Content, SomeClass]` is a table with the fields of a dataclass, and no others.
+`Annotated[Content, SomeClass]` is a table with the fields of a dataclass, and no others; a field
+may have metadata that say by which name earlier releases wrote it.
 """
 
 import dataclasses
@@ -24,6 +25,7 @@ from typing import (
 
 from fitting.runtime.validation import Constraint, Table
 
+FORMERLY = "formerly"  # in the metadata of a field: its name in earlier releases
 LARGEST = 1e300  # of whole numbers that are read as floats
 Finite: TypeAlias = Annotated[float, Constraint("a finite number", lambda x: abs(x) < math.inf)]
 PLAIN = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
@@ -110,7 +112,10 @@ class _Check:
         if is_typeddict(declared):
             required = declared.__required_keys__
         else:
-            required = {field.name for field in dataclasses.fields(declared)}
+            fields = dataclasses.fields(declared)
+            required = {field.name for field in fields}
+            names = {field.metadata.get(FORMERLY, field.name): field.name for field in fields}
+            value = {names.get(key, key): entry for key, entry in value.items()}
             if unknown := sorted(set(value) - required):
                 raise ValueError(f"{where or 'it'} has an unknown {', '.join(unknown)}")
         if self.essential is not None:
