@@ -59,7 +59,8 @@ def _experiment() -> tuple[Experiment, float]:
     known = dict(known_values.load_known_values(whole) or {})
     true_value = known.pop(FREE)
     parameters = {**whole.parameters, **known}
-    return dataclasses.replace(whole, free={FREE: {}}, parameters=parameters), true_value
+    changed = {"free": {FREE: {}}, "parameters": parameters, "loss": "squares"}
+    return dataclasses.replace(whole, **changed), true_value
 
 
 def _descend(problem: Problem, values: dict[str, float], steps: int) -> LMState:

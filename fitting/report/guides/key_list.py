@@ -33,7 +33,8 @@ def _rows(schema: Content, path: str = "") -> Iterator[list[str]]:
         if "description" not in entry:  # the parameters of a stage
             continue
         default = entry.get("default", "")
-        text = str(default).lower() if isinstance(default, bool) else str(default)
+        text = f"{default:.4g}" if isinstance(default, float) else str(default)
+        text = text.lower() if isinstance(default, bool) else text
         value, meaning = _value(entry), entry["description"]
         if len(value) > WIDEST:
             value, meaning = "choice", f"{meaning} One of {value}."
