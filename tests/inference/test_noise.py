@@ -1,6 +1,7 @@
 """Noise that is estimated with the parameters: against SciPy's optima, and against simulation."""
 
 import dataclasses
+import functools
 import math
 from typing import Any, get_args
 
@@ -21,13 +22,13 @@ from fitting.inference.noise import marginal, model, series
 from fitting.inference.noise.density import NoiseDensity
 from fitting.inference.noise.model import NoiseModel, noise_of, with_noise
 from fitting.inference.noise.settings import NoiseOptions
-from fitting.problem.loss import CAUCHY, Loss, apply_loss
+from fitting.problem.loss import CAUCHY, HUBER, Loss, apply_loss
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_by_kind
-from fitting.problem.scene import Scene
+from fitting.problem.scene import LEAST_SIGMAS, Scene
 from fitting.problem.simulation import autoregression
 from fitting.studies import run_folder
-from fitting.studies.fit import search_with_noise
+from fitting.studies.assess import search_with_noise
 from support.experiments import ROOT
 
 BOTH = NoiseOptions("estimated", "whitened")
@@ -253,21 +254,119 @@ def test_intervals_with_estimated_noise_cover_the_truth(no_pipeline, rho, outlie
     assert covered >= 6
 
 
-def test_correlation_is_counted_as_fewer_residuals(correlated, no_pipeline):
-    options = NoiseOptions("given", "counted")
-    noise = model.likeliest_noise(correlated, correlated.space.start, options)
-    assert noise.independent_fraction == pytest.approx(0.4 / 1.6, rel=0.1)
-    assert noise.sigmas == noise_of(correlated).sigmas
-    assert noise.correlations == noise_of(correlated).correlations
+def test_noise_that_no_capture_has_is_refused(correlated, no_pipeline):
+    u = correlated.space.start
+    tiny = resized(simulated(resized(correlated, 0.01), u, 0.0, seed=5), 100.0)
+    message = 'ankle has collapsed: its likeliest sigma is 2e-05, .*correlation = "counted" in'
+    with pytest.raises(model.NoiseCollapse, match=message):
+        model.likeliest_noise(tiny, u, NoiseOptions("estimated"))
+    whitened = model.likeliest_noise(tiny, u, NoiseOptions(correlation="whitened"))
+    assert whitened.sigmas == noise_of(tiny).sigmas
+
+
+# The weight, which counts residuals for intervals and moves no optimum
+
+INFLUENCES: dict[Loss, Any] = {  # derivatives of half the losses
+    "squares": lambda r: r,
+    "huber": lambda r: np.clip(r, -HUBER, HUBER),
+    "cauchy": lambda r: r / (1 + (r / CAUCHY) ** 2),
+}
+
+
+def resized(problem: FootProblem, factor: float) -> FootProblem:
+    """The problem with its sigmas times a factor."""
+    noise = noise_of(problem)
+    sigmas = {kind: factor * sigma for kind, sigma in noise.sigmas.items()}
+    return with_noise(problem, dataclasses.replace(noise, sigmas=sigmas))
+
+
+@pytest.mark.parametrize("loss", INFLUENCES)
+@pytest.mark.parametrize(("rho", "scale"), [(0.0, 1.0), (0.6, 1.0), (0.0, 2.0)])
+def test_the_weight_is_the_curvature_over_the_variance_of_the_score(
+    correlated, no_pipeline, loss, rho, scale
+):
+    """Against integrals over the normal distribution, where 4 frames of the correlated are worth 1;
+    of squares the weights are 1, 1/4 and 1/4."""
+    problem, u = dataclasses.replace(correlated, loss=loss), correlated.space.start
+    captured = resized(simulated(resized(problem, scale), u, rho, seed=5), 1 / scale)
+    r = np.linspace(-40, 40, 80_001)
+    density = stats.norm.pdf(r / scale) / scale * (r[1] - r[0])
+    influence = INFLUENCES[loss](r)
+    expected = density @ np.gradient(influence, r) / (density @ influence**2)
+    expected *= (1 - rho) / (1 + rho)
+    counted = model.counted(captured, u)
+    assert float(counted.weight) == pytest.approx(expected, rel=0.1)
+    assert noise_of(counted).sigmas == noise_of(captured).sigmas
+    assert noise_of(counted).correlations == noise_of(captured).correlations
+
+
+def test_no_residual_counts_as_smaller_than_the_least_sigma(correlated, no_pipeline):
+    u = correlated.space.start
+    exact = resized(simulated(resized(correlated, 1e-6), u, 0.0, seed=5), 1e6)
+    counts = {kind: 2.0 if kind in ("ankle", "knee", "foot") else 1.0 for kind in KINDS}
+    squares = {
+        kind: (LEAST_SIGMAS[kind] / sigma) ** 2 for kind, sigma in noise_of(exact).sigmas.items()
+    }
+    expected = sum(counts.values()) / sum(counts[kind] * squares[kind] for kind in KINDS)
+    assert model.likelihood_weight(exact, u) == pytest.approx(expected, rel=0.1)
+
+
+def test_a_weight_does_not_move_the_best_fit(correlated, no_pipeline):
+    plain = dataclasses.replace(walk(BOTH)[0], noise=NoiseOptions())
+    given = dataclasses.replace(plain, noise=NoiseOptions(correlation="given"))
+    every = dataclasses.replace(plain, independent_every=0.3)
+    pairs = ((correlated, given), (correlated, plain), (correlated.with_weight(0.1), every))
+    fits = [search_with_noise(*pair) for pair in pairs]
+    weights = [float(problem.weight) for problem, _ in fits]
+    np.testing.assert_allclose(weights, [1.0, 0.4 / 1.6, 0.1], rtol=0.15)
+    for _, solution in fits[1:]:
+        np.testing.assert_array_equal(solution.u, fits[0][1].u)
+        assert solution.cost == fits[0][1].cost
+
+
+def test_intervals_contain_the_truth_under_correlated_noise_of_another_size(
+    correlated, no_pipeline
+):
+    """The region of both parameters, of 200 draws of noise twice as large as its sigma."""
+    problem = dataclasses.replace(only_ankles(correlated), loss="huber")
+    (scene,), truth = problem.data, problem.space.start
+    (errors,) = errors_by_kind(problem.space.unpack(truth), (scene,))
+    shift = errors["ankle"] - scene.tracks["ankle"]
+    sigma = 2 * noise_of(problem).sigmas["ankle"]
+    random, inside = np.random.default_rng(0), []
+
+    @jax.jit
+    def evaluate(u: jax.Array, ankle: jax.Array) -> tuple[jax.Array, jax.Array]:
+        own = dataclasses.replace(scene, tracks={**scene.tracks, "ankle": ankle})
+        of_own = dataclasses.replace(problem, data=(own,))
+        return of_own.residuals(u), jax.jacfwd(of_own.residuals)(u)
+
+    for _ in range(200):
+        noise = sigma * autoregression(random.normal(size=errors["ankle"].shape), 0.6)
+        ankle = jnp.asarray(noise) - shift
+
+        def at(u: Any, part: int = 0, ankle: jax.Array = ankle) -> np.ndarray:
+            return np.asarray(evaluate(jnp.asarray(u), ankle)[part])
+
+        jacobian: Any = functools.partial(at, part=1)
+        best = optimize.least_squares(at, truth, jac=jacobian)
+        own = dataclasses.replace(scene, tracks={**scene.tracks, "ankle": ankle})
+        weight = model.likelihood_weight(dataclasses.replace(problem, data=(own,)), best.x)
+        rise = 0.5 * float(np.sum(at(truth) ** 2)) - best.cost
+        inside.append(weight * rise <= 0.5 * stats.chi2.ppf(0.95, 2))
+    assert 0.91 < np.mean(inside) < 0.985
+
+
+def only_ankles(problem: FootProblem) -> FootProblem:
+    (scene,) = problem.data
+    off = {kind: jnp.asarray(jnp.inf) for kind in KINDS[1:]}
+    scene = dataclasses.replace(scene, sigmas=dataclasses.replace(scene.sigmas, **off))
+    return dataclasses.replace(problem, data=(scene,))
 
 
 def test_open_sigmas_are_integrated_out(correlated):
     """Against a sum over a grid of log-sigmas, of which one is open."""
-    only_ankles = dataclasses.replace(
-        correlated.data[0].sigmas, **{kind: jnp.asarray(jnp.inf) for kind in KINDS[1:]}
-    )
-    scene = dataclasses.replace(correlated.data[0], sigmas=only_ankles)
-    problem = dataclasses.replace(correlated, data=(scene,), independent_fraction=jnp.asarray(0.5))
+    problem = only_ankles(correlated).with_weight(0.5)
     opened = marginal.with_unknown_sigmas(problem)
     assert opened.unknown_sigmas is not None and opened.unknown_sigmas.shape[0] == 1
     points = np.asarray(problem.space.start) + np.array([[0.0, 0.0], [0.2, -0.1]])
@@ -275,7 +374,7 @@ def test_open_sigmas_are_integrated_out(correlated):
     expected = []
     for u in points:
         residuals = np.asarray(problem.residuals(jnp.asarray(u)))
-        squares, prior = np.sum(residuals[:-2] ** 2), np.sum(residuals[-2:] ** 2)
+        squares, prior = np.sum(residuals[:-2] ** 2), np.sum(residuals[-2:] ** 2) / 0.5
         count = 0.5 * float(opened.unknown_sigmas.sum())
         logs = -count * log_sigmas - 0.5 * squares * np.exp(-2 * log_sigmas)
         expected.append(np.logaddexp.reduce(logs) - 0.5 * prior)

@@ -170,7 +170,8 @@ def likelihood_weight(problem: Problem[jaxik.FootIK], u: Vector) -> float:
             values, count = residuals.values[scores.active], int(scores.active.sum())
             steps = _influence(problem, values + STEP) - _influence(problem, values - STEP)
             curvature += count * max(float(steps.mean()) / (2 * STEP), LEAST_SLOPE)
-            rho = series.likeliest([scores], "squares", noise.tails, None).correlation
+            # Not of the scores, which a robust loss makes less like an autoregression.
+            rho = series.likeliest([residuals], problem.loss, noise.tails, None).correlation
             frames = min((1 + rho) / (1 - rho), len(scores.values))
             squares = max(
                 float(np.mean(scores.values[scores.active] ** 2)), (LEAST_SIGMAS[kind] / sigma) ** 2
