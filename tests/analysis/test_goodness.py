@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from fitting.analysis import worst_window
-from fitting.analysis.goodness import verdict
+from fitting.analysis.goodness import distances, verdict
 from fitting.analysis.goodness.groups import Assumed, measure_groups
 from fitting.analysis.goodness.noise import MEDIAN
 from fitting.analysis.goodness.verdict import Verdict
@@ -21,6 +21,7 @@ from fitting.problem.simulation import autoregression
 from support.playbacks import FPS, FRAMES, SHAPES, SIGMAS, error, playback
 
 KINDS = ("ankle", "knee", "pelvis")
+FINE = {kind: 0.1 * SIGMAS[kind] for kind in KINDS}  # with noise too small to be seen
 SEEDS = 20  # each violation must be found in all of them
 RHO = 0.95
 ASSUMED = {"correlation": RHO}
@@ -34,8 +35,8 @@ def simulate(seed: int, *, rho: float = 0.0, scale: float = 1.0, outliers: float
     for kind in KINDS:
         values = scale * autoregression(random.normal(size=(FRAMES, *SHAPES[kind])), rho)
         values += 10 * random.normal(size=values.shape) * (random.random(values.shape) < outliers)
-        errors[kind] = SIGMAS[kind] * values
-    return playback(errors)
+        errors[kind] = FINE[kind] * values
+    return playback(errors, FINE)
 
 
 def whiten(play: Playback, rho: float) -> Playback:
@@ -52,7 +53,7 @@ def judge(play: Playback, correlation: float = 0.0, **assumed) -> Verdict:
     assumptions = Assumed(**assumed)
     given: list[dict[str, float]] = [dict.fromkeys(KINDS, correlation)]
     groups = measure_groups([whiten(play, correlation)], given, assumptions)
-    return verdict.judge(groups, assumptions)
+    return verdict.judge(groups, assumptions, distances.measure([play], [play]))
 
 
 # The verdict on simulated noise
@@ -63,7 +64,7 @@ def judge(play: Playback, correlation: float = 0.0, **assumed) -> Verdict:
     [
         ({}, {}),
         ({"rho": RHO}, {"correlation": RHO}),
-        ({"rho": RHO}, {"independent_fraction": (1 - RHO) / (1 + RHO)}),
+        ({"rho": RHO}, {"weight": (1 - RHO) / (1 + RHO)}),
         ({"outliers": 0.03}, {"loss": "cauchy"}),
     ],
 )
@@ -115,13 +116,13 @@ def test_what_is_otherwise_than_assumed_is_named(made, given, said, not_said):
 
 def with_bump(play: Playback, kind: str, size: float, frames: slice) -> Playback:
     """A playback with a smooth misfit of so many sigmas, rms in these frames."""
-    errors = np.array(play.errors[kind])
+    errors, sigma = np.array(play.errors[kind]), play.sigmas[kind]
     arch = np.sin(np.linspace(0, np.pi, frames.stop - frames.start)) * np.sqrt(2)
-    errors[frames] += SIGMAS[kind] * size * arch.reshape(-1, *[1] * (errors.ndim - 1))
+    errors[frames] += sigma * size * arch.reshape(-1, *[1] * (errors.ndim - 1))
     return dataclasses.replace(
         play,
         errors={**play.errors, kind: errors},
-        residuals={**play.residuals, kind: errors / SIGMAS[kind]},
+        residuals={**play.residuals, kind: errors / sigma},
     )
 
 

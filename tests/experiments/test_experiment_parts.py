@@ -30,6 +30,42 @@ from jaxik.world import body
 from support.bodies import scaled
 from support.experiments import CLIP, ROOT, write
 
+# Frames that are held out
+
+PARTS = {"first": f"{CLIP}end = 4.0\n", "second": f"{CLIP}start = 5.0\nend = 7.0\n"}
+
+
+@pytest.mark.parametrize(
+    ("top", "more", "fitted"),
+    [
+        ("holdout = 0.25", "", (0.75, 1.0)),
+        ("", "", (2 / 3, 1.0)),
+        ("", "held_out = true\n", (1, 0)),
+    ],
+)
+def test_the_end_of_a_long_clip_is_held_out_or_a_whole_clip(tmp_path, top, more, fitted):
+    clips = "".join(PARTS.values()) + more
+    experiment = load_experiment(write(tmp_path, top=f"fps = 15\n{top}", clips=clips))
+    for scene, share in zip(make_problem(experiment).data, fitted, strict=True):
+        frames = np.arange(scene.frames.dt.size)
+        np.testing.assert_array_equal(scene.reference.observed, frames < share * frames.size - 0.5)
+        np.testing.assert_array_equal(scene.reference.held_out, ~scene.reference.observed)
+
+
+def test_what_cannot_be_fitted_is_refused(tmp_path):
+    experiment = load_experiment(write(tmp_path))
+    alone = replace(experiment.clips[0], held_out=True)
+    for changed, message in (
+        ({"clips": (alone,)}, "all clips are held out; wanted one that is not"),
+        (
+            {"sigmas": {"foot": 0.001}},
+            r"\[sigmas\]: foot is 0.001; wanted 0.00175 or more \(m, rad",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(experiment, **changed)
+
+
 # Hierarchies, and parameters that follow the body
 
 BASE = ROOT / "data" / "clips" / "uneven_walk_base.npz"

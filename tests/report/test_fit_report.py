@@ -18,11 +18,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from fitting.analysis import limit_activity, playback
+from fitting.analysis.goodness import verdict
 from fitting.datasets.synthetic import walker
 from fitting.experiments import experiment_files, known_values
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.problems import ClipData, make_scene
 from fitting.inference.identifiability import Identifiability
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.inference.sampling import inference_data
 from fitting.inference.sampling.islands import Island
@@ -136,10 +138,12 @@ def test_known_values_are_those_of_the_first_clip_that_has_any(experiment, tmp_p
         known_values.load_known_values(replace(experiment, clips=(broken,)))
 
 
-def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(fitted):
+def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(fitted, experiment):
     text = fit_report.fit_text(fitted)
-    assert text.startswith("Not converged")
-    assert "Cost 900 before, 100 after" in text
+    assert text.startswith(fitted.verdict.sentence) and "\nNot converged: the 8 steps" in text
+    assert "Cost 900 before, 100 after: 8 steps" in text
+    distance = verdict.size("ankle", fitted.distances.parts["fitted"]["fitted"]["ankle"])
+    assert re.split(r"\s{2,}", line_of(text, "ankles  "))[1::3] == ["fitted", distance]
     # 0.11 against 0.10 in a range from 0 to 0.4; 0.3 against 0.5 in one from 0.01 to 0.95.
     planted = line_of(text, "contact.planted_height")
     assert "0.11 " in planted and "2.5 % of range" in planted and "0.1 to 0.12" in planted
@@ -148,7 +152,9 @@ def test_the_text_of_a_fit_has_values_truth_bounds_and_undetermined_parameters(f
     assert "at least 0.85" in soften and "at its upper bound" in soften
     assert "unknown" in soften
     assert text.endswith("1 of 2 determined parameters within 5 % of their range")
-    text = fit_report.fit_text(replace(fitted, known_values=None))
+    whitened = replace(experiment, noise=NoiseOptions(correlation="whitened"))
+    text = fit_report.fit_text(replace(fitted, known_values=None, experiment=whitened))
+    assert "100 after (both with the noise estimated here)" in text
     assert "truth" not in text and "determined parameters within" not in text
     # A gain is shown as half-life, s, and at 30 and 60 Hz.
     name, half_life, *_, gain, gain_at_60 = text.split("gain at 60 Hz")[1].split()[-5:]
@@ -231,7 +237,7 @@ def test_the_goodness_of_fit_has_a_row_for_each_kind_and_clip(fitted, twice):
     assert set(by_kind) == set(playback.RESIDUAL_KINDS)
     assert by_kind["ankle"]["correlation"] == 0.4 and by_kind["contact"]["p"] is None
     # What a translation leaves is measured in tolerances.
-    (_, sentence, *texts) = goodness_report.section(replace(fitted, has_noise=False))
+    (_, sentence, _, *texts) = goodness_report.section(replace(fitted, has_noise=False))
     assert sentence.startswith(("**Not the same motion: ", "**The same motion"))
     assert "tolerance | error, rms |" in texts[1] and len(texts) == 2
 

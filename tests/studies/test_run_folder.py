@@ -20,6 +20,7 @@ import jax
 import numpy as np
 import pytest
 
+from fitting.analysis.goodness.distances import CLOSE, Distances, Kinds, Motion
 from fitting.experiments import experiment_files, parameter_files, problems, systems
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.sampling.chain import Chain
@@ -27,7 +28,8 @@ from fitting.inference.sampling.chain_file import Identity
 from fitting.inference.sampling.posterior import digest
 from fitting.runtime.storage.claimed_folder import LOCK, claimed
 from fitting.studies import assess, run_folder
-from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings, search
+from fitting.studies.assess import search
+from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
 from fitting.studies.sample import walker_start
 from fuzz import kept_files
 from jaxik.maths import parameter_tree
@@ -57,6 +59,7 @@ def sampled(fitted, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("sampled") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Fit, "groups", [])
+        patch.setattr(Fit, "distances", Distances({}))
         save(run, fitted)
     seed, thin_by = fitted.experiment.seed, fitted.experiment.sample.thin_by
     make_chain(run / run_folder.CHAIN, Identity(NAMES, 8, seed, thin_by, digest(fitted.problem)))
@@ -104,13 +107,51 @@ def test_a_run_holds_the_experiment_the_system_and_the_numbers(fitted, sampled):
     assert (experiment.free, experiment.clips) == (fitted.experiment.free, fitted.experiment.clips)
 
 
+def test_a_run_keeps_the_better_parameters_and_the_fitted_ones_beside_them(
+    fitted, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(Fit, "groups", [])
+    near, far = (dict.fromkeys(CLOSE, size) for size in (0.01, 0.05))
+    motions: dict[Motion, Kinds] = {"animation": far, "before": near, "fitted": far}
+    values = [dict(zip(NAMES, fitted.solution.values, strict=True))]
+    space = fitted.problem.space
+    values.append(dict(zip(NAMES, space.values(space.pack({})), strict=True)))
+
+    def kept(name: str) -> dict[str, Any]:
+        ik, _ = parameter_files.load_system(tmp_path / name)
+        return {name: pytest.approx(float(parameter_tree.get(ik, name))) for name in NAMES}
+
+    monkeypatch.setattr(Fit, "distances", Distances({"held_out": motions}))
+    save(tmp_path, fitted := dataclasses.replace(fitted))
+    assert [kept(run_folder.FITTED_PARAMETERS), kept(run_folder.PARAMETERS)] == values
+    _, summary = run_folder.load_fit(tmp_path)
+    assert summary["distances"]["kept"] == "before"  # type: ignore[typeddict-item]
+    assert len(summary["distances"]["setbacks"]) == len(CLOSE)  # type: ignore[typeddict-item]
+    monkeypatch.setattr(Fit, "distances", Distances({}))
+    save(tmp_path, dataclasses.replace(fitted))
+    assert kept(run_folder.PARAMETERS) == values[0]
+    assert not (tmp_path / run_folder.FITTED_PARAMETERS).exists()
+
+
 def test_the_experiment_in_a_run_does_not_need_its_original_file(fitted, tmp_path):
     sigmas = {"ankle": 0.01, "body": math.inf, "correlation.ankle": 0.9, "correlation.foot": 0.5}
     noise = NoiseOptions("estimated", "whitened")
-    changed = dataclasses.replace(fitted.experiment, sigmas=sigmas, noise=noise)
+    changes = {"sigmas": sigmas, "noise": noise, "loss": "squares", "holdout": 0.25}
+    changed = dataclasses.replace(fitted.experiment, **changes)
     (tmp_path / "again.toml").write_text(experiment_files.experiment_to_toml(changed))
     again = experiment_files.load_experiment(tmp_path / "again.toml")
-    for field in ("clips", "free", "preset", "name", "fps", "loss", "seed", "parameters", "fit"):
+    for field in (
+        "clips",
+        "free",
+        "preset",
+        "name",
+        "fps",
+        "loss",
+        "holdout",
+        "seed",
+        "parameters",
+        "fit",
+    ):
         assert getattr(again, field) == getattr(changed, field), field
     assert (again.sample, again.sigmas, again.noise) == (changed.sample, sigmas, noise)
     (scene,) = problems.make_problem(again).data
@@ -294,6 +335,8 @@ def test_a_released_fit_is_read_and_applied_but_its_chain_is_refused(
     experiment, summary = run_folder.load_fit(run)
     values = {row["name"]: row["value"] for row in summary["parameters"]}
     assert values == pytest.approx(quick.TARGETS, abs=0.001)
+    assert (experiment.loss, experiment.holdout) == ("squares", 0.0), "as it was fitted"
+    assert experiment.noise == NoiseOptions(correlation="given")
     space = problems.make_problem(experiment).space
     start = walker_start(summary["parameters"], space)
     started = dict(zip(space.names, space.values(start.u).tolist(), strict=True))
@@ -304,6 +347,11 @@ def test_a_released_fit_is_read_and_applied_but_its_chain_is_refused(
     small_studies.quick_fits(monkeypatch)
     line = refusal(["sample", run], run, capsys)
     assert "chain.h5 holds the chain of another run" in line and "delete the file" in line
+    numbers = json.loads((run / run_folder.FIT).read_text())
+    noise = {"sigmas": {"ankle": 0.02}, "correlations": {"ankle": 0.9}, "tails": 4.0}
+    numbers["noise"] = noise | {"independent_fraction": 0.2}  # as before 0.2.0 was released
+    (run / run_folder.FIT).write_text(json.dumps(numbers))
+    assert run_folder.load_fit(run)[1].get("noise") == noise | {"weight": 0.2}
 
 
 # Damaged: one sentence names what is, and nothing that was whole is changed

@@ -127,6 +127,9 @@ def test_the_folder_is_a_run_with_the_same_problem(run, clip, monkeypatch):
     small_studies.quick_fits(monkeypatch)
     experiment, summary = run_folder.load_fit(run)
     assert set(experiment.free) == set(quick.TARGETS) and summary["converged"]
+    sentence = summary["goodness"]["sentence"]  # of tolerances, not of noise
+    assert sentence.startswith(("The same motion", "Not the same motion"))
+    assert sentence in (run / "summary.md").read_text()
     text = (run / "experiment.toml").read_text()
     base = Path(os.path.relpath(clip, run)).as_posix()
     assert 'reference = "source.npz"' in text and f'base = "{base}"' in text

@@ -47,10 +47,11 @@ def playback(
         for kind, shape in SHAPES.items()
     }
     all_errors, all_sigmas = zeros | (errors or {}), SIGMAS | (sigmas or {})
-    captured = standing(LEVEL)
-    after = dataclasses.replace(
-        captured, **{k: getattr(captured, k) + all_errors[k] for k in ("ankle", "knee", "pelvis")}
-    )
+    before, captured = standing(0.0), standing(LEVEL)
+    positions = {kind: getattr(captured, kind) for kind in ("ankle", "knee", "pelvis")}
+    moved = {kind: pos + all_errors[kind] for kind, pos in positions.items()}
+    after = dataclasses.replace(captured, **moved)
+    animated = {kind: getattr(before, kind) - pos for kind, pos in positions.items()}
     seen = fields.get("seen", np.ones(FRAMES, bool))
     seen_by_kind = {kind: seen[1:-1] if kind == "smooth" else seen for kind in RESIDUAL_KINDS}
     residuals = {
@@ -60,13 +61,14 @@ def playback(
     per_foot = np.ones((FRAMES, 2))
     ground = np.zeros((FRAMES, 2, 3)) + [0.0, LEVEL, 0.0]
     play = Playback(
-        before=standing(0.0), after=after, captured=captured,
+        before=before, after=after, captured=captured,
         up_ws=np.array([0.0, 1.0, 0.0]), forward_ws=np.zeros((FRAMES, 3)) + [0.0, 0.0, 1.0],
         ground_ws=ground, grounded=per_foot, ball_ground_ws=ground, ball_grounded=per_foot,
         floor=np.zeros(FRAMES), dt=np.full(FRAMES, 1 / FPS),
         contact=per_foot, locked=0 * per_foot, reached=per_foot, stance=per_foot,
-        slide=np.zeros(FRAMES), seen=seen, present=np.ones(2, bool),
-        errors=all_errors, residuals=residuals,
+        slide=np.zeros(FRAMES), present=np.ones(2, bool),
+        seen=seen, held_out=np.zeros(FRAMES, bool),
+        errors=all_errors, animated_errors=zeros | animated, residuals=residuals,
         sigmas={kind: np.asarray(sigma) for kind, sigma in all_sigmas.items()}, label="captured",
     )  # fmt: skip
     return dataclasses.replace(play, **fields)
