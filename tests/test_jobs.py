@@ -59,10 +59,11 @@ FIT_WORK = [
     *READ_AND_PREPARE,
     ("Preparing the programs of the search", (search, "_begin")),
     ("Searching from up to 6 starts", (search, "search_from")),
+    ("Weighing the residuals",),
     ("Following 2 parameters over their ranges", (profiling, "lowest")),
     ("Writing the motions and numbers of the fit", (run_folder, "save_clip")),
-    ("Playing the clips with the fitted system", PLAY),
     ("Playing the clips with the system before the fit", PLAY),
+    ("Playing the clips with the fitted system", PLAY),
     ("Drawing the curves of the parameters", (fit_report, "_draw_profiles")),
     (f"Drawing {NAME}", (fit_report, "_draw_clip")),
     ("Measuring where limits are in effect", (fit_report.limit_activity, "measure"), PLAY),
@@ -311,10 +312,11 @@ def test_a_fit_can_be_used_and_systems_be_run_on_its_clips_where_jax_has_32_bits
             problem.space.pack(ik),
             parameter_tree.get(ik, "pelvis.on_gain"),
             done.fitted.results[0].body.pos,
-            assess_identifiability(problem, solution).contraction,
+            assess_identifiability(problem, solution.weighted(float(problem.weight))).contraction,
         ]
         assert {output.dtype for output in outputs} == {np.dtype(np.float64)}
-        assert float(outputs[1]) == pytest.approx(solution.cost, rel=1e-12)
+        unweighted = float(outputs[1] / problem.weight)
+        assert unweighted == pytest.approx(solution.cost, rel=1e-12)
         assert done.fitted.summary["parameters"][0]["value"] == solution.values[0]
         assert with_floats(ik, np.float32).leg.weight.dtype == np.float32
         assert jnp.ones(1).dtype == np.float32
@@ -359,7 +361,7 @@ def test_an_interrupted_fit_writes_its_best_point_and_the_same_command_goes_on(
     assert np.isfinite(numbers["cost"]) and numbers["message"] in output
     assert "\ninterrupted; assessing and writing the best point so far\n" in output
     assert run_folder.SUMMARY in tree(run)
-    assert main.main(words) == 0
+    assert main.main(words) == 4  # what is invented has nothing to do with the motion
     assert numbers_of(run)["parameters"] == numbers_of(done.run)["parameters"]
     assert f"read {run / run_folder.SUMMARY}" in capsys.readouterr().out
 
@@ -372,16 +374,20 @@ def test_an_interrupt_before_the_search_writes_nothing(done, tmp_path, monkeypat
 
 
 def test_the_exit_status_says_what_is_wrong_with_a_fit(done, tmp_path, monkeypatch):
-    for status, interrupted, converged, has_noise, fits in (
-        (0, False, True, True, True),
-        (0, False, True, False, False),  # what a translation leaves over is no failure
-        (3, False, False, True, False),
-        (4, False, True, True, False),
-        (130, True, False, True, False),
+    for status, interrupted, converged, has_noise, fits, setbacks in (
+        (0, False, True, True, True, 0),
+        (0, False, True, False, False, 1),  # what a translation leaves over is no failure
+        (3, False, False, True, False, 0),
+        (4, False, True, True, False, 0),
+        (7, False, True, True, False, 1),
+        (7, False, False, True, False, 1),
+        (130, True, False, True, False, 1),
     ):
         found = SimpleNamespace(interrupted=interrupted, converged=converged)
         verdict = SimpleNamespace(fits=fits)
-        fitted = SimpleNamespace(solution=found, has_noise=has_noise, verdict=verdict)
+        distances = SimpleNamespace(setbacks=[None] * setbacks)
+        parts = {"solution": found, "verdict": verdict, "distances": distances}
+        fitted = SimpleNamespace(has_noise=has_noise, **parts)
         monkeypatch.setattr(jobs, "fit", lambda *_, fitted=fitted, **__: fitted)
         assert main.main(["fit", str(done.experiment), "-o", str(tmp_path)]) == status
 

@@ -193,7 +193,8 @@ class Fit(Shown):
     def before(self) -> tuple[jaxik.Result, ...]:
         """What the system as it was before the fit makes of each clip."""
         space = self.problem.space
-        return playback.run_all(space.unpack(space.pack({})), self.problem.data)
+        with activity.announced("Playing the clips with the system before the fit"):
+            return playback.run_all(space.unpack(space.pack({})), self.problem.data)
 
     @cached_property
     def distances(self) -> Distances:

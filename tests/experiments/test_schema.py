@@ -21,6 +21,7 @@ from fitting.experiments.tables import prior_tables
 from fitting.inference.optimisation.settings import SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.settings import describe
+from fitting.problem.scene import LEAST_SIGMAS
 from fitting.runtime import validation
 from fitting.runtime.validation import Constraint, Content
 from jaxik.maths import parameter_tree
@@ -106,7 +107,7 @@ MISTAKES = {
         ("[rules]\narm = 'TwoBone'", r"\[rules\]: unknown key 'arm'"),
         ("[rules]\nleg = 'FlatFoot'", "leg has no rule 'FlatFoot'; it has .'TwoBone'"),
         ("[sigmas]\nankel = 1", "unknown key 'ankel'; nearest is 'ankle'"),
-        ("[sigmas]\nankle = true", "ankle is True; wanted a number from 1e-09"),
+        ("[sigmas]\nankle = true", "ankle is True; wanted a number from 0.001"),
         ("[sigmas.correlation]\nankel = 0.1", "unknown key 'correlation.ankel'; nearest"),
         ("[noise]\nsigmas = true", r"sigmas is True; wanted one of \['given', 'estimated'\]"),
         ("[noise]\ncorrelation = 'estimated'", "wanted one of .*whitened"),
@@ -138,7 +139,7 @@ BEYOND_SCHEMA: list[tuple[Parts, str]] = [  # about files, or about more than on
     ({"free": "contact.raised_height = { high = 0.05 }"}, r"\[free\]: contact.raised_height stays"),
     ({"rest": "[prior]\nshape = 'uniform'\nspread = 1"}, "prior.: spread is given, but a uniform"),
     ({"rest": f"[prior.pelvis]\non_gain = {UNIFORM}"}, "on_gain: centre is given, but a uniform p"),
-    ({"rest": "[sigmas]\nankle = nan"}, "ankle is nan; wanted a number from 1e-09 to 1e.09, or i"),
+    ({"rest": "[sigmas]\nankle = nan"}, "ankle is nan; wanted a number from 0.001 to 1e.09, or i"),
     ({"top": "independent_every = 1.0", "rest": WHITENED}, "for the same correlation twice"),
     ({"top": "loss = 'huber'", "rest": ESTIMATED}, "under the loss 'huber'.*student"),
     ({"top": "loss = 'cauchy'", "rest": ESTIMATED}, "the loss 'cauchy'.*student"),
@@ -267,7 +268,7 @@ def test_every_key_has_a_meaning_a_parameter_its_range_and_the_defaults_are_thos
     assert search["agreement"]["description"].endswith(" Unit: cost.")
     assert "Unit" not in search["min_step_gain"]["description"]
     tables = schema()["properties"]
-    assert tables["preset"]["default"] == "record" and tables["loss"]["default"] == "squares"
+    assert tables["preset"]["default"] == "record" and tables["loss"]["default"] == "huber"
     assert tables["clips"]["items"]["properties"]["file_up"]["default"] == "y"
     assert tables["fit"]["properties"]["max_steps"]["default"] == 1000
     assert tables["fit"]["properties"]["search"]["properties"]["population"]["default"] == 64
@@ -287,8 +288,8 @@ def test_the_page_on_experiment_files_names_every_key():
 # Numbers: both ends of a range are accepted, nothing beyond is
 
 INF = math.inf
-TOP = {"fps": (1, 1000), "independent_every": (0, 1e6), "seed": (0, 2**32 - 1)}
-SIGMAS = dict.fromkeys(experiment_files.KINDS, (1e-9, 1e9))
+TOP = {"fps": (1, 1000), "independent_every": (0, 1e6), "seed": (0, 2**32 - 1), "holdout": (0, 0.9)}
+SIGMAS = {kind: (LEAST_SIGMAS.get(kind, 1e-9), 1e9) for kind in experiment_files.KINDS}
 CORRELATIONS = dict.fromkeys(("correlation", *experiment_files.CORRELATIONS), (0, 0.999))
 SEARCH = {
     "draws": (2, 100_000), "descents": (1, 1000), "agreement": (0, 1e6),

@@ -276,7 +276,7 @@ FORMATS: dict[str, Format] = {
     "mesh, GLB": mesh_format("glb", damage_glb),
     "experiment": Format(
         "walk.toml",
-        lambda: experiments.text(rest=TABLES).encode(),
+        lambda: experiments.text('loss = "squares"', rest=TABLES).encode(),
         lambda path: soundness.check_experiment(load_experiment(path)),
         damage_toml,
     ),

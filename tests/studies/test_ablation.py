@@ -148,7 +148,7 @@ def test_an_impossible_variant_is_reported_by_name_before_any_fit(tmp_path, sear
 
 def test_each_variant_is_fitted_on_all_parts_but_one_and_measured_on_that_one(tmp_path, search):
     rest = WITHOUT + '[sigmas]\nankle = 0.05\n[noise]\nsigmas = "estimated"\n'
-    experiment = load(tmp_path, rest, top="fps = 15.0")
+    experiment = load(tmp_path, rest, top='fps = 15.0\nloss = "squares"\nholdout = 0.0')
     rows = ablation.ablate(experiment, tmp_path / "out")
     names = [(row.variant, row.part) for row in rows]
     assert names == [(name, part) for name in (ALL, PITCH, BOTH) for part in (1, 2, 0)]

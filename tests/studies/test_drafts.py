@@ -21,6 +21,7 @@ from fitting.experiments.problems import load_clip_data
 from fitting.experiments.schema.experiment_schema import experiment_schema
 from fitting.experiments.systems import Preset
 from fitting.inference import choice, sensitivity
+from fitting.inference.noise.settings import NoiseOptions
 from fitting.problem.free_parameters import free_parameter
 from fitting.problem.prior import SPREAD
 from fitting.problem.space import make_space
@@ -63,7 +64,8 @@ def test_a_first_experiment_is_read_as_it_was_meant(drafted):
     experiment = experiment_files.load_experiment(path)
     (entry,) = experiment.clips
     assert (entry.terrain, entry.base) == (GROUND, path.parents[1] / BASE.name)
-    assert experiment.faithful and experiment.noise.sigmas == "estimated"
+    assert experiment.faithful and experiment.noise == NoiseOptions("given", "counted")
+    assert (experiment.loss, experiment.holdout) == ("huber", 1 / 3)
     written_in, text = (str(path.parent), path.read_text())
     assert text.count(written_in) == text.count(str(path.parents[1])) == 1, "paths are relative"
 

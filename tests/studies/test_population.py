@@ -23,7 +23,7 @@ from fitting.studies.hierarchy.population import Population, clip_names
 from jaxik.maths import parameter_tree
 from support import small_studies
 from support.pages import Page
-from support.small_studies import MEASURED, SUBJECTS, VARYING, kept, write_population
+from support.small_studies import GIVEN, MEASURED, SUBJECTS, VARYING, kept, write_population
 
 
 class Made(NamedTuple):
@@ -100,11 +100,11 @@ def test_noise_is_estimated_in_each_clip_alone(tmp_path, monkeypatch, undrawn):
 
     def watched(problem, experiment, progress, kept):
         estimated.append(len(problem.data) if experiment.noise.estimates_any else 0)
-        quiet = dataclasses.replace(experiment, noise=NoiseOptions())
+        quiet = dataclasses.replace(experiment, noise=NoiseOptions(correlation="given"))
         return search(problem, quiet, progress, kept)
 
     monkeypatch.setattr(kept_searches, "search_with_noise", watched)
-    rest, out = VARYING + '[noise]\nsigmas = "estimated"\n', tmp_path / "out"
+    rest, out = VARYING.replace(GIVEN, '[noise]\nsigmas = "estimated"\n'), tmp_path / "out"
     path = small_studies.quick_population(tmp_path, monkeypatch, rest=rest)
     fitted = fitting.population(path, out)
     assert estimated == [1, 1, 1, 0, 0, 0, 0]

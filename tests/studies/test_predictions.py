@@ -42,7 +42,7 @@ KINDS = ("ankle", "knee", "pelvis", "foot")
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     """A second of the uneven walk with noise of a known truth."""
-    path = write(tmp_path_factory.mktemp("replay"))
+    path = write(tmp_path_factory.mktemp("replay"), top='loss = "squares"')
     loaded = problems.make_problem(experiment_files.load_experiment(path))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "_motions", motions)
@@ -141,7 +141,7 @@ def test_blocks_have_the_likelihood_that_the_fit_has(problem, loss, correlation,
     """The sum over blocks is minus the cost without the prior, up to a constant."""
     problem = dataclasses.replace(problem, loss=loss)
     problem = eqx.tree_at(
-        lambda p: (p.data[0].sigmas.correlation, p.independent_fraction),
+        lambda p: (p.data[0].sigmas.correlation, p.weight),
         problem,
         (jnp.asarray(correlation), jnp.asarray(fraction)),
     )

@@ -25,6 +25,8 @@ TWO_HALF_SECONDS = f"{HALF_SECOND}{CLIP}start = 2.0\nend = 2.5\n"
 ONE_START = "[fit]\nstarts = 1\n[fit.search]\nagreeing_starts = 1\n"
 SIX_SECONDS = CLIP + "end = 6.0\n"
 FREE = "pelvis.on_gain = {}\nfoot.max_pitch = { low = 0.1 }\n"
+GIVEN = '[noise]\ncorrelation = "given"\n'  # what the residuals of a pipeline say is not asked
+SQUARES = 'loss = "squares"\n'
 SAMPLE = "[sample]\nwalkers = 8\nstop_at = 25.0\nmax_steps = 400\n"
 WITHOUT = """
 [[without]]
@@ -34,7 +36,7 @@ parameters = { foot.max_pitch = 0.2 }
 name = "both"
 parameters = { foot.max_pitch = 0.2, pelvis.on_gain = 0.6 }
 """
-VARYING = '[hierarchy]\nper_clip = ["pelvis.on_gain"]\n'
+VARYING = GIVEN + '[hierarchy]\nper_clip = ["pelvis.on_gain"]\n'
 SUBJECTS = ("ann", "ann", "ben")  # of the clips of a population
 MEASURED = ((0.2, 0.41), (0.5, 0.39), (0.3, 0.4))  # in them, in the order of FREE
 
@@ -66,12 +68,12 @@ def without_pipeline(patch: MonkeyPatch) -> None:
     """Replaces the pipeline by `lift`, and makes each scene once for all tests."""
     make_scene = problems.make_scene
 
-    def cached(data, sigmas, label):
+    def cached(data, sigmas, label, held_out):
         captured = data.reference
         mask = b"" if captured.mask is None else captured.mask.tobytes()
-        key = captured.positions_ws.tobytes(), mask, tuple(sigmas.items())
+        key = captured.positions_ws.tobytes(), mask, held_out.tobytes(), tuple(sigmas.items())
         if key not in SCENES:
-            SCENES[key] = make_scene(data, sigmas, label)
+            SCENES[key] = make_scene(data, sigmas, label, held_out)
         return SCENES[key]
 
     patch.setattr(problems, "make_scene", cached)
@@ -92,7 +94,8 @@ def quick_ablation(folder: Path, patch: MonkeyPatch) -> Path:
 
 def write_calibration(folder: Path, top: str = "", rest: str = SAMPLE) -> Path:
     """Half a second of the uneven walk."""
-    return write(folder, "hill.toml", top=top, clips=HALF_SECOND, free=FREE, rest=rest)
+    more = {"top": SQUARES + top, "rest": rest + GIVEN}
+    return write(folder, "hill.toml", clips=HALF_SECOND, free=FREE, **more)
 
 
 def simulate(problem, u, seed, noise: float = 1.0, shift: float = 0.0):
@@ -117,7 +120,7 @@ def write_population(folder: Path, rest: str = VARYING, top: str = "", free: str
         f'{CLIP}start = {c}.0\nend = {c}.1\nsubject = "{subject}"\n'
         for c, subject in enumerate(SUBJECTS)
     )
-    return write(folder, "walks.toml", top=top, clips=clips, free=free, rest=rest)
+    return write(folder, "walks.toml", top=SQUARES + top, clips=clips, free=free, rest=rest)
 
 
 def error_at(problem, u) -> float:
