@@ -13,9 +13,8 @@ from fitting.report.labels import RESIDUALS
 from fitting.studies.fit import Fit
 
 COUNTED = (
-    "Neighbouring frames are alike, and residuals are not as large as their sigmas: for intervals, "
-    "each counts as {:.3g} independent ones of the size of its sigma. The best point does not "
-    "depend on that."
+    "For intervals, each residual counts as {:.3g} independent ones of the size of its sigma, as the "
+    "size of the residuals and their correlation say. The best point does not depend on that."
 )
 
 
