@@ -254,7 +254,7 @@ def test_a_weight_scales_the_whole_cost_and_of_the_probability_only_the_likeliho
     log_probability = -0.5 * (0.3 * losses + prior)
     np.testing.assert_allclose(problem.log_probability(u), log_probability, rtol=TOLERANCE)
     np.testing.assert_allclose(problem.cost(u), 0.15 * (losses + prior), rtol=TOLERANCE)
-    np.testing.assert_allclose(problem.prior_costs(u), [0.15 * prior], rtol=TOLERANCE)
+    np.testing.assert_allclose(problem.prior_costs(np.asarray(u)), [0.15 * prior], rtol=TOLERANCE)
     beyond = replace(problem, data=jnp.asarray([0.9, 0.1]))
     assert beyond.log_probability(jnp.asarray([-3.0])) == -jnp.inf
 

@@ -13,8 +13,8 @@ from fitting.report.labels import RESIDUALS
 from fitting.studies.fit import Fit
 
 COUNTED = (
-    "For intervals, each residual counts as {:.3g} independent ones of the size of its sigma, as the "
-    "size of the residuals and their correlation say. The best point does not depend on that."
+    "For intervals, each residual counts as {:.3g} independent ones of the size of its sigma, as "
+    "their size and correlation say. The best point does not depend on that."
 )
 
 
