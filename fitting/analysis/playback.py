@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxik
 from fitting.problem.residuals import errors_by_kind, errors_of_pose, residuals_by_kind
-from fitting.problem.scene import Scene, legs_ws, own_system, pelvis_ws
+from fitting.problem.scene import Scene, animated_legs_ws, legs_ws, own_system, pelvis_ws
 from fitting.problem.shared_world import groups, run_scenes
 from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64, with_floats
@@ -173,7 +173,7 @@ def play_all(ik: jaxik.FootIK, scenes: Sequence[Scene]) -> tuple[Playback, ...]:
 @program_cache.cached
 def _play(scene: Scene, result: jaxik.Result) -> Playback:
     world, reference, up = scene.frames.world_from_model, scene.reference, scene.terrain.up_ws
-    animated, solved = scene.frames.pose.transformed(_per_leg(world)), legs_ws(scene, result)
+    animated, solved = animated_legs_ws(scene), legs_ws(scene, result)
     animated_pelvis, solved_pelvis = world @ scene.pelvis, pelvis_ws(scene, result)
     # The reference has no hips and toes: they keep their animated offsets from pelvis and ankles.
     hip_offset = _per_leg(animated_pelvis).inverse().apply(animated.hip.pos)

@@ -81,7 +81,10 @@ def _reach(
 
 
 def sweep(
-    space: Space, scenes: tuple[Scene, ...], u: Float[np.ndarray, " free"]
+    space: Space,
+    scenes: tuple[Scene, ...],
+    u: Float[np.ndarray, " free"],
+    fractions: Float[np.ndarray, " tried"] = FRACTIONS,
 ) -> Iterator[tuple[Float[np.ndarray, " tried"], Float[np.ndarray, "tried residuals"]]]:
     """For each parameter alone, its `u` over the range and how the residuals change from `u`.
 
@@ -89,25 +92,28 @@ def sweep(
         space: the parameters.
         scenes: the clips.
         u: where all the others stay.
+        fractions: of each range, that are tried.
     """
     present = np.asarray(space.values(u))
-    log_odds = np.log(FRACTIONS / (1 - FRACTIONS))
+    log_odds = np.log(fractions / (1 - fractions))
     grid = np.asarray(space.values(np.tile(log_odds[:, None], space.size)))
-    first = _residuals(space, scenes, space.pack_values(present[None]))[0]
-    together = BATCH // len(FRACTIONS)  # parameters in one call of the program
+    first = residuals_at(space, scenes, space.pack_values(present[None]))[0]
+    together = BATCH // len(fractions)  # parameters in one call of the program
     for start in range(0, space.size, together):
         indices = range(start, min(start + together, space.size))
-        table = np.tile(present, (len(indices), len(FRACTIONS), 1))
+        table = np.tile(present, (len(indices), len(fractions), 1))
         for row, i in enumerate(indices):
             table[row, :, i] = grid[:, i]
         candidates = space.pack_values(table.reshape(-1, space.size))
-        changes = np.nan_to_num(_residuals(space, scenes, candidates) - first)
+        changes = np.nan_to_num(residuals_at(space, scenes, candidates) - first)
         for row, i in enumerate(indices):
-            tried = slice(row * len(FRACTIONS), (row + 1) * len(FRACTIONS))
+            tried = slice(row * len(fractions), (row + 1) * len(fractions))
             yield candidates[tried, i], changes[tried]
 
 
-def _residuals(space: Space, scenes: tuple[Scene, ...], candidates: np.ndarray) -> np.ndarray:
+def residuals_at(
+    space: Space, scenes: tuple[Scene, ...], candidates: Float[np.ndarray, "points free"]
+) -> Float[np.ndarray, "points residuals"]:
     """Residuals of at most a batch of candidates, filled up so that there is one program."""
     filled = jnp.asarray(np.resize(candidates, (BATCH, space.size)), space.start.dtype)
     return np.asarray(_residuals_of_batch(space, scenes, filled))[: len(candidates)]

@@ -96,6 +96,27 @@ def own_system(ik: jaxik.FootIK, scene: Scene) -> jaxik.FootIK:
     return ik if scene.size is None else similar(ik, scene.size)
 
 
+def animated_legs_ws(scene: Scene) -> jaxik.LegPose:
+    """The animated legs, (frames legs), world space."""
+    world = scene.frames.world_from_model
+    return scene.frames.pose.transformed(Transform(world.pos[:, None], world.rot[:, None]))
+
+
+def left_alone(scene: Scene) -> Scene:
+    """The scene with its animation as the motion that a system should reproduce."""
+    legs, reference = animated_legs_ws(scene), scene.reference
+    animated = Reference(
+        pelvis=scene.frames.world_from_model @ scene.pelvis,
+        knee_ws=legs.knee.pos,
+        ankle=legs.ankle,
+        contact=reference.contact,
+        observed=reference.observed | reference.held_out,
+        held_out=jnp.zeros_like(reference.held_out),
+        label="animated",
+    )
+    return eqx.tree_at(lambda scene: scene.reference, scene, animated)
+
+
 def pelvis_ws(scene: Scene, result: jaxik.Result) -> Transform:
     """The pelvis after the system has moved the body, (frames), world space."""
     return scene.frames.world_from_model @ (result.body @ scene.pelvis)

@@ -31,8 +31,8 @@ def as_toml(draft: Draft) -> str:
     for entry in experiment.clips:
         own = _of_clip(entry, folder)
         parts += ["", "[[clips]]", *_keys(own, schema["clips"]["items"]["properties"])]
-    for name in ("rules", "parameters"):
-        parts += ["", _heading(name, schema)]
+    parts += ["", _heading("rules", schema), "", _heading("parameters", schema)]
+    parts += [f"{_key(name)} = {_value(value)}" for name, value in experiment.parameters.items()]
     parts += ["", _heading("free", schema), *_free(draft)]
     for name in ("prior", "start", "sigmas", "noise", "hierarchy", "fit", "sample"):
         keys = _plain_keys(schema[name]["properties"])
@@ -126,10 +126,14 @@ def _free(draft: Draft) -> Iterator[str]:
             yield f"# {title}"
         for forecast in group:
             mark = "" if forecast.is_free else "# "
-            name = f'"{forecast.name}"' if "[" in forecast.name else forecast.name
             overrides = _value(dict(draft.experiment.free.get(forecast.name, {})))
             rival = f" Much like {forecast.rival}." if forecast.rival else ""
-            yield f"{mark}{name} = {overrides}  # {meanings[forecast.name]}{rival}"
+            yield f"{mark}{_key(forecast.name)} = {overrides}  # {meanings[forecast.name]}{rival}"
+
+
+def _key(name: str) -> str:
+    """A parameter's name as TOML has keys."""
+    return f'"{name}"' if "[" in name else name
 
 
 def _meanings(experiment: Experiment, rig: jaxik.Rig) -> Iterator[tuple[str, str]]:

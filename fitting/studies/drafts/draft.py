@@ -7,7 +7,7 @@ from pathlib import Path
 import jaxik
 from fitting.analysis import playback
 from fitting.analysis.goodness import distances
-from fitting.analysis.goodness.distances import Distances
+from fitting.analysis.goodness.distances import Distances, Setback
 from fitting.analysis.goodness.verdict import describe_setback
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.clips.load import AS_FOUND, ClipOptions
@@ -18,7 +18,8 @@ from fitting.experiments.problems import ClipData, load_clip_data, problem_from_
 from fitting.experiments.record_only import PLACES
 from fitting.experiments.systems import DEFAULT_PRESET, Preset, preset_system
 from fitting.inference.choice import Forecast, choose_free
-from fitting.inference.sensitivity import all_parameters
+from fitting.inference.harmless import leave_alone
+from fitting.inference.sensitivity import FreeTable, all_parameters
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
@@ -29,10 +30,7 @@ from .assumptions import Assumption, of_clip
 
 EXPERIMENT = "experiment.toml"
 FAST, SLOW = 45.0, 30.0  # Hz: clips above the one are resampled to the other, which is enough
-HARM = (
-    "{} as it comes does not leave these feet alone, as it must on flat ground: {}; a fit of what "
-    "is free below can stop that"
-)
+HARM = "{} as it comes does not leave these feet alone, as it must on flat ground: {}"
 SHORTEST = 0.1  # s that is worth cutting off an end without motion
 
 
@@ -187,19 +185,19 @@ def draft(
     with activity.announced(f"Playing the clips with {request.preset.name} as it comes"):
         as_it_comes = playback.play_all(ik, problem_from_clips(experiment, data).data)
     apart = distances.measure(as_it_comes, as_it_comes)
-    if check.flat and not apart.setbacks:
+    lines: list[str] = []
+    if check.flat:
         forecasts = [Forecast(name, is_free=False, reach=0, contraction=0) for name in candidates]
+        if apart.setbacks:
+            experiment, lines = _without_harm(experiment, data, candidates, apart.setbacks[0])
     else:
         problem = problem_from_clips(replace(experiment, free=candidates), data)
         with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
             forecasts = choose_free(problem.space.system, candidates, problem.data)
     free = {f.name: candidates[f.name] for f in forecasts if f.is_free}
-    lines = []
-    if check.flat and apart.setbacks:
-        lines.append(HARM.format(request.preset.name, describe_setback(apart.setbacks[0])))
-    if forecasts and not any(forecast.moves for forecast in forecasts):
+    if not (check.flat or any(forecast.moves for forecast in forecasts)):
         lines.append(f"no parameter of {request.preset.name} moves anything in these clips")
-    elif not free and not check.flat:
+    elif not (check.flat or free):
         lines.append(f"these clips determine no parameter of {request.preset.name}")
     check = replace(check, lines=(*check.lines, *lines))
     return Draft(
@@ -213,6 +211,29 @@ def draft(
         distances=apart,
         rig=rig,
     )
+
+
+def _without_harm(
+    experiment: Experiment, data: Sequence[ClipData], candidates: FreeTable, setback: Setback
+) -> tuple[Experiment, list[str]]:
+    """The experiment with what its system needs to leave a flat capture alone, and what that is."""
+    rig = data[0].base.rig
+    scenes = problem_from_clips(experiment, data).data
+
+    def is_harmless(ik: jaxik.FootIK) -> bool:
+        played = playback.play_all(ik, scenes)
+        return not distances.measure(played, played).setbacks
+
+    ik = experiment.starting_system(rig)
+    with activity.announced("Looking for what leaves the feet alone"):
+        changes = leave_alone(ik, candidates, scenes, is_harmless)
+    changed = replace(experiment, parameters={**experiment.parameters, **changes})
+    lines = [HARM.format(experiment.preset, describe_setback(setback))]
+    if changes and is_harmless(changed.starting_system(rig)):
+        listed = ", ".join(f"{name} = {value:.3g}" for name, value in changes.items())
+        lines.append(f"it does with {listed}, which is set; what that does elsewhere is not known")
+        return changed, lines
+    return experiment, [*lines, "no change of a few parameters stops that"]
 
 
 def _assumptions(

@@ -1,0 +1,65 @@
+"""The few changes to a system with which it leaves a motion alone, found without derivatives.
+
+On flat ground a capture says nothing but that foot IK must not move the feet. Where a system moves
+them, each parameter is swept over its range while the others stay, the change that helps most is
+kept, and so on, up to `MOST` changes.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+import jaxik
+from fitting.problem.free_parameters import free_parameter
+from fitting.problem.loss import rho
+from fitting.problem.scene import Scene, left_alone
+from fitting.problem.space import make_space
+from fitting.runtime.precision import in_float64
+
+from .sensitivity import FRACTIONS, FreeTable, residuals_at, sweep
+
+MOST = 3  # parameters that are changed
+TRIED = np.concatenate([[0.001], FRACTIONS, [0.999]])  # also where a limit is out of the way
+AS_GOOD = 0.02  # of the cost that is to be gained: among changes so alike, the smallest is taken
+
+
+@in_float64
+def leave_alone(
+    ik: jaxik.FootIK,
+    candidates: FreeTable,
+    scenes: tuple[Scene, ...],
+    is_harmless: Callable[[jaxik.FootIK], bool],
+) -> dict[str, float]:
+    """Values by name of the parameters that are to be changed; not more than are needed.
+
+    Args:
+        ik: the system.
+        candidates: the parameters, with overrides of their declarations.
+        scenes: the clips, whose animations are to be left as they are.
+        is_harmless: whether a system leaves them alone, which ends the search.
+    """
+    rig = scenes[0].rig
+    parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
+    space = make_space(ik, parameters)
+    scenes = tuple(left_alone(scene) for scene in scenes)
+    u, changes = np.asarray(space.pack({})), dict[str, float]()
+    while len(changes) < MOST and not is_harmless(space.unpack(u)):
+        here = residuals_at(space, scenes, u[None])[0]
+        present, costs, places = _cost(here), [], []
+        for i, (tried, moved) in enumerate(sweep(space, scenes, u, TRIED)):
+            costs += [_cost(here + row) for row in moved]
+            places += [(i, place) for place in tried]
+        best = min(costs)
+        if not best < present:
+            break
+        good = np.flatnonzero(np.asarray(costs) <= best + AS_GOOD * (present - best))
+        i, place = min((places[k] for k in good), key=lambda at: abs(at[1] - u[at[0]]))
+        u = np.where(np.arange(space.size) == i, place, u)
+        changes[space.names[i]] = float(space.values(u)[i])
+    return changes
+
+
+def _cost(residuals: Float[np.ndarray, " residuals"]) -> float:
+    """As a fit counts it, without the prior."""
+    return 0.5 * float(np.sum(rho(residuals**2, "huber", library=np)))
