@@ -9,6 +9,7 @@ import numpy as np
 
 import jaxik
 from fitting.inference.profiles.profile import Profile
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.loss import rho
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
@@ -58,7 +59,7 @@ def find_evidence(
     for side, outside in sides:
         for k in outside:
             u = problem.space.pack(dict(zip(names, profile.path[k], strict=True)))
-            moved = play_all(problem.space.unpack(jnp.asarray(u)), problem.data)
+            moved = play_all(*system_and_scenes(problem, jnp.asarray(u)))
             after = _frame_costs(problem, moved)
             evidence.append(_evidence(problem, side, float(profile.values[k]), before, after))
     return tuple(evidence)

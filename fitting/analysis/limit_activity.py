@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxik
 from fitting.inference.optimisation import population
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene, own_system
 from fitting.problem.shared_world import groups, in_a_row, moved_out, row_of, split
@@ -140,7 +141,7 @@ def nudge_thresholds(
     values = dict(zip(space.names, np.asarray(space.values(jnp.asarray(u))), strict=True))
 
     def decisions(packed: Array) -> Bool[np.ndarray, " decisions"]:
-        results = run_all(space.unpack(packed), problem.data)
+        results = run_all(*system_and_scenes(problem, packed))
         return np.concatenate([_decisions(result) for result in results])
 
     def nudge(name: str, value: float) -> Nudge:

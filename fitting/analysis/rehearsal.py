@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 
 import jaxik
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.runtime.precision import in_float64
 
@@ -38,9 +39,9 @@ class Rehearsal:
 
 @in_float64
 def _play(problem: Problem[jaxik.FootIK]) -> tuple[jaxik.Result, ...]:
-    system = problem.space.unpack(problem.space.pack({}))
-    results = playback.run_all(system, problem.data)
-    for scene, result in zip(problem.data, results, strict=True):
+    system, scenes = system_and_scenes(problem, problem.space.pack({}))
+    results = playback.run_all(system, scenes)
+    for scene, result in zip(scenes, results, strict=True):
         playback.play(scene, result)
-    limit_activity.measure(system, problem.data, results)
+    limit_activity.measure(system, scenes, results)
     return results

@@ -15,6 +15,7 @@ from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.settings import MAX_STARTS, SearchSettings
 from fitting.inference.sampling.settings import SamplerSettings
 from fitting.inference.sensitivity import FreeTable
+from fitting.problem.capture.system import with_capture
 from fitting.problem.free_parameters import FreeParameter, check_inside, free_parameter
 from fitting.problem.loss import Loss
 from fitting.problem.prior import Priors
@@ -26,6 +27,7 @@ from fitting.runtime.precision import with_floats
 from jaxik.world import body
 from jaxik.world.terrain import Terrain
 
+from . import captures
 from .ablations import Ablation
 from .hierarchies import Hierarchy
 from .systems import DEFAULT_PRESET, OWN_ROOT, Preset, with_parameters, with_rules
@@ -152,6 +154,8 @@ class Experiment(Shown):
     clips: tuple[ClipEntry, ...]
     free: FreeTable
     """By dotted name, with overrides of the declaration."""
+    capture: FreeTable = field(default_factory=dict)
+    """What of the captures is fitted, too; see `captures`."""
     preset: str = DEFAULT_PRESET.name
     faithful: bool = False
     """Whether the preset is the original, as faithful as it is known."""
@@ -268,7 +272,26 @@ class Experiment(Shown):
         """
         with validation.error_context(f"{self.path} [free]"):
             rig = rig if self.body == "clip" else None
-            return [free_parameter(ik, name, rig, **given) for name, given in self.free.items()]
+            free = [free_parameter(ik, name, rig, **given) for name, given in self.free.items()]
+        with validation.error_context(f"{self.path} [capture]"):
+            ik = self.with_capture(ik)
+            return free + [
+                free_parameter(ik, name, None, **given) for name, given in self._of_captures
+            ]
+
+    @property
+    def _of_captures(self) -> list[tuple[str, Mapping[str, float | int | str]]]:
+        """The free parameters of captures by dotted name, with overrides."""
+        return list(captures.free_table(self.capture, len(self.clips)).items())
+
+    @property
+    def free_count(self) -> int:
+        """How many parameters are free: of the system, and of captures."""
+        return len(self.free) + len(self._of_captures)
+
+    def with_capture(self, ik: jaxik.FootIK) -> jaxik.FootIK:
+        """The system with what is not known of the captures, if something of it is fitted."""
+        return with_capture(ik, len(self.clips), list(self.capture)) if self.capture else ik
 
     def check_points(self, rig: jaxik.Rig | None) -> None:
         """Checks, before anything is compiled, that centres of priors and the start are in range.
@@ -280,18 +303,18 @@ class Experiment(Shown):
             ValueError: one is not, or as `free_parameters`.
         """
         parameters = self.free_parameters(self.starting_system(rig), rig)
-        centres = {p.name: self.prior.of(p.name).centre for p in parameters}
+        centres = {name: prior.centre for name, prior in self.prior.named.items()}
         for table, what, values in (("prior", "centre", centres), ("start", "start", self.start)):
             with validation.error_context(f"{self.path} [{table}]"):
                 for parameter in parameters:
-                    value = values.get(parameter.name)
+                    value = captures.entry_for(parameter.name, values)
                     if value is not None:
                         check_inside(parameter, what, value)
 
     @property
     def has_points(self) -> bool:
         """Whether there are centres of priors or a start of the search."""
-        return bool(self.start) or any(self.prior.of(name).centre is not None for name in self.free)
+        return bool(self.start) or any(p.centre is not None for p in self.prior.named.values())
 
     def space(self, ik: jaxik.FootIK, rig: jaxik.Rig | None = None) -> Space[jaxik.FootIK]:
         """The space of the free parameters, with their prior and the start.
@@ -306,15 +329,16 @@ class Experiment(Shown):
         """
         parameters = self.free_parameters(ik, rig)
         with validation.error_context(f"{self.path} [free]"):
-            space = make_space(ik, parameters)
+            space = make_space(self.with_capture(ik), parameters)
+        of_captures = [name for name, _ in self._of_captures]
         with validation.error_context(f"{self.path} [prior]"):
-            space = space.with_prior(self.prior)
+            space = space.with_prior(captures.with_narrow_priors(self.prior, of_captures))
         with validation.error_context(f"{self.path} [start]"):
-            own = {name: value for name, value in self.start.items() if name in self.free}
-            return space.with_start(own)
+            values = {name: captures.entry_for(name, self.start) for name in space.names}
+            return space.with_start({name: v for name, v in values.items() if v is not None})
 
     def with_max_sample_steps(self, max_steps: int) -> "Experiment":
         """The experiment with another limit to the steps of the sampler."""
         sample = replace(self.sample, max_steps=max_steps)
-        sample.walkers_for(len(self.free))
+        sample.walkers_for(self.free_count)
         return replace(self, sample=sample)

@@ -17,6 +17,8 @@ lock.enabled = true
 [free]                               # {} takes range and scale from the rule
 pelvis.on_gain = {}
 contact.planted_height = { low = 0.05, high = 0.2 }
+[capture]                            # what of the captures is fitted, too; see `captures`
+ground_height = {}
 [prior]                              # see `tables.prior_tables`, also for [start]
 spread = 1.6
 [sigmas]
@@ -53,6 +55,7 @@ from fitting.runtime.validation import (
     with_floats,
 )
 
+from . import captures
 from .ablations import read_ablations
 from .experiment import DEFAULT_SIGMAS, Experiment, FitOptions
 from .hierarchies import hierarchy_to_table, read_hierarchy
@@ -106,14 +109,18 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         raise ValueError(f"{path} [sigmas]: all of {list(KINDS)} are inf; wanted one that is not")
     free = read_free_table(content["free"], f"{path} [free]")
     without = read_ablations(content.get("without", []), ik, f"{path} [[without]]")
-    known = list(dict.fromkeys([*free, *(name for ablation in without for name in ablation.free)]))
     places = Places(path, content.get("written_in"))
     clips = tuple(read_clip(entry, places) for entry in content["clips"])
+    capture = captures.read_capture(content.get("capture", {}), len(clips), f"{path} [capture]")
+    known = [*free, *(name for ablation in without for name in ablation.free)]
+    known = list(dict.fromkeys([*known, *captures.known_names(capture, len(clips))]))
+    count = len(free) + len(captures.free_table(capture, len(clips)))
     subjects, hierarchy = [clip.subject for clip in clips], content.get("hierarchy", {})
     tables = {
         "clips": clips,
         "hierarchy": read_hierarchy(hierarchy, free, subjects, f"{path} [hierarchy]"),
         "free": free,
+        "capture": capture,
         "prior": read_priors(content.get("prior", {}), known, f"{path} [prior]"),
         "start": read_start(content.get("start", {}), known, f"{path} [start]"),
         "parameters": flatten(content.get("parameters", {}), 2),
@@ -121,7 +128,7 @@ def parse_experiment(content: Table, path: Path) -> Experiment:
         "noise": _noise_options(content.get("noise", {}), f"{path} [noise]"),
         "without": without,
         "fit": _fit_options(content.get("fit", {}), f"{path}"),
-        "sample": _sampler_settings(content.get("sample", {}), len(free), f"{path} [sample]"),
+        "sample": _sampler_settings(content.get("sample", {}), count, f"{path} [sample]"),
     }
     top = with_floats(content, ("fps", "holdout", "independent_every"))
     top.pop("written_in", None)  # another folder is named when it is written again

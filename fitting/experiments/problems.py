@@ -39,7 +39,7 @@ from jaxik.maths import parameter_tree
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
-from . import track_files
+from . import captures, track_files
 from .experiment import DEFAULT_SIGMAS, ClipEntry, Experiment
 from .systems import without_own_root
 
@@ -141,7 +141,10 @@ def problem_from_clips(experiment: Experiment, clips: Iterable[ClipData]) -> Pro
             with error_context(f"{experiment.path} [parameters]"):
                 parameter_tree.check_shapes(ik, len(scene.rig.side))
             scenes.append(scene)
-        scenes = share_world(scenes, ik.probe)
+        if experiment.capture:
+            scenes = captures.prepare(scenes, space, f"{experiment.path} [capture]")
+        else:
+            scenes = share_world(scenes, ik.probe)
     dt = np.concatenate([np.asarray(scene.frames.dt) for scene in scenes])
     weight = min(1.0, float(dt.mean()) / max(experiment.independent_every, 1e-9))
     problem = Problem(space, tuple(scenes), residuals_of_scenes, experiment.loss, weight)

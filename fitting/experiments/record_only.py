@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from fitting.problem.capture.system import is_of_capture
 from fitting.runtime import validation
 from fitting.runtime.precision import in_float64
 from jaxik import record
@@ -70,8 +71,8 @@ def set_aside(experiment: Experiment) -> dict[str, tuple[str, str]]:
 
 
 def _kept(table: Mapping[str, Entry]) -> dict[str, Entry]:
-    """The entries of parameters that the record has room for."""
-    return {name: entry for name, entry in table.items() if name in PLACES}
+    """The entries of parameters that the record has room for, and of captures."""
+    return {name: entry for name, entry in table.items() if name in PLACES or is_of_capture(name)}
 
 
 def _within(names: tuple[str, ...]) -> tuple[str, ...]:

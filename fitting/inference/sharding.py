@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PyTree
 import jaxik
 from fitting.inference.noise.marginal import with_unknown_sigmas
 from fitting.problem import stacking
+from fitting.problem.capture.system import CapturedSystem
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scene, residuals_of_scenes
 from fitting.problem.scene import Scene
@@ -45,7 +46,8 @@ def over_devices(
     """The problem with its clips shared out among devices; the same up to rounding.
 
     Its residuals come in another order, with zeros where clips were made longer or devices have
-    less to do. With one device or one clip, or residuals of another kind, it stays as it is.
+    less to do. With one device or one clip, a capture that is fitted, or residuals of another
+    kind, it stays as it is.
 
     Args:
         problem: of clips, as `problem_from_clips` makes it.
@@ -56,6 +58,7 @@ def over_devices(
         len(devices) < 2
         or problem.residual_function is not residuals_of_scenes
         or len(problem.data) < 2
+        or isinstance(problem.space.system, CapturedSystem)
     ):
         return problem
     mesh = Mesh(np.array(devices), (CLIPS,))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from fitting.experiments import captures
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.in_memory.saving import with_files
@@ -39,10 +40,12 @@ def ablate(
         log: called with what the command line prints.
 
     Raises:
-        ValueError: as `studies.ablation.ablate`, or the folder cannot be made.
+        ValueError: as `studies.ablation.ablate`, the experiment fits a capture, too, or the folder
+            cannot be made.
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
+    captures.refuse(experiment.capture, str(experiment.path), "ablate")
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)
 

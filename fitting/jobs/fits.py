@@ -84,8 +84,10 @@ def fit(
         lines: list[str] = []
         clips = load_clips(experiment, lines.append)
         problem = problem_from_clips(experiment, clips)
-        what = f"{len(experiment.free)} parameters of" if experiment.free else "no parameter of"
-        heading = f"fitting {what} {experiment.preset} to {len(clips)} clip(s)"
+        what = f"{len(experiment.free) or 'no'} parameters of {experiment.preset}"
+        if of_captures := experiment.free_count - len(experiment.free):
+            what += f" and {of_captures} of the capture"
+        heading = f"fitting {what} to {len(clips)} clip(s)"
         log("\n".join([heading, *lines, *capture_check.check(clips).lines]))
         loaded(experiment, problem, clips)
         kept = kept_stages(run, experiment, problem, log)

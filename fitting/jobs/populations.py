@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
-from fitting.experiments import parameter_files
+from fitting.experiments import captures, parameter_files
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import experiment_to_toml, load_experiment
 from fitting.experiments.in_memory.saving import with_files
@@ -45,11 +45,13 @@ def population(
         log: called with what the command line prints.
 
     Raises:
-        ValueError: the experiment is wrong, nothing in it varies, or a threshold does; it does not
-            fit its clips; the folder cannot be made or holds something else.
+        ValueError: the experiment is wrong, fits a capture, too, nothing in it varies, or a
+            threshold does; it does not fit its clips; the folder cannot be made or holds something
+            else.
     """
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(experiment)
+    captures.refuse(experiment.capture, str(experiment.path), "population")
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)
         problem = make_problem(experiment)

@@ -14,6 +14,7 @@ from fitting import viewer
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.problems import ClipData
 from fitting.inference.optimisation.solution import Progress, Report
+from fitting.problem.capture.system import alone
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
 
@@ -157,8 +158,9 @@ class FitWatch:
             return
         if progress.best != cost and now - when >= EVERY:  # it rises where noise is estimated anew
             self._shown = (progress.best, now)
+            ik = alone(self._problem.space.unpack(progress.best_u))
             note = f"The fit goes on: {progress.stage}, best cost {progress.best:.6g}."
-            self.viewer.restart(BEST, self._problem.space.unpack(progress.best_u), note)
+            self.viewer.restart(BEST, ik, note)
 
 
 def _page() -> ModuleType:

@@ -10,12 +10,15 @@ import jaxik
 from jaxik.maths import quat, vec
 from jaxik.world.skeleton import Transform
 
+from .capture import observation
+from .capture.system import parted
 from .scene import Scene, legs_ws, pelvis_ws
 from .shared_world import groups, run_row, run_scene, scene_in_a_row, split
 
 
 def residuals_of_scenes(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> Float[Array, " residuals"]:
     """Residuals of several clips in standard deviations, one clip after another."""
+    ik, scenes = parted(ik, scenes)
     residuals: dict[int, Array] = {}
     for numbers in groups(scenes):
         members = [scenes[number] for number in numbers]
@@ -54,7 +57,10 @@ def errors_by_kind(scene: Scene, result: jaxik.Result) -> dict[str, Array]:
     """Result minus reference, by kind of residual, in the unit of its sigma."""
     assert result.trace is not None  # `jaxik.run` always has one
     errors = errors_of_pose(scene, legs_ws(scene, result), pelvis_ws(scene, result))
-    contact = result.trace.sensed.contact.weight - scene.reference.contact
+    contact = result.trace.sensed.contact.weight
+    if scene.capture is not None:
+        contact = observation.delayed(scene.capture, scene.frames, contact)
+    contact = contact - scene.reference.contact
     ankle, dt = errors["ankle"], scene.frames.dt[1:-1, None, None]
     return errors | {
         "contact": contact * scene.rig.present,
@@ -71,6 +77,8 @@ def errors_of_pose(scene: Scene, legs: jaxik.LegPose, pelvis: Transform) -> dict
         pelvis: (frames), world space.
     """
     reference, present = scene.reference, scene.rig.present[..., None]
+    if scene.capture is not None:
+        legs, pelvis = observation.shown(scene.capture, scene.rig, scene.frames, legs, pelvis)
     return {
         "ankle": (legs.ankle.pos - reference.ankle.pos) * present,
         "knee": (legs.knee.pos - reference.knee_ws) * present,

@@ -9,6 +9,8 @@ from jaxik.world.similarity import similar
 from jaxik.world.skeleton import Transform
 from jaxik.world.terrain import Terrain
 
+from .capture.parameters import Capture
+
 MEASURED = ("ankle", "knee", "pelvis", "foot", "body")  # kinds that have a noise of their own
 WHITENED = (*MEASURED, "contact")  # kinds whose residuals have a correlation from frame to frame
 # No capture is known better than this: 1 mm, and 0.1 degrees.
@@ -87,6 +89,8 @@ class Scene(eqx.Module):
     size: Float[Array, ""] | None = None
     """Leg length over that of the body for which systems are meant; they become `similar`. None
     takes them as they are."""
+    capture: Capture | None = None
+    """What is not as it seems in the clip; None of a clip of which all is."""
     place: Place | None = None
     """In a world shared with other scenes, with which it then runs in one loop; None runs alone."""
 

@@ -14,6 +14,8 @@ from fitting.runtime.program_cache import cached
 from jaxik.maths import quat
 from jaxik.world.skeleton import Transform
 
+from .capture import observation
+from .capture.system import system_and_scenes
 from .problem import Problem
 from .scene import Reference, Scene, legs_ws, pelvis_ws
 from .shared_world import run_scenes
@@ -44,8 +46,7 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
     """
     random = np.random.default_rng(seed)
     fraction = min(1.0, float(problem.weight))
-    ik = problem.space.unpack(u)
-    motions = zip(problem.data, _motions(ik, problem.data), strict=True)
+    motions = zip(problem.data, _motions(*system_and_scenes(problem, u)), strict=True)
     scenes = tuple(_simulated(scene, motion, fraction, random) for scene, motion in motions)
     return eqx.tree_at(lambda problem: problem.data, problem, scenes)
 
@@ -84,12 +85,16 @@ def _simulated(
 
 @cached
 def _motions(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[Motion]:
-    """What a system makes of each clip."""
+    """What captures would show of what a system makes of each clip."""
     motions = []
     for scene, result in zip(scenes, run_scenes(ik, scenes), strict=True):
         assert result.trace is not None  # `jaxik.run` always has one
-        legs, contact = legs_ws(scene, result), result.trace.sensed.contact.weight
-        motions.append((pelvis_ws(scene, result), legs.knee.pos, legs.ankle, contact))
+        legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
+        contact = result.trace.sensed.contact.weight
+        if (capture := scene.capture) is not None:
+            legs, pelvis = observation.shown(capture, scene.rig, scene.frames, legs, pelvis)
+            contact = observation.delayed(capture, scene.frames, contact)
+        motions.append((pelvis, legs.knee.pos, legs.ankle, contact))
     return motions
 
 

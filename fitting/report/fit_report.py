@@ -19,7 +19,7 @@ from fitting.studies.assess import MIN_IMPROVEMENT
 from fitting.studies.fit import Fit
 from fitting.studies.run_folder import SUMMARY
 
-from . import fit_tables, worst_window_report
+from . import capture_report, fit_tables, worst_window_report
 from .formatting import aligned, bullets, joined, markdown
 from .goodness import goodness_report
 from .identifiability.sections import sections as identifiability_sections
@@ -39,7 +39,13 @@ def fit_text(fitted: Fit) -> str:
     if not rows:
         return joined([*parts, fitted.summary["message"]])
     parts += [fitted.summary["message"], cost_sentence(fitted), ""]
-    parts.append(aligned(fit_tables.parameter_table(rows, truth)))
+    system, capture = capture_report.of_system(rows), capture_report.of_capture(rows)
+    parts.append(aligned(fit_tables.parameter_table(system, truth)))
+    if capture:
+        parts += ["", f"{capture_report.HEADING}:"]
+        parts.append(aligned(fit_tables.parameter_table(capture, truth)))
+    if seen := capture_report.sentences(fitted):
+        parts += ["", *seen]
     if any("half_life" in row for row in rows):
         parts += ["", aligned(fit_tables.gain_table(rows))]
     if truth:
@@ -71,7 +77,7 @@ def write_fit(
     with ExitStack() as drawing, calls_beside():
         with activity.announced("Drawing the curves of the parameters"):  # which takes longest
             curves = _draw_search(run, fitted)
-        plays = zip(fitted.problem.data, fitted.playbacks, strict=True)
+        plays = zip(fitted.scenes, fitted.playbacks, strict=True)
         for index, (scene, after) in enumerate(plays):
             with activity.announced(f"Drawing {_clip_names(fitted, index)[0]}"):
                 first = playback.play(scene, before[index])
@@ -79,14 +85,14 @@ def write_fit(
                 worst += _worst_window(run, fitted, index, after)
         plots |= curves
         with activity.announced("Measuring where limits are in effect"):
-            clips = limit_activity.measure(fitted.ik, fitted.problem.data, fitted.results)
+            clips = limit_activity.measure(fitted.ik, fitted.scenes, fitted.results)
             limits = _limits(fitted, clips)
         parts = [
             *_result(fitted),
             *_check(fitted),
             *opening,
             *goodness_report.section(fitted),
-            *(_parameters(fitted, clips) if fitted.experiment.free else []),
+            *(_parameters(fitted, clips) if fitted.experiment.free_count else []),
             *limits,
             *worst,
             *details,
@@ -167,7 +173,7 @@ def _draw_clip(run: Path, fitted: Fit, index: int, first: Playback, after: Playb
 
 def _draw_search(run: Path, fitted: Fit) -> Plots:
     """Draws the curves of the parameters and the course of the search, where there was one."""
-    if not fitted.experiment.free:
+    if not fitted.experiment.free_count:
         return {}
     title = f"{fitted.experiment.name}: cost of the fit over time"
     cost = fit_plots.cost(fitted.solution.history, fitted.solution.cost_before, title)
@@ -200,11 +206,13 @@ def _check(fitted: Fit) -> list[str]:
 
 def _parameters(fitted: Fit, clips: Sequence[ClipActivity]) -> list[str]:
     rows, truth = fitted.summary["parameters"], fitted.known_values
-    parts = ["## Parameters", markdown(fit_tables.parameter_table(rows, truth))]
+    table = fit_tables.parameter_table(capture_report.of_system(rows), truth)
+    parts = ["## Parameters", markdown(table)]
     if truth:
         parts.append(f"{fit_tables.recovered(rows, truth)}.")
     if any("half_life" in row for row in rows):
         parts.append(markdown(fit_tables.gain_table(rows)))
+    parts += capture_report.section(fitted, truth)
     return [*parts, *priors.prior_section(rows), *identifiability_sections(fitted, clips)]
 
 

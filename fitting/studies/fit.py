@@ -23,8 +23,9 @@ from fitting.inference.identifiability import Identifiability
 from fitting.inference.noise.model import NoiseModel, noise_of
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.profiles import profile
+from fitting.problem.capture.system import is_of_capture, system_and_scenes
 from fitting.problem.problem import Problem
-from fitting.problem.scene import WHITENED
+from fitting.problem.scene import WHITENED, Scene
 from fitting.runtime import activity
 from fitting.runtime.display.data_frames import data_frame
 from fitting.runtime.display.notebook import Shown
@@ -36,6 +37,8 @@ from jaxik.maths import parameter_tree, smoothing
 from . import capture_check
 from .capture_check import CaptureCheck
 from .goodness import DistancesSummary, GoodnessSummary, summarise, summarise_distances
+from .motions import capture_signs
+from .motions.capture_signs import CaptureSigns
 from .prior_summary import PriorSummary, summarise_priors
 
 if TYPE_CHECKING:
@@ -69,6 +72,8 @@ class FittedParameter(TypedDict):
     """A free parameter after a fit, as `fit.json` holds it."""
 
     name: str
+    of: NotRequired[Literal["system", "capture"]]
+    """What it belongs to; fits by earlier versions know systems only."""
     kind: Literal["smooth", "threshold"]
     unit: str
     u: U
@@ -146,20 +151,29 @@ class Fit(Shown):
     """The clips of the problem with whole skeletons; without them no motion is shown or saved."""
 
     @cached_property
+    def _fitted(self) -> tuple[jaxik.FootIK, tuple[Scene, ...]]:
+        return system_and_scenes(self.problem, self.solution.u)
+
+    @property
     def ik(self) -> jaxik.FootIK:
         """The fitted system."""
-        return self.problem.space.unpack(self.solution.u)
+        return self._fitted[0]
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """The clips of the problem, as the fitted capture takes them where one is fitted."""
+        return self._fitted[1]
 
     @cached_property
     def results(self) -> tuple[jaxik.Result, ...]:
         """What the fitted system makes of each clip."""
         with activity.announced("Playing the clips with the fitted system"):
-            return playback.run_all(self.ik, self.problem.data)
+            return playback.run_all(self.ik, self.scenes)
 
     @cached_property
     def playbacks(self) -> tuple[Playback, ...]:
         """The clips with the fitted system."""
-        scenes = zip(self.problem.data, self.results, strict=True)
+        scenes = zip(self.scenes, self.results, strict=True)
         return tuple(playback.play(scene, result) for scene, result in scenes)
 
     @cached_property
@@ -192,14 +206,17 @@ class Fit(Shown):
     @cached_property
     def before(self) -> tuple[jaxik.Result, ...]:
         """What the system as it was before the fit makes of each clip."""
-        space = self.problem.space
         with activity.announced("Playing the clips with the system before the fit"):
-            return playback.run_all(space.unpack(space.pack({})), self.problem.data)
+            return playback.run_all(*self._before)
+
+    @cached_property
+    def _before(self) -> tuple[jaxik.FootIK, tuple[Scene, ...]]:
+        return system_and_scenes(self.problem, self.problem.space.pack({}))
 
     @cached_property
     def distances(self) -> Distances:
         """How far animation, system before the fit and fitted one are from the capture."""
-        scenes = zip(self.problem.data, self.before, strict=True)
+        scenes = zip(self._before[1], self.before, strict=True)
         before = [playback.play(scene, result) for scene, result in scenes]
         return distances.measure(before, self.playbacks)
 
@@ -211,9 +228,7 @@ class Fit(Shown):
     @property
     def kept_system(self) -> jaxik.FootIK:
         """The system that is worth keeping: the fitted one, unless the one before it is better."""
-        if self.distances.better == "fitted":
-            return self.ik
-        return self.problem.space.unpack(self.problem.space.pack({}))
+        return self.ik if self.distances.better == "fitted" else self._before[0]
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -221,6 +236,20 @@ class Fit(Shown):
         if self.has_noise:
             return verdict.judge(self.groups, self.assumed, self.distances)
         return verdict.judge_tolerances(self.groups)
+
+    @property
+    def clips_as_fitted(self) -> tuple[ClipData, ...]:
+        """The clips, on their ground as the fitted capture takes it."""
+        pairs = zip(self.clips, self.scenes, strict=False)
+        return tuple(
+            clip if scene.capture is None else clip._replace(terrain=scene.terrain)
+            for clip, scene in pairs
+        )
+
+    @cached_property
+    def capture_signs(self) -> list[CaptureSigns]:
+        """What each clip shows of a capture that is not as it seems."""
+        return capture_signs.find(self.clips, self.playbacks) if self.has_noise else []
 
     @property
     def start_sd(self) -> Float[np.ndarray, " free"]:
@@ -287,6 +316,7 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
         curve = known.profiles[parameter.name]
         row: FittedParameter = {
             "name": parameter.name,
+            "of": "capture" if is_of_capture(parameter.name) else "system",
             "kind": parameter.kind,
             "unit": declared[parameter.leaf].unit,
             "u": float(solution.u[i]),

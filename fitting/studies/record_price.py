@@ -11,7 +11,9 @@ from fitting.analysis import playback
 from fitting.analysis.goodness import groups
 from fitting.experiments.record_only import left_out
 from fitting.inference.optimisation.solution import Progress
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.problem import Problem
+from fitting.problem.space import Vector
 from fitting.runtime.precision import in_float64
 
 from .assess import search
@@ -55,17 +57,15 @@ def measure(fitted: Fit, progress: Callable[[Progress], None] | None = None) -> 
     freed = search(problem, settings, progress, np.asarray(space.pack(begin)))
     if freed.interrupted:
         return None
-    ik = space.unpack(freed.u)
-    before, after = _errors(fitted.problem, fitted.ik), _errors(problem, ik)
+    before, after = _errors(fitted.problem, fitted.solution.u), _errors(problem, freed.u)
     errors = {kind: (before[kind], after[kind]) for kind in before}
     return RecordPrice(tuple(names), fitted.solution.cost, freed.cost, errors)
 
 
-def _errors(problem: Problem[jaxik.FootIK], ik: jaxik.FootIK) -> dict[str, float]:
-    """Root mean square of the errors by kind, over all clips."""
+def _errors(problem: Problem[jaxik.FootIK], u: Vector) -> dict[str, float]:
+    """Root mean square of the errors by kind at a point, over all clips."""
     squares: dict[str, list[np.ndarray]] = {}
-    for scene, result in zip(problem.data, playback.run_all(ik, problem.data), strict=True):
-        play = playback.play(scene, result)
+    for play in playback.play_all(*system_and_scenes(problem, u)):
         for kind in play.fitted_kinds:
             in_sigmas, _, counts = groups.series(play, kind)
             sizes = in_sigmas[counts] * float(play.sigmas[kind])

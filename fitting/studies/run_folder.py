@@ -31,6 +31,7 @@ from fitting.inference.noise.model import NoiseModel
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.sampling import inference_data
+from fitting.problem.capture.system import alone, is_of_capture
 from fitting.problem.problem import Problem
 from fitting.runtime import activity
 from fitting.runtime.files import TEMPORARY, write_text
@@ -99,7 +100,7 @@ def save_solution(
     for name in (FIT, FITTED_PARAMETERS):
         (run / name).unlink(missing_ok=True)
     _write_toml(run / EXPERIMENT, experiment_files.experiment_to_toml(experiment, run))
-    _write_system(run / PARAMETERS, experiment, problem, problem.space.unpack(solution.u))
+    _write_system(run / PARAMETERS, experiment, problem, alone(problem.space.unpack(solution.u)))
 
 
 def _write_system(
@@ -161,7 +162,11 @@ def load_fitted_system(run: Path, rig: jaxik.Rig | None = None) -> jaxik.FootIK:
 def _check_has_parameters(path: Path, summary: FitSummary) -> None:
     """Raises ValueError for the parameters of another fit."""
     present = flatten(read_toml(path, "a parameter"), 2)
-    names = {row["name"].partition("[")[0] for row in summary["parameters"]}
+    names = {
+        row["name"].partition("[")[0]
+        for row in summary["parameters"]
+        if not is_of_capture(row["name"])
+    }
     if missing := sorted(names - set(present)):
         raise ValueError(f"{path}: not the system of this fit: no {', '.join(missing)}; {HINT}")
 

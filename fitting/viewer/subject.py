@@ -21,10 +21,12 @@ from fitting.experiments.experiment import Experiment
 from fitting.experiments.problems import ClipData
 from fitting.experiments.systems import Preset
 from fitting.inference.noise.model import NoiseModel, with_noise
+from fitting.problem.capture.system import alone, is_of_capture, system_and_scenes
 from fitting.problem.free_parameters import FreeParameter
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_of_scenes
 from fitting.problem.scene import Scene
+from fitting.problem.space import Vector
 from fitting.runtime.precision import in_float64, with_floats
 from fitting.runtime.program_cache import cached
 from fitting.studies import run_folder
@@ -116,15 +118,18 @@ def subject_of_run(run: Path) -> Subject:
     problem = problems.problem_from_clips(experiment, clips)
     if "noise" in summary:
         problem = with_noise(problem, NoiseModel(**summary["noise"]))
-    subject = subject_of_fit(experiment, problem, clips)
     values = {row["name"]: row["u"] for row in summary["parameters"]}
     u = np.array([values[name] for name in problem.space.names])
-    return with_start(subject, FITTED, problem.space.unpack(u))
+    subject = subject_of_fit(experiment, problem, clips, u)
+    return with_start(subject, FITTED, alone(problem.space.unpack(u)))
 
 
 @in_float64
 def subject_of_fit(
-    experiment: Experiment, problem: Problem[jaxik.FootIK], clips: tuple[ClipData, ...]
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    clips: tuple[ClipData, ...],
+    u: Vector | None = None,
 ) -> Subject:
     """The clips of an experiment, and its system as it is before the fit.
 
@@ -132,7 +137,9 @@ def subject_of_fit(
         experiment: what is fitted to what.
         problem: of the experiment.
         clips: of the problem.
+        u: where the captures are taken from, if they are fitted, too; None takes them as they seem.
     """
+    scenes = system_and_scenes(problem, problem.space.pack({}) if u is None else u)[1]
     rig = clips[0].base.rig
     default = with_floats(experiment.preset_system(rig), np.float64)
     if any(clip.root.rise is not None for clip in clips):
@@ -148,16 +155,19 @@ def subject_of_fit(
             size=scene.size,
             captured=with_soles_of(clip.reference, clip.base),
         )
-        for number, (clip, scene) in enumerate(zip(clips, problem.data, strict=True), 1)
+        for number, (clip, scene) in enumerate(zip(clips, scenes, strict=True), 1)
     )
+    cost = partial(cost_of_problem, problem)
+    if experiment.capture:  # then the problem is one of more than a system
+        cost = partial(cost_of_scenes, scenes)
     return Subject(
         title=experiment.name,
         takes=takes,
-        starts={"before": problem.space.system, DEFAULT: default},
+        starts={"before": alone(problem.space.system), DEFAULT: default},
         preset=Preset(experiment.preset, experiment.faithful),
-        free=problem.space.parameters,
+        free=tuple(p for p in problem.space.parameters if not is_of_capture(p.name)),
         leg_length=experiment.leg_length(problem.data[0].rig),
-        cost=partial(cost_of_problem, problem),
+        cost=cost,
     )
 
 

@@ -58,6 +58,11 @@ VALID: list[Parts] = [
     {"rest": "[parameters]\nprobe.layers = 3"},
     {"rest": "[prior]\nspread = 1\n[prior.pelvis]\non_gain.spread = 2"},
     {"rest": '[[without]]\nname = "a"\nrules.lock = "NoLock"'},
+    {"rest": '[capture]\nscale = {}\n"time_shift[0]" = { low = -0.1 }\nankle_up.high = 0.05'},
+    {
+        "rest": "[capture]\nscale = {}\n[prior.capture]\nscale.centre = 1.01\n"
+        "[start]\ncapture.scale = 1"
+    },
 ]
 # In one part of the text each, with what the reader says; the schema refuses them as well.
 MISTAKES = {
@@ -106,6 +111,10 @@ MISTAKES = {
         ("[parameters]\nlock.enabled = 1", "lock.enabled is 1; wanted true or false"),
         ("[rules]\narm = 'TwoBone'", r"\[rules\]: unknown key 'arm'"),
         ("[rules]\nleg = 'FlatFoot'", "leg has no rule 'FlatFoot'; it has .'TwoBone'"),
+        ("[capture]\nheight = {}", "unknown key 'height'; nearest is 'ground_height'"),
+        ("[capture]\nscale = { lo = 1 }", r"\[capture\] scale: unknown key 'lo'; nearest is"),
+        ("[capture]\nscale = 1.01", r"\[capture\] scale is 1.01; wanted a table"),
+        ("[capture]\n'scale[x]' = {}", r"no clip for 'scale\[x\]'; wanted a number of"),
         ("[sigmas]\nankel = 1", "unknown key 'ankel'; nearest is 'ankle'"),
         ("[sigmas]\nankle = true", "ankle is True; wanted a number from 0.001"),
         ("[sigmas.correlation]\nankel = 0.1", "unknown key 'correlation.ankel'; nearest"),

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from fitting.analysis import limit_activity, playback
+from fitting.analysis.capture_signs.ground import GroundOffset
 from fitting.analysis.goodness import verdict
 from fitting.datasets.synthetic import walker
 from fitting.experiments import experiment_files, known_values
@@ -33,7 +34,7 @@ from fitting.problem import residuals
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, make_space
-from fitting.report import fit_report, posterior_report
+from fitting.report import capture_report, fit_report, posterior_report
 from fitting.report.formatting import markdown
 from fitting.report.goodness import goodness_report
 from fitting.report.plots import posterior_plots
@@ -41,6 +42,7 @@ from fitting.report.uncertainty import islands, priors
 from fitting.runtime.display import notebook
 from fitting.studies import run_folder
 from fitting.studies.fit import Fit
+from fitting.studies.motions.capture_signs import CaptureSigns
 from fitting.studies.sample import SampledFit
 from jaxik.maths import parameter_tree
 from jaxik.world import terrain
@@ -564,3 +566,33 @@ def test_a_posterior_is_shown_and_is_a_table_if_there_is_pandas(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match=r'this needs pandas: pip install "jaxik\[tables\]"'):
         posterior.table()
+
+
+# The capture
+
+
+def test_numbers_of_a_capture_and_offsets_that_are_seen_stand_apart_from_the_system(fitted):
+    shown = replace(fitted)
+    rows = fitted.summary["parameters"]
+    of_capture = {**rows[1], "name": "capture.ground_height", "unit": "m", "of": "capture"}
+    vars(shown)["summary"] = {**fitted.summary, "parameters": [*rows, of_capture]}
+    seen = GroundOffset(-0.029, 0.004, 14, tilt_z=math.radians(1.2))
+    vars(shown)["capture_signs"] = [CaptureSigns(seen, -0.031)]
+    text = fit_report.fit_text(shown)
+    system, _, capture = text.partition("The capture:")
+    assert "capture.ground_height" in capture and "capture.ground_height" not in system
+    sentences = capture_report.sentences(shown)
+    assert [line in text for line in sentences] == [True] * 3
+    assert sentences[0] == (
+        "Standing feet are 2.9 cm in the ground in the median of 14 stances, which scatter by "
+        "0.4 cm: a floor offset? `[capture] ground_height = {}` fits it along."
+    )
+    assert "1.2° along z: a tilted floor? `[capture] ground_tilt_z = {}`" in sentences[1]
+    assert "31 ms before the fitted ones: a time shift? `[capture] time_shift" in sentences[2]
+    section = "\n".join(capture_report.section(shown, None))
+    assert section.startswith("## The capture") and "capture.ground_height" in section
+    freed = replace(shown, experiment=replace(shown.experiment, capture={"time_shift": {}}))
+    vars(freed)["capture_signs"] = vars(shown)["capture_signs"]
+    assert len(capture_report.sentences(freed)) == 2  # what is fitted needs no remedy
+    vars(freed)["capture_signs"] = [CaptureSigns(GroundOffset(0.0, 0.01, 14), 0.0)] * 2
+    assert capture_report.sentences(freed) == [] and capture_report.section(fitted, None) == []

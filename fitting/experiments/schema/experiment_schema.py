@@ -29,8 +29,9 @@ def experiment_schema() -> Content:
         "free": system_schema.of_free_parameters("free"),
     }
     tables = of_system | {
+        "capture": system_schema.capture(),
         "prior": system_schema.prior(),
-        "start": system_schema.of_free_parameters("start"),
+        "start": system_schema.start(),
         "sigmas": _sigmas(),
         "noise": _made_by(keys.NOISE_KEYS, NoiseOptions),
         "fit": _fit(),

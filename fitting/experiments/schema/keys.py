@@ -138,6 +138,7 @@ NOISE_KEYS = {
 TABLES = {
     "free": "What is fitted, if anything; {} takes range, kind and scale from the rule's"
     " declaration. Needed.",
+    "capture": "What is not known of the captures and fitted beside the system, for each clip.",
     "prior": "What is known of free parameters before any clip.",
     "start": "Where the search begins; left out, at the system's values.",
     "rules": "Rules that differ from the preset's, by stage.",

@@ -14,6 +14,7 @@ import equinox as eqx
 import jaxik
 from fitting.experiments import systems
 from fitting.experiments.tables.prior_tables import KEYS as PRIOR_KEYS
+from fitting.problem.capture.parameters import Capture
 from fitting.problem.prior import SPREAD
 from fitting.runtime.validation import NUMBER, Content
 from jaxik.maths import parameter_tree
@@ -69,12 +70,42 @@ def of_free_parameters(table: str) -> Content:
     return _by_stage(lambda field: entry if field.is_parameter else None, LEG)
 
 
+def capture(table: str = "free") -> Content:
+    """The schema of [capture], of [prior.capture] or of [start.capture]."""
+    entry, fields = {"$ref": f"#/$defs/{table}"}, Capture()
+    declared = parameter_tree.declarations(fields)
+    descriptions = {
+        name: f"{known.doc} Range: {known.low:g} to {known.high:g}"
+        f"{'' if known.unit == '1' else f' {known.unit}'}."
+        for name, known in declared.items()
+    }
+    clips = {rf"^({'|'.join(declared)})\[\d+\]$": entry}
+    return closed({name: entry | {"description": d} for name, d in descriptions.items()}, clips)
+
+
+def start() -> Content:
+    """The schema of [start]: tables of parameters, and of captures."""
+    return _with_captures("start")
+
+
 def prior() -> Content:
-    """The schema of [prior]: keys of its own, and tables of parameters."""
+    """The schema of [prior]: keys of its own, and tables of parameters, and of captures."""
     own = {key: dict(PRIOR_KEYS[key].schema) for key in ("shape", "spread")}
     own["shape"]["default"], own["spread"]["default"] = "normal", SPREAD
-    tables = of_free_parameters("prior")
+    tables = _with_captures("prior")
     return tables | {"properties": own | tables["properties"]}
+
+
+def _with_captures(table: str) -> Content:
+    """The schema of free parameters in a table, those of captures too."""
+    tables, entry = of_free_parameters(table), {"$ref": f"#/$defs/{table}"}
+    names = "|".join(parameter_tree.declarations(Capture()))
+    pattern = {rf"^capture\.({names}){LEG}$": entry}
+    captures = capture(table) | {"description": "Of what is fitted of the captures."}
+    return tables | {
+        "properties": tables["properties"] | {"capture": captures},
+        "patternProperties": tables["patternProperties"] | pattern,
+    }
 
 
 def only_originals() -> Content:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxik
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.problem.residuals import errors_by_kind
 from fitting.problem.scene import LEAST_SIGMAS, MEASURED, WHITENED, Scene
@@ -185,8 +186,8 @@ def _influence(problem: Problem[jaxik.FootIK], residuals: np.ndarray) -> np.ndar
 
 
 def _errors_of_clips(problem: Problem[jaxik.FootIK], u: Vector) -> list[dict[str, Errors]]:
-    ik = problem.space.unpack(jnp.asarray(u))
-    pairs = zip(problem.data, _errors_by_kind(ik, problem.data), strict=True)
+    ik, scenes = system_and_scenes(problem, jnp.asarray(u))
+    pairs = zip(scenes, _errors_by_kind(ik, scenes), strict=True)
     return [_counted(scene, values) for scene, values in pairs]
 
 

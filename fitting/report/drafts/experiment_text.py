@@ -34,6 +34,9 @@ def as_toml(draft: Draft) -> str:
     parts += ["", _heading("rules", schema), "", _heading("parameters", schema)]
     parts += [f"{_key(name)} = {_value(value)}" for name, value in experiment.parameters.items()]
     parts += ["", _heading("free", schema), *_free(draft)]
+    parts += ["", _heading("capture", schema)]
+    for name, entry in schema["capture"]["properties"].items():
+        parts.append(f"# {name} = {{}}  # {entry['description']}")
     for name in ("prior", "start", "sigmas", "noise", "hierarchy", "fit", "sample"):
         keys = _plain_keys(schema[name]["properties"])
         parts += ["", _heading(name, schema), *_keys({}, keys)]

@@ -46,10 +46,11 @@ def _rig(experiment: Experiment) -> jaxik.Rig | None:
 def _free(experiment: Experiment) -> Table:
     rig = _rig(experiment)
     ik = experiment.starting_system(rig)
-    declared = parameter_tree.declarations(ik)
+    shown = experiment.with_capture(ik)
+    declared = parameter_tree.declarations(shown)
     rows = [["free parameter", "value", "unit", "range", "meaning"]]
     for free in experiment.free_parameters(ik, rig):
         meaning = declared[free.leaf]
-        value = parameter_tree.shown(ik, free.leaf)
+        value = parameter_tree.shown(shown, free.leaf)
         rows.append([free.name, value, meaning.unit, interval(free.low, free.high), meaning.doc])
     return rows

@@ -23,6 +23,9 @@ def rows(experiment: Experiment) -> Table:
         ["System", system(experiment)],
         [f"Free parameters ({len(experiment.free)})", free],
     ]
+    if experiment.capture:
+        of_capture = ", ".join(f"`{name}`" for name in experiment.capture)
+        table.append([f"Of the captures ({len(experiment.capture)})", of_capture])
     for number, entry in enumerate(experiment.clips, 1):
         heading = f"Clip {number}" if len(experiment.clips) > 1 else "Clip"
         table.append([heading, _clip(entry)])

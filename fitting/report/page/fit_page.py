@@ -12,12 +12,12 @@ from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.placement import Placement
 from fitting.analysis.worst_window import WorstWindow
 from fitting.datasets.clips import flight
-from fitting.report import fit_tables, worst_window_report
+from fitting.report import capture_report, fit_tables, worst_window_report
 from fitting.report.formatting import Table
 from fitting.report.goodness import goodness_tables
 from fitting.report.identifiability.sections import missing_table
 from fitting.runtime.precision import in_float64
-from fitting.studies.fit import Fit
+from fitting.studies.fit import Fit, FittedParameter
 from fitting.studies.motions import fit_motions
 from fitting.studies.motions.fit_motions import ClipMotions
 from fitting.studies.run_folder import PAGE
@@ -40,7 +40,7 @@ def write(run: Path, fitted: Fit, measured: Measured) -> None:
     """Writes the page of a fit with its clips into the folder of its run."""
     motions = [
         fit_motions.clip_motions(*results)
-        for results in zip(fitted.clips, measured.before, fitted.results, strict=True)
+        for results in zip(fitted.clips_as_fitted, measured.before, fitted.results, strict=True)
     ]
     windows = [worst_window.find_worst_window(play) for play in fitted.playbacks]
     content = _content(fitted, motions, measured.activities)
@@ -75,12 +75,15 @@ def _content(
     """The variables of the template."""
     summary, space = fitted.summary, fitted.problem.space
     docs = parameter_tree.docs(space.system)
-    rows = figures.parameter_rows(
-        summary["parameters"],
-        {parameter.name: parameter.scale for parameter in space.parameters},
-        {parameter.name: docs.get(parameter.leaf, "") for parameter in space.parameters},
-        fitted.known_values,
-    )
+
+    def rows(parameters: Sequence[FittedParameter]) -> list[figures.ParameterRow]:
+        return figures.parameter_rows(
+            parameters,
+            {parameter.name: parameter.scale for parameter in space.parameters},
+            {parameter.name: docs.get(parameter.leaf, "") for parameter in space.parameters},
+            fitted.known_values,
+        )
+
     accuracies = fit_motions.summarised(motions)
     limits, idle = figures.limit_table(activities)
     return {
@@ -90,7 +93,9 @@ def _content(
         "findings": sentences.findings(fitted, motions, accuracies),
         "technical": f"{summary['goodness']['sentence']} {summary['message']}",
         "requested": _asked(fitted),
-        "rows": rows,
+        "rows": rows(capture_report.of_system(summary["parameters"])),
+        "capture_rows": rows(capture_report.of_capture(summary["parameters"])),
+        "capture_signs": capture_report.sentences(fitted),
         "recovered": fit_tables.recovered(summary["parameters"], fitted.known_values)
         if fitted.known_values
         else "",
@@ -122,6 +127,8 @@ def _asked(fitted: Fit) -> Table:
         ["System", asked.system(experiment)],
         ["Free parameters", f"{len(experiment.free)}"],
     ]
+    if experiment.capture:
+        rows.append(["Of the captures", f"{experiment.free_count - len(experiment.free)}"])
     for number, (clip, entry) in enumerate(zip(fitted.clips, experiment.clips, strict=True), 1):
         frames = clip.reference.frame_count
         rows.append(

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fitting.experiments import captures
 from fitting.experiments.experiment import ClipEntry, Experiment
 from fitting.experiments.experiment_files import experiment_to_toml
 from fitting.studies.hierarchy.population import clip_names
@@ -57,7 +58,8 @@ def plan(
         together: whether the clips of an experiment are fitted together, as `jaxik fit` does.
 
     Raises:
-        ValueError: there is no experiment, or not one seed.
+        ValueError: there is no experiment, or not one seed; a capture of one of several clips is
+            fitted, which each would be alone.
     """
     if not experiments:
         raise ValueError("no experiments; wanted one or more")
@@ -80,6 +82,7 @@ def _parts(
     clips = clip_names(experiment.clips)
     if together:
         return [(clips[0] if len(clips) == 1 else TOGETHER, experiment, ())]
+    captures.check_unnumbered(experiment.capture, str(experiment.path))
     folders = _distinct([_file_name(clip) for clip in clips])
     return [
         (clip, _alone(experiment, entry), (folder,))

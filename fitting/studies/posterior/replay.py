@@ -18,6 +18,7 @@ from fitting.inference.noise import marginal
 from fitting.inference.noise.density import NoiseDensity
 from fitting.inference.sampling.blocks import BlockLogLikelihood
 from fitting.inference.sampling.posterior import Posterior
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.problem import Problem
 from fitting.problem.scene import MEASURED, Scene
 from fitting.runtime import activity
@@ -58,11 +59,11 @@ def replay(problem: Problem[jaxik.FootIK], posterior: Posterior, seed: int) -> R
     clips = [_Clip(problem, index, seed) for index in range(len(problem.data))]
     with activity.announced(f"Playing {len(u)} draws of the posterior", len(u)) as playing:
         for draw, row in enumerate(u):
-            ik = problem.space.unpack(jnp.asarray(row))
+            plays = playback.play_all(*system_and_scenes(problem, jnp.asarray(row)))
             drawn = {kind: float(values[draw]) for kind, values in sigmas.items()}
             replicated = draw % math.ceil(len(u) / REPLICATES) == 0
-            for clip, result in zip(clips, playback.run_all(ik, problem.data), strict=True):
-                clip.add(result, drawn, replicated)
+            for clip, played in zip(clips, plays, strict=True):
+                clip.add(played, drawn, replicated)
             playing.advance()
     ess = min(row["ess"] for row in posterior.summary)
     values = np.concatenate([clip.log_likelihood for clip in clips], axis=1)
@@ -96,15 +97,14 @@ class _Clip:
         self._channels: dict[str, list[np.ndarray]] = defaultdict(list)
         self._last: Playback | None = None
 
-    def add(self, result: jaxik.Result, sigmas: Mapping[str, float], replicated: bool) -> None:
+    def add(self, played: Playback, sigmas: Mapping[str, float], replicated: bool) -> None:
         """Takes in what the system of one draw makes of the clip, and replicates its motion.
 
         Args:
-            result: of the system.
+            played: the clip with the system.
             sigmas: of this draw, by kind; others are the scene's.
             replicated: whether to make one.
         """
-        played = playback.play(self._scene, result)
         given = {kind: float(sigma) for kind, sigma in played.sigmas.items()}
         ratios = {kind: sigma / given[kind] for kind, sigma in sigmas.items()}
         frames = likelihoods.of_frames(played, self._scene, self._density, ratios)
