@@ -145,6 +145,5 @@ def refuse(capture: FreeTable, where: str, command: str) -> None:
     if capture:
         raise ValueError(
             f"{where} [capture]: {sorted(capture)} cannot be fitted by `jaxik {command}`, which "
-            "compares systems on clips as they are; fit them by `jaxik fit`, correct the clips by "
-            "what it finds, and leave the table out"
+            "takes clips as they are; leave the table out, or see by `jaxik fit` what it finds"
         )

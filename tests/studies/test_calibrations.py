@@ -336,3 +336,17 @@ def test_ozz_is_calibrated(tmp_path):
     assert numbers["inside"] and not numbers["wrong"] and not numbers["unconverged"]
     assert numbers["fit_coverage"]["hits"] >= 48 and numbers["fit_coverage"]["total"] == 56
     assert numbers["recovery"]["hits"] == numbers["recovery"]["total"] >= 44
+
+
+@pytest.mark.slow
+def test_numbers_of_a_capture_come_back_within_their_intervals():
+    """Of 50 motions, each with a ground, a time and ankles that are off by draws from the priors."""
+    path = ROOT / "data" / "experiments" / "calibration" / "capture.toml"
+    assessment = fitting.calibrate(path, replicates=50)
+    assert assessment.outside == []
+    recovered = {n: r.hits for n, r in assessment.recovery_of.items() if n.startswith("capture.")}
+    assert recovered == {
+        "capture.ground_height": 50,
+        "capture.time_shift": 50,
+        "capture.ankle_up": 50,
+    }
