@@ -132,6 +132,13 @@ def test_a_wrong_valley_is_counted_whether_or_not_the_fit_says_so(made):
     assert "a valley 3.5 above the truth's" in calibration_report.fit_line(fits[1])
 
 
+def test_costs_of_valleys_are_compared_without_the_weight_of_residuals(experiment_file):
+    path = write_calibration(experiment_file.parent, "independent_every = 0.5")
+    (fitted,) = calibrate(path, None, 1).fits
+    assert fitted["cost"] == pytest.approx(fitted["truth_valley_cost"], abs=1e-3)
+    assert fitted["cost"] > 0.1
+
+
 def test_only_the_intervals_of_thresholds_may_cover_more_than_they_promise(made):
     """Whose ends lie on plateaus of the cost: 95 % is what they promise at least."""
     fitted = made.kept.fits[0]

@@ -134,7 +134,7 @@ def fit_replicate(
         "truth_u": truth.u.tolist(),
         "truth": values.tolist(),
         "truth_levels": levels,
-        "truth_valley_cost": _polished_cost(simulated, own.fit.search, truth.u),
+        "truth_valley_cost": _polished_cost(simulated.with_weight(1.0), own.fit.search, truth.u),
         "cost": solution.cost,
         "converged": solution.converged,
         "message": solution.message,
