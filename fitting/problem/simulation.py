@@ -1,5 +1,6 @@
 """Problems whose truth is known: references made by a system itself, plus noise."""
 
+import dataclasses
 from typing import TypeAlias
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxik
+from fitting.runtime import program_cache
 from fitting.runtime.precision import in_float64
 from fitting.runtime.program_cache import cached
 from jaxik.maths import quat
@@ -17,7 +19,7 @@ from jaxik.world.skeleton import Transform
 from .capture import observation
 from .capture.system import system_and_scenes
 from .problem import Problem
-from .scene import Reference, Scene, legs_ws, pelvis_ws
+from .scene import Scene, legs_ws, own_system, pelvis_ws
 from .shared_world import run_scenes
 from .space import Vector
 
@@ -51,11 +53,41 @@ def simulate(problem: Problem[jaxik.FootIK], u: Vector, seed: int = 0) -> Proble
     return eqx.tree_at(lambda problem: problem.data, problem, scenes)
 
 
+@in_float64
+def with_motion_of(problem: Problem[jaxik.FootIK], ik: jaxik.FootIK) -> Problem[jaxik.FootIK]:
+    """The same problem with references that any system makes, without noise."""
+    scenes = tuple(_with_reference(scene, *_motion_of(ik, scene)) for scene in problem.data)
+    return eqx.tree_at(lambda problem: problem.data, problem, scenes)
+
+
+def _motion_of(ik: jaxik.FootIK, scene: Scene) -> Motion:
+    """By the program that also plays clips, which a fit by the same system needs anyway."""
+    own, terrain = own_system(ik, scene), ik.probe.prepare(scene.terrain)
+    tracks = scene.tracks or None
+    result = program_cache.run(own, scene.rig, terrain, scene.frames, tracks=tracks)
+    return _motion(scene, result)
+
+
+def _with_reference(
+    scene: Scene, pelvis: Transform, knee_ws: Array, ankle: Transform, contact: Array
+) -> Scene:
+    """A scene with this motion in its reference; the same frames count."""
+    reference = dataclasses.replace(
+        scene.reference,
+        pelvis=pelvis,
+        knee_ws=knee_ws,
+        ankle=ankle,
+        contact=contact,
+        label="simulated",
+    )
+    return eqx.tree_at(lambda scene: scene.reference, scene, reference)
+
+
 def _simulated(
     scene: Scene, motion: Motion, independent_fraction: float, random: np.random.Generator
 ) -> Scene:
     """A scene whose reference is the motion of a system plus noise."""
-    sigmas, reference = scene.sigmas, scene.reference
+    sigmas = scene.sigmas
     if np.isfinite(sigmas.smooth):
         raise ValueError(
             f"sigmas.smooth is {float(sigmas.smooth):g}: residuals of accelerations follow from "
@@ -69,18 +101,13 @@ def _simulated(
         return sigma * errors if np.isfinite(sigma) else np.zeros(shape)
 
     pelvis, knee_ws, ankle, contact = motion
-    replaced = Reference(
-        pelvis=_displaced(
-            pelvis, noise("pelvis", pelvis.pos.shape), noise("body", pelvis.pos.shape)
-        ),
-        knee_ws=knee_ws + noise("knee", knee_ws.shape),
-        ankle=_displaced(ankle, noise("ankle", ankle.pos.shape), noise("foot", ankle.pos.shape)),
-        contact=contact + noise("contact", contact.shape),
-        observed=reference.observed,
-        held_out=reference.held_out,
-        label="simulated",
+    return _with_reference(
+        scene,
+        displaced(pelvis, noise("pelvis", pelvis.pos.shape), noise("body", pelvis.pos.shape)),
+        knee_ws + noise("knee", knee_ws.shape),
+        displaced(ankle, noise("ankle", ankle.pos.shape), noise("foot", ankle.pos.shape)),
+        contact + noise("contact", contact.shape),
     )
-    return eqx.tree_at(lambda scene: scene.reference, scene, replaced)
 
 
 @cached
@@ -88,14 +115,19 @@ def _motions(ik: jaxik.FootIK, scenes: tuple[Scene, ...]) -> list[Motion]:
     """What captures would show of what a system makes of each clip."""
     motions = []
     for scene, result in zip(scenes, run_scenes(ik, scenes), strict=True):
-        assert result.trace is not None  # `jaxik.run` always has one
-        legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
-        contact = result.trace.sensed.contact.weight
-        if (capture := scene.capture) is not None:
-            legs, pelvis = observation.shown(capture, scene.rig, scene.frames, legs, pelvis)
-            contact = observation.delayed(capture, scene.frames, contact)
-        motions.append((pelvis, legs.knee.pos, legs.ankle, contact))
+        motions.append(_motion(scene, result))
     return motions
+
+
+@cached
+def _motion(scene: Scene, result: jaxik.Result) -> Motion:
+    assert result.trace is not None  # `jaxik.run` always has one
+    legs, pelvis = legs_ws(scene, result), pelvis_ws(scene, result)
+    contact = result.trace.sensed.contact.weight
+    if (capture := scene.capture) is not None:
+        legs, pelvis = observation.shown(capture, scene.rig, scene.frames, legs, pelvis)
+        contact = observation.delayed(capture, scene.frames, contact)
+    return pelvis, legs.knee.pos, legs.ankle, contact
 
 
 def correlated(draws: Noise, correlation: float, independent_fraction: float) -> Noise:
@@ -116,8 +148,8 @@ def autoregression(innovations: Noise, correlation: float) -> Noise:
     return np.asarray(lfilter([1.0], [1.0, -correlation], scaled, axis=0))
 
 
-def _displaced(joint: Transform, shift: Noise, turn: Noise) -> Transform:
-    """A joint moved by `shift` and turned so that its residual from the original is `-turn`."""
+def displaced(joint: Transform, shift: Noise, turn: Noise) -> Transform:
+    """A joint moved by `shift`, m, and turned so that its residual from the original is `-turn`."""
     half = turn / 2  # the residual is twice the sine of half the angle
     w = np.sqrt(np.maximum(1 - np.sum(half**2, axis=-1, keepdims=True), 0))
     rotation = jnp.asarray(np.concatenate([w, half], axis=-1), joint.rot.dtype)

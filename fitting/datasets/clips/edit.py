@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from jaxik.world.skeleton import Rig
@@ -184,18 +184,29 @@ def on_floor(clip: Clip, floor: float, sole: float | None = None) -> Clip:
 
 
 def pops(clip: Clip) -> Bool[np.ndarray, " frames"]:
-    """True where the pelvis, a knee, an ankle or a toe jumps as if a marker had slipped.
-
-    The criterion is a second difference above 2 cm at 120 Hz, the same acceleration at other rates.
-    """
+    """True where the pelvis, a knee, an ankle or a toe jumps as if a marker had slipped."""
     rig = clip.rig
     joints = [rig.pelvis, *(joint for leg in rig.joints for joint in leg[1:])]
-    second_difference = np.diff(clip.positions_ws[:, joints], n=2, axis=0)
-    popped = np.zeros(clip.frame_count, bool)
-    if clip.frame_count > 2:
-        limit = POP * (POP_RATE / clip.fps) ** 2
-        popped[1:-1] = (np.linalg.norm(second_difference, axis=-1) > limit).any(axis=1)
-    return popped
+    return jumps(clip.positions_ws[:, joints], clip.fps)
+
+
+def jumps(
+    positions_ws: Float64[np.ndarray, "frames joints 3"], fps: float
+) -> Bool[np.ndarray, " frames"]:
+    """True where a joint jumps as no body does.
+
+    The criterion is a second difference above 2 cm at 120 Hz, the same acceleration at other rates.
+
+    Args:
+        positions_ws: m.
+        fps: Hz.
+    """
+    second_difference = np.diff(positions_ws, n=2, axis=0)
+    jumped = np.zeros(len(positions_ws), bool)
+    if len(positions_ws) > 2:
+        limit = POP * (POP_RATE / fps) ** 2
+        jumped[1:-1] = (np.linalg.norm(second_difference, axis=-1) > limit).any(axis=1)
+    return jumped
 
 
 def mask_pops(clip: Clip) -> Clip:

@@ -28,7 +28,7 @@ from fitting.problem.simulation import simulate
 from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
 from fitting.studies.assess import assess_solution, search_with_noise
-from fitting.studies.fit import FittedParameter, Interval
+from fitting.studies.fit import Fit, FittedParameter, Interval
 from fitting.studies.sample import sample_around, with_open_noise
 
 DRAWS = 99  # of each posterior, among which the truth has a rank from 0 to 99
@@ -45,18 +45,11 @@ class Truth(NamedTuple):
     """Of the search and the sampler."""
 
 
-class ReplicateFit(TypedDict):
-    """The fit of a replicate, as its file holds it."""
+class Outcome(TypedDict):
+    """The fit of a replicate of any kind, as its file holds it."""
 
     number: int
     """From 0."""
-    truth_u: list[Finite]
-    truth: list[Finite]
-    """In the parameters' units."""
-    truth_levels: list[Finite]
-    """Of the smallest intervals of the profiles that contain the truth, 0..1."""
-    truth_valley_cost: float
-    """Where a descent that begins at the truth ends."""
     cost: float
     converged: bool
     message: str
@@ -68,6 +61,18 @@ class ReplicateFit(TypedDict):
     """As `fit.json` has them."""
     noise: NotRequired[Annotated[Content, NoiseModel]]
     """Where the experiment estimates it."""
+
+
+class ReplicateFit(Outcome):
+    """The fit to motion that the experiment's own system makes."""
+
+    truth_u: list[Finite]
+    truth: list[Finite]
+    """In the parameters' units."""
+    truth_levels: list[Finite]
+    """Of the smallest intervals of the profiles that contain the truth, 0..1."""
+    truth_valley_cost: float
+    """Where a descent that begins at the truth ends."""
 
 
 class ReplicateChain(TypedDict):
@@ -116,25 +121,53 @@ def fit_replicate(
     """
     truth = draw_truth(problem, experiment, number)
     simulated = _simulated(problem, truth, noise_factor)
-    own = dataclasses.replace(experiment, seed=truth.seed)
-    simulated, solution = search_with_noise(simulated, own, progress)
-    if not solution.interrupted:
-        fitted = assess_solution(own, simulated, solution, progress)
-        solution = fitted.solution
-    if solution.interrupted:
-        raise KeyboardInterrupt
+    fitted = fit_simulated(simulated, dataclasses.replace(experiment, seed=truth.seed), progress)
     values = np.asarray(problem.space.values(truth.u))
     profiles = fitted.identifiability.profiles
     levels = [
         level_at(profiles[parameter.name], parameter, value)
         for parameter, value in zip(problem.space.parameters, values, strict=True)
     ]
-    result: ReplicateFit = {
-        "number": number,
+    settings = experiment.fit.search
+    return {
+        **outcome(number, fitted),
         "truth_u": truth.u.tolist(),
         "truth": values.tolist(),
         "truth_levels": levels,
-        "truth_valley_cost": _polished_cost(simulated.with_weight(1.0), own.fit.search, truth.u),
+        "truth_valley_cost": _polished_cost(fitted.problem.with_weight(1.0), settings, truth.u),
+    }
+
+
+def fit_simulated(
+    simulated: Problem[jaxik.FootIK],
+    experiment: Experiment,
+    progress: Callable[[Progress], None] | None = None,
+) -> Fit:
+    """Fits simulated motion as `jaxik fit` does.
+
+    Args:
+        simulated: the problem of the experiment, with this motion.
+        experiment: its settings of the search, with the seed of the replicate.
+        progress: called as the search goes on.
+
+    Raises:
+        KeyboardInterrupt: the search was interrupted; half a fit counts for nothing.
+        ValueError: the fit cannot be assessed.
+    """
+    simulated, solution = search_with_noise(simulated, experiment, progress)
+    if solution.interrupted:
+        raise KeyboardInterrupt
+    fitted = assess_solution(experiment, simulated, solution, progress)
+    if fitted.solution.interrupted:
+        raise KeyboardInterrupt
+    return fitted
+
+
+def outcome(number: int, fitted: Fit) -> Outcome:
+    """What the file of a replicate says of its fit; numbers count from 0."""
+    solution = fitted.solution
+    result: Outcome = {
+        "number": number,
         "cost": solution.cost,
         "converged": solution.converged,
         "message": solution.message,
@@ -143,7 +176,7 @@ def fit_replicate(
         "seconds": solution.seconds,
         "parameters": fitted.parameters,
     }
-    if experiment.noise.estimates_any:
+    if fitted.experiment.noise.estimates_any:
         result["noise"] = dataclasses.asdict(fitted.noise)
     return result
 
