@@ -23,6 +23,7 @@ from .experiments.in_memory.making import make_experiment as make_experiment
 from .experiments.systems import register_rule as register_rule
 from .jobs import ablate as ablate
 from .jobs import calibrate as calibrate
+from .jobs import calibrate_wrong_model as calibrate_wrong_model
 from .jobs import compare as compare
 from .jobs import export as export
 from .jobs import fit as fit

@@ -10,7 +10,8 @@ bits; a system that was made in 32 bits is taken with the values it has there.
 
 `drafts` makes a first experiment of clips: `init`. `fits` searches: `fit`, `sample` and
 `translate`. `ablations` leaves rules out: `ablate`. `calibrations` judges what fits say:
-`calibrate`. `populations` fits several clips and subjects: `population`. `many`
+`calibrate` and
+`calibrate_wrong_model`. `populations` fits several clips and subjects: `population`. `many`
 fits clips × experiments × seeds in other processes: `fit_many`. `animations` runs finished
 systems: `solve`, `apply`, `compare` and `run_suite`. `views` shows runs, clips and fits in the
 browser: `view`, `view_run`. `comparisons` compares sampled runs: `compare_runs`. `exports` writes
@@ -23,6 +24,7 @@ from .animations import compare as compare
 from .animations import run_suite as run_suite
 from .animations import solve as solve
 from .calibrations import calibrate as calibrate
+from .calibrations import calibrate_wrong_model as calibrate_wrong_model
 from .comparisons import compare_runs as compare_runs
 from .drafts import init as init
 from .exports import export as export

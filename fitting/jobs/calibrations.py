@@ -7,16 +7,19 @@ from pathlib import Path
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.in_memory.saving import with_files
-from fitting.experiments.problems import make_problem
-from fitting.report.calibration import calibration_report
+from fitting.experiments.problems import load_clips, make_problem, problem_from_clips
+from fitting.experiments.systems import without_own_root
+from fitting.report.calibration import calibration_report, wrong_model_report
 from fitting.report.formatting import joined
-from fitting.report.page.studies import calibration_page
+from fitting.report.page.studies import calibration_page, wrong_model_page
 from fitting.runtime import activity
 from fitting.runtime.parallel import cluster
 from fitting.runtime.precision import in_float64
-from fitting.studies.calibration import calibration
+from fitting.studies.calibration import calibration, wrong_model_assessment
 from fitting.studies.calibration.assessment import Assessment, assess
 from fitting.studies.calibration.calibration import CalibrationProgress, Observers
+from fitting.studies.calibration.wrong_model_assessment import WrongModelAssessment
+from fitting.studies.translation import load_named_system
 
 from .output import Log, log_output, output_folder, silent
 
@@ -81,4 +84,64 @@ def calibrate(
                 calibration_page.write(folder, experiment, assessment)
         log(joined(["", calibration_report.calibration_text(assessment)]))
         log_output(log, folder, calibration_report.SUMMARY)
+        return assessment
+
+
+@in_float64
+def calibrate_wrong_model(
+    experiment: Experiment | str | Path,
+    truth: str,
+    output: str | Path | None = None,
+    *,
+    replicates: int = 200,
+    noise_factor: float = 1.0,
+    workers: int = 0,
+    scheduler: str | None = None,
+    progress: Callable[[CalibrationProgress], None] = lambda report: None,
+    log: Log = silent,
+) -> WrongModelAssessment:
+    """Fits an experiment to motion that another system makes, and judges what the fits say.
+
+    Truths are drawn around the parameters of that system; each of their motions is captured with
+    errors that a real capture has, and fitted as `fit` does, with a part held out. A call with the
+    same folder continues where an interrupted one ended, as for `calibrate`.
+
+    Args:
+        experiment: an experiment, or the path of its file.
+        truth: the system that makes the motion: a preset or a parameter .toml.
+        output: folder for the replicates and the report.
+        replicates: number of truths.
+        noise_factor: how much larger the errors of the captures are than usual.
+        workers: as for `calibrate`.
+        scheduler: as for `calibrate`.
+        progress: called as fits go on.
+        log: called with what the command line prints.
+
+    Raises:
+        ValueError: as `calibrate`; there is no such system; no frame is held out.
+    """
+    if not isinstance(experiment, Experiment):
+        experiment = load_experiment(experiment)
+    with output_folder(output) as folder:
+        experiment = with_files(experiment, folder)
+        clips = load_clips(experiment)
+        rig = clips[0].base.rig if experiment.body == "clip" else None
+        system = load_named_system(truth, "truth", rig)
+        if any(clip.root.rise is not None for clip in clips):
+            system = replace(system, ik=without_own_root(system.ik))
+        problem = problem_from_clips(experiment, clips)
+        log(f"{replicates} motions of {system.name}, fitted by {experiment.preset}")
+        with cluster.connect(workers, scheduler) as client:
+            fits = calibration.calibrate_wrong_model(
+                experiment, problem, system, folder, replicates,
+                noise_factor=noise_factor, client=client, progress=progress,
+                on_fit=lambda fitted: log(wrong_model_report.fit_line(fitted)),
+            )  # fmt: skip
+        assessment = wrong_model_assessment.assess(fits)
+        if folder is not None:
+            with activity.announced("Drawing the report"):
+                wrong_model_report.write(folder, experiment, system.name, fits, assessment)
+                wrong_model_page.write(folder, experiment, system.name, fits, assessment)
+        log(joined(["", wrong_model_report.text(assessment, fits)]))
+        log_output(log, folder, wrong_model_report.SUMMARY)
         return assessment

@@ -11,6 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from fitting.analysis.accuracy import Accuracy
+from fitting.analysis.distances import CLOSE, MOTIONS, PARTS
 from fitting.inference.optimisation import search
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.settings import SearchSettings
@@ -35,11 +36,19 @@ PARAMETER = {
     "valleys": [{"value": 0.2, "rise": 0.0, "interval": [0.1, 0.3], "values": [0.2]}],
 }
 ENDING = {"converged": True, "message": "Converged.", "seconds": 1.5}
-FIT = {"number": 0, "truth_u": [0.4], "truth": [0.21], "truth_levels": [0.3], "cost": 10.5}
-FIT |= {"truth_valley_cost": 10.0, "starts": 2, "agreeing": 2, "parameters": [PARAMETER]}
+OUTCOME = {"number": 0, "cost": 10.5, "starts": 2, "agreeing": 2, "parameters": [PARAMETER]}
+FIT = {"truth_u": [0.4], "truth": [0.21], "truth_levels": [0.3], "truth_valley_cost": 10.0}
 CHAIN = {"number": 0, "ranks": {"lean.gain": DRAWS // 2, calibration.LOG_PROBABILITY: 3}}
 CHAIN |= {"intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS}
-REPLICATES = {calibration.FITS: FIT | ENDING, calibration.CHAINS: CHAIN | ENDING}
+DISTANCES = {motion: dict.fromkeys(CLOSE, 0.02) for motion in MOTIONS}
+JUDGEMENT = {"fits": True, "sentence": "Fits.", "distances": dict.fromkeys(PARTS, DISTANCES)}
+WRONG_MODEL = {"truth_values": {"lean.gain": 0.2}, "errors": {"drift": 0.01}}
+WRONG_MODEL |= {"captured": JUDGEMENT, "noise_free": JUDGEMENT}
+REPLICATES = {
+    calibration.FITS: OUTCOME | FIT | ENDING,
+    calibration.CHAINS: CHAIN | ENDING,
+    calibration.WRONG_MODEL: OUTCOME | WRONG_MODEL | ENDING,
+}
 
 
 def text_of(content: Mapping[str, object]) -> bytes:

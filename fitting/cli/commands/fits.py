@@ -1,6 +1,7 @@
 """Commands that fit and sample."""
 
 import argparse
+import functools
 
 from fitting import jobs
 from fitting.cli import progress
@@ -66,13 +67,22 @@ def ablate(options: argparse.Namespace) -> int:
 
 def calibrate(options: argparse.Namespace) -> int:
     """Fits an experiment to simulated motion; status 5 if something is outside."""
+    if options.truth is not None and options.chains:
+        raise ValueError(
+            "--chains ranks true values among a posterior's, and under another system than the "
+            "experiment's none is true; leave --chains or --truth out"
+        )
     cache_folder.use_default()
     with progress.ProgressLine(progress.calibration_line) as line:
-        assessment = jobs.calibrate(
+        job = (
+            functools.partial(jobs.calibrate, chains=options.chains)
+            if options.truth is None
+            else functools.partial(jobs.calibrate_wrong_model, truth=options.truth)
+        )
+        assessment = job(
             options.experiment,
-            options.output,
+            output=options.output,
             replicates=options.replicates,
-            chains=options.chains,
             noise_factor=options.noise_factor,
             workers=options.workers,
             scheduler=options.scheduler,

@@ -113,10 +113,13 @@ def add_calibrate(commands: Commands) -> None:
         """
         jaxik calibrate data/experiments/ozz.toml -n 200 -o runs/calibration
         jaxik calibrate data/experiments/ozz.toml -n 200 --chains --workers 8 -o runs/calibration
+        jaxik calibrate walk.toml --truth stride -n 100 -o runs/wrong_model
 
         Truths are drawn from the experiment's prior. Each fit is written when it is done: after
         Ctrl-C (status 130) the same command continues, also with a larger -n or with --chains. The
-        exit status is 0 if everything is inside its bounds, else 5.
+        exit status is 0 if everything is inside its bounds, else 5. With --truth another system
+        makes the motion, a capture's errors are added, and asked is whether the fit is worth
+        keeping and its verdict true on frames that were held out.
         """,
     )  # fmt: skip
     calibrate.add_argument(
@@ -135,8 +138,13 @@ def add_calibrate(commands: Commands) -> None:
         help="sample each posterior too, which takes much longer than the fits (default: no)",
     )  # fmt: skip
     calibrate.add_argument(
+        "--truth", metavar="SYSTEM",
+        help="preset or parameter .toml that makes the motion (default: the experiment's system)",
+    )  # fmt: skip
+    calibrate.add_argument(
         "--noise-factor", type=number(1e-3, 1e3), default=1.0, metavar="X",
-        help="simulate noise X times as large as the experiment says (default: 1)",
+        help="simulate noise X times as large as the experiment says, or with --truth errors X "
+        "times as large as usual (default: 1)",
     )  # fmt: skip
     add_workers(calibrate, 0, "0")
     add_output(calibrate, "DIR")

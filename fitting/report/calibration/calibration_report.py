@@ -1,5 +1,6 @@
 """The report of a calibration: what is true of the fits' and the posteriors' claims."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
@@ -132,6 +133,11 @@ def remarks(assessment: Assessment) -> list[str]:
             assessment.short_chains
         ),
     }
+    return listed_replicates(sentences)
+
+
+def listed_replicates(sentences: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """A sentence for each kind of replicates of which there are any, with their numbers."""
     return [f"{words}: {_numbers(found)}." for words, found in sentences.items() if found]
 
 

@@ -10,19 +10,19 @@ def checks_table(assessment: Assessment) -> Table:
     table = [["", "found", "share", "bounds", "wanted", "inside"]]
     claimed = f"{FIT_LEVEL:.0%}".replace("%", " %")
     cover = assessment.fit_coverage
-    table.append(_row(f"the fit's {claimed} intervals contain the truth", cover, claimed))
+    table.append(share_row(f"the fit's {claimed} intervals contain the truth", cover, claimed))
     for level, cover in assessment.profile_coverage.items():
         claimed = percent(level, 0)
         words = f"{claimed} intervals by the profiles of smooth parameters contain it"
-        table.append(_row(words, cover, claimed))
+        table.append(share_row(words, cover, claimed))
     for level, cover in assessment.chain_coverage.items():
         claimed = percent(level, 0)
         words = f"the posterior's {claimed} intervals contain the truth"
-        table.append(_row(words, cover, claimed))
+        table.append(share_row(words, cover, claimed))
     valley = f"{percent(IN_VALLEY, 0)} or more"
-    table.append(_row("fits in the right valley", assessment.valley, valley))
+    table.append(share_row("fits in the right valley", assessment.valley, valley))
     back = "determined parameters came back"
-    table.append([*_row(back, assessment.recovery, "")[:-1], ""])
+    table.append([*share_row(back, assessment.recovery, "")[:-1], ""])
     return table
 
 
@@ -49,7 +49,8 @@ def parameter_table(assessment: Assessment) -> Table:
     return table
 
 
-def _row(words: str, share: Proportion, wanted: str) -> list[str]:
+def share_row(words: str, share: Proportion, wanted: str) -> list[str]:
+    """Cells of a claim: what was found, its share and bounds, what is wanted, whether it is so."""
     found = f"{share.hits} of {share.total}"
     fraction = percent(share.fraction) if share.total else "–"
     return [words, found, fraction, _bounds(share), wanted, _verdict(share)]

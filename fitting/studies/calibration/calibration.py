@@ -1,8 +1,9 @@
 """Many replicates of an experiment, each kept on disk as soon as it is finished.
 
-identity.json        what is calibrated; another experiment is refused
-fits/0000.json       the fit of a replicate
-chains/0000.json     its posterior, where chains were wanted
+identity.json           what is calibrated; another experiment is refused
+fits/0000.json          the fit of a replicate
+chains/0000.json        its posterior, where chains were wanted
+wrong_model/0000.json   the fit of a replicate whose motion another system makes
 
 A call continues where an earlier one ended, also with more replicates, or with chains for fits that
 have none yet. All replicates of a process share their compiled programs.
@@ -15,7 +16,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from fitting.runtime import activity
 from fitting.runtime.parallel import cluster
 from fitting.runtime.storage.json_files import JsonFile
 from fitting.runtime.validation import Content, error_context
+from fitting.studies.translation import NamedSystem
 
 from .replicates import (
     LOG_PROBABILITY,
@@ -37,16 +39,19 @@ from .replicates import (
     fit_replicate,
     sample_replicate,
 )
+from .wrong_model import WrongModelFit, fit_wrong_model, identity_of
 
 if TYPE_CHECKING:
     from distributed import Client
 
-IDENTITY, FITS, CHAINS = "identity.json", "fits", "chains"
+IDENTITY, FITS, CHAINS, WRONG_MODEL = "identity.json", "fits", "chains", "wrong_model"
 WRITER, ADVICE = "written by `jaxik calibrate`", "delete it to make it anew, or name another folder"
 FILES = {
     FITS: JsonFile(ReplicateFit, WRITER, ADVICE),
     CHAINS: JsonFile(ReplicateChain, WRITER, ADVICE),
+    WRONG_MODEL: JsonFile(WrongModelFit, WRITER, ADVICE),
 }
+WORDS = {FITS: "fits", CHAINS: "chains", WRONG_MODEL: "fits"}  # for what a stage makes
 PER_PARAMETER = ("truth_u", "truth", "truth_levels", "parameters")
 Result = TypeVar("Result", bound=Mapping[str, Any])
 
@@ -63,6 +68,8 @@ class Identity(TypedDict):
     noise: Content
     fit: Content
     sample: Content
+    truth: NotRequired[Content]
+    """Of another system, where one makes the motion; see `wrong_model.identity_of`."""
 
 
 IDENTITY_FILE = JsonFile(Identity, WRITER, "name another folder")
@@ -132,13 +139,7 @@ def calibrate(
         ValueError: there is not one replicate; the noise is not positive; the folder holds
             something else; a replicate cannot be made.
     """
-    if replicates < 1:
-        raise ValueError(f"replicates is {replicates}; wanted 1 or more")
-    if not 0 < noise_factor < math.inf:
-        raise ValueError(f"noise_factor is {noise_factor:g}; wanted a positive number")
-    if folder is not None:
-        _claim(folder, _identity(experiment, problem, noise_factor))
-
+    _begin(folder, replicates, _identity(experiment, problem, noise_factor))
     names = problem.space.names
     stage = functools.partial(_Stage, folder, replicates, client, observers.progress, names)
     fit = functools.partial(fit_replicate, problem, experiment, noise_factor=noise_factor)
@@ -147,6 +148,57 @@ def calibrate(
         return Calibration(fits, [])
     sample = functools.partial(sample_replicate, problem, experiment, noise_factor=noise_factor)
     return Calibration(fits, stage(CHAINS).run(sample, fits, observers.on_chain))
+
+
+def calibrate_wrong_model(
+    experiment: Experiment,
+    problem: Problem[jaxik.FootIK],
+    truth: NamedSystem,
+    folder: Path | None,
+    replicates: int,
+    *,
+    noise_factor: float = 1.0,
+    client: "Client | None" = None,
+    progress: Callable[[CalibrationProgress], None] = lambda report: None,
+    on_fit: Callable[[WrongModelFit], object] = lambda fitted: None,
+) -> list[WrongModelFit]:
+    """Makes the replicates that a folder does not hold yet, of motion that another system makes.
+
+    Args:
+        experiment: as for `calibrate`.
+        problem: of the experiment; some of its frames are held out.
+        truth: the other system.
+        folder: as for `calibrate`.
+        replicates: number of truths.
+        noise_factor: how much larger the errors of the captures are than usual.
+        client: as for `calibrate`.
+        progress: called meanwhile.
+        on_fit: called with each new fit.
+
+    Raises:
+        ValueError: as `calibrate`, or no frame is held out.
+    """
+    if not any(np.any(scene.reference.held_out) for scene in problem.data):
+        raise ValueError(
+            f"{experiment.path}: no frame is held out, which would show what a fit under a wrong "
+            "model is worth; give `holdout` a fraction above 0, and clips 3 s or more"
+        )
+    identity = _identity(experiment, problem, noise_factor)
+    _begin(folder, replicates, {**identity, "truth": identity_of(truth)})
+    stage = _Stage(folder, replicates, client, progress, problem.space.names, WRONG_MODEL)
+    fit = functools.partial(fit_wrong_model, problem, experiment, truth.ik)
+    return stage.run(functools.partial(fit, noise_factor=noise_factor), range(replicates), on_fit)
+
+
+def _begin(folder: Path | None, replicates: int, identity: Identity) -> None:
+    """Checks what all kinds of replicates have in common, and claims the folder."""
+    if replicates < 1:
+        raise ValueError(f"replicates is {replicates}; wanted 1 or more")
+    factor = identity["noise_factor"]
+    if not 0 < factor < math.inf:
+        raise ValueError(f"noise_factor is {factor:g}; wanted a positive number")
+    if folder is not None:
+        _claim(folder, identity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +232,7 @@ class _Stage:
                 results[number] = self._read(number)
         missing = [number for number in range(self.replicates) if number not in results]
         computed = self._compute_here if self.client is None else self._compute_on_cluster
-        title = f"Making the {self.name} of {self.replicates} replicates"
+        title = f"Making the {WORDS[self.name]} of {self.replicates} replicates"
         with activity.announced(title, self.replicates, done=len(results)) as making:
             for number, result in computed(make, arguments, missing):
                 if self.folder is not None:
@@ -213,7 +265,7 @@ class _Stage:
             with error_context(f"replicate {number + 1}"):
                 result = future.result()
             left = elapsed / done * (len(missing) - done)
-            stage = f"{done} of {len(missing)} {self.name} done"
+            stage = f"{done} of {len(missing)} {WORDS[self.name]} done"
             self.progress(CalibrationProgress(number + 1, self.replicates, stage, elapsed, left))
             yield number, result
 
@@ -252,7 +304,7 @@ class _Stage:
 
     def _names(self, result: Mapping[str, Any]) -> dict[str, list[str]]:
         """The parameters of which a result says something, in each of its parts."""
-        if self.name == FITS:
+        if self.name != CHAINS:
             return {"parameters": [row["name"] for row in result["parameters"]]}
         ranks = set(result["ranks"]) ^ {LOG_PROBABILITY}  # which is ranked beside them
         return {"ranks": list(ranks), "intervals": list(result["intervals"])}
@@ -266,13 +318,14 @@ def _claim(folder: Path, own: Identity) -> None:
     """
     path = folder / IDENTITY
     if not path.exists():
-        if folder.is_dir() and any((folder / name).exists() for name in (FITS, CHAINS)):
+        if folder.is_dir() and any((folder / name).exists() for name in FILES):
             raise ValueError(f"{folder}: has replicates but no {IDENTITY}; name another folder")
         folder.mkdir(parents=True, exist_ok=True)
         IDENTITY_FILE.write(path, own)
         return
     present = IDENTITY_FILE.read(path)
-    changed = [key for key in own if key != "name" and own[key] != present[key]]
+    keys = dict.fromkeys([*own, *present])
+    changed = [key for key in keys if key != "name" and own.get(key) != present.get(key)]
     if changed:
         raise ValueError(
             f"{folder}: holds the calibration of {present['name']!r}, which differs from "

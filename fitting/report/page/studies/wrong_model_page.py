@@ -1,0 +1,59 @@
+"""The page of a calibration under a wrong model."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from fitting.experiments.experiment import Experiment
+from fitting.report.calibration import calibration_report, wrong_model_report
+from fitting.report.page import asked
+from fitting.report.page.study_page import Finding, Grid, Points, Section, StudyPage, Text
+from fitting.studies.calibration.wrong_model import WrongModelFit
+from fitting.studies.calibration.wrong_model_assessment import WrongModelAssessment
+
+FILES = {calibration_report.SUMMARY: "the tables", calibration_report.NUMBERS: "all numbers"}
+LIMITS = [
+    "Errors and truths are drawn at random, and sizes of errors are those of a careful capture: a "
+    "worse one, or a person who walks as no system does, may leave more.",
+    "A part that is held out goes on with the same walk over the same ground.",
+]
+
+
+def write(
+    folder: Path,
+    experiment: Experiment,
+    truth: str,
+    fits: Sequence[WrongModelFit],
+    assessment: WrongModelAssessment,
+) -> None:
+    """Writes the page into the folder of a calibration."""
+    report = wrong_model_report
+    sections = [
+        Section(
+            "Checks",
+            [
+                Text(report.explanation(truth)),
+                Grid(report.checks_table(assessment), "All checks"),
+            ],
+        ),
+        Section("Distances", [Grid(report.distances_table(assessment), "Distances by motion")]),
+    ]
+    if assessment.coverage_of:
+        covered = Grid(report.coverage_table(assessment), "Intervals of shared parameters")
+        sections.append(Section("Parameters of both systems", [Text(report.COVERED), covered]))
+    sections.append(
+        Section("Limits of the data", [Points([*LIMITS, *report.remarks(assessment, fits)])])
+    )
+    StudyPage(
+        kind="Fits of motion that another system makes",
+        title=experiment.name,
+        verdict="True" if assessment.inside else "Not true",
+        good=assessment.inside,
+        findings=[Finding(report.sentence(assessment), bad=not assessment.inside)],
+        sections=sections,
+        asked=[
+            *asked.rows(experiment),
+            ["Made by", truth],
+            ["Simulated motions", f"{assessment.replicates}"],
+        ],
+        files=FILES,
+    ).write(folder)
