@@ -226,6 +226,11 @@ def test_a_kept_system_that_is_worse_than_the_animation_is_outside():
     assert assessment.outside == ["the kept system against the animation"]
     assert assessment.worse == (2,) and assessment.false == ()
     assert assessment.fitted_no_worse.hits == assessment.kept_no_worse_noise_free.hits == 2
+    near = judgement(False, motions(animation=1.0, before=2.0, fitted=1.14))  # 1.7 mm rms
+    feet = judgement(False, motions(animation=1.0, fitted=1.0))
+    feet["distances"]["held_out"]["fitted"]["foot"] *= 1.2  # 0.57 degrees
+    assessment = assess([replicate(near, near), replicate(feet, feet)])
+    assert assessment.inside and assessment.kept_no_worse_anywhere.hits == 0
     saved = judgement(False, motions(animation=1.0, before=1.0, fitted=1.3))
     saved["distances"]["fitted"] = saved["distances"]["held_out"]
     assessment = assess([replicate(saved, saved)])
