@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fitting.analysis.distances import CLOSE, UNSEEN
-from fitting.analysis.goodness.verdict import NAMES, describe_distances, size
+from fitting.analysis.goodness.verdict import NAMES, PARTS, describe_distances, size
 from fitting.experiments.experiment import Experiment
 from fitting.report.formatting import Table, aligned, bullets, joined, markdown, percent
 from fitting.runtime import files
@@ -129,10 +129,12 @@ def remarks(assessment: WrongModelAssessment, fits: Sequence[WrongModelFit]) -> 
     lines = listed_replicates(sentences)
     for number in assessment.false:
         fitted = fits[number - 1]
-        held_out = distances_of(fitted["noise_free"]).parts["held_out"]
-        off = describe_distances(held_out["fitted"])
+        off = "; ".join(
+            f"{describe_distances(motions['fitted'])} in {PARTS[part]}"
+            for part, motions in distances_of(fitted["noise_free"]).parts.items()
+        )
         said = fitted["captured"]["sentence"]
-        lines.append(f'Replicate {number} says: "{said}" Without errors, held out: {off}.')
+        lines.append(f'Replicate {number} says: "{said}" Without errors: {off}.')
     return lines
 
 

@@ -5,10 +5,13 @@ from pathlib import Path
 
 from fitting.experiments.experiment import Experiment
 from fitting.report.calibration import calibration_report, wrong_model_report
+from fitting.report.formatting import percent
 from fitting.report.page import asked
 from fitting.report.page.study_page import Finding, Grid, Points, Section, StudyPage, Text
 from fitting.studies.calibration.wrong_model import WrongModelFit
 from fitting.studies.calibration.wrong_model_assessment import WrongModelAssessment
+
+from .calibration_page import WIDE
 
 FILES = {calibration_report.SUMMARY: "the tables", calibration_report.NUMBERS: "all numbers"}
 LIMITS = [
@@ -48,7 +51,7 @@ def write(
         title=experiment.name,
         verdict="True" if assessment.inside else "Not true",
         good=assessment.inside,
-        findings=[Finding(report.sentence(assessment), bad=not assessment.inside)],
+        findings=_findings(assessment),
         sections=sections,
         asked=[
             *asked.rows(experiment),
@@ -57,3 +60,14 @@ def write(
         ],
         files=FILES,
     ).write(folder)
+
+
+def _findings(assessment: WrongModelAssessment) -> list[Finding]:
+    """What was found, and whether there are too few motions for it."""
+    found = Finding(wrong_model_report.sentence(assessment), bad=not assessment.inside)
+    true = assessment.verdicts
+    if true.high - true.low <= WIDE:
+        return [found]
+    bounds = f"{percent(true.low, 0)} to {percent(true.high, 0)}"
+    few = f"So few motions prove little: the share of true verdicts may be {bounds}."
+    return [found, Finding(few, bad=True)]
