@@ -28,7 +28,7 @@ UNSEEN = {"ankle": 0.002, "knee": 0.002, "pelvis": 0.002, "foot": math.radians(0
 
 
 class Setback(NamedTuple):
-    """A distance that the fit has made larger."""
+    """A distance that is larger for the fitted motion than for another one."""
 
     part: Part
     kind: str
@@ -48,7 +48,7 @@ class Distances:
     """m and rad, of `CLOSE`'s kinds; no part of which no frame was observed."""
 
     @property
-    def setbacks(self) -> list[Setback]:
+    def losses(self) -> list[Setback]:
         """Where the fitted motion is visibly worse than another, the largest ones first."""
         worse = [
             Setback(part, kind, motions["fitted"][kind], other, distance)
@@ -58,6 +58,16 @@ class Distances:
             if motions["fitted"][kind] > distance + UNSEEN[kind]
         ]
         return sorted(worse, key=lambda s: (s.distance - s.fitted) / CLOSE[s.kind])
+
+    @property
+    def setbacks(self) -> list[Setback]:
+        """Those losses for which the other joints do not make up: the motion is worse as a whole."""
+        sizes = {
+            (part, motion): _size(kinds)
+            for part, motions in self.parts.items()
+            for motion, kinds in motions.items()
+        }
+        return [s for s in self.losses if sizes[s.part, "fitted"] > sizes[s.part, s.other]]
 
     @property
     def far(self) -> list[tuple[Part, str, float]]:
@@ -76,11 +86,12 @@ class Distances:
         return "before" if worse and self._score("before") < self._score("fitted") else "fitted"
 
     def _score(self, motion: Motion) -> float:
-        return sum(
-            (distance / CLOSE[kind]) ** 2
-            for motions in self.parts.values()
-            for kind, distance in motions[motion].items()
-        )
+        return sum(_size(motions[motion]) for motions in self.parts.values())
+
+
+def _size(kinds: Kinds) -> float:
+    """The distances of all kinds as one number: squares, in units of what looks the same."""
+    return sum((distance / CLOSE[kind]) ** 2 for kind, distance in kinds.items())
 
 
 def measure(before: Sequence[Playback], fitted: Sequence[Playback]) -> Distances:

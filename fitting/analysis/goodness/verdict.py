@@ -75,6 +75,8 @@ def judge(groups: Sequence[Group], assumed: Assumed, distances: Distances) -> Ve
         for part, motions in distances.parts.items()
     ]
     off = "; ".join([first, *others])
+    if losses := distances.losses:
+        return Verdict(True, f"Fits, though {describe_setback(losses[0])}: {off}.")
     if findings:
         return Verdict(True, f"Fits, but {findings}; {off}.")
     if assumed.sigmas_estimated:
@@ -100,7 +102,7 @@ def size(kind: str, distance: float) -> str:
     """A distance with its unit, cm or degrees."""
     if kind in ("foot", "body"):
         return f"{math.degrees(distance):.1f}°"
-    return f"{100 * distance:.2g} cm" if distance < 0.1 else f"{100 * distance:.0f} cm"
+    return f"{100 * distance:.{1 if distance >= 0.01 else 2}f} cm"
 
 
 def judge_tolerances(groups: Sequence[Group]) -> Verdict:
