@@ -107,7 +107,7 @@ def is_true(fit: WrongModelFit) -> bool:
     """Whether the motion without errors agrees with what a fit says of its capture."""
     noise_free = distances_of(fit["noise_free"])
     if fit["captured"]["fits"]:
-        return not _is_far(noise_free, 1.0) and not _is_worse(noise_free, 2.0)
+        return not _is_far(noise_free, 1.0) and not noise_free.setbacks
     if setbacks := distances_of(fit["captured"]).setbacks:
         part, kind, _, other, _ = setbacks[0]
         motions = noise_free.parts[part]
@@ -153,16 +153,6 @@ def _is_far(distances: Distances, margin: float) -> bool:
         motions["fitted"][kind] > CLOSE[kind] + margin * UNSEEN[kind]
         for motions in distances.parts.values()
         for kind in CLOSE
-    )
-
-
-def _is_worse(distances: Distances, margin: float) -> bool:
-    """Whether the fit has made something worse than another motion by so many `UNSEEN`."""
-    return any(
-        motions["fitted"][kind] > motions[other][kind] + margin * UNSEEN[kind]
-        for motions in distances.parts.values()
-        for other in ("animation", "before")
-        for kind in UNSEEN
     )
 
 
