@@ -61,7 +61,7 @@ class Distances:
 
     @property
     def setbacks(self) -> list[Setback]:
-        """Those losses for which the other joints do not make up: the motion is worse as a whole."""
+        """The losses of a motion that is worse as a whole, other joints included."""
         sizes = {
             (part, motion): _size(kinds)
             for part, motions in self.parts.items()
@@ -84,6 +84,11 @@ class Distances:
         """Whose parameters are worth keeping: the fitted ones, or those from before the fit."""
         worse = any(setback.other == "before" for setback in self.setbacks)
         return "before" if worse and self._score("before") < self._score("fitted") else "fitted"
+
+    @property
+    def best(self) -> Motion:
+        """Which motion is nearest as a whole; of equal ones the fitted one."""
+        return min(reversed(MOTIONS), key=self._score)
 
     def _score(self, motion: Motion) -> float:
         return sum(_size(motions[motion]) for motions in self.parts.values())

@@ -58,7 +58,10 @@ def judge(groups: Sequence[Group], assumed: Assumed, distances: Distances) -> Ve
         if len(setbacks) > 1:
             sentence += f", and in {len(setbacks) - 1} more of the distances below"
         kept = "of the fit" if distances.better == "fitted" else "from before the fit"
-        return Verdict(False, f"{sentence}. The parameters {kept} are the better ones.")
+        sentence += f". The parameters {kept} are the better ones"
+        if distances.best == "animation":
+            sentence += ", but without foot IK the whole motion is nearer"
+        return Verdict(False, f"{sentence}.")
     if far := distances.far:
         off = "; ".join(
             f"{NAMES[kind]} {size(kind, distance)} off the capture in {PARTS[part]}, and "
