@@ -93,7 +93,7 @@ NEAR_IN_WORDS = "ankles 1.0 cm, knees 1.0 cm, pelvis 1.0 cm, orientation of the 
             of({"knee": 0.035}, {"knee": 0.3}, {"knee": 0.2}, "held_out"),
             [],
             "fitted",
-            "Does not fit: knees 3.5 cm off the capture in held-out frames, and 3.0 cm would be seen",
+            "Does not fit: knees 3.5 cm off the capture in held-out frames, and 3.0 cm would be",
         ),
         (Distances({}), [], "fitted", "Nothing was observed"),
     ],

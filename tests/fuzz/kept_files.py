@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from fitting.analysis.accuracy import Accuracy
-from fitting.analysis.distances import CLOSE, MOTIONS, PARTS
+from fitting.analysis.goodness.distances import CLOSE, MOTIONS, PARTS
 from fitting.inference.optimisation import search
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.settings import SearchSettings

@@ -347,7 +347,7 @@ def test_ozz_is_calibrated(tmp_path):
 
 @pytest.mark.slow
 def test_numbers_of_a_capture_come_back_within_their_intervals():
-    """Of 50 motions, each with a ground, a time and ankles that are off by draws from the priors."""
+    """Of 50 motions, with a ground, a time and ankles that are off by draws from the priors."""
     path = ROOT / "data" / "experiments" / "calibration" / "capture.toml"
     assessment = fitting.calibrate(path, replicates=50)
     assert assessment.outside == []

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import fitting
 import jaxik
-from fitting.analysis.distances import CLOSE
+from fitting.analysis.goodness.distances import CLOSE
 from fitting.cli import main
 from fitting.datasets.clips import contacts
 from fitting.experiments import problems

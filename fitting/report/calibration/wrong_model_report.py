@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fitting.analysis.distances import CLOSE, UNSEEN
+from fitting.analysis.goodness.distances import CLOSE, UNSEEN
 from fitting.analysis.goodness.verdict import NAMES, PARTS, describe_distances, size
 from fitting.experiments.experiment import Experiment
 from fitting.report.formatting import Table, aligned, bullets, joined, markdown, percent

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from fitting.analysis.distances import CLOSE, UNSEEN, Distances, Kinds, Motion, Part
+from fitting.analysis.goodness.distances import CLOSE, UNSEEN, Distances, Kinds, Motion, Part
 from fitting.inference.calibration.proportions import Proportion, proportion
 
 from .wrong_model import Judgement, WrongModelFit
