@@ -1,8 +1,8 @@
-"""The few changes to a system with which it leaves a motion alone, found without derivatives.
+"""The few parameters on which it depends whether a system leaves a motion alone.
 
 On flat ground a capture says nothing but that foot IK must not move the feet. Where a system moves
 them, each parameter is swept over its range while the others stay, the change that helps most is
-kept, and so on, up to `MOST` changes.
+kept, and so on, up to `MOST` changes. They are for a fit to refine.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,9 @@ from fitting.problem.scene import Scene, left_alone
 from fitting.problem.space import make_space
 from fitting.runtime.precision import in_float64
 
-from .sensitivity import FRACTIONS, FreeTable, residuals_at, sweep
+from .sensitivity import FreeTable, residuals_at, sweep
 
 MOST = 3  # parameters that are changed
-TRIED = np.concatenate([[0.001], FRACTIONS, [0.999]])  # also where a limit is out of the way
 AS_GOOD = 0.02  # of the cost that is to be gained: among changes so alike, the smallest is taken
 
 
@@ -47,7 +46,7 @@ def leave_alone(
     while len(changes) < MOST and not is_harmless(space.unpack(u)):
         here = residuals_at(space, scenes, u[None])[0]
         present, costs, places = _cost(here), [], []
-        for i, (tried, moved) in enumerate(sweep(space, scenes, u, TRIED)):
+        for i, (tried, moved) in enumerate(sweep(space, scenes, u)):
             costs += [_cost(here + row) for row in moved]
             places += [(i, place) for place in tried]
         best = min(costs)

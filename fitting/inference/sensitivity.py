@@ -84,7 +84,6 @@ def sweep(
     space: Space,
     scenes: tuple[Scene, ...],
     u: Float[np.ndarray, " free"],
-    fractions: Float[np.ndarray, " tried"] = FRACTIONS,
 ) -> Iterator[tuple[Float[np.ndarray, " tried"], Float[np.ndarray, "tried residuals"]]]:
     """For each parameter alone, its `u` over the range and how the residuals change from `u`.
 
@@ -92,22 +91,21 @@ def sweep(
         space: the parameters.
         scenes: the clips.
         u: where all the others stay.
-        fractions: of each range, that are tried.
     """
     present = np.asarray(space.values(u))
-    log_odds = np.log(fractions / (1 - fractions))
+    log_odds = np.log(FRACTIONS / (1 - FRACTIONS))
     grid = np.asarray(space.values(np.tile(log_odds[:, None], space.size)))
     first = residuals_at(space, scenes, space.pack_values(present[None]))[0]
-    together = BATCH // len(fractions)  # parameters in one call of the program
+    together = BATCH // len(FRACTIONS)  # parameters in one call of the program
     for start in range(0, space.size, together):
         indices = range(start, min(start + together, space.size))
-        table = np.tile(present, (len(indices), len(fractions), 1))
+        table = np.tile(present, (len(indices), len(FRACTIONS), 1))
         for row, i in enumerate(indices):
             table[row, :, i] = grid[:, i]
         candidates = space.pack_values(table.reshape(-1, space.size))
         changes = np.nan_to_num(residuals_at(space, scenes, candidates) - first)
         for row, i in enumerate(indices):
-            tried = slice(row * len(fractions), (row + 1) * len(fractions))
+            tried = slice(row * len(FRACTIONS), (row + 1) * len(FRACTIONS))
             yield candidates[tried, i], changes[tried]
 
 

@@ -108,7 +108,12 @@ def _free(draft: Draft) -> Iterator[str]:
     """The free parameters, and as comments the others with the reason."""
     forecasts, meanings = draft.forecasts, dict(_meanings(draft.experiment, draft.rig))
     groups: list[tuple[str, Sequence[Forecast]]] = [
-        ("These clips should determine:", [f for f in forecasts if f.is_free]),
+        (
+            "What leaves the feet alone depends on these:"
+            if draft.check.flat
+            else "These clips should determine:",
+            [f for f in forecasts if f.is_free],
+        ),
         (
             "Not free, as these clips hardly tell them from another one:",
             [f for f in forecasts if f.rival],

@@ -7,7 +7,7 @@ from pathlib import Path
 import jaxik
 from fitting.analysis import playback
 from fitting.analysis.goodness import distances
-from fitting.analysis.goodness.distances import Distances, Setback
+from fitting.analysis.goodness.distances import Distances
 from fitting.analysis.goodness.verdict import describe_setback
 from fitting.datasets.clips import Clip, edit, load_clip
 from fitting.datasets.clips.load import AS_FOUND, ClipOptions
@@ -187,9 +187,13 @@ def draft(
     apart = distances.measure(as_it_comes, as_it_comes)
     lines: list[str] = []
     if check.flat:
-        forecasts = [Forecast(name, is_free=False, reach=0, contraction=0) for name in candidates]
+        moved = _harmful(experiment, data, candidates) if apart.setbacks else {}
+        forecasts = [
+            Forecast(name, is_free=name in moved, reach=float(name in moved), contraction=0)
+            for name in candidates
+        ]
         if apart.setbacks:
-            experiment, lines = _without_harm(experiment, data, candidates, apart.setbacks[0])
+            lines = [HARM.format(request.preset.name, describe_setback(apart.setbacks[0]))]
     else:
         problem = problem_from_clips(replace(experiment, free=candidates), data)
         with activity.announced(f"Trying {len(candidates)} parameters over their ranges"):
@@ -213,27 +217,19 @@ def draft(
     )
 
 
-def _without_harm(
-    experiment: Experiment, data: Sequence[ClipData], candidates: FreeTable, setback: Setback
-) -> tuple[Experiment, list[str]]:
-    """The experiment with what its system needs to leave a flat capture alone, and what that is."""
-    rig = data[0].base.rig
+def _harmful(
+    experiment: Experiment, data: Sequence[ClipData], candidates: FreeTable
+) -> dict[str, float]:
+    """Which parameters, at which values, let a system leave a flat capture alone."""
     scenes = problem_from_clips(experiment, data).data
 
     def is_harmless(ik: jaxik.FootIK) -> bool:
         played = playback.play_all(ik, scenes)
         return not distances.measure(played, played).setbacks
 
-    ik = experiment.starting_system(rig)
+    ik = experiment.starting_system(data[0].base.rig)
     with activity.announced("Looking for what leaves the feet alone"):
-        changes = leave_alone(ik, candidates, scenes, is_harmless)
-    changed = replace(experiment, parameters={**experiment.parameters, **changes})
-    lines = [HARM.format(experiment.preset, describe_setback(setback))]
-    if changes and is_harmless(changed.starting_system(rig)):
-        listed = ", ".join(f"{name} = {value:.3g}" for name, value in changes.items())
-        lines.append(f"it does with {listed}, which is set; what that does elsewhere is not known")
-        return changed, lines
-    return experiment, [*lines, "no change of a few parameters stops that"]
+        return leave_alone(ik, candidates, scenes, is_harmless)
 
 
 def _assumptions(
