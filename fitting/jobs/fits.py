@@ -25,11 +25,12 @@ from fitting.report.formatting import joined
 from fitting.report.goodness import record_price_report
 from fitting.report.plots import style
 from fitting.runtime.precision import in_float64
-from fitting.studies import capture_check, record_price, run_folder, translation
+from fitting.studies import record_price, run_folder, translation
 from fitting.studies.assess import assess_solution, search, search_with_noise
 from fitting.studies.fit import Fit
+from fitting.studies.motions import capture_check
 from fitting.studies.posterior.replay import replay
-from fitting.studies.sample import SampledFit, minus_cost_at, sample_around
+from fitting.studies.sample import SampledFit, minus_cost_at, sample_around, shown_noise
 from fitting.studies.translation import TranslationRequest
 
 from .kept import kept_stages, remove
@@ -160,7 +161,8 @@ def sample(
         played = None
         try:
             if not posterior.interrupted:
-                played = replay(problem, posterior, experiment.seed)
+                u = np.array([row["u"] for row in parameters])
+                played = replay(shown_noise(problem, experiment, u), posterior, experiment.seed)
                 posterior = dataclasses.replace(posterior, blocks=played.blocks)
         except KeyboardInterrupt:
             posterior = dataclasses.replace(posterior, interrupted=True)

@@ -15,13 +15,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
-from jaxik.maths import parameter_tree
+from jaxik.maths import parameter_tree, smoothing
 from jaxik.world.body import scaled_declarations
 from jaxik.world.skeleton import Rig
 
 DOMAINS = {"linear": (-math.inf, math.inf), "log": (0.0, math.inf), "gain": (1e-9, 1.0 - 1e-9)}
 NARROWEST, WIDEST = 1e-6, 1e6  # of a range, times the one that the rule declares
 LARGEST_RATIO = 1e12  # of the bounds of a logarithmic range
+TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 OVERRIDES = ("low", "high", "kind", "scale")
 
 
@@ -212,3 +213,18 @@ def from_fractions(
     """Inverse of `to_fractions`."""
     start, end = to_scale(np.array([parameter.low, parameter.high]), parameter.scale, np)
     return from_scale(start + (end - start) * np.asarray(fractions), parameter.scale, np)
+
+
+def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
+    """The half-life, s, of a gain per tick, and the gains with the same half-life at other rates.
+
+    Args:
+        gain: fraction of the distance to its target that a value moves in each tick.
+        tick_hz: ticks per second.
+    """
+    per_tick, rate = jnp.asarray(gain), jnp.asarray(tick_hz)
+    readings = {"half_life": float(smoothing.half_life_of_gain(per_tick, rate))}
+    for hz in TICK_RATES:
+        fraction = smoothing.fraction_of_gain(per_tick, jnp.asarray(1.0 / hz), rate)
+        readings[f"gain_at_{hz:.0f}_hz"] = float(fraction)
+    return readings

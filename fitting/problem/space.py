@@ -155,7 +155,8 @@ class Space(eqx.Module, Generic[System]):
             fraction = library.clip((coordinate - start) / (end - start), EDGE, 1 - EDGE)
             u[i] = library.log(fraction) - library.log1p(-fraction)
             leaves[parameter.leaf] = _with_value(self, i, leaf, value, library)
-        return _free_last(_stack(library, u))
+        columns = library.broadcast_arrays(*u)
+        return _free_last(library.stack(columns) if u else library.zeros((0,)))
 
     @in_float64
     def prior_residuals(self, u: Rows) -> Rows:
@@ -281,20 +282,13 @@ def _with_value(space: Space, i: int, leaf: Any, value: Any, library: ModuleType
     return library.stack(library.broadcast_arrays(*legs))
 
 
-def _stack(library: ModuleType, columns: Sequence[Any]) -> Any:
-    """Columns of any shapes that go together, (free, *rows)."""
-    return library.stack(library.broadcast_arrays(*columns)) if columns else library.zeros((0,))
-
-
 def _free_last(columns: Any) -> Any:
     """(free, *rows) as (*rows, free)."""
     return library_of(columns).moveaxis(columns, 0, -1)
 
 
 def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]:
-    """The space of these free parameters of a system, with the default prior and start.
-
-    There may be none: then the only point is the system as it is.
+    """The space of these free parameters of a system, if any, with the default prior and start.
 
     Raises:
         ValueError: for one named twice, or one that has no room left above another.
@@ -303,7 +297,7 @@ def make_space(ik: System, parameters: Sequence[FreeParameter]) -> Space[System]
         _check_free_once(parameter, parameters)
         _check_room(ik, parameter, parameters)
     leaves = [parameter_tree.get(ik, parameter.leaf) for parameter in parameters]
-    dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
+    dtype = leaves[0].dtype if leaves else jnp.result_type(float)
     zeros = jax.device_put(np.zeros(len(parameters), dtype))
     space = Space(
         system=ik,

@@ -19,9 +19,9 @@ from fitting.studies.assess import MIN_IMPROVEMENT
 from fitting.studies.fit import Fit
 from fitting.studies.run_folder import SUMMARY
 
-from . import capture_report, fit_tables, worst_window_report
+from . import fit_tables, worst_window_report
 from .formatting import aligned, bullets, joined, markdown
-from .goodness import goodness_report
+from .goodness import capture_report, goodness_report
 from .identifiability.sections import sections as identifiability_sections
 from .page import fit_page
 from .page.fit_page import Measured

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxik
+from fitting.analysis import playback
 from fitting.experiments.experiment import Experiment
 from fitting.inference.identifiability import assess_identifiability
 from fitting.inference.noise.joint import fit_with_noise
@@ -14,7 +15,9 @@ from fitting.inference.noise.model import counted
 from fitting.inference.optimisation.kept_stages import KeptStages
 from fitting.inference.optimisation.search import find_best_fit, refine
 from fitting.inference.optimisation.solution import Progress, Solution
+from fitting.problem.capture.system import system_and_scenes
 from fitting.problem.problem import Problem
+from fitting.problem.scene import MEASURED
 from fitting.runtime import activity
 
 from .fit import Fit
@@ -78,8 +81,10 @@ def weighted(
     """The problem with the weight by which the residuals at its solution count for intervals."""
     if experiment.noise.correlation != "counted" or experiment.independent_every:
         return problem
-    with activity.announced("Weighing the residuals"):
-        return counted(problem, solution.u)
+    with activity.announced("Weighing the residuals"):  # by programs that a report needs, too
+        played = playback.play_all(*system_and_scenes(problem, solution.u))
+        errors = [{kind: play.errors[kind] for kind in MEASURED} for play in played]
+        return counted(problem, solution.u, errors)
 
 
 def assess_solution(

@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NotRequired, TypeAlias, TypedDict
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -24,6 +23,7 @@ from fitting.inference.noise.model import NoiseModel, noise_of
 from fitting.inference.optimisation.solution import Solution
 from fitting.inference.profiles import profile
 from fitting.problem.capture.system import is_of_capture, system_and_scenes
+from fitting.problem.free_parameters import gain_readings
 from fitting.problem.problem import Problem
 from fitting.problem.scene import WHITENED, Scene
 from fitting.runtime import activity
@@ -32,12 +32,11 @@ from fitting.runtime.display.notebook import Shown
 from fitting.runtime.precision import in_float64
 from fitting.runtime.storage.declared_types import Finite, between, length
 from fitting.runtime.validation import Content
-from jaxik.maths import parameter_tree, smoothing
+from jaxik.maths import parameter_tree
 
-from . import capture_check
-from .capture_check import CaptureCheck
 from .goodness import DistancesSummary, GoodnessSummary, summarise, summarise_distances
-from .motions import capture_signs
+from .motions import capture_check, capture_signs
+from .motions.capture_check import CaptureCheck
 from .motions.capture_signs import CaptureSigns
 from .prior_summary import PriorSummary, summarise_priors
 
@@ -48,7 +47,6 @@ if TYPE_CHECKING:
 # for a threshold would be the prior's: walkers that start far from a threshold's value get stuck.
 THRESHOLD_SD = 0.05
 MIN_START_SD, MAX_START_SD = 1e-3, 0.5
-TICK_RATES = (30.0, 60.0)  # Hz, at which a gain per tick is reported
 
 # Beyond these, a parameter is at the end of its range to the last digit, where no fit ends.
 U: TypeAlias = Annotated[float, between(-40.0, 40.0)]
@@ -345,18 +343,3 @@ def _fitted_parameters(fitted: Fit) -> list[FittedParameter]:
             row |= gain_readings(row["value"])  # type: ignore[operator]
         rows.append(row)
     return rows
-
-
-def gain_readings(gain: float, tick_hz: float = 30.0) -> dict[str, float]:
-    """The half-life, s, of a gain per tick, and the gains with the same half-life at other rates.
-
-    Args:
-        gain: fraction of the distance to its target that a value moves in each tick.
-        tick_hz: ticks per second.
-    """
-    per_tick, rate = jnp.asarray(gain), jnp.asarray(tick_hz)
-    readings = {"half_life": float(smoothing.half_life_of_gain(per_tick, rate))}
-    for hz in TICK_RATES:
-        fraction = smoothing.fraction_of_gain(per_tick, jnp.asarray(1.0 / hz), rate)
-        readings[f"gain_at_{hz:.0f}_hz"] = float(fraction)
-    return readings

@@ -12,6 +12,7 @@ from jaxtyping import Float
 import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.inference.noise.marginal import draw_sigmas, with_unknown_sigmas
+from fitting.inference.noise.model import measured
 from fitting.inference.sampling.blocks import LeaveOneOut, leave_one_out
 from fitting.inference.sampling.posterior import (
     Posterior,
@@ -133,6 +134,20 @@ def minus_cost_at(
     problem = with_open_noise(problem, experiment)
     log_probability = problem.log_probability(jnp.asarray(u, problem.space.start.dtype))
     return float(minus_cost(problem, u, np.asarray(log_probability)))
+
+
+def shown_noise(
+    problem: Problem[jaxik.FootIK], experiment: Experiment, u: Float[np.ndarray, " free"]
+) -> Problem[jaxik.FootIK]:
+    """The problem with the noise by which its motion is predicted.
+
+    Where residuals are counted, sigmas are no more than what a difference weighs, and the noise is
+    what the residuals at the fit show.
+    """
+    noise = experiment.noise
+    if noise.correlation != "counted" or noise.moves_optimum or experiment.independent_every:
+        return problem
+    return measured(problem, u)
 
 
 def with_open_noise(

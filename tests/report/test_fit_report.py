@@ -34,9 +34,9 @@ from fitting.problem import residuals
 from fitting.problem.prior import ParameterPrior, Priors
 from fitting.problem.problem import Problem
 from fitting.problem.space import Space, make_space
-from fitting.report import capture_report, fit_report, posterior_report
+from fitting.report import fit_report, posterior_report
 from fitting.report.formatting import markdown
-from fitting.report.goodness import goodness_report
+from fitting.report.goodness import capture_report, goodness_report
 from fitting.report.plots import posterior_plots
 from fitting.report.uncertainty import islands, priors
 from fitting.runtime.display import notebook

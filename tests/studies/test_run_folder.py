@@ -26,10 +26,11 @@ from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.sampling.chain import Chain
 from fitting.inference.sampling.chain_file import Identity
 from fitting.inference.sampling.posterior import digest
+from fitting.problem.free_parameters import gain_readings
 from fitting.runtime.storage.claimed_folder import LOCK, claimed
 from fitting.studies import assess, run_folder
 from fitting.studies.assess import search
-from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit, gain_readings
+from fitting.studies.fit import MAX_START_SD, THRESHOLD_SD, Fit
 from fitting.studies.sample import walker_start
 from fuzz import kept_files
 from jaxik.maths import parameter_tree

@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -144,14 +145,41 @@ def _check_noise(sigmas: Mapping[str, float]) -> None:
 
 
 @in_float64
-def counted(problem: Problem[jaxik.FootIK], u: Vector) -> Problem[jaxik.FootIK]:
-    """The problem with the weight that its residuals at `u` say; see `likelihood_weight`."""
-    weight = likelihood_weight(problem, u)
+def measured(problem: Problem[jaxik.FootIK], u: Vector) -> Problem[jaxik.FootIK]:
+    """The problem with the noise that its residuals at `u` show, for what is predicted of them."""
+    noise, by_clip = noise_of(problem), _errors_of_clips(problem, u)
+    estimates = {
+        kind: series.likeliest([e[kind] for e in by_clip], problem.loss, noise.tails, None)
+        for kind in noise.sigmas
+        if any(errors[kind].active.any() for errors in by_clip)
+    }
+    sigmas = {kind: max(own.sigma, LEAST_SIGMAS[kind]) for kind, own in estimates.items()}
+    correlations = {kind: estimate.correlation for kind, estimate in estimates.items()}
+    shown = NoiseModel(
+        {**noise.sigmas, **sigmas}, {**noise.correlations, **correlations}, noise.tails, weight=1.0
+    )
+    return with_noise(problem, shown)
+
+
+@in_float64
+def counted(
+    problem: Problem[jaxik.FootIK], u: Vector, errors: Sequence[Mapping[str, Any]] | None = None
+) -> Problem[jaxik.FootIK]:
+    """The problem with the weight that its residuals at `u` say; see `likelihood_weight`.
+
+    Args:
+        problem: at its solution.
+        u: of the solution.
+        errors: of its motion, by kind, clip by clip, where they are known already.
+    """
+    weight = likelihood_weight(problem, u, errors)
     return with_noise(problem, dataclasses.replace(noise_of(problem), weight=weight))
 
 
 @in_float64
-def likelihood_weight(problem: Problem[jaxik.FootIK], u: Vector) -> float:
+def likelihood_weight(
+    problem: Problem[jaxik.FootIK], u: Vector, errors: Sequence[Mapping[str, Any]] | None = None
+) -> float:
     """Weight of the log-likelihood at which intervals are as wide as the residuals say.
 
     Of kinds of residuals, each a first-order autoregression, the variance of the score over the
@@ -159,11 +187,15 @@ def likelihood_weight(problem: Problem[jaxik.FootIK], u: Vector) -> float:
     worth one, and residuals of twice their sigma a quarter. No residual counts as smaller than the
     least sigma that a capture has.
     """
-    noise, by_clip = noise_of(problem), _errors_of_clips(problem, u)
+    noise = noise_of(problem)
+    if errors is None:
+        by_clip = _errors_of_clips(problem, u)
+    else:
+        by_clip = [_counted(*pair) for pair in zip(problem.data, errors, strict=True)]
     curvature = variance = 0.0
     for kind, sigma in noise.sigmas.items():
-        for errors in by_clip:
-            in_sigmas = errors[kind]._replace(values=errors[kind].values / sigma)
+        for of_clip in by_clip:
+            in_sigmas = of_clip[kind]._replace(values=of_clip[kind].values / sigma)
             residuals = series.whitened(in_sigmas, noise.correlations[kind])
             scores = residuals._replace(values=_influence(problem, residuals.values))
             if not scores.active.any():

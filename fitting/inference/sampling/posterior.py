@@ -204,9 +204,7 @@ def sample_posterior(
 
 
 def minus_cost(
-    problem: Problem,
-    u: Float[np.ndarray, "*rows free"],
-    log_probability: Float[np.ndarray, "*rows"],
+    problem: Problem, u: Float[np.ndarray, "*rows free"], log_probability: np.ndarray
 ) -> Float[np.ndarray, "*rows"]:
     """Minus the cost of points, whose lowest one is the fit, from their log-probability."""
     of_prior = np.sum(problem.space.prior_costs(np.asarray(u)), axis=-1)

@@ -50,6 +50,12 @@ def _describe_sizes(fitted: Fit) -> str:
         squares = f"square of the residuals' median size, before the loss `{loss}`,"
     every = fitted.experiment.independent_every
     taken = f" One in {every:g} s counts as independent in the fit." if every else ""
+    if fitted.assumed.counted:
+        return (
+            f"Sigmas say what a difference weighs. Reduced chi-square is the {squares} in units of "
+            "what noise of this size would have; intervals do not rest on it, but on size and "
+            f"correlation of the residuals.{taken}"
+        )
     return (
         f"Reduced chi-square is the {squares} in units of what is expected: 1 if sigmas and system "
         "are right. p is the probability of one at least as far from 1; its degrees of freedom are "

@@ -12,9 +12,9 @@ from fitting.analysis.limit_activity import ClipActivity
 from fitting.analysis.placement import Placement
 from fitting.analysis.worst_window import WorstWindow
 from fitting.datasets.clips import flight
-from fitting.report import capture_report, fit_tables, worst_window_report
+from fitting.report import fit_tables, worst_window_report
 from fitting.report.formatting import Table
-from fitting.report.goodness import goodness_tables
+from fitting.report.goodness import capture_report, goodness_tables
 from fitting.report.identifiability.sections import missing_table
 from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit, FittedParameter

@@ -11,7 +11,7 @@ from fitting.datasets.clips import Clip, flight, summary
 from fitting.datasets.clips.rigs import USUAL_ERROR, measure_soles
 from fitting.datasets.terrain.reconstruction import Reconstruction
 from fitting.experiments.problems import ClipData
-from fitting.studies.capture_check import stances_of
+from fitting.studies.motions.capture_check import stances_of
 from jaxik.world import body
 
 FEW_STANCES = 6  # of a foot

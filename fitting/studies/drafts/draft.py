@@ -23,8 +23,8 @@ from fitting.inference.sensitivity import FreeTable, all_parameters
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.runtime.validation import error_context
-from fitting.studies import capture_check
-from fitting.studies.capture_check import CaptureCheck
+from fitting.studies.motions import capture_check
+from fitting.studies.motions.capture_check import CaptureCheck
 
 from .assumptions import Assumption, of_clip
 

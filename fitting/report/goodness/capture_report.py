@@ -3,11 +3,10 @@
 import math
 from collections.abc import Sequence
 
+from fitting.report.fit_tables import Truth, parameter_table
+from fitting.report.formatting import bullets, markdown
 from fitting.studies.fit import Fit, FittedParameter
 from fitting.studies.motions.capture_signs import CaptureSigns
-
-from .fit_tables import Truth, parameter_table
-from .formatting import bullets, markdown
 
 HEADING = "The capture"
 
