@@ -59,12 +59,12 @@ FIT_WORK = [
     *READ_AND_PREPARE,
     ("Preparing the programs of the search", (search, "_begin")),
     ("Searching from up to 6 starts", (search, "search_from")),
-    ("Weighing the residuals",),
+    ("Weighing the residuals", PLAY),
     ("Following 2 parameters over their ranges", (profiling, "lowest")),
     ("Writing the motions and numbers of the fit", (run_folder, "save_clip")),
     ("Playing the clips with the system before the fit", PLAY),
     ("Playing the clips with the fitted system", PLAY),
-    ("Drawing the curves of the parameters", (fit_report, "_draw_profiles")),
+    ("Drawing the curves of the parameters", (fit_report, "_draw_search")),
     (f"Drawing {NAME}", (fit_report, "_draw_clip")),
     ("Measuring where limits are in effect", (fit_report.limit_activity, "measure"), PLAY),
     ("Finding what determines 2 parameters", (sections, "find_evidence"), PLAY),
@@ -229,7 +229,7 @@ def test_a_lower_point_of_a_chain_becomes_the_fit_of_its_run(done, run):
     worsen(run)
     lines: list[str] = []
     sampled = fitting.sample(run, log=lines.append)
-    assert any("higher than the fit's; the fit goes on from there" in line for line in lines)
+    assert any("lower than the fit's; the fit goes on from there" in line for line in lines)
     _, adopted = run_folder.load_fit(run)
     for before, after in zip(done.fitted.parameters, adopted["parameters"], strict=True):
         assert after["u"] == pytest.approx(before["u"], abs=0.1 * before["start_sd"])

@@ -81,10 +81,16 @@ def weighted(
     """The problem with the weight by which the residuals at its solution count for intervals."""
     if experiment.noise.correlation != "counted" or experiment.independent_every:
         return problem
-    with activity.announced("Weighing the residuals"):  # by programs that a report needs, too
-        played = playback.play_all(*system_and_scenes(problem, solution.u))
-        errors = [{kind: play.errors[kind] for kind in MEASURED} for play in played]
-        return counted(problem, solution.u, errors)
+    with activity.announced("Weighing the residuals"):
+        return counted(problem, solution.u, played_errors(problem, solution.u))
+
+
+def played_errors(
+    problem: Problem[jaxik.FootIK], u: Float[np.ndarray, " free"]
+) -> list[dict[str, Float[np.ndarray, "frames ..."]]]:
+    """Errors of each measured kind, clip by clip, by programs that a report needs, too."""
+    played = playback.play_all(*system_and_scenes(problem, u))
+    return [{kind: np.asarray(play.errors[kind]) for kind in MEASURED} for play in played]
 
 
 def assess_solution(

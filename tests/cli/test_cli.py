@@ -492,7 +492,7 @@ def test_schema_is_written_as_json_and_lists_every_key(tmp_path, capsys):
 def test_a_copied_example_is_whole_and_names_its_schema(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     elsewhere = {"blocks", "blocks_walk", "blocks_causal"}  # whose clips are not in the repository
-    assert len(examples.names().keys() - elsewhere) == 14
+    assert len(examples.names().keys() - elsewhere) == 15
     assert main.main(["example", name, "-o", "copy"]) == 0
     path = tmp_path / "copy" / f"{Path(name).name}.toml"
     loaded, original = load_experiment(path), load_experiment(examples.path_of(name))

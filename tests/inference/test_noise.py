@@ -27,7 +27,7 @@ from fitting.problem.problem import Problem
 from fitting.problem.residuals import residuals_by_kind
 from fitting.problem.scene import LEAST_SIGMAS, Scene
 from fitting.problem.simulation import autoregression
-from fitting.studies import run_folder
+from fitting.studies import assess, run_folder
 from fitting.studies.assess import search_with_noise
 from support.experiments import ROOT
 
@@ -171,6 +171,7 @@ def walk(options: NoiseOptions, loss: str = "squares") -> tuple[Experiment, Foot
 def no_pipeline(monkeypatch) -> None:
     """The errors are those of the problem's own residuals."""
     monkeypatch.setattr(model, "_errors_by_kind", errors_by_kind)
+    monkeypatch.setattr(assess, "played_errors", lambda problem, u: None)  # as above
 
 
 @pytest.fixture(scope="module")

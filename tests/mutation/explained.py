@@ -37,9 +37,6 @@ REASONS = {
         ("default=0", "default= 1", "the longest word counts only where it is long")
     ],
     "fitting/datasets/clips/formats/gltf/writer.py": [("GREY = [", "", LOOK)],
-    "fitting/datasets/clips/assemble.py": [
-        ("< PLAUSIBLE_RATIO", "<= PLAUSIBLE_RATIO", "rounding decides at exactly 1.5 times a leg")
-    ],
     "fitting/datasets/flat_animation.py": [
         ("(joints, after, strict=True", "(joints, after, strict=False", GUARD)
     ],

@@ -295,7 +295,6 @@ def test_other_data_bounds_starts_priors_and_weights_do_not_compile_again():
         ("foot.share", {"prior_sd": 1.0}, "unknown.*prior_sd.*takes"),
         ("foot.share", {"scale": "square"}, "scale is 'square'"),
         ("foot.share", {"kind": "soft"}, "kind is 'soft'"),
-        ("", {}, "nothing is free"),
         ("foot.share foot.share", {}, "free twice"),
         ("foot.limit foot.limit[0]", {}, "free twice"),
         ("lock.height_on lock.height_off", {"high": 0.11}, "above lock.height_on, which reaches"),

@@ -398,9 +398,9 @@ NUMBERS = [
     (row(kind="cubic"), "parameters[0].kind is 'cubic'"),
     (row(interval=[1.0]), "parameters[0].interval is [1.0]; wanted a list of 2"),
     (row(valleys=[{"value": 1.0}]), "parameters[0].valleys[0] has no interval"),
-    (row(name="foot.max_pitch"), "wanted one or more, each once"),
+    (row(name="foot.max_pitch"), "wanted each once"),
     (row(name="pelvis.limit"), "the fit has the parameters"),
-    (lambda fit: {"parameters": []}, "its parameters are []"),
+    (lambda fit: {"parameters": []}, "the fit has the parameters []"),
     (lambda fit: {"noise": {"sigmas": {}}}, "noise has no correlations"),
     (lambda fit: {"format": 9}, "its format is 9; this release reads"),
 ]

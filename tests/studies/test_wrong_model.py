@@ -246,7 +246,7 @@ def test_false_verdicts_are_outside_and_shown():
     assert (assessment.verdicts_of["fits"].hits, assessment.verdicts_of["fits"].total) == (1, 4)
     text = wrong_model_report.text(assessment, fits)
     assert "outside their bounds: the share of true verdicts" in text
-    assert 'Replicate 1 says: "Said." Without errors: ankles 1 cm, knees 1.5 cm' in text
+    assert 'Replicate 1 says: "Said." Without errors: ankles 1.0 cm, knees 1.5 cm' in text
     assert "ankles 2.5 cm, knees 3.8 cm" in text
 
 

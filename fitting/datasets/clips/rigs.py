@@ -98,7 +98,8 @@ def measure_rig(
         for index, leg in enumerate(roles.legs)
     ]
     axes, feet, lengths = (np.stack(part) for part in zip(*legs, strict=True))
-    with jax.enable_x64(True):
+    # Numbers also inside a trace, as soles are measured from them by NumPy.
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
         rig = Rig(
             knee_axis_ls=jnp.asarray(axes),
             ankle_from_foot=jnp.asarray(feet),
