@@ -39,8 +39,8 @@ def distance_table(distances: Distances) -> Table:
 def distances_of_preset(distances: Distances) -> Table:
     """How far a system that nobody has fitted yet leaves the captured motion."""
     table = [["distance from the capture, rms", "flat animation", "preset"]]
-    for kind in CLOSE:
-        motions = distances.parts["fitted"]
+    motions = distances.parts.get("fitted", {})
+    for kind in CLOSE if motions else ():
         sizes = [size(kind, motions[motion][kind]) for motion in ("animation", "before")]
         table.append([NAMES[kind], *sizes])
     return table
