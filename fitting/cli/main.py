@@ -20,7 +20,8 @@ MISTAKE, INTERRUPTED = 2, start.INTERRUPTED  # exit statuses
 # Allocations between searches for dead cycles of objects. Imports and traces leave hundreds of
 # thousands of objects that live on; by Python's own numbers a first fit spends 3 s looking at them.
 COLLECTIONS = (200_000, 10, 10)
-LIBRARIES, OWN = ("site-packages", "dist-packages"), ("jaxik", "fitting")  # folders
+LIBRARIES = ("site-packages", "dist-packages")  # folders
+OWN = ("jaxik", "fitting", "jaxtyping", "beartype")  # and what may wrap functions of ours
 RENAMED = {"contribution": "ablate"}  # old commands, which still work in this release
 
 
