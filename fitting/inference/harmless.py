@@ -29,8 +29,8 @@ def leave_alone(
     candidates: FreeTable,
     scenes: tuple[Scene, ...],
     is_harmless: Callable[[jaxik.FootIK], bool],
-) -> dict[str, float]:
-    """Values by name of the parameters that are to be changed; not more than are needed.
+) -> list[str]:
+    """Names of the parameters that are to be changed; not more than are needed.
 
     Args:
         ik: the system.
@@ -42,8 +42,8 @@ def leave_alone(
     parameters = [free_parameter(ik, name, rig, **given) for name, given in candidates.items()]
     space = make_space(ik, parameters)
     scenes = tuple(left_alone(scene) for scene in scenes)
-    u, changes = np.asarray(space.pack({})), dict[str, float]()
-    while len(changes) < MOST and not is_harmless(space.unpack(u)):
+    u, changed = np.asarray(space.pack({})), list[str]()
+    while len(changed) < MOST and not is_harmless(space.unpack(u)):
         here = residuals_at(space, scenes, u[None])[0]
         present, costs, places = _cost(here), [], []
         for i, (tried, moved) in enumerate(sweep(space, scenes, u)):
@@ -55,8 +55,8 @@ def leave_alone(
         good = np.flatnonzero(np.asarray(costs) <= best + AS_GOOD * (present - best))
         i, place = min((places[k] for k in good), key=lambda at: abs(at[1] - u[at[0]]))
         u = np.where(np.arange(space.size) == i, place, u)
-        changes[space.names[i]] = float(space.values(u)[i])
-    return changes
+        changed.append(space.names[i])
+    return changed
 
 
 def _cost(residuals: Float[np.ndarray, " residuals"]) -> float:

@@ -187,7 +187,7 @@ def draft(
     apart = distances.measure(as_it_comes, as_it_comes)
     lines: list[str] = []
     if check.flat:
-        moved = _harmful(experiment, data, candidates) if apart.setbacks else {}
+        moved = _decisive(experiment, data, candidates) if apart.setbacks else []
         forecasts = [
             Forecast(name, is_free=name in moved, reach=float(name in moved), contraction=0)
             for name in candidates
@@ -217,10 +217,8 @@ def draft(
     )
 
 
-def _harmful(
-    experiment: Experiment, data: Sequence[ClipData], candidates: FreeTable
-) -> dict[str, float]:
-    """Which parameters, at which values, let a system leave a flat capture alone."""
+def _decisive(experiment: Experiment, data: Sequence[ClipData], candidates: FreeTable) -> list[str]:
+    """Names of the parameters on which it depends whether a flat capture is left alone."""
     scenes = problem_from_clips(experiment, data).data
 
     def is_harmless(ik: jaxik.FootIK) -> bool:
