@@ -128,6 +128,7 @@ RECORD_TRUTH = {
     "pelvis.limit": 0.22,
     "pelvis.on_gain": 0.15,
     "leg.max_knee_angle": 2.85,
+    "leg.soften": 0.98,
     "foot.max_pitch": 0.26,
     "foot.max_roll": 0.12,
 }

@@ -68,7 +68,7 @@ def record(rig: Rig | None = None, *, faithful: bool = False) -> FootIK:
         separation=NoSeparation(),
         pelvis=LowestPelvis(),
         effector=DirectEffector(),
-        leg=TwoBone(),
+        leg=TwoBone(soften=1.0),  # nothing in the record softens
         foot=PitchRollFoot(),
         fade=NoFade() if faithful else SpeedFade(),
     )

@@ -239,7 +239,7 @@ def test_a_changed_parameter_changes_its_own_bytes_only():
         ("lock.max_speed", 0.9, "lock.max_speed = 0.9 m/s (inf m/s)"),
         ("lock.release_distance", math.inf, "lock.release_distance = inf m (0.2 m)"),
         ("target.max_slope", 0.3, "target.max_slope = 0.3 rad (17.19°) (1.047 rad (60°))"),
-        ("leg.soften", [0.9, 0.8], "leg.soften = [0.9, 0.8] (0.98)"),
+        ("leg.soften", [0.9, 0.8], "leg.soften = [0.9, 0.8] (1)"),
         ("lean.spring", True, "lean.spring = on (off)"),
         ("probe.layers", 0b101, "probe.layers = 0x5 (all)"),
         ("pelvis.tick_hz", 60.0, "pelvis.tick_hz = 60 Hz (30 Hz)"),

@@ -184,7 +184,7 @@ def test_the_table_of_priors_has_shape_centre_spread_and_both_intervals(fitted):
     )
     assert "| uniform |  |  | 0.805 to 0.995 |" in line_of(text, "leg.soften")  # of 0.8 to 1
     text = "\n".join(priors.prior_section(fitted.summary["parameters"]))
-    assert "| normal | 0.9667 (system: 0.98) | 1.6 |" in line_of(text, "leg.soften")
+    assert "| normal | 0.9667 (system: 1) | 1.6 |" in line_of(text, "leg.soften")
     assert "| normal | 0.1 | 1.6 |" in line_of(text, "contact.planted_height")
 
 

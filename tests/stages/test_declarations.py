@@ -100,7 +100,7 @@ record: SpeedContact planted_height=0.09 raised_height=0.12 raised_speed=0.35 ha
   FootSeparation; LowestPelvis wait_to_rise=yes; DirectEffector; TwoBone as_animated=yes;
   PitchRollFoot max_pitch=0.8 min_pitch=-1 max_roll=0.45 min_roll=-0.6; SpeedFade
 record!: HeightContact; KeepRoot; StrideWarp; FootProbe limited=no; SlopeTarget; SlopeLean;
-  OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone; PitchRollFoot; NoFade
+  OffsetLock; NoSeparation; LowestPelvis; DirectEffector; TwoBone soften=1; PitchRollFoot; NoFade
 ozz: StandingContact; GroundRoot; StrideWarp; FootProbe ray_down=inf use_toe=no; SoleTarget; NoLean;
   NoLock; NoSeparation; LowestPelvis limit=inf on_gain=1 off_gain=1; FoundEffector; PoleLeg;
   AimFoot; SpeedFade
