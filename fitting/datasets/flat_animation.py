@@ -2,7 +2,9 @@
 
 Foot IK takes such an animation and the terrain, and should return the captured motion. To derive
 it, the terrain is taken out from under the feet: during a stance a foot is lowered by the height of
-the ground below it, and between two stances by a quintic smoothstep from one height to the next.
+the ground below it and turned about its ball by the ground's slope, which foot IK adds again;
+between two stances by a quintic smoothstep from one height to the next, and from one slope to a
+foot as captured in mid-swing.
 The pelvis keeps its path in the ground plane at a constant height: what it does on uneven ground is
 for foot IK to find. Where the ground is flat, there is nothing to find, and the clip itself is such
 an animation: the pelvis moves as captured. Knees follow from the law of
@@ -30,21 +32,25 @@ from .relief import FLAT, relief
 
 HeightFunction = Callable[[np.ndarray], np.ndarray]
 """Ground heights, m, (points,), below points (points, 3), m."""
+NormalFunction = Callable[[np.ndarray], np.ndarray]
+"""Unit normals of the ground, (points, 3), below points (points, 3), m."""
 
 LENGTH_TOLERANCE = 1e-4  # m: a bone whose length varies by more is being stretched
 UNEVEN = 0.05  # m, of an adult, between stances: a flat animation and its noise differ by less
 MAX_REACH = 0.9995  # of a leg's length, to which it may be extended
+STEEPEST = np.radians(40.0)  # ground on which feet stand; steeper is the side of a step
 
 
 def flatten_clip(
     clip: Clip,
     height_under: HeightFunction,
     *,
+    normal_under: NormalFunction | None = None,
     pelvis_height: float | Float64[np.ndarray, " frames"] | None = None,
 ) -> Clip:
     """The clip over a flat floor at y = 0.
 
-    Feet keep their orientation and their path in the ground plane. Where the pelvis is too high for
+    Balls keep their path in the ground plane, and feet their rotation against the ground. Where the pelvis is too high for
     a leg, its foot moves towards the hip until the leg reaches, so bones always keep their lengths.
     The body above the hips moves with the pelvis, as captured.
 
@@ -52,6 +58,7 @@ def flatten_clip(
         clip: captured motion over terrain. Its contact labels decide when a foot stands; if it has
             none, they are detected from its motion.
         height_under: the height of the terrain.
+        normal_under: the normal of the terrain; None takes all of it for level.
         pelvis_height: m; None keeps the captured heights on flat ground, and their mean above the
             ground under the standing feet on any other.
 
@@ -70,8 +77,11 @@ def flatten_clip(
         under = (ground * stance).sum(axis=1)[any_foot] / stance.sum(axis=1)[any_foot]
         pelvis_height = float(np.mean(pelvis[any_foot, 1] - under))
     lift = (pelvis_height - pelvis[:, 1])[:, None, None] * [0.0, 1.0, 0.0]
+    tilt = np.zeros((*stance.shape, 3))
+    if normal_under is not None:
+        tilt = _ground_tilts(clip, stance, normal_under)
     flat = _rebuild_legs(
-        clip.with_motion(clip.positions_ws + lift, clip.rotations_ws), clip, ground
+        clip.with_motion(clip.positions_ws + lift, clip.rotations_ws), clip, ground, tilt
     )
     return replace(flat, stance=stance)
 
@@ -90,7 +100,8 @@ def with_rigid_legs(clip: Clip) -> Clip:
     ]
     if max(errors) < LENGTH_TOLERANCE:
         return clip
-    return _rebuild_legs(clip, clip, np.zeros((clip.frame_count, len(rig.joints))))
+    level = np.zeros((clip.frame_count, len(rig.joints), 3))
+    return _rebuild_legs(clip, clip, level[..., 0], level)
 
 
 def load_flat_animation(path: Path, floor: float = 0.0, options: ClipOptions = AS_FOUND) -> Clip:
@@ -176,18 +187,46 @@ def ground_heights(
                 f"stances of the {name} foot, first at x {x:.2f}, z {z:.2f} m; make the terrain "
                 "larger, or cut the clip with start and end"
             )
-        start, end, x = heights[falls.last], heights[falls.next], falls.swing_fraction
-        ground[:, leg] = start + (end - start) * x**3 * (10 - 15 * x + 6 * x**2)
+        start, end = heights[falls.last], heights[falls.next]
+        ground[:, leg] = start + (end - start) * _smoothstep(falls.swing_fraction)
     return ground
 
 
-def _rebuild_legs(moved: Clip, captured: Clip, ground: np.ndarray) -> Clip:
-    """The clip `moved` with legs that reach the captured feet, lowered by `ground`.
+def _ground_tilts(
+    clip: Clip, stance: np.ndarray, normal_under: NormalFunction
+) -> Float64[np.ndarray, "frames legs 3"]:
+    """Rotations from level ground to that under each foot, as rotation vectors, rad.
+
+    They fade out until the middle of a swing, and then in; ground too steep to stand on counts as
+    level.
+    """
+    balls = clip.joints_ws(3)
+    tilts = np.zeros((*stance.shape, 3))
+    for leg in range(stance.shape[1]):
+        falls = contacts.footfalls(balls[:, leg], stance[:, leg])
+        x, y, z = np.asarray(normal_under(falls.positions_ws), np.float64).T
+        level = np.hypot(x, z)
+        angle = np.arctan2(level, y)
+        turn = np.where((level > 0) & (angle < STEEPEST), angle / np.where(level > 0, level, 1), 0)
+        slopes = np.stack([z * turn, np.zeros_like(x), -x * turn], axis=-1)
+        twice = 2 * falls.swing_fraction[:, None]
+        tilts[:, leg] = slopes[falls.last] * (1 - _smoothstep(np.minimum(twice, 1)))
+        tilts[:, leg] += slopes[falls.next] * _smoothstep(np.maximum(twice - 1, 0))
+    return tilts
+
+
+def _smoothstep(x: np.ndarray) -> np.ndarray:
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def _rebuild_legs(moved: Clip, captured: Clip, ground: np.ndarray, tilt: np.ndarray) -> Clip:
+    """The clip `moved` with legs that reach the captured feet, lowered and turned back.
 
     Args:
         moved: the captured clip, its body lifted.
         captured: the captured clip.
-        ground: m, (frames, legs).
+        ground: m, (frames, legs), by which feet are lowered.
+        tilt: rad, (frames, legs, 3), rotation vectors by whose inverse they turn about their balls.
     """
     rig, left_ws = captured.rig, captured.left_ws()
     positions_ws, rotations_ws = moved.positions_ws.copy(), captured.rotations_ws.copy()
@@ -195,18 +234,23 @@ def _rebuild_legs(moved: Clip, captured: Clip, ground: np.ndarray) -> Clip:
         before = [captured.positions_ws[:, joint] for joint in joints]
         hip = positions_ws[:, joints[0]]
         bones = float(rig.thigh[leg]), float(rig.shin[leg])
-        ankle = before[2] - ground[:, leg, None] * [0.0, 1.0, 0.0]
+        back = Rotation.from_rotvec(-tilt[:, leg])
+        foot = back.apply(before[3] - before[2])
+        ankle = before[3] - foot - ground[:, leg, None] * [0.0, 1.0, 0.0]
         distance = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)
         ankle = hip + (ankle - hip) * np.minimum(1.0, MAX_REACH * sum(bones) / distance)
         pole = _carried_pole(before, ankle - hip, left_ws)
         knee = knee_positions(hip, ankle, pole, bones)
-        after = [hip, knee, ankle, before[3] + ankle - before[2]]
+        after = [hip, knee, ankle, ankle + foot]
         for joint, pos in zip(joints, after, strict=True):
             positions_ws[:, joint] = pos
         for bone in (0, 1):
             change = _bone_axes(after, bone, left_ws) * _bone_axes(before, bone, left_ws).inv()
             old = Rotation.from_quat(captured.rotations_ws[:, joints[bone]], scalar_first=True)
             rotations_ws[:, joints[bone]] = (change * old).as_quat(scalar_first=True)
+        for joint in joints[2:]:
+            old = Rotation.from_quat(captured.rotations_ws[:, joint], scalar_first=True)
+            rotations_ws[:, joint] = (back * old).as_quat(scalar_first=True)
     return captured.with_motion(*_attach_children(captured, positions_ws, rotations_ws))
 
 

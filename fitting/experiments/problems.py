@@ -205,7 +205,11 @@ def load_clip_data(
     reference = _cut(captured, entry.reference, entry, fps)
     if entry.base is None:
         check_ground(reference)
-        base = flatten_clip(reference, mesh_files.height_function(terrain))
+        base = flatten_clip(
+            reference,
+            mesh_files.height_function(terrain),
+            normal_under=mesh_files.normal_function(terrain),
+        )
         base, root = place_root(base, terrain, entry.root)
         base, tracks = track_files.along(base, entry.tracks, entry.start)
         return ClipData(reference, base, terrain, root, tracks)

@@ -163,6 +163,8 @@ def test_a_root_stays_as_animated_where_it_follows_the_ground_or_there_is_none(c
 
 # Flat animations
 
+SLOPE = 0.2  # of an even hill
+
 
 @pytest.fixture(scope="module")
 def walk():
@@ -227,6 +229,41 @@ def test_the_ground_changes_smoothly_between_stances_and_is_refused_where_unknow
         flatten_clip(walk, lambda points: np.full(len(points), np.nan))
     with pytest.raises(ValueError, match="the left foot never stands"):
         flatten_clip(replace(walk, stance=np.zeros_like(walk.stance)), stairs)
+
+
+def test_feet_keep_their_rotation_against_slopes_and_not_against_the_sides_of_steps():
+    lying = Rotation.from_rotvec([-np.arctan(SLOPE), 0.0, 0.0])
+
+    def height_under(points: np.ndarray) -> np.ndarray:
+        return SLOPE * points[:, 2]
+
+    walk = stair_walk(height_under)
+    positions, rotations = walk.positions_ws.copy(), walk.rotations_ws.copy()
+    for _, _, ankle, toe in walk.rig.joints:  # feet that lie on the slope, also as they swing
+        positions[:, ankle] = walk.positions_ws[:, toe] + lying.apply([0.0, 0.05, -0.1])
+        rotations[:, [ankle, toe]] = lying.as_quat(scalar_first=True)
+    captured = walk.with_motion(positions, rotations)
+
+    def flattened(steepness: float) -> Clip:
+        normal = np.array([0.0, 1.0, -steepness]) / np.hypot(1.0, steepness)
+        normals = np.tile(normal, (100, 1))
+        return flatten_clip(captured, height_under, normal_under=lambda p: normals[: len(p)])
+
+    for steepness, expected in ((SLOPE, np.eye(3)), (5.0, lying.as_matrix())):
+        flat = flattened(steepness)
+        balls, ankles = flat.joints_ws(3), flat.joints_ws(2)
+        kept = flatten_clip(captured, height_under).joints_ws(3)
+        np.testing.assert_allclose(balls, kept, atol=1e-9)
+        foot = flat.rotations_ws[:, [joints[2] for joints in flat.rig.joints]][walk.stance]
+        turned = Rotation.from_quat(foot, scalar_first=True).as_matrix()
+        np.testing.assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-9)
+        away = (ankles - balls)[walk.stance]
+        offset = np.broadcast_to(expected @ [0.0, 0.05, -0.1], away.shape)
+        np.testing.assert_allclose(away, offset, atol=1e-9)
+    first, last = next(run for run in runs(~walk.stance[:, 0]) if run[0] > 0)
+    foot = flattened(SLOPE).rotations_ws[first : last + 1, walk.rig.joints[0][2]]
+    back = (lying.inv() * Rotation.from_quat(foot, scalar_first=True)).magnitude()
+    assert back[len(back) // 2] < 0.02 < 0.19 < back[0] and back[-1] > 0.19
 
 
 def test_the_flat_animation_of_the_blocks_benchmark_agrees_with_its_own(mocap):

@@ -303,8 +303,27 @@ def height_function(
     """
 
     def height_under(points_ws: np.ndarray) -> np.ndarray:
-        origins = jnp.asarray(points_ws) * jnp.array([1.0, 0.0, 1.0]) + jnp.array([0, above, 0])
-        hit = terrain.cast(surface, origins, jnp.asarray(2 * above))
+        hit = _cast_down(surface, points_ws, above)
         return np.where(hit.found > 0, np.asarray(hit.point)[..., 1], np.nan)
 
     return height_under
+
+
+def normal_function(
+    surface: terrain.Terrain, above: float = 100.0
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from points (points, 3), m, to the unit normal of the highest ground below them.
+
+    The normal is the up axis where there is no ground; see `height_function`.
+    """
+
+    def normal_under(points_ws: np.ndarray) -> np.ndarray:
+        hit = _cast_down(surface, points_ws, above)
+        return np.where(hit.found[:, None] > 0, hit.normal, [0.0, 1.0, 0.0])
+
+    return normal_under
+
+
+def _cast_down(surface: terrain.Terrain, points_ws: np.ndarray, above: float) -> terrain.Hit:
+    origins = jnp.asarray(points_ws) * jnp.array([1.0, 0.0, 1.0]) + jnp.array([0, above, 0])
+    return terrain.cast(surface, origins, jnp.asarray(2 * above))
