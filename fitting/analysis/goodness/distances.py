@@ -23,8 +23,8 @@ PARTS: tuple[Part, ...] = get_args(Part)
 
 # Distances up to which two motions look the same, m and rad: what a good fit of a capture leaves.
 CLOSE = {"ankle": 0.02, "knee": 0.03, "pelvis": 0.02, "foot": 0.1}
-# Differences between two distances that nobody sees, m and rad.
-UNSEEN = {"ankle": 0.002, "knee": 0.002, "pelvis": 0.002, "foot": math.radians(0.5)}
+# Differences between two distances that nobody sees, m and rad: 2 mm, of a foot at heel and tip.
+UNSEEN = {"ankle": 0.002, "knee": 0.002, "pelvis": 0.002, "foot": math.radians(1.0)}
 
 
 class Setback(NamedTuple):
@@ -48,7 +48,7 @@ class Distances:
     """m and rad, of `CLOSE`'s kinds; no part of which no frame was observed."""
 
     @property
-    def losses(self) -> list[Setback]:
+    def setbacks(self) -> list[Setback]:
         """Where the fitted motion is visibly worse than another, the largest ones first."""
         worse = [
             Setback(part, kind, motions["fitted"][kind], other, distance)
@@ -58,16 +58,6 @@ class Distances:
             if motions["fitted"][kind] > distance + UNSEEN[kind]
         ]
         return sorted(worse, key=lambda s: (s.distance - s.fitted) / CLOSE[s.kind])
-
-    @property
-    def setbacks(self) -> list[Setback]:
-        """The losses of a motion that is worse as a whole, other joints included."""
-        sizes = {
-            (part, motion): _size(kinds)
-            for part, motions in self.parts.items()
-            for motion, kinds in motions.items()
-        }
-        return [s for s in self.losses if sizes[s.part, "fitted"] > sizes[s.part, s.other]]
 
     @property
     def far(self) -> list[tuple[Part, str, float]]:
@@ -91,12 +81,12 @@ class Distances:
         return min(reversed(MOTIONS), key=self._score)
 
     def _score(self, motion: Motion) -> float:
-        return sum(_size(motions[motion]) for motions in self.parts.values())
-
-
-def _size(kinds: Kinds) -> float:
-    """The distances of all kinds as one number: squares, in units of what looks the same."""
-    return sum((distance / CLOSE[kind]) ** 2 for kind, distance in kinds.items())
+        """All distances as one number: squares, in units of what looks the same."""
+        return sum(
+            (distance / CLOSE[kind]) ** 2
+            for motions in self.parts.values()
+            for kind, distance in motions[motion].items()
+        )
 
 
 def measure(before: Sequence[Playback], fitted: Sequence[Playback]) -> Distances:

@@ -78,8 +78,6 @@ def judge(groups: Sequence[Group], assumed: Assumed, distances: Distances) -> Ve
         for part, motions in distances.parts.items()
     ]
     off = "; ".join([first, *others])
-    if losses := distances.losses:
-        return Verdict(True, f"Fits, though {describe_setback(losses[0])}: {off}.")
     if findings:
         return Verdict(True, f"Fits, but {findings}; {off}.")
     if assumed.sigmas_estimated:
