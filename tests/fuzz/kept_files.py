@@ -43,7 +43,7 @@ CHAIN |= {"intervals": {"lean.gain": [[0.1, 0.3]] * len(LEVELS)}, "draws": DRAWS
 DISTANCES = {motion: dict.fromkeys(CLOSE, 0.02) for motion in MOTIONS}
 JUDGEMENT = {"fits": True, "sentence": "Fits.", "distances": dict.fromkeys(PARTS, DISTANCES)}
 WRONG_MODEL = {"truth_values": {"lean.gain": 0.2}, "errors": {"drift": 0.01}}
-WRONG_MODEL |= {"captured": JUDGEMENT, "noise_free": JUDGEMENT}
+WRONG_MODEL |= dict.fromkeys(("captured", "lasting", "noise_free"), JUDGEMENT)
 REPLICATES = {
     calibration.FITS: OUTCOME | FIT | ENDING,
     calibration.CHAINS: CHAIN | ENDING,

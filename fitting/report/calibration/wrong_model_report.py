@@ -76,8 +76,10 @@ def explanation(truth: str) -> str:
         f"{1000 * WORSE:.0f} mm, the root mean square over ankles, knees and pelvis. A verdict is "
         "true unless the motion without errors contradicts it by more than nobody sees "
         f'({unseen}): one that says "fits" if this motion is further off than what looks the same '
-        f'({describe_distances(CLOSE)}) or the fit has made it worse, "does not fit" if it is '
-        'nearer everywhere, "worse" if the distance that it names is not larger than the other. '
+        f'({describe_distances(CLOSE)}) or the fit has made it worse, "worse" if the distance that '
+        'it names is not larger than the other. "Does not fit" is said of the capture, whose drift '
+        "and offsets no system has: it is false if the capture without noise and jumps is nearer "
+        "everywhere. "
         f"Bounds are those of the probability behind a share, at {percent(LEVEL, 0)}."
     )
 

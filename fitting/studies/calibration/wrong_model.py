@@ -4,6 +4,7 @@ No value of the fitted parameters is true, then. What a fit says of its motion s
 frames that were held out, against the capture and against the motion that has no errors.
 """
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from typing import TypedDict, cast
@@ -73,6 +74,8 @@ class WrongModelFit(Outcome):
     """Sizes of the capture's errors, as `ErrorSizes` has them."""
     captured: Judgement
     """The fit against the capture, as `jaxik fit` reports it."""
+    lasting: Judgement
+    """The same fit against a capture with only the errors that last: no noise and no jumps."""
     noise_free: Judgement
     """The same fit against the motion without errors."""
 
@@ -127,8 +130,11 @@ def fit_wrong_model(
     random = np.random.default_rng([experiment.seed, number])
     rig = problem.data[0].rig if experiment.body == "clip" else None
     ik, values = draw_system(truth, rig, random)
+    masked = [clip.mask_pops for clip in experiment.clips]
     made, sizes = with_motion_of(problem, ik), draw_sizes(random, noise_factor)
-    captured = with_errors(made, sizes, [clip.mask_pops for clip in experiment.clips], random)
+    lasting_sizes = dataclasses.replace(sizes, pop=0.0, noise=0.0)
+    lasting = with_errors(made, lasting_sizes, masked, copy.deepcopy(random))
+    captured = with_errors(made, sizes, masked, random)
     own = dataclasses.replace(experiment, seed=int(random.integers(2**32)))
     fitted = fit_simulated(captured, own, progress)
     return {
@@ -136,6 +142,7 @@ def fit_wrong_model(
         "truth_values": values,
         "errors": dataclasses.asdict(sizes),
         "captured": _judged(fitted),
+        "lasting": _judged(_against(fitted, lasting)),
         "noise_free": _judged(_against(fitted, made)),
     }
 

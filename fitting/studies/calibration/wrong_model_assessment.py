@@ -1,9 +1,10 @@
 """What finished replicates under a wrong model say: is a fit worth keeping, its verdict true?
 
-Nobody sees differences as small as `distances.UNSEEN`. So a verdict is true unless the motion
-without errors contradicts it by more: one that says "fits" where that motion is further off than
-what looks the same, or where the fit has made something worse; "does not fit" where all of it is
-clearly within; "worse" where the distance that it names is not larger than the other one.
+Nobody sees differences as small as `distances.UNSEEN`. So a verdict is true unless it is
+contradicted by more: one that says "fits" where the motion without errors is further off than what
+looks the same, or where the fit has made something worse; "worse" where the distance that it names
+is not larger than the other one there; "does not fit", which is said of the capture, where this is
+clearly within without its noise and jumps.
 """
 
 import dataclasses
@@ -104,7 +105,7 @@ def word(judgement: Judgement) -> str:
 
 
 def is_true(fit: WrongModelFit) -> bool:
-    """Whether the motion without errors agrees with what a fit says of its capture."""
+    """Whether the motion and its capture, without noise, agree with what a fit says."""
     noise_free = distances_of(fit["noise_free"])
     if fit["captured"]["fits"]:
         return not _is_far(noise_free, 1.0) and not noise_free.setbacks
@@ -112,7 +113,7 @@ def is_true(fit: WrongModelFit) -> bool:
         part, kind, _, other, _ = setbacks[0]
         motions = noise_free.parts[part]
         return motions["fitted"][kind] > motions[other][kind]
-    return not fit["noise_free"]["fits"] or _is_far(noise_free, -1.0)
+    return not fit["lasting"]["fits"] or _is_far(distances_of(fit["lasting"]), -1.0)
 
 
 def distances_of(judgement: Judgement) -> Distances:
