@@ -19,7 +19,7 @@ from fitting.runtime.precision import in_float64
 
 from .sensitivity import FreeTable, residuals_at, sweep
 
-MOST = 3  # parameters that are changed
+MOST = 4  # parameters that are changed
 AS_GOOD = 0.02  # of the cost that is to be gained: among changes so alike, the smallest is taken
 
 

@@ -104,7 +104,7 @@ def test_what_a_preset_does_to_flat_clips_is_said_and_what_stops_it_is_free(
     assert "under all stances is flat" in text and "ozz as it comes, for this body" in text
     assert "ozz as it comes does not leave these feet alone, as it must on flat ground" in text
     free = load_experiment(draft / "experiment.toml").free
-    assert "target.foot_height" in free and len(free) <= 3
+    assert "target.foot_height" in free and len(free) <= 5
 
 
 def test_where_nothing_is_free_the_system_is_judged_as_it_comes(tmp_path, capsys):
