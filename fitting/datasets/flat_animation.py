@@ -50,9 +50,9 @@ def flatten_clip(
 ) -> Clip:
     """The clip over a flat floor at y = 0.
 
-    Balls keep their path in the ground plane, and feet their rotation against the ground. Where the pelvis is too high for
-    a leg, its foot moves towards the hip until the leg reaches, so bones always keep their lengths.
-    The body above the hips moves with the pelvis, as captured.
+    Balls keep their path in the ground plane, and feet their rotation against the ground. Where the
+    pelvis is too high for a leg, its foot moves towards the hip until the leg reaches, so bones
+    always keep their lengths. The body above the hips moves with the pelvis, as captured.
 
     Args:
         clip: captured motion over terrain. Its contact labels decide when a foot stands; if it has
