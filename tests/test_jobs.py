@@ -36,6 +36,7 @@ from fitting.inference.sampling import posterior
 from fitting.inference.sampling.posterior import Posterior
 from fitting.report import fit_report, posterior_report
 from fitting.report.identifiability import sections
+from fitting.report.page import rendering
 from fitting.runtime import activity
 from fitting.runtime.precision import with_floats
 from fitting.studies import assess, run_folder
@@ -183,12 +184,12 @@ def interrupt(*_, **__) -> Any:
 
 def test_a_fit_writes_numbers_tables_and_plots_and_says_where(done):
     """The names in its experiment are no paths."""
-    summary, page = done.run / run_folder.SUMMARY, done.run / run_folder.PAGE
+    summary, page = done.run / run_folder.SUMMARY, done.run / rendering.PAGE
     assert done.fitted.run == done.run
     assert done.log[0].startswith("fitting 2 parameters of record to 1 clip")
     assert done.log[-1] == f"written to {done.run}; read {summary}, or open {page} in a browser"
     names = {run_folder.EXPERIMENT, run_folder.FIT, run_folder.PARAMETERS, run_folder.SUMMARY}
-    names |= {run_folder.PAGE, "base.npz", "fitted.npz", "motion.png", "cost.png"}
+    names |= {rendering.PAGE, "base.npz", "fitted.npz", "motion.png", "cost.png"}
     assert names <= tree(done.run)
     numbers = numbers_of(done.run)
     assert numbers["converged"] and numbers["experiment"] == NAME

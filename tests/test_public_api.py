@@ -59,7 +59,7 @@ def test_the_wheel_carries_stubs_types_files_of_pages_and_examples_and_stays_sma
         names = set(archive.namelist())
     for package in house.PACKAGES:
         assert {f"{package}/{name}" for name in ("py.typed", "__init__.pyi")} <= names
-    page = ROOT / "fitting" / "report" / "page"
+    page = ROOT / "fitting" / "report"
     files = [path for folder in ("templates", "assets") for path in (page / folder).iterdir()]
     assert files and {path.relative_to(ROOT).as_posix() for path in files} <= names
     shipped = {"experiments/uneven_walk.toml", "clips/uneven_walk.npz", "terrains/uneven_walk.ply"}

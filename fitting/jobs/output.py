@@ -9,6 +9,7 @@ import jaxik
 from fitting.experiments.experiment import Experiment
 from fitting.experiments.problems import ClipData
 from fitting.problem.problem import Problem
+from fitting.report.page import rendering
 from fitting.runtime.storage.claimed_folder import claimed
 from fitting.studies import run_folder
 
@@ -46,6 +47,6 @@ def output_folder(output: str | Path | None) -> Iterator[Path | None]:
 def log_output(log: Log, folder: Path | None, text: str) -> None:
     """Logs where the results are, and the name of the file to read first."""
     if folder is not None:
-        page = folder / run_folder.PAGE
+        page = folder / rendering.PAGE
         in_browser = f", or open {page} in a browser" if page.is_file() else ""
         log(f"written to {folder}; read {folder / text}{in_browser}")

@@ -47,7 +47,6 @@ from .sample import SampledFit
 EXPERIMENT, FIT, PARAMETERS = "experiment.toml", "fit.json", "parameters.toml"
 FITTED_PARAMETERS = "parameters_fitted.toml"
 CHAIN, POSTERIOR, SUMMARY = "chain.h5", "posterior.json", "summary.md"
-PAGE = "report.html"
 INFERENCE_DATA, LOWER_POINT = "posterior.nc", "lower_point.toml"
 SEARCH = "search.json"
 SAMPLER_KEYS = ("name", "unit", "u", "start_sd", "value", "determined")  # that sampling reads

@@ -10,7 +10,6 @@ from PIL import Image
 from fitting.report import comparison_report
 from fitting.report.page import rendering
 from fitting.report.page.comparisons import compare_page, runs_page
-from fitting.studies import run_folder
 from fitting.studies.posterior.run_comparison import ComparedRun
 from support import comparisons, runs
 from support.browsers import launch, needs_chromium
@@ -38,7 +37,7 @@ pytestmark = needs_chromium
 def path(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     runs.write_run(folder, runs.with_clips(runs.invented_fit(folder)))
-    return folder / run_folder.PAGE
+    return folder / rendering.PAGE
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +47,7 @@ def comparison_path(tmp_path_factory) -> Path:
     compared = comparisons.invented_comparison(comparisons.walk())
     Image.new("RGB", (1700, 900), "white").save(folder / comparison_report.FIGURE)
     compare_page.write(folder, compared)
-    return folder / run_folder.PAGE
+    return folder / rendering.PAGE
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +55,7 @@ def plain_path(tmp_path_factory) -> Path:
     """A page without a view."""
     folder = tmp_path_factory.mktemp("plain")
     runs_page.write(folder, RUNS)
-    return folder / run_folder.PAGE
+    return folder / rendering.PAGE
 
 
 @pytest.fixture(scope="module")

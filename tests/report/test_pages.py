@@ -37,7 +37,6 @@ from fitting.report.page.comparisons import compare_page, compare_sentences, run
 from fitting.report.page.study_page import Finding, Grid, Section, StudyPage, Text
 from fitting.report.plots import goodness_plots, worst_window_plots
 from fitting.report.plots.style import save
-from fitting.studies import run_folder
 from fitting.studies.fit import Fit
 from fitting.studies.motions import comparison_motions, fit_motions
 from fitting.studies.posterior.run_comparison import ComparedRun
@@ -255,7 +254,7 @@ def run(fitted, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(run) -> Page:
-    return Page(run / run_folder.PAGE)
+    return Page(run / rendering.PAGE)
 
 
 @pytest.fixture(scope="module")
@@ -314,20 +313,20 @@ def test_the_page_has_the_noise_of_a_kind_that_the_second_clip_lacks(fitted, mon
 
 
 def test_a_posterior_is_added_once_and_replaced(run, tmp_path):
-    page = (run / run_folder.PAGE).read_text()
-    (tmp_path / run_folder.PAGE).write_text(page)
+    page = (run / rendering.PAGE).read_text()
+    (tmp_path / rendering.PAGE).write_text(page)
     for count in (1, 2):
         lines = [f"chain {count} <b>"]
         first = ["`jaxik fit` <i>: **run** it"]
         posterior_section.insert(tmp_path, first, lines, [["parameter"], ["x"]])
-    sampled = Page(tmp_path / run_folder.PAGE)
+    sampled = Page(tmp_path / rendering.PAGE)
     assert "chain 2 <b>" in sampled.text and "chain 1" not in sampled.text
     assert "<code>jaxik fit</code> &lt;i&gt;: <strong>run</strong> it" in sampled.html
     assert sampled.headings.count("h2 Posterior") == 1
-    assert sampled.data == Page(run / run_folder.PAGE).data
-    (tmp_path / run_folder.PAGE).write_text("of another kind")
+    assert sampled.data == Page(run / rendering.PAGE).data
+    (tmp_path / rendering.PAGE).write_text("of another kind")
     posterior_section.insert(tmp_path, [], [], [["parameter"]])
-    assert (tmp_path / run_folder.PAGE).read_text() == "of another kind"
+    assert (tmp_path / rendering.PAGE).read_text() == "of another kind"
 
 
 def test_positions_and_soles_on_the_page_are_those_of_the_motions(page, fitted, motions):
@@ -431,7 +430,7 @@ def test_a_comparison_begins_with_the_worst_system_and_shows_all_of_them(
 ):
     Image.new("RGB", (1700, 900), "white").save(tmp_path / comparison_report.FIGURE)
     compare_page.write(tmp_path, compared)
-    page = Page(tmp_path / run_folder.PAGE)
+    page = Page(tmp_path / rendering.PAGE)
     assert page.text.startswith(
         f" walk {HOSTILE} Foot IK systems compared on one clip walk {HOSTILE} "
         "1 of 2 beyond a limit ◐ Worst is deep: its standing feet are 2 cm or more off the "
@@ -497,7 +496,7 @@ def test_what_went_badly_comes_first_and_marks_are_not_html(tmp_path):
         sections=[Section("Table", [Grid([["x", "y"], ["1!", "2!"]], "numbers"), Text("`t`")])],
         asked=[["What", HOSTILE]],
     ).write(tmp_path)
-    page = Page(tmp_path / run_folder.PAGE)
+    page = Page(tmp_path / rendering.PAGE)
     assert "bad ◐ bad <i> good a b good too" in page.text
     assert "<li>good <code>a</code> <strong>b</strong></li>" in page.html
     assert '<td class="miss">2!</td>' in page.html and page.elements.count("script") == 2

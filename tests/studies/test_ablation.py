@@ -22,9 +22,10 @@ from fitting.inference.noise.settings import NoiseOptions
 from fitting.inference.optimisation.solution import Progress, Solution
 from fitting.report import ablation_report
 from fitting.report.labels import ACCURACY
+from fitting.report.page import rendering
 from fitting.report.page.studies import ablation_page
 from fitting.report.plots import ablation_plots
-from fitting.studies import ablation, run_folder
+from fitting.studies import ablation
 from fitting.studies.ablation import Row
 from jaxik.maths import parameter_tree
 from support import small_studies
@@ -279,7 +280,7 @@ def test_summary_and_page_show_groups_ablations_and_fits_that_did_not_converge(t
     wide, high = struct.unpack(">II", head[16:24])
     assert 1000 < wide < 2000 and 400 < high < 2000
     ablation_page.write(tmp_path, experiment, ROWS)
-    page = Page(tmp_path / run_folder.PAGE)
+    page = Page(tmp_path / rendering.PAGE)
     assert "2 fits not converged ◐ 2 of 6 fits did not converge" in page.text
     assert "3.10 cm from the captured ones (rms) on parts that were held out, 2.50 cm" in page.text
     assert "Not converged: without pitch, part 2 held out: Far off." in page.text

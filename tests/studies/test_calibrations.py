@@ -24,8 +24,8 @@ from fitting.inference.noise.model import noise_of
 from fitting.inference.profiles.profile import make_profile
 from fitting.problem.problem import Problem
 from fitting.report.calibration import calibration_report, calibration_tables
+from fitting.report.page import rendering
 from fitting.report.plots import calibration_plots
-from fitting.studies import run_folder
 from fitting.studies.calibration import calibration, replicates
 from fitting.studies.calibration.assessment import Assessment, assess, summarise
 from fitting.studies.calibration.calibration import Calibration, CalibrationProgress, Observers
@@ -292,7 +292,7 @@ def test_the_folder_has_a_report(finished):
     assert summary.startswith(f"# hill: calibration\n\n{everything}")
     for picture in ("ranks.png", "recovery.png"):
         assert f"({picture})" in summary and (out / picture).stat().st_size > 10_000
-    page = Page(out / run_folder.PAGE)
+    page = Page(out / rendering.PAGE)
     assert f"but {COUNT} simulated motions prove little, as these bounds are wide" in page.text
     assert page.elements.count("img") == 2 and "h2 Ranks" in page.headings
     numbers = json.loads((out / "calibration.json").read_text())
@@ -310,7 +310,7 @@ def test_what_is_outside_is_named_and_ends_with_status_5(tmp_path, monkeypatch, 
     assert "Not calibrated: on 8 simulated motions, outside their bounds: the fit's 95 %" in printed
     assert "**no**, too few" in printed
     assert not (out / "ranks.png").exists(), "there are no chains"
-    page = Page(out / run_folder.PAGE)
+    page = Page(out / rendering.PAGE)
     assert "hill Not calibrated ◐ Of 8 simulated motions, outside their bounds: the" in page.text
     assert "No posterior was sampled" in page.text and "no, too few" in page.text
 

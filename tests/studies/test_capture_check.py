@@ -16,6 +16,7 @@ from fitting.datasets.relief import relief
 from fitting.datasets.terrain.mesh_files import load_terrain
 from fitting.experiments.experiment_files import load_experiment
 from fitting.experiments.problems import ClipData
+from fitting.report.page import rendering
 from fitting.studies import run_folder
 from fitting.studies.motions import capture_check
 from support.experiments import write
@@ -114,6 +115,6 @@ def test_where_nothing_is_free_the_system_is_judged_as_it_comes(tmp_path, capsys
     assert "Does not fit: " in text and "Nothing is free: this is the system as it comes." in text
     numbers = json.loads((run / run_folder.FIT).read_text())
     assert numbers["parameters"] == [] and numbers["distances"]["kept"] == "fitted"
-    assert (run / run_folder.PAGE).exists() and (run / run_folder.PARAMETERS).exists()
+    assert (run / rendering.PAGE).exists() and (run / run_folder.PARAMETERS).exists()
     assert main.main(["sample", str(run)]) == 2
     assert "nothing was free" in capsys.readouterr().err

@@ -25,8 +25,9 @@ from fitting.datasets.terrain import mesh_files
 from fitting.experiments.systems import preset_system
 from fitting.report import comparison_report
 from fitting.report.labels import MEASURES
+from fitting.report.page import rendering
 from fitting.report.plots import comparison_plots, style
-from fitting.studies import comparison, frame_rates, run_folder
+from fitting.studies import comparison, frame_rates
 from fitting.studies.animations import Animation
 from fitting.studies.frame_rates import every_frame, measure
 from jaxik.maths import parameter_tree
@@ -165,7 +166,7 @@ def test_points_without_ground_are_left_out_and_mentioned(folder, tmp_path):
 def test_the_folder_holds_a_page_a_table_its_numbers_and_a_figure(compared):
     folder = compared.folder
     table, figure = folder / comparison_report.TABLE, folder / comparison_report.FIGURE
-    page, files = folder / run_folder.PAGE, {path.name for path in folder.iterdir()}
+    page, files = folder / rendering.PAGE, {path.name for path in folder.iterdir()}
     assert files == {page.name, table.name, figure.name, comparison_report.NUMBERS}
     (clip,) = Page(page).data["clips"]
     labels = [skeleton["label"] for skeleton in clip["skeletons"]]
@@ -281,7 +282,7 @@ def test_the_command_writes_the_table_of_frame_rates(fast, monkeypatch, tmp_path
     assert row in " ".join(capsys.readouterr().out.split())
     text = (tmp_path / "out" / comparison_report.TABLE).read_text()
     assert "## At other frame rates" in text
-    assert "h2 At other frame rates" in Page(tmp_path / "out" / run_folder.PAGE).headings
+    assert "h2 At other frame rates" in Page(tmp_path / "out" / rendering.PAGE).headings
     assert "| ozz | 60 Hz | 83.3 | 83.3 | 83.3 | 83.3 | 83.3 |" in text
     half, quarter = json.loads((tmp_path / "out/compare.json").read_text())["rates"]
     assert (half["system"], half["fps"], quarter["fps"]) == ("ozz", 60.0, 30.0)

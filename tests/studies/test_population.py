@@ -17,7 +17,7 @@ from fitting.experiments.experiment import ClipEntry
 from fitting.experiments.experiment_files import load_experiment
 from fitting.inference.noise.settings import NoiseOptions
 from fitting.report.hierarchy import population_plots, population_report, population_tables
-from fitting.studies import run_folder
+from fitting.report.page import rendering
 from fitting.studies.hierarchy import kept_searches
 from fitting.studies.hierarchy.population import Population, clip_names
 from jaxik.maths import parameter_tree
@@ -147,7 +147,7 @@ def test_the_folder_has_a_report_and_parameters(made):
     assert summary.startswith("# walks: clips and their population\n\n- `pelvis.on_gain` differs ")
     assert "from 3 clips only." in summary and "A clip that is left out is predicted to" in summary
     assert "(population.png)" in summary and (out / "population.png").stat().st_size > 10_000
-    page = Page(out / run_folder.PAGE)
+    page = Page(out / rendering.PAGE)
     assert "too few to say much of spreads: pelvis.on_gain differs between them." in page.text
     assert "All 7 searches and the fit of the population converged." in page.text
     assert page.elements.count("img") == 1 and "uneven_walk from 1 s (ann)" in page.text
@@ -171,7 +171,7 @@ def test_what_has_not_converged_is_said_and_ends_with_status_3(
     path = small_studies.quick_population(tmp_path, monkeypatch, rest=rest)
     assert main.main(["population", str(path), "-o", str(tmp_path / "out")]) == 3
     assert "**Not converged**: all clips: Not converged: stopped" in capsys.readouterr().out
-    page = Page(tmp_path / "out" / run_folder.PAGE)
+    page = Page(tmp_path / "out" / rendering.PAGE)
     assert re.search(r"walks \d not converged ◐ \d of the searches did not converge", page.text)
 
 

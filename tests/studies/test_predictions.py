@@ -24,6 +24,7 @@ from fitting.problem import residuals, simulation
 from fitting.problem.loss import apply_loss
 from fitting.problem.problem import Problem
 from fitting.problem.scene import Scene, legs_ws, pelvis_ws
+from fitting.report.page import rendering
 from fitting.report.uncertainty import band_plots, predictive
 from fitting.studies import run_folder
 from fitting.studies.posterior import likelihoods
@@ -254,7 +255,7 @@ def test_the_command_prints_and_writes_the_table(folder, capsys):
     assert "elpd of clip 2" in lines[0]
     text = Path("compared/runs.md").read_text()
     assert "| a | " in text and "expected log predictive density" in text
-    page = Page(Path("compared") / run_folder.PAGE)
+    page = Page(Path("compared") / rendering.PAGE)
     assert "b predicts best; a is 6.0 ± 0.8 below." in page.text
     rows = json.loads(Path("compared/runs.json").read_text())
     assert [row["name"] for row in rows] == ["b", "a"]

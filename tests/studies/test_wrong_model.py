@@ -21,7 +21,7 @@ from fitting.experiments.experiment_files import load_experiment
 from fitting.inference import sensitivity
 from fitting.problem.free_parameters import present_value
 from fitting.report.calibration import wrong_model_report
-from fitting.studies import run_folder
+from fitting.report.page import rendering
 from fitting.studies.calibration import capture_errors, wrong_model_assessment
 from fitting.studies.calibration.capture_errors import LARGEST, ErrorSizes
 from fitting.studies.calibration.wrong_model import SPREAD, draw_system
@@ -296,7 +296,7 @@ def test_the_command_reports_what_it_found(finished):
         assert captured != lasting != noise_free and captured["animation"]["ankle"] > 0.01
     summary = (out / "summary.md").read_text()
     assert "drawn around `record`" in summary and "| true verdicts | " in summary
-    page = Page(out / run_folder.PAGE)
+    page = Page(out / rendering.PAGE)
     assert "h2 Checks" in page.headings and "Made by record" in page.text
     assert "So few motions prove little: the share of true verdicts may be" in page.text
 

@@ -20,7 +20,6 @@ from fitting.runtime.precision import in_float64
 from fitting.studies.fit import Fit, FittedParameter
 from fitting.studies.motions import fit_motions
 from fitting.studies.motions.fit_motions import ClipMotions
-from fitting.studies.run_folder import PAGE
 from jaxik.maths import parameter_tree
 
 from . import asked, figures, motion_data, rendering, sentences
@@ -50,7 +49,7 @@ def write(run: Path, fitted: Fit, measured: Measured) -> None:
     ]
     labels = [scene.reference.label for scene in fitted.problem.data]
     clips = [shown(*each) for each in zip(motions, labels, windows, strict=True)]
-    rendering.write(run / PAGE, "fit.html", motion_data.pack(clips), **content)
+    rendering.write(run / rendering.PAGE, "fit.html", motion_data.pack(clips), **content)
 
 
 def shown(clip: ClipMotions, label: str, window: WorstWindow) -> ShownClip:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from fitting.report.formatting import Table
 from fitting.runtime import files
-from fitting.studies.run_folder import PAGE
 
 from . import rendering
 
@@ -21,7 +20,7 @@ def insert(run: Path, warnings: Sequence[str], lines: Sequence[str], table: Tabl
         lines: how the sampling went, likewise.
         table: the posterior of the parameters.
     """
-    path = run / PAGE
+    path = run / rendering.PAGE
     if not path.is_file():
         return
     page = path.read_text(encoding="utf-8", errors="replace")  # what is damaged may stay

@@ -14,7 +14,8 @@ from markupsafe import Markup, escape
 from fitting.report.plots import style
 from fitting.runtime import files
 
-PACKAGE = "fitting.report.page"
+PACKAGE = "fitting.report"
+PAGE = "report.html"  # in the folder of a run
 STYLES = ("page.css", "viewer.css")
 SCRIPTS = ("theme.js",)
 VIEWER_SCRIPTS = (  # in the order in which they use each other

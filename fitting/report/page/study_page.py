@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from fitting.report.formatting import Table
-from fitting.studies.run_folder import PAGE
 
 from . import motion_data, rendering
 from .motion_data import ShownClip
@@ -115,7 +114,7 @@ class StudyPage:
         spent = sum(picture.size for picture in pictures)
         clips = [] if self.view is None else motion_data.pack(self.view.clips, spent)
         rendering.write(
-            folder / PAGE,
+            folder / rendering.PAGE,
             "study.html",
             clips,
             page=self,

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from fitting.datasets.clips.clip import Clip
 from fitting.datasets.clips.kinematics import local_from_world, world_from_local
-from fitting.datasets.terrain.meshes import Mesh
 
 from .bones import bone_mesh
 
@@ -20,6 +19,9 @@ BODY = "body"
 STILL = 1e-6  # m; a joint that moves less against its parent needs no track of positions
 TERRAIN = "terrain"
 GREY = [0.6, 0.6, 0.6, 1.0]
+
+Triangles = tuple[Float64[np.ndarray, "vertices 3"], Int64[np.ndarray, "faces 3"]]
+"""Vertices, m, and their indices in each face."""
 
 
 class _Buffer:
@@ -51,7 +53,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def glb_bytes(clip: Clip, ground: Mesh | None = None) -> bytes:
+def glb_bytes(clip: Clip, ground: Triangles | None = None) -> bytes:
     """A GLB file: metres, y up; each joint is a node under its own name, and all are one skin.
 
     A mesh of bones hangs on the skin, as some programs take no skeleton without a mesh.
@@ -172,11 +174,12 @@ def _animation(clip: Clip, buffer: _Buffer) -> dict[str, Any]:
     return {"name": Path(clip.source).stem or "motion", "samplers": samplers, "channels": channels}
 
 
-def _ground(ground: Mesh, buffer: _Buffer) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _ground(ground: Triangles, buffer: _Buffer) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A mesh, and the materials: its own is grey, and is seen from both sides."""
+    vertices, faces = ground
     primitive = {
-        "attributes": {"POSITION": buffer.add(ground.vertices, "VEC3", with_range=True)},
-        "indices": buffer.add(ground.faces.reshape(-1), "SCALAR"),
+        "attributes": {"POSITION": buffer.add(vertices, "VEC3", with_range=True)},
+        "indices": buffer.add(faces.reshape(-1), "SCALAR"),
         "material": 0,
     }
     surface = {"baseColorFactor": GREY, "metallicFactor": 0.0}
