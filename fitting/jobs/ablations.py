@@ -14,6 +14,7 @@ from fitting.report.page.studies import ablation_page
 from fitting.runtime import activity
 from fitting.runtime.precision import in_float64
 from fitting.studies import ablation
+from fitting.studies.ablation import Row
 
 from .output import Log, log_output, output_folder, silent
 
@@ -26,7 +27,7 @@ def ablate(
     folds: int = 2,
     progress: Callable[[Progress], None] | None = None,
     log: Log = silent,
-) -> list[ablation.Row]:
+) -> list[Row]:
     """Fits an experiment as it is and without each of its rules, cross-validated.
 
     What is left out stands in the experiment's [[without]] tables. Each finished fit is written at
@@ -49,7 +50,7 @@ def ablate(
     with output_folder(output) as folder:
         experiment = replace(with_files(experiment, folder), holdout=0.0)
 
-        def log_row(row: ablation.Row) -> None:
+        def log_row(row: Row) -> None:
             log(ablation_report.row_text(row))
 
         rows = ablation.ablate(experiment, folder, folds=folds, progress=progress, on_row=log_row)

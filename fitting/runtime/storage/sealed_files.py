@@ -8,7 +8,7 @@ A program that changes the file drops the seal, and then it is not checked.
 import zlib
 from pathlib import Path
 
-from fitting.runtime import files
+from fitting.runtime.files import write
 
 SEAL = b"jaxik crc32 "
 DIGITS = 8
@@ -23,11 +23,11 @@ def write_sealed(path: Path, image: bytes | memoryview) -> None:
     seal = SEAL + f"{zlib.crc32(image):0{DIGITS}x}".encode()
 
     def fill(temporary: Path) -> None:
-        with open(temporary, "wb") as file:
-            file.write(image)
-            file.write(seal)
+        with open(temporary, "wb") as stream:
+            stream.write(image)
+            stream.write(seal)
 
-    files.write(path, fill)
+    write(path, fill)
 
 
 def check_seal(path: Path) -> None:

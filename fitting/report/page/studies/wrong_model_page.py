@@ -29,22 +29,30 @@ def write(
     assessment: WrongModelAssessment,
 ) -> None:
     """Writes the page into the folder of a calibration."""
-    report = wrong_model_report
     sections = [
         Section(
             "Checks",
             [
-                Text(report.explanation(truth)),
-                Grid(report.checks_table(assessment), "All checks"),
+                Text(wrong_model_report.explanation(truth)),
+                Grid(wrong_model_report.checks_table(assessment), "All checks"),
             ],
         ),
-        Section("Distances", [Grid(report.distances_table(assessment), "Distances by motion")]),
+        Section(
+            "Distances",
+            [Grid(wrong_model_report.distances_table(assessment), "Distances by motion")],
+        ),
     ]
     if assessment.coverage_of:
-        covered = Grid(report.coverage_table(assessment), "Intervals of shared parameters")
-        sections.append(Section("Parameters of both systems", [Text(report.COVERED), covered]))
+        covered = Grid(
+            wrong_model_report.coverage_table(assessment), "Intervals of shared parameters"
+        )
+        sections.append(
+            Section("Parameters of both systems", [Text(wrong_model_report.COVERED), covered])
+        )
     sections.append(
-        Section("Limits of the data", [Points([*LIMITS, *report.remarks(assessment, fits)])])
+        Section(
+            "Limits of the data", [Points([*LIMITS, *wrong_model_report.remarks(assessment, fits)])]
+        )
     )
     StudyPage(
         kind="Fits of motion that another system makes",
